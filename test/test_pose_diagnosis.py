@@ -277,3 +277,51 @@ def test_a_body_at_rest_tells_no_lever_arm_and_breaks_nothing():
     world.after = rest
     found = diagnose_poses(world.session())
     assert hand_eyes(found)[0].parameters['lever_arm_m'] == [None] * 3
+    assert named(found) == {}  # noise has no extent that tells a unit, and no velocity
+
+
+@pytest.mark.parametrize(('strain', 'expected'), [(0.0, {'time_offset'}), (0.02, set())])
+def test_a_body_that_is_only_carried_tells_the_clock_where_that_leaves_nothing(strain, expected):
+    world = World(5, duration=30.0)
+    turn, world.offset = world._turn, 0.03
+    world._turn = lambda time: 0.01 * turn(time)
+    world.bend = lambda sensor, place: place + sensor * strain * (place - [0.05, 0.02, -0.3])
+    found = diagnose_poses(world.session())
+    assert set(named(found)) == expected
+    assert (found.unexplained > 0.5) == (not expected)
+
+
+def test_the_scale_of_a_single_sensor_that_is_part_of_a_bend_is_none():
+    world = World(6, duration=40.0, sensors=1)
+
+    def bend(sensor, place):
+        away = (place - [0.05, 0.02, -0.3]) / 0.06
+        return place + 0.5e-3 * away + 2e-3 * away[:, [0]] * away
+
+    world.bend = bend
+    assert set(named(diagnose_poses(world.session()))) == {'field_distortion'}
+
+
+def test_the_slow_beat_of_a_poll_is_no_rate_of_the_clock():
+    world = World(206, duration=32.0, sensors=1, rate=1 / (2.0016 * 0.03))
+
+    def poll(streams):
+        streams['sensor_0'][0] = np.ceil(streams['sensor_0'][0] / 0.03) * 0.03
+        return streams
+
+    world.after = poll
+    assert 'clock_rate' not in named(diagnose_poses(world.session()))
+
+
+def test_errors_of_a_poll_are_not_as_uncertain_as_random_ones():
+    world = World(13, duration=40.0, sensors=1, rate=17.0)
+
+    def poll(streams):
+        streams['sensor_0'][0] = np.ceil(streams['sensor_0'][0] / 0.03) * 0.03
+        return streams
+
+    world.after = poll
+    offset = named(diagnose_poses(world.session()))['time_offset']
+    sigma = offset.uncertainty['offset_s']
+    assert sigma < 0.7 * 0.03 / np.sqrt(12 * 17 * 40)
+    assert abs(offset.parameters['offset_s'] - 0.015) < 4 * sigma

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.assessment.intervals import blocks_of_time
 from anser_ros.errors import FitError
-from anser_ros.poses.diagnosis import turn_jitter
+from anser_ros.poses.lever_arms import turn_jitter
 from anser_ros.poses.sequence import PoseSequence
 
 Array = NDArray[np.float64]

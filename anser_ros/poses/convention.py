@@ -11,7 +11,7 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.poses.effect import Role
 from anser_ros.poses.registry import effect_with
 from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession
-from anser_ros.poses.start import coarse_offset, first_cost, first_fit, pose_problem
+from anser_ros.poses.start import coarse_offset, first_cost, first_fit, is_at_rest, pose_problem
 from anser_ros.sessions.plausibility import check_positions
 from anser_ros.sessions.units import LENGTH_M
 
@@ -174,6 +174,8 @@ def _cost(session: PoseSession) -> float:
 def _extent_ratio(session: PoseSession) -> float:
     """Extent of the tracked positions over that of the optical ones at the same times."""
     problem = pose_problem(session)
+    if session.reference is not None and is_at_rest(session.reference):
+        return 1.0  # of noise, which tells no unit
     ratios = []
     for poses in problem.sensors:
         place, _, _, known = problem.path.at(poses.time)

@@ -4,14 +4,13 @@ The stages are those of a diagnosis of fluxes: read and set up, search on four f
 of time, judge on the fifth that took no part; then the parameters are fitted to all poses.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.clock_records import one_clock
 from anser_ros.poses.convention import read_rightly
@@ -26,10 +25,18 @@ from anser_ros.poses.effect import (
 )
 from anser_ros.poses.fit import PoseFit, fit_poses, noise_of, unexplained_poses
 from anser_ros.poses.jitter import jitter
-from anser_ros.poses.problem import PosePart, PoseProblem, PoseState
+from anser_ros.poses.lever_arms import (
+    LEAST_KNOWN_M,
+    LEAST_KNOWN_RAD,
+    is_lever_determined,
+    knows_levers,
+    most_poses,
+    turn_jitter,
+)
+from anser_ros.poses.problem import PoseProblem, PoseState
 from anser_ros.poses.registry import effect_with, pose_effects
-from anser_ros.poses.search import PoseEvidence, search_effects
-from anser_ros.poses.sequence import PoseSequence, PoseSession
+from anser_ros.poses.search import PoseEvidence, frame_terms, search_effects
+from anser_ros.poses.sequence import PoseSession
 from anser_ros.poses.start import (
     coarse_offset,
     first_fit,
@@ -125,8 +132,11 @@ def diagnose_poses(
         problem = pose_problem(session)
         training = problem.in_blocks(train)
         first = first_fit(training, coarse_offset(training), alone)
-    search = search_effects(first, say)
+    search = search_effects(first, session, say)
     say('held out')
+    if not search.knows_levers and _leaves_more(search.fit.state):
+        alone_fit = fit_poses(search.fit.state.problem, frame_terms(search.fit.terms))
+        search = replace(search, fit=alone_fit, evidence=(None,) * len(alone_fit.terms))
     found = search.fit
     frames = fit_poses(_without_stamps(found.state.problem), frame_terms(found.terms))
     whole = _whole(problem, found)
@@ -136,7 +146,10 @@ def diagnose_poses(
     floor = _floor(after)
     residuals = _residuals(session, problem, whole)
     records = _records(whole, search.evidence, session)
+    is_known = search.knows_levers and knows_levers(whole, most_poses(session))
     for effect in pose_effects().values():
+        if effect.needs_levers and not is_known:
+            continue
         words = {'summary': effect.summary, 'advice': effect.advice}
         records += [
             replace(r, evidence={**words, **r.evidence}) for r in effect.observed(residuals)
@@ -163,9 +176,9 @@ def diagnose_poses(
     )
 
 
-def frame_terms(terms: Sequence[Term]) -> list[Term]:
-    """Return the terms of the two unknown frames, without the effects."""
-    return [term for term in terms if effect_of(term).role.is_frame]
+def _leaves_more(state: PoseState) -> bool:
+    """Whether more is left than jitter, so that a clock may stand for what else there is."""
+    return state.rms()[0] > ABOVE_FLOOR * _floor(state)
 
 
 def _registered(frames: PoseFit, unseen: PoseProblem) -> HeldOutErrors:
@@ -252,8 +265,7 @@ def _records(
     covariance = fit.covariance()
     covariances = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
     base = next((i for i, t in enumerate(fit.terms) if is_of(t, Role.REGISTRATION)), None)
-    reference = session.reference or max(session.sensors.values(), key=lambda p: p.size)
-    shaking = turn_jitter(reference)
+    shaking = turn_jitter(most_poses(session))
     records = []
     for i, term in enumerate(fit.terms):
         if is_of(term, Role.MOUNT):
@@ -277,63 +289,6 @@ def _records(
         }  # fmt: skip
         records.append(replace(record, evidence=words))
     return one_clock(records, fit.state.problem.setting.duration)
-
-
-LEAST_JITTER_RAD = 1e-5  # no reference measures turns better; none at all has no inverse
-FEWEST_TURNS = 20  # poses that tell a reference's jitter, to 16 %
-MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
-LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
-"""Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given:
-the motion does not determine it."""
-HARDLY_DETERMINED_M = 0.022
-"""Lever arm, m, that would make the median error by turns alone, from which the motion does not
-determine it, whatever its formal uncertainty: errors of trackers go with the turns of a hand. On
-recordings of one body levers were off by 9 mm and more beyond this, and by 4 mm and less below."""
-
-
-def is_lever_determined(part: PosePart, jitter_rad: float) -> NDArray[np.bool_]:
-    """Return the mask (3,) of the components of a lever arm that the motion determines."""
-    return (lever_blur(part, jitter_rad) < MOST_BLUR) & (lever_reach(part) < HARDLY_DETERMINED_M)
-
-
-def lever_reach(part: PosePart) -> Array:
-    """Return the lever arm (3,), m, that makes the median error by the turns of the body alone."""
-    far = np.linalg.norm(part.residual[part.used, :3], axis=1)
-    information = np.linalg.inv(_turn_information(part) + LEAST_JITTER_RAD**2 * np.eye(3))
-    return np.asarray(np.median(far) * np.sqrt(np.diag(information)))
-
-
-def _turn_information(part: PosePart) -> Array:
-    """How much turns move a unit lever arm, shape (3, 3), squares, along the body's axes."""
-    turns = Rotation.from_matrix(part.view.turn[part.used])
-    tilt = np.cov((turns.mean().inv() * turns).as_rotvec().T)
-    return np.asarray(np.trace(tilt) * np.eye(3) - tilt)
-
-
-def lever_blur(part: PosePart, jitter_rad: float) -> Array:
-    """Return by which share (3,) the reference's own jitter of orientation shrinks a lever arm.
-
-    Errors of the measured rotations make a lever arm too small by their share of the rotations'
-    variance, whatever its formal uncertainty.
-    """
-    information = _turn_information(part)
-    error = 2 * max(jitter_rad, LEAST_JITTER_RAD) ** 2
-    return np.asarray(error * np.diag(np.linalg.inv(information + 1e-3 * error * np.eye(3))))
-
-
-def turn_jitter(reference: PoseSequence) -> float:
-    """Return the jitter of a reference's orientation, rad a coordinate, from its quietest
-    stretches.
-
-    The squared second difference of noise has six times its variance per coordinate; the lowest
-    quarter of that with three coordinates is at 1.21.
-    """
-    if reference.size < FEWEST_TURNS:
-        return 0.0
-    turns = Rotation.from_quat(reference.rows(~reference.repeated).quaternion)
-    steps = (turns[:-1].inv() * turns[1:]).as_rotvec()
-    second = np.sum(np.diff(steps, axis=0) ** 2, axis=1)
-    return float(np.sqrt(np.percentile(second, 25) / (6 * 1.21)))
 
 
 def hand_eye_record(

@@ -154,6 +154,9 @@ class PoseEffect(Effect[Term]):
     """What somebody at the tracker can do about it, in a sentence."""
     blocks_in_space = False
     """Whether blocks of space and not of time decide on it."""
+    needs_levers = False
+    """Whether it is seen only where the motion determines a lever arm: one that is not known,
+    times turns that go with place or velocity, makes what looks like it."""
     makes_jitter = False
     """Whether poses that jitter more than before are explained by it."""
 

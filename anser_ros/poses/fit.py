@@ -11,7 +11,7 @@ from anser_ros.calibration.blocks import FOLDS
 from anser_ros.diagnosis.fit import descended, stepped
 from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.term import Term
-from anser_ros.poses.effect import Role, is_of
+from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
 
 Array = NDArray[np.float64]
@@ -33,6 +33,9 @@ FEW_SHARE = 0.03
 and the two that metal must be near to be named (`episodes.WINDOWS`). Smaller takes a handful of
 reflections for something to explain; larger takes an effect of a few seconds for outliers."""
 SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
+FEWEST_BLOCKS = 10
+"""Blocks by whose scatter the variance of a time is judged: it is then known to half of itself.
+Fewer take chance for accuracy; more leave errors of stamps random that are not."""
 LARGEST_STAMP_S = 0.1
 """Spread of stamps, s, beyond which a time makes no pose of a hand's motion."""
 
@@ -68,10 +71,34 @@ class PoseFit:
         return sums.held_out(self.prior, FOLDS)
 
     def covariance(self) -> Array:
-        """Return the covariance of all parameters, as `BlockSums.covariance`."""
+        """Return the covariance of all parameters, as `BlockSums.covariance`.
+
+        How far errors of stamps are independent is not assumed for what moves times: those of a
+        poll are a sawtooth, whose mean over many poses is nearer to half a step than that of
+        random errors. The blocks' scores show it: where a block ends in the middle of a tooth the
+        next begins there, so that products of neighbours count by half (Bartlett's window). What
+        the poses' own noise makes is the least.
+        """
         filtered = any(is_of(term, Role.FILTER) for term in self.terms)
         sums = self.state.sums(filter_slopes=True) if filtered else self.sums
-        return sums.covariance(self.prior, self.misfit)
+        whole = sums.covariance(self.prior, self.misfit)
+        blocks = sums.squares.size
+        clocks = np.repeat(
+            [effect_of(t).role.is_clock for t in self.terms], [t.theta.size for t in self.terms]
+        )
+        noises = [part.noise for part in self.state.parts]
+        if not clocks.any() or blocks <= FEWEST_BLOCKS or not any(n.stamp_s for n in noises):
+            return whole
+        formal = sums.solve(self.prior)[1][clocks]
+        scores = sums.right @ formal.T
+        shown = np.sum(scores**2, axis=0) + np.sum(scores[1:] * scores[:-1], axis=0)
+        shown *= blocks / (blocks - 1)
+        exact = self.state.sums(filter_slopes=filtered, stamps_exact=True).normal.sum(axis=0)
+        exact += np.diag(1 / self.prior**2)
+        least = np.einsum('ci,ij,cj->c', formal, exact, formal) * max(self.misfit, 1.0)
+        scale = np.ones(clocks.size)
+        scale[clocks] = np.sqrt(np.maximum(shown, least) / np.diag(whole)[clocks])
+        return np.asarray(whole * scale[:, None] * scale[None, :])
 
     def covariance_of(self, index: int, whole: Array | None = None) -> Array:
         """Return the covariance of one term's parameters."""

@@ -9,6 +9,7 @@ from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.fit import PoseFit
 from anser_ros.poses.problem import PosePart
+from anser_ros.poses.stamp_step import stamp_step
 
 LEAST_EXPLAINED = 0.015
 """Share of the sum of squares that an effect must explain on blocks that it has not seen. Errors
@@ -65,6 +66,19 @@ def doubt(fit: PoseFit, index: int) -> str:
     effect = effect_of(term)
     own_clock = effect.role.is_clock and effect.sensor_of(term) is not None
     is_one_number = effect.is_scale(term) or own_clock
+    if effect.role is Role.RATE and _is_beat(fit, term):
+        return 'no more than the beat of a poll'
     if is_one_number and abs(float(term.theta[0])) < LEAST_SCALE_SIGMAS * sigma:
         return f'less than {LEAST_SCALE_SIGMAS:g} of its standard deviations'
     return ''
+
+
+def _is_beat(fit: PoseFit, term: Term) -> bool:
+    """Whether a clock gains no more over the session than the step of its poll.
+
+    Stamps on a grid are off by a sawtooth, which is slow where the rates of tracker and poll are
+    nearly in a simple ratio: then it is a course of the clock by up to a step.
+    """
+    problem = fit.state.problem
+    step = max(stamp_step(poses.time) for poses in problem.sensors)
+    return 1e-3 * abs(float(term.theta[0])) * problem.setting.duration < step

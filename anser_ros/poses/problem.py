@@ -42,15 +42,21 @@ class PoseNoise:
         """Return values (n, 6, ...) in units of their spread; velocity (n, 6) as in `PoseView`."""
         scale = np.repeat([1 / self.position_m, 1 / self.orientation_rad], 3)
         shape = (1, 6) + (1,) * (values.ndim - 2)
-        out = values * scale.reshape(shape)
+        return self.without_stamps(values * scale.reshape(shape), velocity)
+
+    def without_stamps(self, values: Array, velocity: Array) -> Array:
+        """Return values (n, 6, ...) of unit spread apart from what errors of stamps add, without
+        that.
+        """
         if self.stamp_s == 0.0:
-            return np.asarray(out)
+            return values
+        scale = np.repeat([1 / self.position_m, 1 / self.orientation_rad], 3)
         along = velocity * scale * self.stamp_s
         size = np.linalg.norm(along, axis=1)
         unit = along / np.maximum(size, 1e-12)[:, None]
         less = 1 - 1 / np.sqrt(1 + size**2)
-        part = np.einsum('ni,ni...->n...', unit, out)
-        return np.asarray(out - np.einsum('n,ni,n...->ni...', less, unit, part))
+        part = np.einsum('ni,ni...->n...', unit, values)
+        return np.asarray(values - np.einsum('n,ni,n...->ni...', less, unit, part))
 
 
 @dataclass(frozen=True)
@@ -205,11 +211,13 @@ class PoseState:
         terms: Sequence[Term] | None = None,
         in_space: bool = False,
         filter_slopes: bool = False,
+        stamps_exact: bool = False,
     ) -> BlockSums:
         """Return normal equations of the terms' parameters, block by block.
 
         With ``filter_slopes`` time constants of filters, which have no slopes of their own, count
-        by differences; otherwise they are held.
+        by differences; otherwise they are held. With ``stamps_exact`` the normal equations are the
+        scores' variance if the stamps have no errors after all, with the weights as they are.
         """
         wanted = self.terms if terms is None else tuple(terms)
         sizes = [term.theta.size for term in wanted]
@@ -231,6 +239,8 @@ class PoseState:
                     columns[:, :, a:b] = slope
             white = part.white
             columns = part.noise.whitened(columns, part.view.velocity)
+            if stamps_exact:
+                columns = part.noise.without_stamps(columns, part.view.velocity)
             columns *= part.weight[:, None, None]
             for row, number in enumerate(numbers):
                 chosen = label == number

@@ -18,9 +18,11 @@ from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.fit import LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, unexplained_poses
+from anser_ros.poses.lever_arms import knows_levers, most_poses
 from anser_ros.poses.prices import LEAST_EXPLAINED, doubt, price
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
+from anser_ros.poses.sequence import PoseSession
 
 Array = NDArray[np.float64]
 
@@ -37,6 +39,10 @@ believed; chance takes off one."""
 SAME_SCALE = 1 / 370
 """Chance that noise makes the scales of any two sensors of one reference differ so much: of one
 pair, three standard deviations. Larger takes noise for a difference; smaller misses some."""
+PART_OF_MAP = 2 / 3
+"""Share of what a map gains below which a scale is a part of it: a map contains the scale, and so
+gains as much where there is nothing else. Smaller calls a bent space a scale; larger takes the
+noise that a map follows for a bend."""
 SCALE_DIFFERS = 0.003  # difference of scales that matters: 1 mm in a tracked volume
 
 
@@ -72,21 +78,28 @@ class PoseSearch:
         None for the frames.
     refused : tuple of (str, str)
         Candidates that promised something, and why they are not named.
+    knows_levers : bool
+        Whether the motion determines any lever arm.
     """
 
     fit: PoseFit
     evidence: tuple[PoseEvidence | None, ...]
     refused: tuple[tuple[str, str], ...]
+    knows_levers: bool
 
 
-def with_noise(fit: PoseFit) -> PoseFit:
-    """Return the fit with the noise that it shows, and without poses that stand out from that."""
+def with_noise(fit: PoseFit, with_stamps: bool = True) -> PoseFit:
+    """Return the fit with the noise that it shows, and without poses that stand out from that.
+
+    Errors of the stamps are part of the noise where they are believed, if ``with_stamps``.
+    """
     problem = fit.state.problem
     for _ in range(NOISE_ROUNDS):
         out = unexplained_poses(fit)
         weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
         cut = replace(problem, weight=weight)
-        noise = tuple(likely_noise(part)[0] for part in cut.state(fit.terms).parts)
+        parts = cut.state(fit.terms).parts
+        noise = tuple((likely_noise(p) if with_stamps else noise_of(p, False))[0] for p in parts)
         every = tuple(np.ones(mask.size) for mask in out)
         judged = replace(problem, weight=every, noise=noise)
         state = judged.state(fit.terms)
@@ -105,19 +118,33 @@ def likely_noise(part: PosePart) -> tuple[PoseNoise, float]:
     return (full, gain) if believed else (plain, 0.0)
 
 
-def search_effects(start: PoseFit, say: Callable[[str], None] | None = None) -> PoseSearch:
-    """Add effects one by one, the best first, while each pays for itself; drop what does not."""
+def search_effects(
+    start: PoseFit, session: PoseSession, say: Callable[[str], None] | None = None
+) -> PoseSearch:
+    """Add effects one by one, the best first, while each pays for itself; drop what does not.
+
+    Where the motion determines no lever arm, turns that go with the place or the velocity, times a
+    lever arm of any length, look like any of them. Only the clocks are tried there.
+    """
     tell = say or (lambda text: None)
     fit = with_noise(start)
+    is_known = knows_levers(fit, most_poses(session))
+    if not is_known:
+        fit = with_noise(start, False)
     refused: list[tuple[str, str]] = []
     for _ in range(MOST_EFFECTS):
         tell(f'search besides {len(effects_of(fit))} effects')
-        better = _best_addition(fit, refused)
+        better = _best_addition(fit, refused, is_known)
         if better is None:
             break
-        fit = with_noise(better)
-    fit, evidence, dropped = _settled(_one_map(fit))
-    return PoseSearch(fit, evidence, (*refused, *dropped))
+        fit = with_noise(better, is_known)
+    fit, evidence, dropped = _settled(_one_map(fit), is_known)
+    return PoseSearch(fit, evidence, (*refused, *dropped), is_known)
+
+
+def frame_terms(terms: Sequence[Term]) -> list[Term]:
+    """Return the terms of the two unknown frames, without the effects."""
+    return [term for term in terms if effect_of(term).role.is_frame]
 
 
 def effects_of(fit: PoseFit) -> list[Term]:
@@ -125,13 +152,17 @@ def effects_of(fit: PoseFit) -> list[Term]:
     return [term for term in fit.terms if not effect_of(term).role.is_frame]
 
 
-def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | None:
+def _best_addition(
+    fit: PoseFit, refused: list[tuple[str, str]], knows_levers: bool
+) -> PoseFit | None:
     """The fit with the candidate that is worth most, or None; a lag is looked for at the end."""
     setting = fit.state.problem.setting
     promising: list[tuple[float, Term]] = []
     for effect in pose_effects().values():
         for term in _beside_scale(effect.sites(setting), fit.terms):
             if is_of(term, Role.FILTER) or _is_covered(term, fit.terms):
+                continue
+            if not knows_levers and (not effect.role.is_clock or effect.sensor_of(term)):
                 continue
             if 6 * POSES_A_PARAMETER * term.theta.size > fit.state.count:
                 continue
@@ -149,6 +180,8 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
             accepted.append(found)
     best = _simplest(accepted) if accepted else None
     if best is not None and effect_of(best.terms[-1]).role.is_clock:
+        return best
+    if not knows_levers:
         return best
     # A filter rounds off turning points, which looks like a scale or a map.
     lagging, filtered = _with_lag(fit, refused)
@@ -170,8 +203,20 @@ def _beside_scale(sites: Sequence[Term], force: Sequence[Term]) -> list[Term]:
 
 
 def _simplest(accepted: list[tuple[float, PoseFit]]) -> PoseFit:
-    """The one that gains most; a map only when no effect with few numbers is left."""
-    plain = [pair for pair in accepted if not is_of(pair[1].terms[-1], Role.MAP)]
+    """The one that gains most; a map only when no effect with few numbers is left.
+
+    A scale that gains much less than a map is a part of that, unless several sensors vouch for it,
+    which see the same one (`_one_scale`) at different places.
+    """
+    ends = [(gain, fit.terms[-1]) for gain, fit in accepted]
+    maps = [gain for gain, t in ends if is_of(t, Role.MAP)]
+    is_alone = len(accepted[0][1].state.parts) == 1
+    least = PART_OF_MAP * max(maps, default=0.0) if is_alone else 0.0
+    plain = [
+        pair
+        for pair, (gain, term) in zip(accepted, ends, strict=True)
+        if not is_of(term, Role.MAP) and (gain >= least or not is_of(term, Role.SCALE))
+    ]
     return max(plain or accepted, key=lambda pair: pair[0])[1]
 
 
@@ -341,7 +386,7 @@ def _one_map(fit: PoseFit) -> PoseFit:
 
 
 def _settled(
-    fit: PoseFit,
+    fit: PoseFit, with_stamps: bool
 ) -> tuple[PoseFit, tuple[PoseEvidence | None, ...], list[tuple[str, str]]]:
     """Drop effects that are no longer worth their parameters, given the others; evidence for those
     that stay."""
@@ -373,4 +418,4 @@ def _settled(
             return fit, tuple(evidence), dropped
         share, term, without = weakest
         dropped.append((term.label, f'{share:.2f} of the gain that it must have'))
-        fit = with_noise(without)
+        fit = with_noise(without, with_stamps)

@@ -1,6 +1,7 @@
 """Starts a fit from a session: blocks, a coarse time offset, two frames in closed form."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ PAUSE_S = 2.0
 """Pause, s, that parts static recordings; where there are several, each is a block."""
 AT_REST_M, POSES_AT_REST = 2e-3, 4
 """Extent of a recording at rest, m, and the poses of it that are kept."""
+HAND_M = 0.1  # a hand's breadth, m: distance at which an angle counts as the displacement it makes
 AT_REST_SHARE = 0.3  # share of poses kept below which all is recordings at rest
 FEWEST_PARTS = 5  # recordings that make blocks of their own; fewer leave too few to hold out
 FEWEST_HAND_EYE_POSES = 8
@@ -64,7 +66,7 @@ def pose_problem(session: PoseSession) -> PoseProblem:
                 f'{session.path}: one sensor and no reference; there is nothing to compare'
             )
     reference = reference.rows(~jumping_poses(reference))
-    path = OpticalPath.through(reference.track())
+    path = OpticalPath.through(reference.track(), is_at_rest=is_at_rest(reference))
     kept = {name: _thinned(poses) for name, poses in sensors.items()}
     starts = _pauses(list(kept.values()))
     if starts.size + 1 >= FEWEST_PARTS:
@@ -74,7 +76,7 @@ def pose_problem(session: PoseSession) -> PoseProblem:
         )
         kept = few
         if rests:
-            path = OpticalPath.through(reference.track(), is_at_rest=True)
+            path = replace(path, is_at_rest=True)
     kept = {
         name: poses for name, poses in kept.items() if _seen(poses, path) >= FEWEST_HAND_EYE_POSES
     }
@@ -99,6 +101,17 @@ def pose_problem(session: PoseSession) -> PoseProblem:
         tuple(np.ones(poses.size) for poses in values),
         tuple(START_NOISE for _ in values),
     )
+
+
+def is_at_rest(poses: PoseSequence) -> bool:
+    """Return whether a body stays where it is: what differs between its poses is noise."""
+    turns = Rotation.from_quat(poses.quaternion)
+    turned = HAND_M * (turns.mean().inv() * turns).as_rotvec()
+    return _extent(np.concatenate([poses.position, turned], axis=1)) < AT_REST_M
+
+
+def _extent(values: Array) -> float:
+    return float(np.linalg.norm(np.ptp(np.percentile(values, [10, 90], axis=0), axis=0)))
 
 
 def _seen(poses: PoseSequence, path: OpticalPath) -> int:
@@ -129,8 +142,7 @@ def _still_ones(poses: PoseSequence) -> PoseSequence:
     keep = []
     for one in np.unique(number):
         rows = np.flatnonzero(number == one)
-        extent = np.ptp(np.percentile(poses.position[rows], [10, 90], axis=0), axis=0)
-        if float(np.linalg.norm(extent)) < AT_REST_M and rows.size > POSES_AT_REST:
+        if _extent(poses.position[rows]) < AT_REST_M and rows.size > POSES_AT_REST:
             rows = rows[np.linspace(0, rows.size - 1, POSES_AT_REST).astype(int)]
         keep.append(rows)
     return poses.rows(np.concatenate(keep))
@@ -301,11 +313,11 @@ def _frames(problem: PoseProblem, offset: float, is_one_frame: bool) -> list[Arr
 def first_cost(fit: PoseFit) -> float:
     """Return the median misfit of a sensor's poses, m, on average over the sensors.
 
-    An angle counts as the displacement that it causes at 0.1 m, a hand's breadth.
+    An angle counts as the displacement that it causes at a hand's breadth.
     """
     total = 0.0
     for part in fit.state.parts:
         far = np.linalg.norm(part.residual[:, :3], axis=1)
-        far = far + 0.1 * np.linalg.norm(part.residual[:, 3:], axis=1)
+        far = far + HAND_M * np.linalg.norm(part.residual[:, 3:], axis=1)
         total += float(np.median(far[part.used])) if part.used.any() else 0.0
     return total / max(len(fit.state.parts), 1)

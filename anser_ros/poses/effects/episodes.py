@@ -122,6 +122,7 @@ class PoseMovingMetal(PoseEffect):
     summary = 'metal comes near for a while'
     advice = 'See what was near these sensors at that time, and do not use their poses of it.'
     units: ClassVar[Mapping[str, str]] = {'t_start_s': 's', 't_end_s': 's'}
+    needs_levers = True
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a record of the sensors that are off at one time, for each such time."""
@@ -166,6 +167,7 @@ class LooseMount(PoseEffect):
     summary = 'a sensor moves against the body and the other sensors'
     advice = 'Fasten the sensor on its body, and record again.'
     units: ClassVar[Mapping[str, str]] = {'rms_m': 'm', 'rms_deg': 'deg'}
+    needs_levers = True
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return the sensor whose shifts are its own; a single sensor's could be anything else."""

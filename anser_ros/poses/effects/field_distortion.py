@@ -54,6 +54,19 @@ def _count(site: Site) -> int:
     return int(basis.shape[1])
 
 
+def _without_turn(term: Term) -> Array:
+    """Return a map's coefficients without the turn in their linear part.
+
+    A turn bends nothing: it is a registration of places that differs from that of rotations. A
+    body that turns about one axis tells the two hardly apart.
+    """
+    bent = term.theta.reshape(-1, 3).copy()
+    linear = slice(1 - _lowest(term.site), 4 - _lowest(term.site))
+    if _lowest(term.site) <= 1:
+        bent[linear] = 0.5 * (bent[linear] + bent[linear].T)
+    return bent.ravel()
+
+
 class FieldDistortion(PoseEffect):
     """Theta is a vector (mm) a monomial: what is added to the tracked position."""
 
@@ -178,10 +191,11 @@ class FieldDistortion(PoseEffect):
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the map, and how far it moves poses at their rms distance."""
         degree = term.site['degree']
+        bent = _without_turn(term) if degree else term.theta
         # A scale's first number moves all three coordinates, as its shift does together.
-        rms = UNIT_M * float(np.linalg.norm(term.theta)) / (np.sqrt(3) if degree else 1.0)
+        rms = UNIT_M * float(np.linalg.norm(bent)) / (np.sqrt(3) if degree else 1.0)
         # A shift strains nothing.
-        stretched = term.theta[3 * (_lowest(term.site) == 0) :] if degree else term.theta[:1]
+        stretched = bent[3 * (_lowest(term.site) == 0) :] if degree else bent[:1]
         strain = UNIT_M * float(np.linalg.norm(stretched)) / (np.sqrt(3) if degree else 1.0)
         strain /= term.site['size_m']
         spread = UNIT_M * float(np.sqrt(np.mean(sigmas(covariance) ** 2)))

@@ -1,0 +1,91 @@
+"""States which components of a sensor's place on the body the motion determines."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.poses.effect import Role, effect_of, is_of
+from anser_ros.poses.fit import PoseFit
+from anser_ros.poses.problem import PosePart
+from anser_ros.poses.sequence import PoseSequence, PoseSession
+
+Array = NDArray[np.float64]
+
+LEAST_JITTER_RAD = 1e-5  # no reference measures turns better; none at all has no inverse
+FEWEST_TURNS = 20  # poses that tell a reference's jitter, to 16 %
+MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
+LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
+"""Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given:
+the motion does not determine it."""
+HARDLY_DETERMINED_M = 0.022
+"""Lever arm, m, that would make the median error by turns alone, from which the motion does not
+determine it, whatever its formal uncertainty: errors of trackers go with the turns of a hand. On
+recordings of one body levers were off by 9 mm and more beyond this, and by 4 mm and less below."""
+
+
+def is_lever_determined(part: PosePart, jitter_rad: float) -> NDArray[np.bool_]:
+    """Return the mask (3,) of the components of a lever arm that the motion determines."""
+    return (lever_blur(part, jitter_rad) < MOST_BLUR) & (lever_reach(part) < HARDLY_DETERMINED_M)
+
+
+def lever_reach(part: PosePart) -> Array:
+    """Return the lever arm (3,), m, that makes the median error by the turns of the body alone."""
+    far = np.linalg.norm(part.residual[part.used, :3], axis=1)
+    information = np.linalg.inv(_turn_information(part) + LEAST_JITTER_RAD**2 * np.eye(3))
+    return np.asarray(np.median(far) * np.sqrt(np.diag(information)))
+
+
+def _turn_information(part: PosePart) -> Array:
+    """How much turns move a unit lever arm, shape (3, 3), squares, along the body's axes."""
+    turns = Rotation.from_matrix(part.view.turn[part.used])
+    tilt = np.cov((turns.mean().inv() * turns).as_rotvec().T)
+    return np.asarray(np.trace(tilt) * np.eye(3) - tilt)
+
+
+def lever_blur(part: PosePart, jitter_rad: float) -> Array:
+    """Return by which share (3,) the reference's own jitter of orientation shrinks a lever arm.
+
+    Errors of the measured rotations make a lever arm too small by their share of the rotations'
+    variance, whatever its formal uncertainty.
+    """
+    information = _turn_information(part)
+    error = 2 * max(jitter_rad, LEAST_JITTER_RAD) ** 2
+    return np.asarray(error * np.diag(np.linalg.inv(information + 1e-3 * error * np.eye(3))))
+
+
+def turn_jitter(reference: PoseSequence) -> float:
+    """Return the jitter of a reference's orientation, rad a coordinate, from its quietest
+    stretches.
+
+    The squared second difference of noise has six times its variance per coordinate; the lowest
+    quarter of that with three coordinates is at 1.21.
+    """
+    if reference.size < FEWEST_TURNS:
+        return 0.0
+    turns = Rotation.from_quat(reference.rows(~reference.repeated).quaternion)
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    second = np.sum(np.diff(steps, axis=0) ** 2, axis=1)
+    return float(np.sqrt(np.percentile(second, 25) / (6 * 1.21)))
+
+
+def most_poses(session: PoseSession) -> PoseSequence:
+    """Return the reference, or without one the sensor with most poses, which takes its place."""
+    return session.reference or max(session.sensors.values(), key=lambda poses: poses.size)
+
+
+def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
+    """Return whether the motion determines two components of a sensor's lever arm.
+
+    So many are determined by turns about one axis. Where they are not, a body was carried about
+    with hardly a turn, or not moved at all.
+    """
+    shaking, covariance = turn_jitter(reference), fit.covariance()
+    parts = {part.view.sensor: part for part in fit.state.parts}
+    for index, term in enumerate(fit.terms):
+        if is_of(term, Role.MOUNT):
+            part = parts[str(effect_of(term).sensor_of(term))]
+            sigma = np.sqrt(np.maximum(np.diag(fit.covariance_of(index, covariance)), 0.0))[:3]
+            is_known = (sigma < LEAST_KNOWN_M) & is_lever_determined(part, shaking)
+            if np.count_nonzero(is_known) >= 2:
+                return True
+    return False
