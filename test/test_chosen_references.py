@@ -53,11 +53,19 @@ def test_the_chosen_references_are_all_that_a_session_has(metal):
 @pytest.mark.usefixtures('shared_tables')
 def test_without_enough_references_there_is_no_pose_near_metal(metal):
     model, clean = load_model(MODEL), load_session(REPO / 'bags' / 'factory.mcap')
-    for count in (0, 2):
-        few = with_references(metal, metal.reference.sensors.channel[:count].tolist())
-        found = track_session(few, model, baseline=clean, refit=True)
-        states = {e.state for s in found.sensors.values() for e in s.estimates}
-        assert states == {'references_lost'}
+    few, none = (
+        track_session(
+            with_references(metal, metal.reference.sensors.channel[:count].tolist()), model,
+            baseline=clean, refit=True,
+        )
+        for count in (2, 0)
+    )  # fmt: skip
+    assert {e.state for s in few.sensors.values() for e in s.estimates} == {'references_lost'}
+    alone = track_session(metal, model)
+    for name, series in alone.sensors.items():
+        states = [e.state for e in series.estimates]
+        assert [e.state for e in none.sensors[name].estimates] == states
+        assert 'residual' in states and 'ok' not in states, 'metal is noticed without references'
 
 
 def test_references_without_a_refit_are_bad_usage(tmp_path, capsys):

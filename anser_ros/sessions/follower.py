@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from anser_ros.errors import BagError, FitError
-from anser_ros.integrity.ageing import FrameModel, ModelAge
+from anser_ros.integrity.ageing import UNCHANGED_MODEL, FrameModel, ModelAge
 from anser_ros.pose_states import OK, REFERENCES_LOST, Withheld
 from anser_ros.refit.baseline import check_enough
 from anser_ros.refit.change import Pace
@@ -95,7 +95,7 @@ class ModelFollower:
             tools = frame.tools
             self._patches.take_flux(frame.stamp_ns, tools.channels, tools.flux, tools.flags)
         if self._refit is None:
-            return FrameModel(None, Withheld(REFERENCES_LOST, 'there are no reference sensors'))
+            return UNCHANGED_MODEL  # as live: there is nothing to follow, the checks decide
         if frame.reference is not None:
             self._follow(frame.stamp_ns, frame.reference)
         result = None if frame.reference is None else self._result
