@@ -31,6 +31,16 @@ def test_a_camera_that_jitters_shifts_neither_field_nor_tool():
     assert 5e-6 < found.shift_sigma_m < 5e-5
 
 
+def test_what_the_cameras_jitter_limits_is_not_said_to_be_known_better():
+    found, truth = surveyed(307, 3, 20.0, 0.6, Errors(jitter=4.3), CENTRES)
+    sigma = np.sqrt(np.diag(found.posterior.covariance))
+    lever, offset = (sigma[found.parameters.rows(kind)] for kind in ('lever_arm', 'time_offset'))
+    # 500 poses of 0.25 mm and 1.4 mrad by a hand at 0.11 m/s and 0.64 rad/s.
+    assert 6e-5 < offset[0] < 1e-4
+    assert 2.4e-5 < lever.min() and lever.max() < 4e-5
+    assert (np.abs(found.survey('tool').lever_arm - truth.lever) < 3.0 * lever).all()
+
+
 def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
     found, _ = surveyed(22, 3, 6.0, 0.01, Errors(), CENTRES)
     assert 'lever_arm' in found.undetermined

@@ -10,6 +10,7 @@ field is written in those modes of a rich layer of dipoles that the readings det
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy.linalg
@@ -26,14 +27,22 @@ from anser_ros.physics.dipole import flux_jacobian
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-MOST_MODES = 160
-"""Modes of the field at most: the size of the system grows in proportion, its time with the third
-power. The flux of the last of them is a millionth of the first one's for a scan of a board's
-volume, below the noise."""
-LEAST_MODE = 1e-6
+LEAST_MOST_MODES, MOST_MODES = 160, 240
+"""Modes of the field at most, for a scan of minutes and for a short one. With fewer, what they
+miss of a wide board's field passes for an error of the lever arm: with 160, 20 pT and 0.1 mm in
+20 s by a camera that jitters by 0.3 mm. The size of the system grows in proportion."""
+MODES_WORK = 6e7
+"""Frames times the square of the modes, to which the time of a step is proportional."""
+POSES_A_MODE = 2.0
+"""Poses for each mode of more than the least number: fewer determine none of the finest modes."""
+LEAST_MODE = 1e-8
 """Singular value of a mode at least, relative to the largest."""
 SYSTEM_ROWS = 1200
 """Readings in memory at a time: each has a row for every parameter."""
+STRETCHES = 20
+"""Stretches of a body's frames at least: how much their scores scatter tells the weight of the
+fluxes, of which two stretches tell nothing. Many more are shorter than the way over which errors
+of the field's model are alike."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +64,9 @@ class FieldModes:
     size: Array
 
     @staticmethod
-    def of(measurements: Sequence[Measurements], sites: DipoleSites) -> 'FieldModes':
+    def of(
+        measurements: Sequence[Measurements], sites: DipoleSites, most: int = LEAST_MOST_MODES
+    ) -> 'FieldModes':
         """Return the modes of dipoles over the usable readings of measurements at their poses."""
         gram, count = np.zeros((len(sites), len(sites))), 0.0
         for m in measurements:
@@ -67,7 +78,7 @@ class FieldModes:
         values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
         values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
         size = np.sqrt(values / values[0])
-        keep = (size > LEAST_MODE) & (np.arange(size.size) < MOST_MODES)
+        keep = (size > LEAST_MODE) & (np.arange(size.size) < most)
         moments = vectors[:, keep] / scale[:, None] / np.sqrt(values[keep] / count)
         return FieldModes(sites, moments, size[keep])
 
@@ -164,7 +175,10 @@ class JointSystem:
         """
         velocity = velocity_of(linear.part)
         modes = self.modes.size.size
-        for block in frame_blocks(len(weights), weights.shape[1], SYSTEM_ROWS):
+        count, sensors = weights.shape
+        stretches = max(STRETCHES, len(frame_blocks(count, sensors, SYSTEM_ROWS)))
+        edges = np.unique(np.linspace(0, count, stretches + 1).astype(int)).tolist()
+        for block in (slice(*pair) for pair in pairwise(edges)):
             part, root = linear.part.frames(block), np.sqrt(weights[block]) / noise_t
             columns = self.parameters.derivatives(
                 part, linear.flux[block], linear.by_place[block], linear.by_axis[block],

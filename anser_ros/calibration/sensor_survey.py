@@ -23,6 +23,10 @@ from anser_ros.calibration.dipole_sites import basis_rows
 from anser_ros.calibration.disturbances import glitches, outside, spans_of, unsteady_tool
 from anser_ros.calibration.factors import ComplexArray, as_real
 from anser_ros.calibration.joint_system import (
+    LEAST_MOST_MODES,
+    MODES_WORK,
+    MOST_MODES,
+    POSES_A_MODE,
     Eliminated,
     FieldModes,
     JointSystem,
@@ -38,6 +42,7 @@ from anser_ros.calibration.pose_correction import (
     SMALLEST_NOISE_T,
     PoseTerms,
     most_probable_step,
+    moved,
     outlier_weights,
 )
 from anser_ros.calibration.prior import DrawnBoard
@@ -60,10 +65,11 @@ MOST_ROWS = 22_000
 """Readings of the last steps; more are thinned. Their time grows in proportion."""
 COARSE_STEPS = 6
 """First steps at most, with `COARSE_ROWS`; `SMALL_STEP` ends them earlier."""
-FINE_STEPS = 3
+FINE_STEPS = 6
 """Last steps at most, with `MOST_ROWS`: they start where few readings led to."""
 SMALL_STEP = 0.1
-"""Step, in standard deviations, below which another one is not worth its time."""
+"""Step, in standard deviations, below which another one is not worth its time; and the relative
+change of the fluxes' weight (as a standard deviation) below which the weight has settled."""
 LOOSE = OpticalNoise(1e-3, 1e-2)
 """Jitter of the first step, m and rad: poses are off by that much while the clock's offset and the
 lever arm are unknown."""
@@ -73,15 +79,18 @@ holds only what they do not determine."""
 FIELD_WIDTH = 0.3
 """Prior width of the field's deviation from the drawing, relative to the flux, to begin with.
 Smaller holds the first steps to a poor drawing; larger lets it take up what is the sensors'."""
-WIDTH_ALONE = 5.0
-"""The same without a drawing, where the prior's middle is no field at all. It is learnt from the
-first step on. Smaller shrinks the field until then, and a shift of all sensors makes up for it:
-0.3 gave a patch of magnetometers a lever arm of 2.5 mm that it did not have."""
+WIDTH_ALONE = 100.0
+"""The same without a drawing, where the prior's middle is no field at all; it is not learnt. A
+learnt width is that of the strongest modes, shrinks the fine ones, and a shift of all sensors
+makes up for it: lever arms came out 60 um too low where 24 um were said. This wide, the prior only
+holds what no reading determines."""
 LEAST_FIELD_WIDTH = 1e-3
 """Least such width: no board is made more exactly than that."""
 FEWEST_READINGS = 7.0
 """Readings for each mode of the field from which on sensors are looked at although there are fewer
 poses than modes. Nine coils on 75 poses, 6 a mode, had a clock 7 ms off with no doubt about it."""
+CLEAR_MODE = 1e-6
+"""Size of a mode, relative to the largest, from which on it counts there."""
 FIT_NOISE = 10.0
 """Noise of the first step as a multiple of the fluxes' own."""
 
@@ -169,7 +178,8 @@ class SensorSurveyor:
         self._start(tools)
         # With too few to distinguish noise from modes of the field, errors of any size seem
         # certain.
-        poses, modes = sum(len(tool.weights) for tool in tools), self.modes.size.size
+        poses = sum(len(tool.weights) for tool in tools)
+        modes = int((self.modes.size > CLEAR_MODE).sum())
         readings = sum(int(m.usable.sum()) for m in self.measured)
         path = any(m.is_followed for m in self.measured)  # its neighbouring poses are alike
         if path and poses < modes and readings < FEWEST_READINGS * modes:
@@ -178,18 +188,20 @@ class SensorSurveyor:
             self.values = np.zeros(0)
         for step in range(COARSE_STEPS):
             self._report(step / total)
-            moved = self._step(tools, inspect=step > 0)
-            if step > 2 and moved < 10.0 * SMALL_STEP:
+            size = self._step(tools, inspect=step > 0)
+            if step > 2 and size < 10.0 * SMALL_STEP:
                 break
         tools = self._tools(MOST_ROWS)
         for step in range(FINE_STEPS):
             self._report((COARSE_STEPS + 3 * step) / total)
             # Metal is looked for once field and sensors fit: where neither is known yet, both look
             # as if something moved, and what is left out is not learnt.
-            moved = self._step(tools, inspect=True, watch=step > 0)
+            before = self.inflation
+            size = self._step(tools, inspect=True, watch=step > 0)
             if self.population.stand_alone(self.posterior):
                 continue
-            if moved < SMALL_STEP:
+            settled = abs(self.inflation / before - 1.0) < 2.0 * SMALL_STEP
+            if size < SMALL_STEP and settled:
                 break
         whole = self.posterior
         posterior, left_out, evidence = self.population.chosen(self.likelihood)
@@ -258,7 +270,12 @@ class SensorSurveyor:
         """Set up the field's modes, and its first amplitudes as a plain fit has them."""
         measured = [tool.measured for tool in tools]
         sites = place(rich_layout(measured, self.generator), self.generator)
-        self.modes = FieldModes.of(measured, sites)
+        total = sum(m.flux.shape[0] * m.flux.shape[1] for m in self.measured)
+        share = min(1.0, MOST_ROWS / max(total, 1))
+        frames = max(share * sum(len(m.time) for m in self.measured), 1.0)
+        most = min(np.sqrt(MODES_WORK / frames), frames / POSES_A_MODE)
+        most = int(np.clip(most, LEAST_MOST_MODES, MOST_MODES))
+        self.modes = FieldModes.of(measured, sites, most)
         moments, _ = MomentFitter(measured, sites, RICH_DAMPING, self.accuracy).solve(exact=False)
         self.middle = np.zeros((self.modes.size.size, 2 * moments.shape[1]))
         drawn = None
@@ -294,30 +311,45 @@ class SensorSurveyor:
         """Take one step of field and parameters; return its size in standard deviations."""
         linear = [linearise(self._corrected(tool), self.modes, self.field) for tool in tools]
         if inspect:
+            pairs = zip(linear, tools, strict=True)
+            linear = [self._about_probable_poses(at, tool) for at, tool in pairs]
             self._inspect(tools, linear, watch)
         rest = self._sums(tools, self.parameters, linear)
         # Errors of the field's model are alike in neighbouring frames: the scatter of whole
         # stretches tells how much less the data say than independent readings would. It has to be
         # known where they are weighed against the optical poses: else what the model misses is
         # made good by a shift of the field and of the tool, which no single frame contradicts.
-        before = self.inflation
-        self.inflation = max(1.0, rest.inflation * before) if inspect else 1.0
-        more = self.inflation / before
+        # The next step uses it: what the jitter of the poses limits would not scale with it.
+        readings = sum(float(tool.weights.sum()) for tool in tools) * self.field.shape[1]
         self.likelihood = Likelihood(
-            rest.information / more + self.parameters.rule(),
-            (rest.gradient + rest.information @ self.values) / more,
-            sum(float(tool.weights.sum()) for tool in tools)
-            * self.field.shape[1]
-            / self.inflation,
+            rest.information + self.parameters.rule(),
+            rest.gradient + rest.information @ self.values,
+            readings / self.inflation,
         )
+        self.inflation = max(1.0, rest.inflation * self.inflation) if inspect else 1.0
         # Nothing is held here: while a clock is off, poses look too bad to tell it.
         self.posterior = self.population.fit(self.likelihood)
         step = self.posterior.values - self.values
         change = rest.field_step(step, self.modes.size.size)
         self.values, self.field = self.posterior.values, self.field + change
-        self._learn_field_width(rest.field_variance)
+        if self.nominal is not None:
+            self._learn_field_width(rest.field_variance)
         sigma = np.sqrt(np.maximum(np.diag(self.posterior.covariance), 1e-300))
         return float(np.abs(step / sigma).max(initial=0.0))
+
+    def _about_probable_poses(self, at: Linear, tool: _Tool) -> Linear:
+        """Return the readings linearised where the fluxes put the poses, in steps from the
+        measured ones.
+
+        A camera that jitters by 0.3 mm measures poses at which the field differs in its second
+        order by as much as the fluxes' noise.
+        """
+        terms, share = PoseTerms(at.residual, at.slope), interpolation_share(at.part)
+        prior = 1.0 / (self.optical.jitter**2 * share[:, None])
+        step, _ = self._pose_steps(terms, tool.weights, prior)
+        near = linearise(moved(at.part, step), self.modes, self.field)
+        back = np.einsum('fsci,fi->fsc', near.slope, step)
+        return replace(near, residual=near.residual + back)
 
     def _learn_field_width(self, variance: Array) -> None:
         """Set the field's prior width to what makes its amplitudes most probable."""
