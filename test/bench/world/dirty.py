@@ -1,6 +1,6 @@
 """Makes labs in which everything is a little wrong, calibrates and diagnoses in them, and scores.
 
-    python test/bench/world/dirty.py --out DIR [--rows 0 1 2] [--seed 601]
+    python test/bench/world/dirty.py --out DIR [--rows 0 1 2] [--seed 703] [--json FILE]
 
 Every row has a board, a tool whose coils are all a little wrong in gain, axis and place, a lever
 arm, and a camera that stamps off. One scan by hand is calibrated; sessions with nothing new, a
@@ -102,7 +102,7 @@ def lines(out, row, seed):
         after = 1e12 * found['held_out']['flux_rms_after_t']
         names = ', '.join(effect['name'] for effect in found['effects']) or 'nothing'
         put = ', '.join(truth[name]) or 'nothing'
-        yield f'|  | {name}: {put} | {names} | {after:.1f} pT |'
+        yield f'| {board.design.name} | {name}: {put} | {names} | {after:.1f} pT |'
 
 
 def main():
@@ -110,11 +110,17 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--out', required=True, type=Path)
     parser.add_argument('--rows', type=int, nargs='*', default=range(len(ROWS)))
-    parser.add_argument('--seed', type=int, default=601)
+    parser.add_argument('--seed', type=int, default=703)
+    parser.add_argument('--json', type=Path, help='file that gets the lines')
     args = parser.parse_args()
+    kept = []
     for row in args.rows:
-        for line in lines(args.out, row, args.seed):
+        for number, line in enumerate(lines(args.out, row, args.seed)):
             print(line, flush=True)
+            name = ('scan', *SESSIONS)[number]
+            kept.append({'name': f'row {row}, seed {args.seed}: {name}', 'line': line})
+            if args.json:
+                args.json.write_text(json.dumps(kept, indent=1) + '\n')
 
 
 if __name__ == '__main__':
