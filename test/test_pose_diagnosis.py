@@ -1,6 +1,7 @@
 """Sessions of poses with one thing wrong: it is named, with its size, and nothing else is."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +10,13 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from anser_ros.cli.main import run_verb
+from anser_ros.cli.pose_report import pose_verdict
 from anser_ros.errors import DiagnosisError, PlausibilityError
+from anser_ros.poses import search
 from anser_ros.poses.diagnosis import diagnose_poses
+from anser_ros.poses.effect import PoseSetting, Role
 from anser_ros.poses.recording import write_pose_session
+from anser_ros.poses.registry import effect_with
 
 pytestmark = pytest.mark.long
 
@@ -291,15 +296,19 @@ def test_a_body_that_is_only_carried_tells_the_clock_where_that_leaves_nothing(s
     assert (found.unexplained > 0.5) == (not expected)
 
 
-def test_the_scale_of_a_single_sensor_that_is_part_of_a_bend_is_none():
-    world = World(6, duration=40.0, sensors=1)
-
-    def bend(sensor, place):
-        away = (place - [0.05, 0.02, -0.3]) / 0.06
-        return place + 0.5e-3 * away + 2e-3 * away[:, [0]] * away
-
-    world.bend = bend
-    assert set(named(diagnose_poses(world.session()))) == {'field_distortion'}
+@pytest.mark.parametrize(('sensors', 'expected'), [(1, 'field_distortion'), (2, 'optical_scale')])
+def test_a_scale_that_gains_much_less_than_a_bend_is_part_of_it_unless_sensors_agree(
+    sensors, expected
+):
+    setting = PoseSetting(('a',), 0.0, 1.0, np.zeros(3), 0.1)
+    (scale,) = effect_with(Role.SCALE).sites(setting)
+    bend = effect_with(Role.MAP).at(setting, 2, None)
+    state = SimpleNamespace(parts=[None] * sensors)
+    accepted = [
+        (gain, SimpleNamespace(terms=[term], state=state))
+        for gain, term in ((150.0, scale), (1000.0, bend))
+    ]
+    assert search._simplest(accepted).terms[-1].effect.name == expected
 
 
 def test_the_slow_beat_of_a_poll_is_no_rate_of_the_clock():
@@ -325,3 +334,15 @@ def test_errors_of_a_poll_are_not_as_uncertain_as_random_ones():
     sigma = offset.uncertainty['offset_s']
     assert sigma < 0.7 * 0.03 / np.sqrt(12 * 17 * 40)
     assert abs(offset.parameters['offset_s'] - 0.015) < 4 * sigma
+
+
+@pytest.mark.parametrize(
+    ('lever', 'is_open'), [([None, 0.02, None], True), ([0.0, 0.02, 0], False)]
+)
+def test_the_verdict_says_why_nothing_of_place_is_named(lever, is_open):
+    document = {
+        'held_out': {'position_rmse_before_m': 1e-3, 'position_rmse_after_m': 1e-3},
+        'unexplained': {'fraction': 0.0, 'depends_on': []},
+        'effects': [{'name': 'hand_eye', 'parameters': {'lever_arm_m': lever}}],
+    }
+    assert ('turn the body about two axes' in pose_verdict(document)) == is_open

@@ -36,10 +36,16 @@ def pose_verdict(document: dict[str, Any]) -> str:
     before, after = 1e3 * held['position_rmse_before_m'], 1e3 * held['position_rmse_after_m']
     if found:
         names = ', '.join(dict.fromkeys(str(effect['name']) for effect in found))
-        text = f'Found: {names}. On held-out poses the error falls from '
-        text += f'{before:.2f} to {after:.2f} mm.'
+        text = f'Found: {names}. On held-out poses the error is '
+        text += f'{before:.2f} mm without and {after:.2f} mm with their correction.'
     else:
         text = f'No effect is found: with hand-eye alone the held-out error is {after:.2f} mm.'
+    levers = [e['parameters']['lever_arm_m'] for e in document['effects'] if e['name'] == HAND_EYE]
+    if all(lever.count(None) > 1 for lever in levers):
+        text += (
+            ' The motion hardly determines where the sensors sit on the body, so that no effect'
+        )
+        text += ' of place or of a single sensor can be told: turn the body about two axes.'
     if rest['fraction'] > 0:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         text += f' {rest["fraction"]:.0%} of the squared error above the jitter stays'
