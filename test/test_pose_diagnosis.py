@@ -346,3 +346,9 @@ def test_the_verdict_says_why_nothing_of_place_is_named(lever, is_open):
         'effects': [{'name': 'hand_eye', 'parameters': {'lever_arm_m': lever}}],
     }
     assert ('turn the body about two axes' in pose_verdict(document)) == is_open
+
+
+def test_a_slow_filter_whose_error_hides_the_lever_arm_is_found():
+    world = World(260817, duration=40.0, sensors=1, rate=13.5, optical_rate=28.0)
+    world.tau = 0.16
+    assert set(named(diagnose_poses(world.session()))) == {'tracker_lag'}

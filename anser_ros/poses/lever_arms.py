@@ -17,6 +17,10 @@ MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
 LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
 """Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given:
 the motion does not determine it."""
+MUCH_TILT = 0.15
+"""Turns of the body, rad rms, that move a lever arm of 5 cm by 8 mm, as much as a slow filter
+moves a hand. Smaller takes what goes with small turns for effects; larger looks for no effect
+where a large one hides the lever arm."""
 HARDLY_DETERMINED_M = 0.022
 """Lever arm, m, that would make the median error by turns alone, from which the motion does not
 determine it, whatever its formal uncertainty: errors of trackers go with the turns of a hand. On
@@ -77,7 +81,8 @@ def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
     """Return whether the motion determines two components of a sensor's lever arm.
 
     So many are determined by turns about one axis. Where they are not, a body was carried about
-    with hardly a turn, or not moved at all.
+    with hardly a turn, or not moved at all. Much tilt determines them once the effects are found,
+    however large the error is that these make before.
     """
     shaking, covariance = turn_jitter(reference), fit.covariance()
     parts = {part.view.sensor: part for part in fit.state.parts}
@@ -86,6 +91,7 @@ def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
             part = parts[str(effect_of(term).sensor_of(term))]
             sigma = np.sqrt(np.maximum(np.diag(fit.covariance_of(index, covariance)), 0.0))[:3]
             is_known = (sigma < LEAST_KNOWN_M) & is_lever_determined(part, shaking)
-            if np.count_nonzero(is_known) >= 2:
+            tilted = np.sqrt(np.diag(_turn_information(part))) > MUCH_TILT
+            if np.count_nonzero(is_known | tilted) >= 2:
                 return True
     return False
