@@ -26,9 +26,10 @@ def tool_readings(
     ----------
     correction : Correction
         Of the tools' sensors, by the effects of the model.
-    channels, flags : ndarray, shape (S,)
+    channels : ndarray, shape (S,)
     flux : ndarray, shape (S, K), complex
         T, as measured.
+    flags : ndarray, shape (S,)
     poses : mapping
         By body; bodies without a coil in the frame are left out.
     """
