@@ -19,7 +19,7 @@ LOOK_S = 0.1
 """How often the graph is asked at most, s, while messages go on as before: it takes 15 us.
 Smaller costs more; larger, and who only begins to publish is noticed later."""
 SETTLED_S = 0.3
-"""Time, s, after a message was refused in which the graph has to go on knowing one publisher
+"""Time, s, after the first refused message in which the graph has to go on knowing one publisher
 before it is asked again what holds. Smaller, and a second publisher is believed whose message came
 before the graph knew it, which takes about 0.1 s; larger, and a successor is believed later."""
 NO_INFORMATION: Mapping[str, Any] = MappingProxyType({})
@@ -109,7 +109,9 @@ class OneSource:
             self._looked_s = 0.0  # the graph as it is at this moment is needed
         is_good = self._sources.take(number, self._count(now_s), now_s, lasting)
         if not is_good:
-            self._refused_s = now_s
+            # A successor that goes on publishing is refused again and again: the first counts.
+            if self._refused_s is None or self._publishers > 1:
+                self._refused_s = now_s
             self._node.warn('messages_of_two_sources', self._sources.complaint)
         return is_good
 
