@@ -16,10 +16,7 @@ class Refit:
     """Stands for the refit: notes what it is given."""
 
     def __init__(self):
-        self.given, self.noise_t = [], 0.0
-
-    def enable_witnesses(self, noise_t):
-        self.noise_t = noise_t
+        self.given = []
 
     def witnessed(self, readings):
         self.given.append(readings)
@@ -61,8 +58,7 @@ def pose(stamp_ns, x, frame_id='fg'):
 
 def test_readings_and_poses_of_one_frame_come_together_in_any_order(witnesses):
     refit, found = Refit(), witnesses._pose_taker('tool_a')
-    witnesses.join(refit)
-    assert refit.noise_t > 0
+    assert witnesses.noise_t > 0
     witnesses._on_flux(flux(100, 1e-9))
     found(pose(100, 0.01))
     found(pose(200, 0.02))  # the next frame is here before the references of this one

@@ -11,6 +11,7 @@ from anser_ros.cli.main import main
 from anser_ros.errors import BagError
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.refit.tables import RefitTables
 from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised
 from anser_ros.sessions.chosen_references import with_references
 from anser_ros.sessions.evaluation import track_session
@@ -89,6 +90,22 @@ def followed(world, witnesses: bool, gain=None, off_m: float = 0.0):
         told = place + off_m * rng.normal(size=3)
         refit.witnessed([ToolReading(tool(), gain[:, None] * flux + noise, told, np.eye(3))])
     return float(np.mean(share)), refit
+
+
+@pytest.mark.long
+def test_who_is_made_ready_works_out_no_cloud_later(world, monkeypatch):
+    refit = few(world)
+    made, one_by_one = [], RefitTables.reduced
+    monkeypatch.setattr(
+        RefitTables, 'reduced', lambda t, prior: made.append(prior.name) or one_by_one(t, prior)
+    )
+    refit.enable_witnesses(NOISE_T, ready=True)
+    clouds = [prior.name for prior in refit._tables.priors]
+    assert made == clouds and len(clouds) > 10
+    monkeypatch.setattr(f'{__name__}.few', lambda _: refit)
+    monkeypatch.setattr(refit, 'enable_witnesses', lambda _: None)
+    followed(world, witnesses=True)
+    assert not set(made[len(clouds) :]) & set(clouds)
 
 
 @pytest.fixture(scope='module')

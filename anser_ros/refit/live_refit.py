@@ -350,9 +350,14 @@ class LiveRefit:
             weights=dict(zip(bank.names, weights.tolist(), strict=True)), drift=drift, find=metal,
         )  # fmt: skip
 
-    def enable_witnesses(self, flux_noise_t: float) -> None:
-        """Use `witnessed` from now on; the noise is of the tools' components, T."""
+    def enable_witnesses(self, flux_noise_t: float, *, ready: bool = False) -> None:
+        """Use `witnessed` from now on; the noise is of the tools' components, T.
+
+        If it must be ``ready``, seconds are spent now, and no later frame waits for them.
+        """
         self._witness = Witness(self._tables, self.model, self.settings.tools, flux_noise_t)
+        if ready:
+            self._witness.make_ready()
 
     def witnessed(self, readings: Sequence[ToolReading]) -> None:
         """Take in what tools read in the last frame, after its poses have been given.

@@ -80,7 +80,8 @@ class RefitInForce:
         self._witnesses.expect(setup, base)
         if len(references):
             bodies, folder, ahead = self._moving.bodies, self._kept.folder, self._kept.ahead
-            self._start = RefitStart(setup, base, references, bodies, folder, ahead)
+            noise_t = self._witnesses.noise_t
+            self._start = RefitStart(setup, base, references, bodies, folder, ahead, noise_t)
             if at_once:
                 self._start.prepare()
         else:
@@ -168,7 +169,6 @@ class RefitInForce:
             return False
         self.current, self._moving.patches = started
         self.result = None
-        self._witnesses.join(self.current)
         self._count('refit_starts')
         return True
 

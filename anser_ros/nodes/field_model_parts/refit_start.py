@@ -60,6 +60,8 @@ class RefitStart:
         Where tables are kept; None where they are not.
     ahead : ReadAhead, optional
         Of this folder.
+    witness_noise_t : float, optional
+        Noise of a component of what tools read, T, if they are witnesses.
 
     Attributes
     ----------
@@ -75,9 +77,10 @@ class RefitStart:
         bodies: tuple[str, ...],
         folder: Path | None = None,
         ahead: ReadAhead | None = None,
+        witness_noise_t: float | None = None,
     ) -> None:
         self._setup, self._model, self._fixed = setup, model, references
-        self._folder, self._ahead = folder, ahead
+        self._folder, self._ahead, self._witness_noise_t = folder, ahead, witness_noise_t
         moving = tuple(s for s in setup.tool_sensors if s.body in bodies)
         self._moving = sensor_table(moving) if moving else None
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=WORKER)
@@ -182,6 +185,9 @@ class RefitStart:
         made = self._tables.result()
         self._share = 1.0
         if self._moving is None:
-            return LiveRefit(model, references, baseline, setup.refit, tables=made), None
+            refit = LiveRefit(model, references, baseline, setup.refit, tables=made)
+            if self._witness_noise_t is not None:
+                refit.enable_witnesses(self._witness_noise_t, ready=True)
+            return refit, None
         patches = Patches(self._moving, baseline, setup.frame_id, setup.refit)
         return patches.started(model, references, tables=made), patches

@@ -69,6 +69,7 @@ class ToolWitnesses:
 
     def expect(self, setup: Setup, model: FieldModel) -> None:
         """Have to do with the tools of a setup, and with a model's effects, from now on."""
+        self._correction = None
         if not self._is_wanted or not setup.tool_sensors:
             return
         sensors = sensor_table(setup.tool_sensors)
@@ -82,10 +83,10 @@ class ToolWitnesses:
         for body in set(self._subscriptions) - set(sensors.body):
             self._node.destroy_subscription(self._subscriptions.pop(body))
 
-    def join(self, refit: LiveRefit) -> None:
-        """Let a refit that begins expect witnesses."""
-        if self._correction is not None:
-            refit.enable_witnesses(self._noise)
+    @property
+    def noise_t(self) -> float | None:
+        """Return the noise of a component of what the tools read, T; None without witnesses."""
+        return None if self._correction is None else self._noise
 
     def tell(self, refit: LiveRefit, stamp_ns: int) -> None:
         """Give the refit what the tools read in its last frame, of the stamp given, once."""
