@@ -23,7 +23,6 @@ OWN_WORDS = {
     'demo': 'its live table',
     'loop': 'a line a step',
     'measured': 'the commands that it runs',
-    'paper': 'a bar for each recording',
     'setup': 'its questions',
     'views': 'two small files are written at once',
     'warm_up': 'a line every five seconds',

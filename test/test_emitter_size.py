@@ -28,6 +28,7 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.field.symmetry import size_parameters, symmetry_axis
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tangent import tangents
 from anser_ros.settings import Accuracy
 
 EFFECT = effect_named('emitter_size')
@@ -49,7 +50,7 @@ class Cylinder:
         return self.length_m**2 / 12 - self.radius_m**2 / 4
 
     def field(self, points):
-        turn = Rotation.align_vectors([AXIS], [[0.0, 0.0, 1.0]])[0]
+        turn = Rotation.from_matrix(np.stack([*tangents(AXIS[None])[0], AXIS], axis=1))
         if not self.length_m:
             source = magpylib.misc.Dipole(moment=(0, 0, MOMENT_AM2))
         else:

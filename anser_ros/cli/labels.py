@@ -54,8 +54,7 @@ def name_points(axes: Axes, labels: Sequence[Label], drawn: ArrayLike, size: flo
     size : float
         Of the letters, points.
     """
-    figure = axes.figure.get_figure(root=True)
-    assert figure is not None
+    figure = axes.figure.figure  # not a figure inside it; older versions have no other way
     dots = figure.dpi / POINTS_PER_INCH
     margin = MARGIN_PT * dots
     taken = [_box(text) for text in axes.texts]

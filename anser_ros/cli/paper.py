@@ -2,16 +2,15 @@
 
 import argparse
 import json
-import sys
 import tempfile
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from anser_ros.cli.folders import make_folder
 from anser_ros.cli.output import say_written
+from anser_ros.cli.progress import progress_of
 from anser_ros.experiments.figures import draw_all
 from anser_ros.experiments.recordings import (
     Recordings,
@@ -56,17 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command and return the exit code."""
     make_folder(args.out)
-    console = Console(stderr=True)
-    columns = (TextColumn('{task.description}'), BarColumn(), TimeElapsedColumn())
-    with (
-        tempfile.TemporaryDirectory() as scratch,
-        Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar,
-    ):
-        task = bar.add_task('recordings', total=1.0)
+    with tempfile.TemporaryDirectory() as scratch, progress_of('recordings') as tell:
         recordings = _recordings(args, Path(scratch))
-        study = Study(
-            recordings, lambda name, share: bar.update(task, description=name, completed=share)
-        )
+        study = Study(recordings, tell)
         results = study.run()
         figures = draw_all(study, args.out)
     document = results.document()
