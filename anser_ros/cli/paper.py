@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command and return the exit code."""
     make_folder(args.out)
-    with tempfile.TemporaryDirectory() as scratch, progress_of('recordings') as tell:
+    with progress_of('recordings') as tell, tempfile.TemporaryDirectory() as scratch:
         recordings = _recordings(args, Path(scratch))
         study = Study(recordings, tell)
         results = study.run()
