@@ -85,6 +85,7 @@ class Listener:
 
     def __init__(self, topics: list[str], domain: int) -> None:
         import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseStamped
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -98,6 +99,10 @@ class Listener:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._setup = self._node.create_publisher(String, '/anser/setup', latched)
         self._text = String
+        self._refit_starts = 0
+        self._node.create_subscription(
+            DiagnosticArray, '/diagnostics', self._on_diagnostics, QoSProfile(depth=10)
+        )
         self.got: dict[str, list[tuple]] = {topic: [] for topic in topics}
         for topic in topics:
             self._node.create_subscription(
@@ -110,6 +115,18 @@ class Listener:
         stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         p, q = message.pose.position, message.pose.orientation
         rows.append((stamp, p.x, p.y, p.z, *_axis(q)))
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            self._refit_starts = int(values.get('refit_starts', self._refit_starts))
+
+    def await_refit(self) -> None:
+        """Wait until the field model has made its refit: frames that come before may be lost."""
+        end = time.monotonic() + STARTUP_S
+        while not self._refit_starts:
+            assert time.monotonic() < end, 'the field model never made its refit'
+            self.spin(0.2)
 
     def announce(self, setup: str) -> None:
         """Say the setup, and wait for a publisher of every topic: before, poses would be lost."""
@@ -178,6 +195,8 @@ def replay_through_nodes(
         ]  # fmt: skip
         try:
             listener.announce(read_bag(bag).setup_text)
+            if any('baseline_file' in argument for argument in server):
+                listener.await_refit()
             player = start(
                 'replay', str(bag), '--rate', str(rate), '--wait', str(STARTUP_S),
                 domain=domain, log=logs / 'replay.log',

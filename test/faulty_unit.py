@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from anser_ros.nodes.acquisition_parts.wall_clock import WallClock
 from anser_ros.simulation.control_unit import ControlUnit
 from anser_ros.simulation.pseudo_port import PseudoPort
 from anser_ros.wire.channel_calibration import parse_channels
@@ -88,7 +89,7 @@ class FaultyUnit:
 
     def taken_s(self, stamp_ns: int) -> float:
         """Return the time since power-up that a stamp of the system's clock means, s."""
-        return (stamp_ns - time.time_ns()) / 1e9 + self.now_s
+        return (stamp_ns - WallClock().offset_ns()) / 1e9 - self.begin_s
 
     def close(self) -> None:
         """Stop, and remove the port."""
