@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.factors import as_complex, as_real
+from anser_ros.calibration.normal_factor import NormalFactor, subtract_gram
 from anser_ros.calibration.pose_correction import pose_slopes
 from anser_ros.calibration.readings import frame_blocks
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
@@ -152,7 +152,7 @@ class JointSystem:
         self.parameters, self.modes, self.parts = parameters, modes, parts
         self.fields = parts * modes.size.size
         width = self.fields + len(parameters) + 1
-        self.normal = np.zeros((width, width))
+        self.normal = np.zeros((width, width))  # its upper triangle
         self.scores: list[Array] = []
 
     def add(
@@ -205,7 +205,7 @@ class JointSystem:
             taken = np.concatenate([by_field.reshape(count, 6, -1), by_rest], axis=2)
             taken = taken.reshape(6 * count, -1)
             score = -(taken[:, :-1].T @ taken[:, -1])
-            self.normal -= taken.T @ taken
+            subtract_gram(self.normal, taken)
             flat_rows = rows.reshape(-1, modes)
             gram = flat_rows.T @ flat_rows
             mixed = np.tensordot(rows, right, axes=([0, 1], [0, 1]))
@@ -213,7 +213,6 @@ class JointSystem:
                 own = slice(c * modes, (c + 1) * modes)
                 self.normal[own, own] += gram
                 self.normal[own, self.fields :] += mixed[:, :, c]
-                self.normal[self.fields :, own] += mixed[:, :, c].T
                 score[own] += mixed[:, -1, c]
             columns_flat = right.transpose(2, 0, 1, 3).reshape(right.shape[2], -1)
             inner = columns_flat @ columns_flat.T
@@ -233,18 +232,18 @@ class JointSystem:
         """
         n = self.fields
         precision = np.tile(field_precision, self.parts)
-        factor = scipy.linalg.cho_factor(self.normal[:n, :n] + np.diag(precision), lower=True)
+        inner = self.normal[:n, :n].copy()
+        inner[np.diag_indices(n)] += precision
+        factor = NormalFactor(inner)
         right = self.normal[:n, n:].copy()
         right[:, -1] += precision * pull.T.ravel()
-        inside = scipy.linalg.cho_solve(factor, right)
-        rest = self.normal[n:, n:] - self.normal[n:, :n] @ inside
+        inside = factor.solve(right)
+        own = np.triu(self.normal[n:, n:])
+        rest = own + np.triu(own, 1).T - self.normal[:n, n:].T @ inside
         gradient = self.normal[n:-1, -1] - inside[:, :-1].T @ right[:, -1]
         scores = np.array([s[n:] - inside[:, :-1].T @ s[:n] for s in self.scores])
-        inverse, _ = scipy.linalg.lapack.dpotri(factor[0], lower=1)
-        return Eliminated(
-            rest[:-1, :-1], gradient, inside, scores,
-            np.diag(inverse).reshape(self.parts, -1).T.copy(),
-        )  # fmt: skip
+        variance = factor.inverse_diagonal().reshape(self.parts, -1).T.copy()
+        return Eliminated(rest[:-1, :-1], gradient, inside, scores, variance)
 
 
 @dataclass(frozen=True)
