@@ -87,6 +87,12 @@ metal at another place in each block) must explain: less than that is another ef
 its columns. On unused seeds (`docs/log.md`) twice as much called a low pass a gain, half changed
 no name, and the marginal likelihood alone gave one wrong name less. It was not put in its place,
 as on metal that moves it fits fluctuations that are all refused, for two thirds more time."""
+LEAST_OF_NOISE = 0.05
+"""Share of the noise's power that a fluctuation must explain: a field model's own error is alike
+in neighbouring frames and channels, and any freedom takes some of it. On unused seeds
+(`docs/log.md`) twice as much changed no name, and without it three small effects that are missed
+got their names; but a clean session, with a model from a scan in which all was a little wrong, got
+a loose axis that explains 0.015."""
 REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""

@@ -240,8 +240,11 @@ def _metal_beside(
 
 def _fluctuating(problem: Problem, before: Fit) -> list[tuple[float, Term]]:
     """The fluctuations that explain most of what is there to explain."""
-    excess = before.state.sum_of_squares - before.state.count
-    least = max(decisions.LEAST_GAIN, decisions.LEAST_OF_EXCESS * excess)
+    count = before.state.count
+    excess = before.state.sum_of_squares - count
+    least = max(
+        decisions.LEAST_GAIN, decisions.LEAST_OF_EXCESS * excess, decisions.LEAST_OF_NOISE * count
+    )
     found = []
     for effect in all_effects().values():
         if effect.family is not Family.FLUCTUATION:
