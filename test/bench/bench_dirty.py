@@ -1,0 +1,141 @@
+"""A laboratory where everything is a little wrong, by the commands that are shipped.
+
+Both scans of the recorded sessions `dirty/` are calibrated by default, and the clean session and
+those with known effects are diagnosed with the first model. Errors of positions are exact, of all
+coils of the tool in the clean session. The rival is the same scan with ``--estimate none``, which
+trusts the setup. Without the recorded sessions there are no rows.
+
+    python test/bench/run.py dirty
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+REPO = Path(__file__).resolve().parents[2]
+SESSIONS = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared')) / 'sessions' / 'dirty'
+CLEAN, SINGLE = 'check', 'tool_a/'
+
+
+def command(*arguments: Any) -> float:
+    """Run `anser` and return the processor time that it took, s."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(
+        [sys.executable, '-P', '-m', 'anser_ros.cli.main', *map(str, arguments)],
+        check=True, cwd=REPO, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def exact_errors(folder: Path, model: Path) -> tuple[list[float], float]:
+    """RMSE of each coil in the clean session, m, and the share of ok poses over 3 sigma."""
+    command('evaluate', SESSIONS / f'{CLEAN}.mcap', '--model', model, '--out', folder)
+    truth = np.load(SESSIONS / f'{CLEAN}_truth.npz')
+    frame_of = {int(stamp): frame for frame, stamp in enumerate(truth['t_ns'])}
+    with (folder / 'poses.csv').open(newline='') as file:
+        poses = [row for row in csv.DictReader(file) if row['status'] == 'ok']
+    coils = sorted({row['sensor'] for row in poses if row['sensor'].startswith(SINGLE)})
+    errors: list[list[float]] = [[] for _ in coils]
+    scores = []
+    for row in poses:
+        if row['sensor'] not in coils:
+            continue
+        coil = coils.index(row['sensor'])
+        found = [float(row[key]) for key in ('x_m', 'y_m', 'z_m')]
+        error = np.linalg.norm(found - truth['p'][frame_of[int(row['stamp_ns'])], coil])
+        errors[coil].append(float(error))
+        scores.append(float(error) / float(row['sigma_position_m']))
+    each = [float(np.sqrt(np.mean(np.square(one)))) for one in errors]
+    return each, float(np.mean(np.array(scores) > 3.0))
+
+
+def offset_of(calibration: dict[str, Any]) -> float:
+    """By how much a calibration says that the optical stamps are off, s."""
+    found = [e['parameters'] for e in calibration['effects'] if e['name'] == 'time_offset']
+    return float(found[0]['offset_s'])
+
+
+def scan_rows(folder: Path, truth: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """What the models of both scans are worth; they are left in the folder."""
+    trusting = folder / 'trusting.yaml'
+    scan = SESSIONS / 'scan.mcap'
+    command('calibrate', scan, '--out', trusting, '--estimate', 'none', '--force')
+    rival, _ = exact_errors(folder / 'trusting', trusting)
+    for name, most in (('scan', 1e-4), ('scan_metal', 1.2e-4)):
+        bag, model = SESSIONS / f'{name}.mcap', folder / f'{name}.yaml'
+        taken_s = command('calibrate', bag, '--out', model, '--report', folder / name)
+        each, over = exact_errors(folder / f'{name}_check', model)
+        calibration = json.loads((folder / name / 'calibration.json').read_text())
+        yield {
+            'name': f'dirty/{name}: exact error of all coils',
+            'value': 1e3 * float(np.sqrt(np.mean(np.square(each)))), 'unit': 'mm',
+            'rival': 'scan, --estimate none', 'target': 1e3 * most,
+            'rival_value': 1e3 * float(np.sqrt(np.mean(np.square(rival)))),
+        }  # fmt: skip
+        yield {
+            'name': f'dirty/{name}: worst coil', 'value': 1e3 * max(each), 'unit': 'mm',
+            'rival': 'scan, --estimate none', 'rival_value': 1e3 * max(rival), 'target': 0.15,
+        }  # fmt: skip
+        yield {
+            'name': f'dirty/{name}: ok poses over 3 sigma', 'value': 100 * over, 'unit': '%',
+            'target': 1.0,
+        }  # fmt: skip
+        yield {
+            'name': f'dirty/{name}: error of the time offset', 'unit': 'ms', 'target': 0.1,
+            'value': 1e3 * abs(offset_of(calibration) - truth['_lab']['dt']),
+        }  # fmt: skip
+        limit = {'target': 60.0} if name == 'scan' else {}
+        yield {'name': f'dirty/{name}: processor time', 'value': taken_s, 'unit': 's', **limit}
+    metal = truth['scan_metal']['moving_metal']
+    (found,) = [
+        e['parameters'] for e in calibration['effects'] if e['name'] == 'moving_metal'
+    ]  # fmt: skip
+    wrong = [found[key] - metal[key] for key in ('t_start_s', 't_end_s')]
+    yield {
+        'name': 'dirty/scan_metal: error of the times of the metal', 'unit': 's',
+        'value': float(np.abs(wrong).max()), 'target': 1.5,
+    }  # fmt: skip
+
+
+def session_rows(folder: Path, truth: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """What is named in the sessions, with the model of the first scan."""
+    clean = np.nan
+    for name in [key for key in truth if not key.startswith(('_', 'scan'))]:
+        bag = SESSIONS / f'{name}.mcap'
+        command('diagnose', bag, '--model', folder / 'scan.yaml', '--out', folder / name)
+        found = json.loads((folder / name / 'diagnosis.json').read_text())
+        names = sorted(effect['name'] for effect in found['effects'])
+        yield {
+            'name': f'dirty/{name}: {", ".join(truth[name]) or "nothing"} and no other named',
+            'value': float(names == sorted(truth[name])), 'unit': '', 'target': 1.0,
+            'target_is': 'least',
+        }  # fmt: skip
+        left = found['held_out']['flux_rms_after_t']
+        clean = left if name == CLEAN else clean
+        yield {
+            'name': f'dirty/{name}: flux left, over that of {CLEAN}', 'value': left / clean,
+            'unit': '', 'target': 1.15,
+        }  # fmt: skip
+
+
+def rows() -> Iterator[dict[str, Any]]:
+    """All of them; some minutes."""
+    if not SESSIONS.is_dir():
+        print('  no folder of recorded sessions beside the repository: no rows')
+        return
+    truth = json.loads((SESSIONS / 'truth.json').read_text())
+    with tempfile.TemporaryDirectory() as name:
+        yield from scan_rows(Path(name), truth)
+        yield from session_rows(Path(name), truth)
