@@ -96,6 +96,11 @@ a loose axis that explains 0.015."""
 REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""
+OWN_METAL = 2.0
+"""Gain of metal at rest, over the power that the model states of its own error in all readings,
+below which the metal may be the model's: what was taken off a scan with metal near leaves a field
+that is metal's, by 2.3 of its stated sigmas in `dirty/scan_metal`, the only such scan that was
+tried. Larger hides faint metal (2.0: what moves a tool by 0.03 mm); smaller names what is none."""
 MOST_METALS = 2
 """Pieces of metal in force beside which no further metal is looked for. More let what the shapes
 of these leave pass for another piece; fewer leave a second piece to be taken for other effects."""

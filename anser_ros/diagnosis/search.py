@@ -140,6 +140,14 @@ def is_worthwhile(gain: float, parameters: int, fit: Fit) -> bool:
     return gain > least * left
 
 
+def _may_be_the_model_s(gain: float, fit: Fit) -> bool:
+    """Return whether metal at rest explains no more than what the model may have of its own."""
+    if fit.newest.effect.family is not Family.METAL_AT_REST:
+        return False
+    own = fit.state.problem.spread.model_share * fit.state.count
+    return gain < decisions.OWN_METAL * own * max(misfit(fit), 1.0)
+
+
 class _Round:
     """One round of the search: the best effect to add to those in force."""
 
@@ -166,7 +174,7 @@ class _Round:
         if not is_worthwhile(gain, term.complexity, best):
             return None
         if term.effect.family.is_metal:
-            if gain < decisions.REMNANT * search.metal_gain:
+            if gain < decisions.REMNANT * search.metal_gain or _may_be_the_model_s(gain, best):
                 return None
             search.metal_gain = max(search.metal_gain, gain)
         search.rivals[term.label] = _rivals(gain, best, fitted)

@@ -1,7 +1,7 @@
 """A laboratory where everything is a little wrong, by the commands that are shipped.
 
 Both scans of the recorded sessions `dirty/` are calibrated by default, and the clean session and
-those with known effects are diagnosed with the first model. Errors of positions are exact, of all
+those with known effects are diagnosed with both models. Errors of positions are exact, of all
 coils of the tool in the clean session. The rival is the same scan with ``--estimate none``, which
 trusts the setup. Without the recorded sessions there are no rows.
 
@@ -109,23 +109,24 @@ def scan_rows(folder: Path, truth: dict[str, Any]) -> Iterator[dict[str, Any]]:
     }  # fmt: skip
 
 
-def session_rows(folder: Path, truth: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """What is named in the sessions, with the model of the first scan."""
+def session_rows(folder: Path, truth: dict[str, Any], scan: str) -> Iterator[dict[str, Any]]:
+    """What is named in the sessions, with the model of a scan."""
     clean = np.nan
     for name in [key for key in truth if not key.startswith(('_', 'scan'))]:
-        bag = SESSIONS / f'{name}.mcap'
-        command('diagnose', bag, '--model', folder / 'scan.yaml', '--out', folder / name)
-        found = json.loads((folder / name / 'diagnosis.json').read_text())
+        bag, out = SESSIONS / f'{name}.mcap', folder / f'{scan}_{name}'
+        command('diagnose', bag, '--model', folder / f'{scan}.yaml', '--out', out)
+        found = json.loads((out / 'diagnosis.json').read_text())
         names = sorted(effect['name'] for effect in found['effects'])
+        what = f'dirty/{name}, model of {scan}'
         yield {
-            'name': f'dirty/{name}: {", ".join(truth[name]) or "nothing"} and no other named',
+            'name': f'{what}: {", ".join(truth[name]) or "nothing"} and no other named',
             'value': float(names == sorted(truth[name])), 'unit': '', 'target': 1.0,
             'target_is': 'least',
         }  # fmt: skip
         left = found['held_out']['flux_rms_after_t']
         clean = left if name == CLEAN else clean
         yield {
-            'name': f'dirty/{name}: flux left, over that of {CLEAN}', 'value': left / clean,
+            'name': f'{what}: flux left, over that of {CLEAN}', 'value': left / clean,
             'unit': '', 'target': 1.15,
         }  # fmt: skip
 
@@ -138,4 +139,5 @@ def rows() -> Iterator[dict[str, Any]]:
     truth = json.loads((SESSIONS / 'truth.json').read_text())
     with tempfile.TemporaryDirectory() as name:
         yield from scan_rows(Path(name), truth)
-        yield from session_rows(Path(name), truth)
+        for scan in ('scan', 'scan_metal'):
+            yield from session_rows(Path(name), truth, scan)
