@@ -55,6 +55,14 @@ def test_a_poll_slower_than_its_tracker_is_told_by_poses_that_share_a_stamp():
     assert stamp_step(np.arange(0, 20, 0.016)) == 0.0  # the tracker's own rate
 
 
+def test_a_poll_hardly_slower_than_its_tracker_is_told_by_its_beat():
+    taken = np.arange(0, 40, 1 / 32.5)
+    assert stamp_step(np.ceil(taken / 0.03) * 0.03) == pytest.approx(0.03)
+    own, rng = np.arange(1600), np.random.default_rng(1)
+    assert stamp_step(0.025 * own[rng.random(own.size) > 0.02]) == 0.0  # lost at random
+    assert stamp_step(0.025 * own[own // 64 % 5 != 3]) == 0.0  # blocks that are held out
+
+
 @pytest.mark.parametrize('poses_a_step', [0.37161, 0.27639, 0.35, 0.25, 1 / 3])
 def test_poses_are_thinned_out_of_step_with_a_poll(poses_a_step):
     # Two poses are 2 / 0.37161 = 5.38197 steps, which is 6 less the golden section.

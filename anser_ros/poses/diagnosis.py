@@ -23,7 +23,13 @@ from anser_ros.poses.effect import (
     frames_of,
     is_of,
 )
-from anser_ros.poses.fit import PoseFit, fit_poses, noise_of, unexplained_poses
+from anser_ros.poses.fit import (
+    PoseFit,
+    fit_poses,
+    noise_of,
+    unexplained_poses,
+    with_time_constants,
+)
 from anser_ros.poses.jitter import jitter
 from anser_ros.poses.lever_arms import (
     LEAST_KNOWN_M,
@@ -216,9 +222,9 @@ def _judged(problem: PoseProblem, fit: PoseFit) -> PoseProblem:
 
 
 def _whole(problem: PoseProblem, found: PoseFit) -> PoseFit:
-    """The terms fitted to all poses."""
+    """The terms fitted to all poses, time constants of filters too."""
     every = _judged(replace(problem, noise=found.state.problem.noise), found)
-    return fit_poses(every, found.terms)
+    return with_time_constants(fit_poses(every, found.terms))
 
 
 def _errors(state: PoseState) -> HeldOutErrors:

@@ -121,6 +121,11 @@ class Role(Enum):
         """
         return self in (Role.OFFSET, Role.RATE)
 
+    @property
+    def moves_times(self) -> bool:
+        """Return whether it is a clock or a filter, which is a delay to first order."""
+        return self.is_clock or self is Role.FILTER
+
 
 @dataclass(frozen=True)
 class Frames:

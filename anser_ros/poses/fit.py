@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.stats import chi2
 
 from anser_ros.calibration.blocks import FOLDS
 from anser_ros.diagnosis.fit import descended, stepped
@@ -13,6 +14,7 @@ from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
+from anser_ros.poses.stamp_step import stamp_step
 
 Array = NDArray[np.float64]
 
@@ -34,8 +36,18 @@ and the two that metal must be near to be named (`episodes.WINDOWS`). Smaller ta
 reflections for something to explain; larger takes an effect of a few seconds for outliers."""
 SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
 FEWEST_BLOCKS = 10
-"""Blocks by whose scatter the variance of a time is judged: it is then known to half of itself.
-Fewer take chance for accuracy; more leave errors of stamps random that are not."""
+"""Blocks by whose scores the variance of a time beside a poll is judged. Fewer have no slow
+course; more take errors of stamps as random that are not."""
+SLOW = 6
+"""Tapers of a slow course. Fewer take chance for accuracy; more are as quick as the teeth that end
+in blocks."""
+CHANCE = 0.01
+"""Chance that the poses' own noise makes a slow course that is believed. Larger widens sigmas for
+noise; smaller leaves out a slow beat of poll and tracker."""
+FILTER_STEPS = 3  # Newton's, to a time constant that is known to some percent
+NEAR_TAU = 1.25
+"""Factor by which positions alone may move a time constant. Smaller keeps one that orientations
+have moved; larger follows steps where no filter is, which lead anywhere."""
 LARGEST_STAMP_S = 0.1
 """Spread of stamps, s, beyond which a time makes no pose of a hand's motion."""
 
@@ -73,32 +85,36 @@ class PoseFit:
     def covariance(self) -> Array:
         """Return the covariance of all parameters, as `BlockSums.covariance`.
 
-        How far errors of stamps are independent is not assumed for what moves times: those of a
-        poll are a sawtooth, whose mean over many poses is nearer to half a step than that of
-        random errors. The blocks' scores show it: where a block ends in the middle of a tooth the
-        next begins there, so that products of neighbours count by half (Bartlett's window). What
-        the poses' own noise makes is the least.
+        Errors of stamps are not independent where these lie on the grid of a poll: they are a
+        sawtooth, whose mean over many poses is far nearer to half a step than that of random
+        errors. What it adds to the poses' own noise is slow, and is seen in the slow course of the
+        blocks' scores (by sine tapers); the quick course is where teeth end in blocks.
         """
         filtered = any(is_of(term, Role.FILTER) for term in self.terms)
         sums = self.state.sums(filter_slopes=True) if filtered else self.sums
         whole = sums.covariance(self.prior, self.misfit)
-        blocks = sums.squares.size
         clocks = np.repeat(
             [effect_of(t).role.is_clock for t in self.terms], [t.theta.size for t in self.terms]
         )
-        noises = [part.noise for part in self.state.parts]
-        if not clocks.any() or blocks <= FEWEST_BLOCKS or not any(n.stamp_s for n in noises):
+        blocks = sums.squares.size
+        if not clocks.any() or blocks <= FEWEST_BLOCKS or not self._is_polled():
             return whole
         formal = sums.solve(self.prior)[1][clocks]
-        scores = sums.right @ formal.T
-        shown = np.sum(scores**2, axis=0) + np.sum(scores[1:] * scores[:-1], axis=0)
-        shown *= blocks / (blocks - 1)
         exact = self.state.sums(filter_slopes=filtered, stamps_exact=True).normal.sum(axis=0)
         exact += np.diag(1 / self.prior**2)
         least = np.einsum('ci,ij,cj->c', formal, exact, formal) * max(self.misfit, 1.0)
+        course = np.outer(np.arange(1, SLOW + 1), np.arange(1, blocks + 1))
+        tapers = np.sin(np.pi * course / (blocks + 1)) * np.sqrt(2 * blocks / (blocks + 1))
+        slow = np.mean((tapers @ sums.right @ formal.T) ** 2, axis=0)
+        variance = np.where(slow > least * chi2.ppf(1 - CHANCE, SLOW) / SLOW, slow, least)
         scale = np.ones(clocks.size)
-        scale[clocks] = np.sqrt(np.maximum(shown, least) / np.diag(whole)[clocks])
+        scale[clocks] = np.sqrt(variance / np.diag(whole)[clocks])
         return np.asarray(whole * scale[:, None] * scale[None, :])
+
+    def _is_polled(self) -> bool:
+        """Whether the stamps of a sensor have errors and lie on a grid."""
+        sensors = zip(self.state.problem.sensors, self.state.parts, strict=True)
+        return any(part.noise.stamp_s and stamp_step(poses.time) for poses, part in sensors)
 
     def covariance_of(self, index: int, whole: Array | None = None) -> Array:
         """Return the covariance of one term's parameters."""
@@ -126,6 +142,24 @@ def fit_poses(problem: PoseProblem, terms: Sequence[Term], iterations: int = 10)
         iterations,
     )
     return PoseFit(state, sums, prior)
+
+
+def with_time_constants(fit: PoseFit) -> PoseFit:
+    """Return the fit with the time constants of filters, which lie near, fitted by their slopes.
+
+    Positions alone tell them (`PoseState.sums`), so that steps need not lower the sum of squares.
+    """
+    filters = [i for i, term in enumerate(fit.terms) if is_of(term, Role.FILTER)]
+    if not filters:
+        return fit
+    state = fit.state
+    for _ in range(FILTER_STEPS):
+        terms = stepped(state.terms, state.sums(filter_slopes=True).step(fit.prior, 0.0))
+        moved = [float(terms[i].theta[0] / fit.terms[i].theta[0]) for i in filters]
+        if not all(1 / NEAR_TAU < factor < NEAR_TAU for factor in moved):
+            return fit
+        state = state.problem.state(terms)
+    return PoseFit(state, state.sums(), fit.prior)
 
 
 def robust_fit(problem: PoseProblem, terms: Sequence[Term]) -> PoseFit:

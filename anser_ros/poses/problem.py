@@ -216,8 +216,10 @@ class PoseState:
         """Return normal equations of the terms' parameters, block by block.
 
         With ``filter_slopes`` time constants of filters, which have no slopes of their own, count
-        by differences; otherwise they are held. With ``stamps_exact`` the normal equations are the
-        scores' variance if the stamps have no errors after all, with the weights as they are.
+        by differences; otherwise they are held. Positions alone tell times then: how a tracker
+        takes means of orientations (of vectors, quaternions or matrices) is not known, and moves
+        a time constant by two standard deviations. With ``stamps_exact`` the normal equations are
+        the scores' variance if the stamps have no errors after all, with the weights as they are.
         """
         wanted = self.terms if terms is None else tuple(terms)
         sizes = [term.theta.size for term in wanted]
@@ -235,6 +237,8 @@ class PoseState:
                 slope = effect_of(term).slopes(term, part.view)
                 if term.name_and_site in turned:
                     slope = turned[term.name_and_site][i]
+                if slope is not None and turned and effect_of(term).role.moves_times:
+                    slope[:, 3:] = 0.0
                 if slope is not None:
                     columns[:, :, a:b] = slope
             white = part.white
@@ -259,6 +263,6 @@ class PoseState:
             for way in (1, -1)
         ]  # fmt: skip
         return [
-            -((more.residual - less.residual) / (2 * step[0]))[:, :, None]
+            (less.residual - more.residual)[:, :, None] / (2 * step[0])
             for more, less in zip(*ends, strict=True)
         ]

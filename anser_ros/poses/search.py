@@ -17,7 +17,14 @@ from anser_ros.calibration.blocks import FOLDS
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
-from anser_ros.poses.fit import LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, unexplained_poses
+from anser_ros.poses.fit import (
+    LARGEST_STAMP_S,
+    PoseFit,
+    fit_poses,
+    noise_of,
+    unexplained_poses,
+    with_time_constants,
+)
 from anser_ros.poses.lever_arms import knows_levers, most_poses
 from anser_ros.poses.prices import LEAST_EXPLAINED, doubt, price
 from anser_ros.poses.problem import PoseNoise, PosePart
@@ -29,7 +36,7 @@ Array = NDArray[np.float64]
 POSES_A_PARAMETER = 6
 """Poses that a parameter needs: neighbours in time are hardly new. More leave metal unnamed on a
 hundred poses that a slow tracker gives in a minute; blocks judge what fewer would do."""
-LAST_STEP = 1.02  # factor of a time constant about which what is left is a parabola
+LAG_STEPS = (1.4, 1.4, 1.2, 1.1, 1.05)  # factors of a time constant by which it is neared
 MOST_EFFECTS = 6  # effects in force after which the search ends: more would be stand-ins
 FULL_FITS = 3  # candidates fitted in full in each round, which takes most of the time
 NOISE_ROUNDS = 3  # times that noise and what stands out, which depend on each other, are found
@@ -322,21 +329,15 @@ def _gain(before: PoseFit, after: PoseFit, term: Term) -> float:
 
 
 def _finest_lag(fit: PoseFit) -> PoseFit:
-    """The fit at the time constant that leaves least: ever smaller steps, then a parabola."""
+    """The fit at the best time constant: ever smaller steps to the least, then by its slopes."""
     best = fit
-    for factor in (1.4, 1.4, 1.2, 1.1, 1.05, LAST_STEP):
+    for factor in LAG_STEPS:
         for direction in (factor, 1 / factor):
             trial = _slower(best, direction)
             if trial.state.sum_of_squares < best.state.sum_of_squares:
                 best = trial
                 break
-    less, more = (_slower(best, way).state.sum_of_squares for way in (1 / LAST_STEP, LAST_STEP))
-    bend = less + more - 2 * best.state.sum_of_squares
-    if bend <= 0:
-        return best
-    shift = float(np.clip(0.5 * (less - more) / bend, -1.0, 1.0))
-    trial = _slower(best, LAST_STEP**shift)
-    return min(best, trial, key=lambda one: one.state.sum_of_squares)
+    return with_time_constants(best)
 
 
 def _slower(fit: PoseFit, factor: float) -> PoseFit:

@@ -32,8 +32,8 @@ from pose_world import World  # noqa: E402
 
 from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses  # noqa: E402
 
-REPORTED, REPEATED = (309,), (310,)
-REPEATS = 12  # sessions of a kind by which sigmas are judged: their rms is then known to 20 %
+REPORTED, REPEATED = (321,), (322,)
+REPEATS = 24  # sessions of a kind by which sigmas are judged: their rms is then known to 14 %
 MIDDLE = np.array([0.05, 0.02, -0.3])
 TARGET, HONEST = 0.95, (0.8, 1.3)
 WIDE = {
