@@ -59,7 +59,7 @@ class NormalFactor:
 
             in_order(reduce, self._strips[at:])
             corner = left[own, own]
-            corner[:] = np.linalg.cholesky(np.triu(corner).T + np.triu(corner, 1)).T
+            corner[:] = np.linalg.cholesky(corner.T).T  # which reads the lower triangle only
             inverse = _inverse_of_upper(corner).T
 
             def divide(other: slice, own: slice = own, inverse: Array = inverse) -> None:

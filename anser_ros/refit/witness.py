@@ -25,6 +25,7 @@ from anser_ros.refit.evidence import STRENGTHS, FrameEvidence
 from anser_ros.refit.layer import component_rows
 from anser_ros.refit.modes import PosteriorModes
 from anser_ros.refit.posterior import Bank
+from anser_ros.refit.prior import CloudPrior
 from anser_ros.refit.reduced import ReducedPrior
 from anser_ros.refit.tables import RefitTables
 from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised
@@ -97,10 +98,9 @@ class Witness:
     def make_ready(self) -> None:
         """Work out the coordinates of all clouds, a tenth of a second each, before they count."""
         for prior in self._tables.priors:
-            self._reduced[prior.name] = self._tables.reduced(prior)
+            self._reduced_of(prior)
 
-    def _reduced_of(self, bank: Bank, hypothesis: int) -> ReducedPrior:
-        prior = bank.prior(hypothesis)
+    def _reduced_of(self, prior: CloudPrior) -> ReducedPrior:
         if prior.name not in self._reduced:
             self._reduced[prior.name] = self._tables.reduced(prior)
         return self._reduced[prior.name]
@@ -137,7 +137,7 @@ class Witness:
 
     def _posterior(self, bank: Bank, seen: FrameEvidence, h: int) -> Array:
         """Return the covariance (2, D, D) that the references of a frame leave."""
-        reduced = self._reduced_of(bank, h)
+        reduced = self._reduced_of(bank.prior(h))
         across = reduced.cross[:, bank.rows] @ bank.bases[h]
         out = np.empty((2, len(across), len(across)))
         for part in range(2):
@@ -150,7 +150,7 @@ class Witness:
     def moments(self, bank: Bank, h: int) -> ComplexArray:
         """Return what the tools add to a hypothesis' moments (N, K), in units of the noise."""
         state = self._filters[bank.prior(h).name]
-        reduced = self._reduced_of(bank, h)
+        reduced = self._reduced_of(bank.prior(h))
         flat = reduced.basis.reshape(-1, len(state.mean)) @ state.mean
         return np.asarray((flat @ np.array([1.0, 1.0j])).reshape(len(reduced.basis), -1))
 
@@ -161,7 +161,7 @@ class Witness:
         stated for these places.
         """
         state = self._filters[bank.prior(h).name]
-        reduced = self._reduced_of(bank, h)
+        reduced = self._reduced_of(bank.prior(h))
         d, k = len(state.mean), bank.width
         layer = bank.prior(h).layer
         points = layer.points[::FIRST_SAMPLE_STEP] if self._near is None else self._near
@@ -243,7 +243,7 @@ class Witness:
                 layer, length = bank.prior(h).layer, reading.table.length
                 basis = flux_basis(rows.at, rows.axes, length, layer.positions, layer.directions)
                 off = rows.left - (basis @ bank.moments(seen, h)).ravel()
-                design = basis @ self._reduced_of(bank, h).basis.astype(np.float64)
+                design = basis @ self._reduced_of(bank.prior(h)).basis.astype(np.float64)
                 design = design.reshape(off.size, len(state.mean))
                 for i, (values, (pose, own)) in enumerate(
                     zip((off.real, off.imag), parts, strict=True)

@@ -10,7 +10,6 @@ trusts the setup. Without the recorded sessions there are no rows.
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import resource
@@ -23,9 +22,13 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parent / 'world'))
+
+from scoring import exact_errors
+
 REPO = Path(__file__).resolve().parents[2]
 SESSIONS = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared')) / 'sessions' / 'dirty'
-CLEAN, SINGLE = 'check', 'tool_a/'
+CLEAN = 'check'
 
 
 def command(*arguments: Any) -> float:
@@ -39,32 +42,19 @@ def command(*arguments: Any) -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def exact_errors(folder: Path, model: Path) -> tuple[list[float], float]:
+def coil_errors(folder: Path, model: Path) -> tuple[list[float], float]:
     """RMSE of each coil in the clean session, m, and the share of ok poses over 3 sigma."""
     command('evaluate', SESSIONS / f'{CLEAN}.mcap', '--model', model, '--out', folder)
     truth = np.load(SESSIONS / f'{CLEAN}_truth.npz')
-    frame_of = {int(stamp): frame for frame, stamp in enumerate(truth['t_ns'])}
-    with (folder / 'poses.csv').open(newline='') as file:
-        poses = [row for row in csv.DictReader(file) if row['status'] == 'ok']
-    coils = sorted({row['sensor'] for row in poses if row['sensor'].startswith(SINGLE)})
-    errors: list[list[float]] = [[] for _ in coils]
-    scores = []
-    for row in poses:
-        if row['sensor'] not in coils:
-            continue
-        coil = coils.index(row['sensor'])
-        found = [float(row[key]) for key in ('x_m', 'y_m', 'z_m')]
-        error = np.linalg.norm(found - truth['p'][frame_of[int(row['stamp_ns'])], coil])
-        errors[coil].append(float(error))
-        scores.append(float(error) / float(row['sigma_position_m']))
-    each = [float(np.sqrt(np.mean(np.square(one)))) for one in errors]
-    return each, float(np.mean(np.array(scores) > 3.0))
+    coils, _, errors, sigmas, _ = exact_errors(folder / 'poses.csv', truth['t_ns'], truth['p'])
+    each = [float(np.sqrt(np.mean(errors[coils == coil] ** 2))) for coil in np.unique(coils)]
+    return each, float(np.mean(errors > 3.0 * sigmas))
 
 
-def offset_of(calibration: dict[str, Any]) -> float:
-    """By how much a calibration says that the optical stamps are off, s."""
-    found = [e['parameters'] for e in calibration['effects'] if e['name'] == 'time_offset']
-    return float(found[0]['offset_s'])
+def parameters_of(calibration: dict[str, Any], name: str) -> dict[str, Any]:
+    """Parameters of the one effect of a name that a calibration found."""
+    (found,) = [e['parameters'] for e in calibration['effects'] if e['name'] == name]
+    return dict(found)
 
 
 def scan_rows(folder: Path, truth: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -72,12 +62,13 @@ def scan_rows(folder: Path, truth: dict[str, Any]) -> Iterator[dict[str, Any]]:
     trusting = folder / 'trusting.yaml'
     scan = SESSIONS / 'scan.mcap'
     command('calibrate', scan, '--out', trusting, '--estimate', 'none', '--force')
-    rival, _ = exact_errors(folder / 'trusting', trusting)
+    rival, _ = coil_errors(folder / 'trusting', trusting)
     for name, most in (('scan', 1e-4), ('scan_metal', 1.2e-4)):
         bag, model = SESSIONS / f'{name}.mcap', folder / f'{name}.yaml'
         taken_s = command('calibrate', bag, '--out', model, '--report', folder / name)
-        each, over = exact_errors(folder / f'{name}_check', model)
+        each, over = coil_errors(folder / f'{name}_check', model)
         calibration = json.loads((folder / name / 'calibration.json').read_text())
+        offset_s = parameters_of(calibration, 'time_offset')['offset_s']
         yield {
             'name': f'dirty/{name}: exact error of all coils',
             'value': 1e3 * float(np.sqrt(np.mean(np.square(each)))), 'unit': 'mm',
@@ -94,14 +85,12 @@ def scan_rows(folder: Path, truth: dict[str, Any]) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
         yield {
             'name': f'dirty/{name}: error of the time offset', 'unit': 'ms', 'target': 0.1,
-            'value': 1e3 * abs(offset_of(calibration) - truth['_lab']['dt']),
+            'value': 1e3 * abs(offset_s - truth['_lab']['dt']),
         }  # fmt: skip
         limit = {'target': 60.0} if name == 'scan' else {}
         yield {'name': f'dirty/{name}: processor time', 'value': taken_s, 'unit': 's', **limit}
     metal = truth['scan_metal']['moving_metal']
-    (found,) = [
-        e['parameters'] for e in calibration['effects'] if e['name'] == 'moving_metal'
-    ]  # fmt: skip
+    found = parameters_of(calibration, 'moving_metal')
     wrong = [found[key] - metal[key] for key in ('t_start_s', 't_end_s')]
     yield {
         'name': 'dirty/scan_metal: error of the times of the metal', 'unit': 's',

@@ -155,6 +155,41 @@ def describe(truth, found):
     return ', '.join(words)
 
 
+def exact_errors(poses_csv, stamp_ns, places):
+    """How far the poses with state ok are off.
+
+    Parameters
+    ----------
+    poses_csv : path
+    stamp_ns : array, shape (F,)
+    places : array, shape (F, S, 3)
+        Of the sensors by name.
+
+    Returns
+    -------
+    tuple of ndarray, shape (n,), and int
+        Number of the sensor, stamp, error and sigma of the position of each, m; and of how many
+        poses, ok or not.
+    """
+    frame = {int(s): i for i, s in enumerate(stamp_ns)}
+    with open(poses_csv, newline='', encoding='utf-8') as stream:
+        rows = list(csv.DictReader(stream))
+    sensors = {name: i for i, name in enumerate(sorted({row['sensor'] for row in rows}))}
+    numbers, stamps, errors, sigmas = [], [], [], []
+    for row in rows:
+        if row['status'] != 'ok':
+            continue
+        numbers.append(sensors[row['sensor']])
+        stamps.append(int(row['stamp_ns']))
+        place = np.array([float(row[k]) for k in ('x_m', 'y_m', 'z_m')])
+        errors.append(np.linalg.norm(place - places[frame[stamps[-1]], numbers[-1]]))
+        sigmas.append(float(row['sigma_position_m']))
+    return (
+        np.array(numbers, int), np.array(stamps, np.int64), np.array(errors), np.array(sigmas),
+        len(rows),
+    )  # fmt: skip
+
+
 def true_errors(poses_csv, path_npz):
     """Errors of every sensor's poses against the exact path.
 
@@ -166,28 +201,16 @@ def true_errors(poses_csv, path_npz):
         own sigmas; ``last_m``: the root mean square of the last 8 s.
     """
     truth = np.load(path_npz)
-    frame = {int(s): i for i, s in enumerate(truth['stamp_ns'])}
-    with open(poses_csv, newline='', encoding='utf-8') as stream:
-        rows = list(csv.DictReader(stream))
-    sensors = {name: i for i, name in enumerate(sorted({row['sensor'] for row in rows}))}
-    errors, sigmas, late = [], [], []
-    end = int(truth['stamp_ns'][-1]) - 8_000_000_000
-    for row in rows:
-        if row['status'] != 'ok':
-            continue
-        stamp = int(row['stamp_ns'])
-        true = truth['sensor_position'][frame[stamp], sensors[row['sensor']]]
-        place = np.array([float(row[k]) for k in ('x_m', 'y_m', 'z_m')])
-        errors.append(np.linalg.norm(place - true))
-        sigmas.append(float(row['sigma_position_m']))
-        late.append(stamp > end)
-    errors, sigmas, late = np.array(errors), np.array(sigmas), np.array(late, dtype=bool)
+    _, stamps, errors, sigmas, count = exact_errors(
+        poses_csv, truth['stamp_ns'], truth['sensor_position']
+    )
+    late = stamps > int(truth['stamp_ns'][-1]) - 8_000_000_000
     if not errors.size:
         return {'rmse_m': None, 'p95_m': None, 'tracked': 0.0, 'over_3_sigma': 0.0, 'last_m': None}
     return {
         'rmse_m': float(np.sqrt(np.mean(errors**2))),
         'p95_m': float(np.percentile(errors, 95)),
-        'tracked': len(errors) / len(rows),
+        'tracked': len(errors) / count,
         'over_3_sigma': float(np.mean(errors > 3 * sigmas)),
         'last_m': float(np.sqrt(np.mean(errors[late] ** 2))) if late.any() else None,
     }
