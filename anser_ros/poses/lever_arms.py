@@ -29,6 +29,8 @@ recordings of one body levers were off by 9 mm and more beyond this, and by 4 mm
 
 def is_lever_determined(part: PosePart, jitter_rad: float) -> NDArray[np.bool_]:
     """Return the mask (3,) of the components of a lever arm that the motion determines."""
+    if not part.used.any():
+        return np.zeros(3, dtype=np.bool_)
     return (lever_blur(part, jitter_rad) < MOST_BLUR) & (lever_reach(part) < HARDLY_DETERMINED_M)
 
 
@@ -91,7 +93,8 @@ def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
             part = parts[str(effect_of(term).sensor_of(term))]
             sigma = np.sqrt(np.maximum(np.diag(fit.covariance_of(index, covariance)), 0.0))[:3]
             is_known = (sigma < LEAST_KNOWN_M) & is_lever_determined(part, shaking)
-            tilted = np.sqrt(np.diag(_turn_information(part))) > MUCH_TILT
+            turns = _turn_information(part) if part.used.any() else np.zeros((3, 3))
+            tilted = np.sqrt(np.diag(turns)) > MUCH_TILT
             if np.count_nonzero(is_known | tilted) >= 2:
                 return True
     return False

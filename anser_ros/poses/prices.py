@@ -49,8 +49,11 @@ def price(term: Term, total: float, fit: PoseFit) -> float:
 
 
 def _map_share(term: Term, parts: Sequence[PosePart]) -> float:
-    """Share of the squared error of its sensors' positions that a map must explain."""
-    squares = [np.sum(p.residual[p.used, :3] ** 2, axis=1) for p in parts]
+    """Share of the squared error of its sensors' positions that a map must explain.
+
+    What errors of the stamps make is no error of places, and follows no map.
+    """
+    squares = [p.noise.position_m**2 * np.sum(p.white[p.used, :3] ** 2, axis=1) for p in parts]
     error = float(np.mean(np.concatenate(squares)))
     is_scale = effect_of(term).is_scale(term)
     least, size = (SCALE_SHARE, SCALE_M) if is_scale else (LARGE_SHARE, LARGE_M)

@@ -16,6 +16,7 @@ from scipy.special import ndtri
 from anser_ros.calibration.blocks import FOLDS
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
 from anser_ros.effects.term import Term
+from anser_ros.errors import DiagnosisError
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.fit import (
     LARGEST_STAMP_S,
@@ -30,6 +31,7 @@ from anser_ros.poses.prices import LEAST_EXPLAINED, doubt, price
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
 from anser_ros.poses.sequence import PoseSession
+from anser_ros.poses.start import FEWEST_HAND_EYE_POSES
 
 Array = NDArray[np.float64]
 
@@ -132,9 +134,20 @@ def search_effects(
 
     Where the motion determines no lever arm, turns that go with the place or the velocity, times a
     lever arm of any length, look like any of them. Only the clocks are tried there.
+
+    Raises
+    ------
+    DiagnosisError
+        When too few poses agree with the reference.
     """
     tell = say or (lambda text: None)
     fit = with_noise(start)
+    agreeing = fit.state.count // 6
+    if agreeing < FEWEST_HAND_EYE_POSES:
+        raise DiagnosisError(
+            f'{session.path}: {agreeing} poses agree with the reference; hand-eye needs '
+            f'{FEWEST_HAND_EYE_POSES}'
+        )
     is_known = knows_levers(fit, most_poses(session))
     if not is_known:
         fit = with_noise(start, False)

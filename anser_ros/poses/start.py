@@ -1,7 +1,6 @@
 """Starts a fit from a session: blocks, a coarse time offset, two frames in closed form."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.diagnosis.prepare import BLOCKS, TEST_EVERY
 from anser_ros.effects.term import Site, Term
 from anser_ros.errors import DiagnosisError, FitError
+from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.poses.effect import PoseSetting, Role
 from anser_ros.poses.fit import PoseFit, robust_fit
 from anser_ros.poses.path import OpticalPath
@@ -76,7 +76,9 @@ def pose_problem(session: PoseSession) -> PoseProblem:
         )
         kept = few
         if rests:
-            path = replace(path, is_at_rest=True)
+            path = OpticalPath.through(
+                _resting(reference, list(sensors.values())), is_at_rest=True
+            )
     kept = {
         name: poses for name, poses in kept.items() if _seen(poses, path) >= FEWEST_HAND_EYE_POSES
     }
@@ -146,6 +148,31 @@ def _still_ones(poses: PoseSequence) -> PoseSequence:
             rows = rows[np.linspace(0, rows.size - 1, POSES_AT_REST).astype(int)]
         keep.append(rows)
     return poses.rows(np.concatenate(keep))
+
+
+def _resting(reference: PoseSequence, sensors: Sequence[PoseSequence]) -> PoseTrack:
+    """The reference's track, over the whole of each recording in which it is at rest.
+
+    Two programs that record one after the other share no time, and still the place.
+    """
+    streams = [reference, *sensors]
+    number = [np.searchsorted(_pauses(streams), p.time, side='right') for p in streams]
+    pieces = []
+    for one in np.unique(number[0]):
+        rows = reference.rows(number[0] == one)
+        spans = [p.time[n == one] for p, n in zip(streams, number, strict=True)]
+        if is_at_rest(rows):
+            every = np.concatenate(spans)
+            steps = int(np.ptp(every) / (LONGEST_GAP_S / 2)) + 2
+            time = np.linspace(every.min(), every.max() + 1e-6, steps)
+            middle = _middle(Rotation.from_quat(rows.quaternion))
+            turn = Rotation.from_matrix(middle).as_quat()
+            place = np.median(rows.position, axis=0)
+            pieces.append((time, np.tile(place, (steps, 1)), np.tile(turn, (steps, 1))))
+        else:
+            track = rows.track()
+            pieces.append((track.time, track.position, track.quaternion))
+    return PoseTrack(*(np.concatenate(values) for values in zip(*pieces, strict=True)))
 
 
 def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArray[np.int64], ...]:

@@ -22,6 +22,10 @@ TIMES = 9.0
 """Squared error over the median window's from which a window belongs to an episode: three times
 the error, which the range of places in a session hardly makes. Smaller takes the far side of the
 volume for an episode; larger misses those that bend poses little."""
+LOUD = 3.0
+"""The same of a window in which a sensor leaves the others on its body by `TIMES`. Smaller takes
+differences of sensors that are all good for an episode; larger overlooks metal where stamps
+jitter, which makes every window loud."""
 LONGEST = 0.4
 """Share (0 to 1) of the windows that episodes may be: they stand out from the median
 window, which is a quiet one only where fewer than half are in episodes, and a tenth is left for
@@ -77,20 +81,65 @@ def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
     if len(judged) < WINDOWS // 3:
         return Episode()
     size = {w: float(np.median(square[window == w])) for w in judged}
+    high = {w for w in _loud(size) if _is_shift(sensing, window == w)}
+    runs = [w for w in judged if w in high and (w - 1 in high or w + 1 in high)]
+    if runs and len(runs) <= LONGEST * len(judged):
+        inside = np.isin(window, runs)
+        outside = (window >= 0) & ~inside & (square < TIMES * np.median(list(size.values())))
+        place = sensing.view.measured
+        is_alone = _is_alone(sensing, residuals, runs)
+        if is_alone or (outside.any() and _is_revisited(place[inside], place[outside])):
+            return Episode(tuple(runs), is_alone)
+    return _by_the_body(sensing, residuals, size)
+
+
+def in_episode(sensing: Sensing, residuals: PoseResiduals) -> Mask:
+    """Return the mask (n,) of a sensor's poses that are in one of its episodes."""
+    inside = episode(sensing, residuals).windows
+    return np.asarray(np.isin(windows_of(sensing, residuals), inside))
+
+
+def _loud(size: Mapping[int, float]) -> list[int]:
+    """The windows whose squared error is so many times that of the median window."""
     usual = float(np.median(list(size.values())))
-    high = [w for w in judged if size[w] > TIMES * usual and _is_shift(sensing, window == w)]
+    return [w for w, square in size.items() if square > TIMES * usual]
+
+
+def _is_revisited(inside: Array, outside: Array) -> bool:
+    """Whether most places (n, 3) of an episode are near some (m, 3) outside it."""
+    distance, _ = cKDTree(outside).query(inside)
+    return bool(np.mean(distance < NEAR_M) > REVISITED_SHARE)
+
+
+def _by_the_body(sensing: Sensing, residuals: PoseResiduals, size: Mapping[int, float]) -> Episode:
+    """When a sensor leaves the others on its body, whose clock and reference are the same.
+
+    What all of them share, errors of the stamps before all, is in no difference of two.
+    """
+    own = _middles(sensing, residuals)
+    others = [_middles(one, residuals) for one in residuals.sensors if one is not sensing]
+    usual = float(np.median(list(size.values())))
+    apart = {
+        w: float(np.sum((own[w] - np.median([one[w] for one in others], axis=0)) ** 2))
+        for w in size
+        if others and all(w in one for one in others)
+    }
+    if not apart:
+        return Episode()
+    high = [w for w in _loud(apart) if size[w] > LOUD * usual]
     runs = [w for w in high if w - 1 in high or w + 1 in high]
-    if not runs or len(runs) > LONGEST * len(judged):
-        return Episode()
-    inside = np.isin(window, runs)
-    outside = (window >= 0) & ~inside & (square < TIMES * usual)
-    if not outside.any():
-        return Episode()
-    place = sensing.view.measured
-    distance, _ = cKDTree(place[outside]).query(place[inside])
-    is_alone = _is_alone(sensing, residuals, runs)
-    is_revisited = bool(np.mean(distance < NEAR_M) > REVISITED_SHARE)
-    return Episode(tuple(runs), is_alone) if is_revisited or is_alone else Episode()
+    is_alone = 0 < len(runs) <= LONGEST * len(apart) and _is_alone(sensing, residuals, runs)
+    return Episode(tuple(runs), True) if is_alone else Episode()
+
+
+def _middles(sensing: Sensing, residuals: PoseResiduals) -> dict[int, Array]:
+    """The median residual (3,), m, of each window that can be judged."""
+    window = windows_of(sensing, residuals)
+    return {
+        int(w): np.median(sensing.residual[window == w, :3], axis=0)
+        for w in np.unique(window[window >= 0])
+        if np.count_nonzero(window == w) >= FEWEST_POSES_OF_WINDOW
+    }
 
 
 def _is_alone(sensing: Sensing, residuals: PoseResiduals, runs: list[int]) -> bool:
@@ -100,9 +149,8 @@ def _is_alone(sensing: Sensing, residuals: PoseResiduals, runs: list[int]) -> bo
         return False
 
     def error(one: Sensing) -> float:
-        rows = np.isin(windows_of(one, residuals), runs)
-        square = np.sum(one.residual[rows, :3] ** 2, axis=1)
-        return float(np.median(square)) if square.size else np.inf
+        middles = [v for w, v in _middles(one, residuals).items() if w in runs]
+        return float(np.median(np.sum(np.square(middles), axis=1))) if middles else np.inf
 
     others = [error(one) for one in residuals.sensors if one is not sensing]
     return bool(others) and max(others) < FAST * error(sensing)

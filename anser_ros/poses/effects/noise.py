@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.effect import PoseEffect, PoseResiduals
+from anser_ros.poses.effects.episodes import in_episode
 from anser_ros.poses.jitter import jitter
 
 Array = NDArray[np.float64]
@@ -144,7 +145,11 @@ class RangeNoise(PoseEffect):
         """Return a power law of all sensors together, each with a level of its own."""
         # Each sensor has a level of its own, so only what changes within one tells a power.
         # Poses far away stand out from a noise that is taken as one; the law judges them too.
-        every = [replace(one, used=one.used | one.out) for one in residuals.sensors]
+        # Those of an episode are off by something else.
+        every = [
+            replace(one, used=(one.used | one.out) & ~in_episode(one, residuals))
+            for one in residuals.sensors
+        ]
         pairs = [pair for pair in map(jitter, every) if pair[0].size >= FEWEST_DIFFERENCES]
         if not pairs:
             return []

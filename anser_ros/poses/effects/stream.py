@@ -10,7 +10,7 @@ from anser_ros.diagnosis.decisions import FEWEST_OUTLIERS
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S
 from anser_ros.poses.effect import PoseEffect, PoseResiduals, Sensing
-from anser_ros.poses.effects.episodes import episode, windows_of
+from anser_ros.poses.effects.episodes import in_episode
 from anser_ros.poses.sequence import PoseSequence, PoseSession, jumping_poses
 from anser_ros.sessions.plausibility import FROZEN_S
 
@@ -171,8 +171,7 @@ class PoseOutliers(PoseEffect):
 
 def _alone(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.bool_]:
     """Poses of a sensor that stand out, less those of an episode, which are off together."""
-    inside = np.isin(windows_of(sensing, residuals), episode(sensing, residuals).windows)
-    return np.asarray(sensing.out & ~inside)
+    return np.asarray(sensing.out & ~in_episode(sensing, residuals))
 
 
 def _record(
