@@ -46,6 +46,9 @@ def pose_verdict(document: dict[str, Any]) -> str:
             ' The motion hardly determines where the sensors sit on the body, so that no effect'
         )
         text += ' of place or of a single sensor can be told: turn the body about two axes.'
+    if document['left_out']:
+        text += ' Left out, with too few poses at times with a reference: '
+        text += f'{", ".join(document["left_out"])}.'
     if rest['fraction'] > 0:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         text += f' {rest["fraction"]:.0%} of the squared error above the jitter stays'

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.clock_records import one_clock
 from anser_ros.poses.convention import read_rightly
@@ -51,7 +52,7 @@ from anser_ros.poses.start import (
     train_blocks,
 )
 from anser_ros.poses.structure import depends_on
-from anser_ros.poses.swaps import put_back, swapped_spans
+from anser_ros.poses.swaps import put_back, swapped_spans, untangled
 
 Array = NDArray[np.float64]
 
@@ -96,6 +97,8 @@ class PoseDiagnosis:
     refused : tuple of (str, str)
     states : tuple of PoseState
         The held-out poses before and after.
+    left_out : tuple of str
+        Sensors that have too few poses at times with a reference.
     """
 
     session: PoseSession
@@ -109,6 +112,7 @@ class PoseDiagnosis:
     depends_on: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]
     states: tuple[PoseState, PoseState]
+    left_out: tuple[str, ...] = ()
 
 
 def diagnose_poses(
@@ -125,7 +129,7 @@ def diagnose_poses(
     """
     say = progress or (lambda text: None)
     say('conventions')
-    session, convention = read_rightly(session)
+    session, convention, exchanged = _as_meant(session)
     problem = pose_problem(session)
     train, test = train_blocks(problem)
     say('hand-eye')
@@ -160,7 +164,7 @@ def diagnose_poses(
         records += [
             replace(r, evidence={**words, **r.evidence}) for r in effect.observed(residuals)
         ]
-    records += swapped
+    records += [*exchanged, *swapped]
     if convention is not None:
         records.append(convention)
     errors = _errors(after)
@@ -179,7 +183,27 @@ def diagnose_poses(
         depends_on=depends_on(after) if significant else (),
         refused=search.refused,
         states=(before, after),
+        left_out=_left_out(session, problem),
     )
+
+
+def _as_meant(
+    session: PoseSession,
+) -> tuple[PoseSession, EffectRecord | None, list[EffectRecord]]:
+    """The session as it is meant, its convention, and sensors that were exchanged for half of
+    it."""
+    try:
+        return *read_rightly(session), []
+    except PlausibilityError:
+        session, exchanged = untangled(session)
+        if not exchanged:
+            raise
+        return *read_rightly(session), exchanged
+
+
+def _left_out(session: PoseSession, problem: PoseProblem) -> tuple[str, ...]:
+    others = [name for name, p in session.sensors.items() if p is not most_poses(session)]
+    return tuple(name for name in others if name not in problem.setting.sensors)
 
 
 def _leaves_more(state: PoseState) -> bool:
@@ -272,6 +296,7 @@ def _records(
     covariances = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
     base = next((i for i, t in enumerate(fit.terms) if is_of(t, Role.REGISTRATION)), None)
     shaking = turn_jitter(most_poses(session))
+    views = [part.view for part in fit.state.parts]
     records = []
     for i, term in enumerate(fit.terms):
         if is_of(term, Role.MOUNT):
@@ -285,6 +310,7 @@ def _records(
         if one is None:
             continue
         record = term.effect.record(term, spread)
+        record = effect_of(term).seen_at(record, term, spread, views)
         words = {
             'summary': term.effect.summary, 'advice': effect_of(term).advice,
             'remedy': term.effect.remedy.value,

@@ -47,6 +47,7 @@ def to_document(found: PoseDiagnosis) -> dict[str, Any]:
         'unexplained': {
             'fraction': found.unexplained, 'depends_on': list(found.depends_on),
         },
+        'left_out': list(found.left_out),
         'refused': [{'candidate': label, 'why': why} for label, why in found.refused],
     }  # fmt: skip
     return dict(finite(document))

@@ -209,6 +209,12 @@ class PoseEffect(Effect[Term]):
         """Return tracked poses, (n, 3) m and (n, 3, 3), without what the effect does to them."""
         return position, rotation
 
+    def seen_at(
+        self, record: EffectRecord, term: Term, covariance: Array, views: Sequence[PoseView]
+    ) -> EffectRecord:
+        """Return the record of a fitted term with what it amounts to at the poses of a session."""
+        return record
+
     def observed(self, residuals: 'PoseResiduals') -> Sequence[EffectRecord]:
         """Return what is seen of the effect without a fit; nothing where parameters are fitted."""
         return ()

@@ -25,8 +25,9 @@ def jitter(sensing: Sensing) -> tuple[Array, Array]:
         return np.zeros(0), np.zeros((0, 3))
     along = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
     if sensing.stamp_s > 0:
-        # Neighbours move another way, and errors of their stamps lie along theirs.
-        residual = _across(residual, along)
+        # Neighbours move another way, and errors of their stamps lie along theirs. What is the
+        # same everywhere would change with the direction that is taken out of it.
+        residual = _across(residual - np.median(residual, axis=0), along)
     second = residual[1:-1] - 0.5 * (residual[:-2] + residual[2:])
     second = _across(second, along[1:-1])
     usual = float(np.median(np.diff(time)))

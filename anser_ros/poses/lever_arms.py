@@ -26,19 +26,33 @@ HARDLY_DETERMINED_M = 0.022
 determine it, whatever its formal uncertainty: errors of trackers go with the turns of a hand. On
 recordings of one body levers were off by 9 mm and more beyond this, and by 4 mm and less below."""
 
+OWN_ERROR_M = 1e-3
+"""Error, m, that a tracker has of itself: data sheets say 0.5 to 1.4 mm. A motion of some seconds
+leaves less, because the frames take up what goes with its turns: on parts of recordings of one
+body levers were off by 37 mm with 0.2 mm left. Smaller gives such levers; larger gives none of a
+hand-held body."""
+
 
 def is_lever_determined(part: PosePart, jitter_rad: float) -> NDArray[np.bool_]:
     """Return the mask (3,) of the components of a lever arm that the motion determines."""
+    return _is_turned_for(part, jitter_rad, OWN_ERROR_M)
+
+
+def _is_turned_for(part: PosePart, jitter_rad: float, error_m: float) -> NDArray[np.bool_]:
+    """Mask (3,) of the components that turns determine, with errors of at least so much."""
     if not part.used.any():
         return np.zeros(3, dtype=np.bool_)
-    return (lever_blur(part, jitter_rad) < MOST_BLUR) & (lever_reach(part) < HARDLY_DETERMINED_M)
+    is_near = lever_reach(part, error_m) < HARDLY_DETERMINED_M
+    return (lever_blur(part, jitter_rad) < MOST_BLUR) & is_near
 
 
-def lever_reach(part: PosePart) -> Array:
-    """Return the lever arm (3,), m, that makes the median error by the turns of the body alone."""
-    far = np.linalg.norm(part.residual[part.used, :3], axis=1)
+def lever_reach(part: PosePart, error_m: float = 0.0) -> Array:
+    """Return the lever arm (3,), m, that makes the median error by the turns of the body alone, or
+    an error of ``error_m`` if that is larger.
+    """
+    far = max(float(np.median(np.linalg.norm(part.residual[part.used, :3], axis=1))), error_m)
     information = np.linalg.inv(_turn_information(part) + LEAST_JITTER_RAD**2 * np.eye(3))
-    return np.asarray(np.median(far) * np.sqrt(np.diag(information)))
+    return np.asarray(far * np.sqrt(np.diag(information)))
 
 
 def _turn_information(part: PosePart) -> Array:
@@ -92,7 +106,7 @@ def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
         if is_of(term, Role.MOUNT):
             part = parts[str(effect_of(term).sensor_of(term))]
             sigma = np.sqrt(np.maximum(np.diag(fit.covariance_of(index, covariance)), 0.0))[:3]
-            is_known = (sigma < LEAST_KNOWN_M) & is_lever_determined(part, shaking)
+            is_known = (sigma < LEAST_KNOWN_M) & _is_turned_for(part, shaking, 0.0)
             turns = _turn_information(part) if part.used.any() else np.zeros((3, 3))
             tilted = np.sqrt(np.diag(turns)) > MUCH_TILT
             if np.count_nonzero(is_known | tilted) >= 2:

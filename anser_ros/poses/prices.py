@@ -33,6 +33,9 @@ LEAST_SCALE_SIGMAS = 5.0
 Of a few recordings at rest, each a block, these are uncertain themselves: of six blocks 1 in 250
 such is chance. Smaller names a scale for what ten places have in common; larger misses slight ones
 in short sessions."""
+LEAST_CLOCK_SIGMAS = 3.0
+"""The same of a clock that all sensors share: 1 in 370. Smaller names an offset that is less than
+what is known of it; larger misses slight ones of a slow tracker."""
 
 
 def price(term: Term, total: float, fit: PoseFit) -> float:
@@ -68,11 +71,13 @@ def doubt(fit: PoseFit, index: int) -> str:
     sigma = float(np.sqrt(covariance[0, 0]))
     effect = effect_of(term)
     own_clock = effect.role.is_clock and effect.sensor_of(term) is not None
-    is_one_number = effect.is_scale(term) or own_clock
     if effect.role is Role.RATE and _is_beat(fit, term):
         return 'no more than the beat of a poll'
-    if is_one_number and abs(float(term.theta[0])) < LEAST_SCALE_SIGMAS * sigma:
-        return f'less than {LEAST_SCALE_SIGMAS:g} of its standard deviations'
+    least = LEAST_CLOCK_SIGMAS if effect.role.is_clock else 0.0
+    if effect.is_scale(term) or own_clock:
+        least = LEAST_SCALE_SIGMAS
+    if abs(float(term.theta[0])) < least * sigma:
+        return f'less than {least:g} of its standard deviations'
     return ''
 
 

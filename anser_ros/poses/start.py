@@ -255,9 +255,29 @@ def frames_from_places(tracked: Array, optical: Array) -> Array:
 def frames_from_turns(tracked: Array, optical: Array) -> Array:
     """Return the rotation (3, 3) from the optical frame to the tracker's, from quaternions alone.
 
-    ``q_tracked = q_frame q_optical q_mount`` is a rotation of four dimensions, which is found as
-    any rotation is from pairs; it splits into the two factors.
+    ``q_tracked = q_frame q_optical q_mount`` is a rotation of four dimensions, which splits into
+    the two factors.
     """
+    solution = _turn_of_turns(tracked, optical)
+    # Of all products of units from the left and the right, how much of each is in it: a dyad.
+    units, matrix = np.eye(4), np.zeros((4, 4))
+    for a, b in np.ndindex(4, 4):
+        both = np.stack([_product(_product(units[a], u), units[b]) for u in units], axis=1)
+        matrix[a, b] = np.sum(both * solution)
+    u, _, _ = np.linalg.svd(matrix)
+    return np.asarray(Rotation.from_quat(u[:, 0]).as_matrix())
+
+
+def turn_misfit(tracked: Array, optical: Array) -> float:
+    """Return the median angle, rad, by which quaternions (n, 4) miss those of a body with any
+    frame and any mount.
+    """
+    agreement = np.einsum('ij,ij->i', tracked, optical @ _turn_of_turns(tracked, optical).T)
+    return float(np.median(2 * np.arccos(np.clip(np.abs(agreement), 0.0, 1.0))))
+
+
+def _turn_of_turns(tracked: Array, optical: Array) -> Array:
+    """The rotation (4, 4) of quaternions, found as any rotation is from pairs."""
     solution = np.eye(4)
     sign = np.ones(len(tracked))
     jumps = np.sign(np.einsum('ij,ij->i', tracked[1:], tracked[:-1]))
@@ -270,13 +290,7 @@ def frames_from_turns(tracked: Array, optical: Array) -> Array:
         if np.array_equal(agreement, sign):
             break
         sign = np.where(agreement == 0, 1.0, agreement)
-    # Of all products of units from the left and the right, how much of each is in it: a dyad.
-    units, matrix = np.eye(4), np.zeros((4, 4))
-    for a, b in np.ndindex(4, 4):
-        both = np.stack([_product(_product(units[a], u), units[b]) for u in units], axis=1)
-        matrix[a, b] = np.sum(both * solution)
-    u, _, _ = np.linalg.svd(matrix)
-    return np.asarray(Rotation.from_quat(u[:, 0]).as_matrix())
+    return np.asarray(solution)
 
 
 def _product(left: Array, right: Array) -> Array:

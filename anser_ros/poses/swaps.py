@@ -13,12 +13,16 @@ from anser_ros.poses.fit import PoseFit
 from anser_ros.poses.problem import PoseProblem
 from anser_ros.poses.registry import effect_with
 from anser_ros.poses.sequence import PoseSequence, PoseSession
+from anser_ros.poses.start import coarse_offset, first_fit, pose_problem
 
 Array = NDArray[np.float64]
 
 FAR, FITS = 8.0, 0.25
 """Distance of a pose from its own prediction, in spreads, from which it may be another sensor's,
 and the share of it that is left from the other's prediction."""
+EARLY = 0.4
+"""Share of a session by which the sensors' names are meant, where they are exchanged for half of
+it. Smaller determines no lever arms; larger meets the exchange itself."""
 NEAR_S = 1.0  # s; nearer spans are one: nobody swaps two plugs and back in a second
 FEWEST, LEAST_SHARE = 5, 0.01  # poses in a span, and share of a sensor's poses, that are a swap
 
@@ -36,6 +40,21 @@ def swapped_spans(
         if spans:
             found.append((problem.sensors[a].name, problem.sensors[b].name, spans))
     return found
+
+
+def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
+    """Return the session with sensors put back that were exchanged for about half of it, and the
+    records of it; as it is if there are none.
+
+    Nothing fits all of such a session. Its first part says whose poses are whose.
+    """
+    problem = pose_problem(session)
+    blocks = np.unique(np.concatenate(problem.blocks))
+    early = problem.in_blocks(blocks[: round(EARLY * blocks.size)])
+    if len(problem.sensors) < 2 or session.reference is None:
+        return session, []
+    fit = first_fit(early, coarse_offset(early), False)
+    return put_back(session, swapped_spans(problem, fit))
 
 
 def _looks_like(

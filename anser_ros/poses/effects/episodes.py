@@ -14,10 +14,12 @@ from anser_ros.poses.effect import PoseEffect, PoseResiduals, Sensing
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-WINDOWS = 40
+WINDOWS, FEWEST_WINDOWS = 40, 15
 """Windows of time that a session is cut into: an episode of a twentieth is seen in two. Fewer miss
-short episodes; more leave too few poses in a window to judge it."""
+short episodes; more leave too few poses in a window to judge it. A slow tracker has fewer windows:
+of fewer yet an episode is too large a part."""
 FEWEST_POSES_OF_WINDOW = 4  # poses that a window needs to be judged: fewer may be outliers
+POSES_OF_WINDOW = 4.5  # on average, so that most windows can be judged
 TIMES = 9.0
 """Squared error over the median window's from which a window belongs to an episode: three times
 the error, which the range of places in a session hardly makes. Smaller takes the far side of the
@@ -37,20 +39,27 @@ NEAR_M = 0.03
 size, centimetres. Smaller finds no pose to compare with; larger compares places where a constant
 distortion differs."""
 REVISITED_SHARE = 0.5  # share of the episode's places that must have been visited outside it
-STRETCH, FILLED = 6, 0.8
-"""Windows that an episode of one sensor alone must span where its places were visited at no other
-time, and the share of them that are in it: a hand does not stay so long where a smooth distortion
-is large. Smaller takes what is left of a distortion for metal; larger
-overlooks metal beside which a sensor stays for a seventh of the session."""
+STRETCH, FILLED = 0.15, 0.8
+"""Share of the windows that an episode of one sensor alone must span where its places were visited
+at no other time, and the share of these that are in it: a hand does not stay so long where a
+smooth distortion is large. Smaller takes what is left of a distortion for metal; larger overlooks
+metal beside which a sensor stays for a seventh of the session."""
 LOOSE, FAST = 0.5, 0.25
 """Share of a sensor's squared error that shifts in the body's frame explain if its mount is loose,
 and up to which the others' must be lower."""
 
 
+def window_count(residuals: PoseResiduals) -> int:
+    """Return how many windows a session is cut into, by the poses of its median sensor."""
+    poses = np.median([np.count_nonzero(s.used | s.out) for s in residuals.sensors])
+    return int(np.clip(poses // POSES_OF_WINDOW, FEWEST_WINDOWS, WINDOWS))
+
+
 def windows_of(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.int64]:
     """Return the window of each pose of a sensor that counts; -1 for the others."""
     share = (sensing.view.time - residuals.setting.start) / max(residuals.setting.duration, 1e-9)
-    window = np.clip((WINDOWS * share).astype(np.int64), 0, WINDOWS - 1)
+    count = window_count(residuals)
+    window = np.clip((count * share).astype(np.int64), 0, count - 1)
     return np.where(sensing.used | sensing.out, window, -1)
 
 
@@ -77,8 +86,9 @@ def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
     """
     window = windows_of(sensing, residuals)
     square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
-    judged = [w for w in range(WINDOWS) if np.count_nonzero(window == w) >= FEWEST_POSES_OF_WINDOW]
-    if len(judged) < WINDOWS // 3:
+    count = window_count(residuals)
+    judged = [w for w in range(count) if np.count_nonzero(window == w) >= FEWEST_POSES_OF_WINDOW]
+    if len(judged) < count // 3:
         return Episode()
     size = {w: float(np.median(square[window == w])) for w in judged}
     high = {w for w in _loud(size) if _is_shift(sensing, window == w)}
@@ -145,7 +155,7 @@ def _middles(sensing: Sensing, residuals: PoseResiduals) -> dict[int, Array]:
 def _is_alone(sensing: Sensing, residuals: PoseResiduals, runs: list[int]) -> bool:
     """Whether a sensor is off for a long stretch in which the others on its body are right."""
     span = runs[-1] - runs[0] + 1
-    if span < STRETCH or len(runs) < FILLED * span:
+    if span < round(STRETCH * window_count(residuals)) or len(runs) < FILLED * span:
         return False
 
     def error(one: Sensing) -> float:
@@ -188,7 +198,10 @@ class PoseMovingMetal(PoseEffect):
                 ends = min(other[0], group[0]), max(other[1], group[1])
                 group = *ends, other[2] + group[2]
             groups.append(group)
-        start, length = residuals.setting.start, residuals.setting.duration / WINDOWS
+        start, length = (
+            residuals.setting.start,
+            residuals.setting.duration / window_count(residuals),
+        )
         return [
             EffectRecord(
                 self.name,
@@ -252,7 +265,7 @@ def _shifts(sensing: Sensing, residuals: PoseResiduals) -> tuple[float, float, f
         explained += len(rows) * float(np.sum(mean[:3] ** 2))
         total += float(np.sum(rows[:, :3] ** 2))
         count += len(rows)
-    if count < WINDOWS:
+    if count < window_count(residuals):
         return 0.0, 0.0, 0.0
     values = np.array(means)
     share = explained / max(total, 1e-18) - len(means) / count

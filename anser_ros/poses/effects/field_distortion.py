@@ -1,6 +1,7 @@
 """The tracker's map of space is bent: a smooth function of the tracked place, for a sensor."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import combinations_with_replacement
 from typing import ClassVar, cast
@@ -189,7 +190,10 @@ class FieldDistortion(PoseEffect):
         return position + self.shift(term, position), rotation
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the map, and how far it moves poses at their rms distance."""
+        """Record the map, and how far it moves poses at their rms distance.
+
+        `seen_at` states how far it moves those of a session.
+        """
         degree = term.site['degree']
         bent = _without_turn(term) if degree else term.theta
         # A scale's first number moves all three coordinates, as its shift does together.
@@ -208,6 +212,33 @@ class FieldDistortion(PoseEffect):
             },
             {'rms_m': spread, 'coefficients_mm': sigmas(covariance).tolist()},
         )  # fmt: skip
+
+    def seen_at(
+        self, record: EffectRecord, term: Term, covariance: Array, views: Sequence[PoseView]
+    ) -> EffectRecord:
+        """Return the record with how far the map moves the poses of a session, m rms.
+
+        What it has of a rigid motion is a registration's, and moves nothing.
+        """
+        place = np.concatenate([v.measured for v in views if self.acts_on(term, v.sensor)])
+        moved = self._derivative(term, place)
+        rigid = np.zeros((len(place), 3, 6))
+        rigid[:, :, :3] = np.eye(3)
+        away = (place - place.mean(axis=0)) / term.site['size_m']
+        for axis in range(3):
+            rigid[:, :, 3 + axis] = np.cross(np.eye(3)[axis], away)
+        basis, _ = np.linalg.qr(rigid.reshape(-1, 6))
+        bent = moved.reshape(-1, term.theta.size)
+        bent = bent - basis @ (basis.T @ bent)
+        size = bent @ term.theta
+        rms = float(np.sqrt(size @ size / len(place)))
+        slope = (size @ bent) / (len(place) * max(rms, 1e-12))
+        sigma = float(np.sqrt(slope @ covariance @ slope))
+        return replace(
+            record,
+            parameters={**record.parameters, 'rms_m': rms},
+            uncertainty={**record.uncertainty, 'rms_m': sigma},
+        )
 
     def term(self, record: EffectRecord) -> Term:
         """Read the map's coefficients, mm, from a record."""

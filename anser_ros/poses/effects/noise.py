@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseResiduals
+from anser_ros.poses.effect import PoseEffect, PoseResiduals, Sensing
 from anser_ros.poses.effects.episodes import in_episode
 from anser_ros.poses.jitter import jitter
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 NOISIER = 2.0
 """Factor over the other sensors' median noise from which a sensor's is named; sensors of one kind
@@ -38,6 +39,10 @@ NEW_SHARE = 18 / 35
 REACHED = 12.0
 """Squared deviation over its variance by the law that noise does not reach: once in 1e5. A pose
 that the law does not reach has another cause, and one that it reaches is no outlier."""
+AT_REST_M_S, HARDLY_EVER = 0.01, 0.1
+"""Speed, m/s, below which a body counts as at rest, and share of poses in motion below which it all
+is: a hand that holds still drifts by less. Smaller takes a rest for motion; larger leaves out slow
+motions."""
 FEWEST_DIFFERENCES = 60  # differences of neighbours that a power law is fitted to
 
 
@@ -97,6 +102,16 @@ def _likeliest(square: Array, place: Array) -> Array:
     return np.asarray(min(tries, key=lambda result: float(result.fun)).x)
 
 
+def _in_motion(sensing: Sensing, chosen: Mask) -> Mask:
+    """Which of some poses (n,) the body moves in; all of them where it hardly ever does.
+
+    A body that rests at one place and moves at others jitters less at the one.
+    """
+    moving = chosen & (np.linalg.norm(sensing.view.velocity[:, :3], axis=1) > AT_REST_M_S)
+    hardly = np.count_nonzero(moving) < HARDLY_EVER * np.count_nonzero(chosen)
+    return chosen if hardly else moving
+
+
 class PoseExcessNoise(PoseEffect):
     """One sensor's noise is a multiple of the others'."""
 
@@ -118,7 +133,8 @@ class PoseExcessNoise(PoseEffect):
         law = RangeNoise().observed(residuals)
         exponent = float(law[0].parameters['exponent']) if law else 0.0
         for sensing in residuals.sensors:
-            square, distance = jitter(sensing)
+            quiet = sensing.used & ~in_episode(sensing, residuals)
+            square, distance = jitter(replace(sensing, used=_in_motion(sensing, quiet)))
             square = square / distance[:, 1] ** (2 * exponent)
             if square.size >= FEWEST_DIFFERENCES:
                 noise[sensing.view.sensor] = float(np.sqrt(np.median(square)))
@@ -147,7 +163,7 @@ class RangeNoise(PoseEffect):
         # Poses far away stand out from a noise that is taken as one; the law judges them too.
         # Those of an episode are off by something else.
         every = [
-            replace(one, used=(one.used | one.out) & ~in_episode(one, residuals))
+            replace(one, used=_in_motion(one, (one.used | one.out) & ~in_episode(one, residuals)))
             for one in residuals.sensors
         ]
         pairs = [pair for pair in map(jitter, every) if pair[0].size >= FEWEST_DIFFERENCES]

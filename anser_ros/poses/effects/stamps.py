@@ -24,9 +24,14 @@ STEP_SHARE = (0.15, 0.7)
 
 
 def _is_wide(residuals: PoseResiduals) -> tuple[float, float]:
-    """The median error of the stamps over the sensors, and what believing it gains."""
-    rms = float(np.median([s.stamp_s for s in residuals.sensors]))
-    return rms, float(np.median([s.stamp_gain for s in residuals.sensors]))
+    """The median error of the stamps over the sensors, and what believing it gains.
+
+    None where fewer than half of the sensors have one: what one of two shows is no clock's.
+    """
+    errors = [s.stamp_s for s in residuals.sensors]
+    if np.percentile(errors, 50, method='lower') < LEAST_S:
+        return 0.0, 0.0
+    return float(np.median(errors)), float(np.median([s.stamp_gain for s in residuals.sensors]))
 
 
 def _sigma(residuals: PoseResiduals) -> float:
