@@ -180,7 +180,7 @@ def diagnose_poses(
         after=errors,
         floor_m=floor,
         unexplained=excess / possible if significant else 0.0,
-        depends_on=depends_on(after) if significant else (),
+        depends_on=(depends_on(after) or depends_on(whole.state)) if significant else (),
         refused=search.refused,
         states=(before, after),
         left_out=_left_out(session, problem),

@@ -27,6 +27,9 @@ larger then, and something is there that bends the field."""
 SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
 """The same of a scale of one sensor alone, which is few numbers and follows hardly anything: this
 share, or more where that is less than `SCALE_M`."""
+LEAST_MAP_M = 0.5e-3
+"""How far a map must move poses, m rms: no tracker claims less of itself. Smaller names what is
+within its accuracy."""
 
 LEAST_SCALE_SIGMAS = 5.0
 """Standard deviations by which a scale must differ from one, or a sensor's clock from the others'.
@@ -66,10 +69,15 @@ def _map_share(term: Term, parts: Sequence[PosePart]) -> float:
 def doubt(fit: PoseFit, index: int) -> str:
     """Return why the parameters of a term are not believed; empty where they are."""
     term, covariance = fit.terms[index], fit.covariance_of(index)
-    if not term.effect.possible(term.effect.record(term, covariance)):
-        return 'implausible parameters'
-    sigma = float(np.sqrt(covariance[0, 0]))
     effect = effect_of(term)
+    record = effect.record(term, covariance)
+    if not effect.possible(record):
+        return 'implausible parameters'
+    views = [part.view for part in fit.state.parts]
+    seen = effect.seen_at(record, term, covariance, views)
+    if is_of(term, Role.MAP) and float(seen.parameters['rms_m']) < LEAST_MAP_M:
+        return f'moves poses by less than {1e3 * LEAST_MAP_M:g} mm'
+    sigma = float(np.sqrt(covariance[0, 0]))
     own_clock = effect.role.is_clock and effect.sensor_of(term) is not None
     if effect.role is Role.RATE and _is_beat(fit, term):
         return 'no more than the beat of a poll'

@@ -13,15 +13,23 @@ LEAST_OF_MEANS = 0.1
 """Share (0 to 1) of the squared residual that groups' means must explain beyond chance to be told.
 Without it the error would be 5 % less. Smaller tells of traces that any tracker has; larger leaves
 a dependence unsaid."""
+FEWEST_POSES = 30  # poses of a sensor by which a dependence is judged
+TWICE = 1 / 3
+"""Share by which halves of poses differ, of their sum, if one has twice the squared error of the
+other; a tracker's error grows a little with the distance."""
 
 
 def depends_on(state: PoseState) -> tuple[str, ...]:
-    """Return names of what the residual depends on, the strongest first."""
+    """Return names of what the residual depends on, the strongest first.
+
+    The distance is that from the tracker's origin, which is at its field generator.
+    """
     shares = {}
-    for name in ('time', 'position', 'orientation', 'speed'):
-        found = [_share(part, name) for part in state.parts if np.count_nonzero(part.used) > 30]
-        if found:
-            shares[name] = float(np.median(found))
+    parts = [part for part in state.parts if np.count_nonzero(part.used) > FEWEST_POSES]
+    for name in ('time', 'position', 'orientation', 'speed', 'distance') if parts else ():
+        shares[name] = float(np.median([_share(part, name) for part in parts]))
+    if shares.get('distance', 0.0) < TWICE:
+        shares.pop('distance', None)
     ordered = sorted(shares, key=lambda name: -shares[name])
     return tuple(name for name in ordered if shares[name] > LEAST_OF_MEANS)
 
@@ -30,13 +38,14 @@ def _share(part: PosePart, name: str) -> float:
     """Share of the squared residual that means of groups explain, less what chance gives."""
     used = part.used
     residual = part.residual[used, :3]
-    if name == 'speed':
-        speed = np.linalg.norm(part.view.velocity[used, :3], axis=1)
+    if name in ('speed', 'distance'):
+        values = part.view.velocity[:, :3] if name == 'speed' else part.view.measured
+        along = np.linalg.norm(values[used], axis=1)
         size = np.sum(residual**2, axis=1)
-        quick = speed > np.median(speed)
-        if not quick.any():  # all is at rest
+        upper = along > np.median(along)
+        if not upper.any():  # all is at rest
             return 0.0
-        low, high = float(size[~quick].mean()), float(size[quick].mean())
+        low, high = float(size[~upper].mean()), float(size[upper].mean())
         return max((high - low) / max(high + low, 1e-18), 0.0)
     groups = _groups(part, used, name)
     explained, count = 0.0, 0

@@ -40,9 +40,9 @@ REACHED = 12.0
 """Squared deviation over its variance by the law that noise does not reach: once in 1e5. A pose
 that the law does not reach has another cause, and one that it reaches is no outlier."""
 AT_REST_M_S, HARDLY_EVER = 0.01, 0.1
-"""Speed, m/s, below which a body counts as at rest, and share of poses in motion below which it all
-is: a hand that holds still drifts by less. Smaller takes a rest for motion; larger leaves out slow
-motions."""
+"""Speed, m/s, below which a body counts as at rest, and share of poses in motion below which it
+always is: a hand that holds still drifts by less. Smaller takes a rest for motion; larger leaves
+out slow motions."""
 FEWEST_DIFFERENCES = 60  # differences of neighbours that a power law is fitted to
 
 
