@@ -88,7 +88,9 @@ def run(args: argparse.Namespace) -> int:
         for poses in session.streams.values()
     }  # fmt: skip
     if args.json:
-        document = {'schema': SCHEMA, 'file': str(args.out), 'sequences': rows}
+        document = {
+            'schema': SCHEMA, 'file': str(args.out), 'sequences': rows, 'lost': session.lost,
+        }  # fmt: skip
         print(json.dumps(document, indent=1))
         return 0
     for name, one in rows.items():
@@ -96,5 +98,7 @@ def run(args: argparse.Namespace) -> int:
             f'{name}: {one["poses"]} poses, {one["missing"]} missing, '
             f'{one["out_of_order"]} out of order'
         )
+    for note in filter(None, [session.lost]):
+        print(note)
     say_written(args.out)
     return 0

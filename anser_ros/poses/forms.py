@@ -6,7 +6,7 @@ TUM's ``t x y z qx qy qz qw``; and CSV with named columns.
 
 import csv
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -36,6 +36,7 @@ LEAST_COUNTED = 8
 """Numbers that a line of TUM's form has: the time, a position, a quaternion."""
 TUM = re.compile(r'\s*[-+.\deE]+([\s,]+([-+.\deE]+|[-+]?nan|[-+]?inf)){7}', re.IGNORECASE)
 """A line of TUM's form; values that are no numbers stand where there was no pose."""
+TITLE_LINES = 20  # lines that a program may write before its poses
 PORT_COLUMNS = 13
 """Columns of a port in a ToolTracker file: name, frame, face, state, pose, error, markers."""
 _KEY = re.compile(r'(\w+):\s*((?:[^\s:]+(?:\s+|$)(?!:))*?)(?=\s*\w+:|\s*$)')
@@ -64,8 +65,30 @@ class RawRows:
     unit: str = 'mm'
 
 
-def read_form(path: Path) -> dict[str, RawRows]:
+Reader = Callable[[Sequence[str], Path], tuple[dict[str, RawRows], int]]
+"""What makes rows of lines, and tells of how many."""
+
+
+@dataclass
+class FormFile:
+    """Holds what a file of poses contains.
+
+    Attributes
+    ----------
+    rows : dict of str to RawRows
+        By the sensor's name.
+    unread : int
+        Lines that hold no pose and no marker for one.
+    """
+
+    rows: dict[str, RawRows]
+    unread: int = 0
+
+
+def read_form(path: Path) -> FormFile:
     """Read a file of any known form; the rows of each sensor that it names.
+
+    Lines before the first that has the form, such as a title, are left out.
 
     Raises
     ------
@@ -76,17 +99,25 @@ def read_form(path: Path) -> dict[str, RawRows]:
     lines = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
     if not lines:
         raise ParameterError(f'{path}: no rows')
-    if lines[0].startswith('Tools\t'):
-        rows = _tool_tracker(lines)
-    elif 'Position:' in lines[0]:
-        rows = _keyed(lines, path)
-    elif TUM.match(lines[0]):
-        rows = _tum(lines, path)
-    else:
-        rows = _table(lines, path)
+    first, reader = next(
+        ((i, r) for i, line in enumerate(lines[:TITLE_LINES]) if (r := _reader(line))),
+        (0, _table),
+    )
+    rows, read = reader(lines[first:], path)
     if not any(one.values for one in rows.values()):
         raise ParameterError(f'{path}: no row that is a pose')
-    return rows
+    return FormFile(rows, len(lines) - read)
+
+
+def _reader(line: str) -> Reader | None:
+    """What reads the form that a line is of, or None; a table's header has names of columns."""
+    if line.startswith('Tools\t'):
+        return _tool_tracker
+    if 'Position:' in line:
+        return _keyed
+    if TUM.match(line):
+        return _tum
+    return _table if {'qx', 'qw'} <= set(line.strip().split(',')) else None
 
 
 def _number(text: str) -> float:
@@ -96,11 +127,16 @@ def _number(text: str) -> float:
         return float('nan')
 
 
-def _tool_tracker(lines: Sequence[str]) -> dict[str, RawRows]:
+def _tool_tracker(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
     """NDI ToolTracker: a group of columns a port; scalar first; states in words."""
     rows: dict[str, RawRows] = {}
-    for line in lines[1:]:
+    read = 0
+    for line in lines:
         cells = line.split('\t')
+        if cells[0] == 'Tools':  # once more where the program was started again
+            read += 1
+            continue
+        read += len(cells) >= PORT_COLUMNS
         for start in range(1, len(cells), PORT_COLUMNS):
             port = cells[start : start + PORT_COLUMNS]
             if len(port) < PORT_COLUMNS - 1:
@@ -114,10 +150,10 @@ def _tool_tracker(lines: Sequence[str]) -> dict[str, RawRows]:
             one.host.append(float('nan'))
             one.device.append(_number(port[1]) / rate)
             one.values.append(pose)
-    return rows
+    return rows, read
 
 
-def _keyed(lines: Iterable[str], path: Path) -> dict[str, RawRows]:
+def _keyed(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
     """Lines such as ``SensorID: 0 Position: x y z Orientation: a b c d Time: ns``."""
     rows: dict[str, RawRows] = {}
     for line in lines:
@@ -141,10 +177,10 @@ def _keyed(lines: Iterable[str], path: Path) -> dict[str, RawRows]:
         one.values.append(tuple(numbers))
     if not rows:
         raise ParameterError(f'{path}: no line with a position and an orientation')
-    return rows
+    return rows, sum(len(one.values) for one in rows.values())
 
 
-def _tum(lines: Iterable[str], path: Path) -> dict[str, RawRows]:
+def _tum(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
     """TUM: s, m, scalar last."""
     one = RawRows(unit='m')
     for line in lines:
@@ -154,10 +190,10 @@ def _tum(lines: Iterable[str], path: Path) -> dict[str, RawRows]:
         one.host.append(numbers[0])
         one.device.append(float('nan'))
         one.values.append(tuple(numbers[1:8]))
-    return {path.stem: one}
+    return {path.stem: one}, len(lines)
 
 
-def _table(lines: Sequence[str], path: Path) -> dict[str, RawRows]:
+def _table(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
     """CSV: ``stamp_ns`` or ``time_s``, positions with their unit, quaternions, ``sensor``."""
     reader = csv.DictReader(lines)
     names = reader.fieldnames or []
@@ -177,4 +213,4 @@ def _table(lines: Sequence[str], path: Path) -> dict[str, RawRows]:
         one.device.append(float('nan'))
         place = (_number(row[f'{axis}_{unit}'] or '') for axis in 'xyz')
         one.values.append((*place, *(_number(row[key] or '') for key in turn)))
-    return rows
+    return rows, len(lines)

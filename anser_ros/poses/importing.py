@@ -1,11 +1,12 @@
 """Makes one session of tracked and optical poses, from files of any known form.
 
 Times of receipt (the host's counter) are taken as they stand. A device's own counter is put on the
-host's axis by the smallest delay, or begins at zero if a form has no host's time; after a restart,
-it continues from its last value.
+host's axis by the smallest delay, after a restart again. If a form has no host's time, it begins
+at zero, and after a restart it continues from its last value.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,10 @@ Array = NDArray[np.float64]
 BETWEEN_FILES_S = 10.0
 """Pause, s, between recordings without a host's time that are put one after the other. A pose is
 not interpolated over a tenth of it."""
+MOST_RESTARTS = 5
+"""Falls of a device's counter in one recording up to which they are restarts: a program that is
+restarted more often makes files of its own. Smaller takes restarts for rows in another order;
+larger, rows that are mixed up for a recording of hours."""
 LATEST_S = 9e9
 """Latest time, s: stamps in ns have no room for more in 63 bits."""
 STAMPS = ('host', 'device')
@@ -68,11 +73,20 @@ def import_poses(
             'they belong together one by one'
         )
     pieces: list[tuple[str, Array, Array, Array]] = []
+    lost: list[str] = []
     free = 0.0  # where the next recording without a host's time begins, s
     for number, path in enumerate(tracked):
-        groups = _named(read_form(path), None, unit, quaternion)
+        file = read_form(path)
+        groups, files = _named(file.rows, None, unit, quaternion), [(path, file.unread)]
         if reference:
-            groups |= _named(read_form(reference[number]), REFERENCE, None, None)
+            file = read_form(reference[number])
+            groups |= _named(file.rows, REFERENCE, None, None)
+            files.append((reference[number], file.unread))
+        lost += [
+            f'lines of {p} that are no poses, and are left out: {unread}'
+            for p, unread in files
+            if unread
+        ]
         times = {label: _times(rows, stamps) for label, (rows, _, _) in groups.items()}
         for label, (time, _) in times.items():
             if not np.isfinite(time).any():
@@ -84,7 +98,8 @@ def import_poses(
             pieces.append((label, time - begin, position, turn))
         if own:
             free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
-    return _session(str(tracked[0]), _renamed(pieces, names or {}))
+    session = _session(str(tracked[0]), _renamed(pieces, names or {}))
+    return replace(session, lost='; '.join(lost))
 
 
 def _renamed(
@@ -110,8 +125,8 @@ def _named(
     rows: Mapping[str, RawRows], name: str | None, unit: str | None, quaternion: str | None
 ) -> dict[str, tuple[RawRows, Array, Array]]:
     """Positions (m) and quaternions (x y z w) of each group of rows, under its name."""
-    if name is not None:  # of an optical file only the first tool is the reference
-        rows = {name: next(iter(rows.values()))}
+    if name is not None:  # of an optical file only the tool with most poses is the reference
+        rows = {name: max(rows.values(), key=lambda one: np.isfinite(one.values).all(1).sum())}
     found = {}
     for label, one in rows.items():
         table = np.array(one.values, dtype=np.float64).reshape(-1, 7)
@@ -125,19 +140,43 @@ def _named(
 
 def _times(rows: RawRows, stamps: str) -> tuple[Array, bool]:
     """Times of a group of rows, s, and whether they are on the host's axis."""
-    host, device = np.array(rows.host), _continued(np.array(rows.device))
+    host, device = np.array(rows.host), np.array(rows.device)
     if not np.isfinite(host).any():
-        return device, False
+        return _continued(device), False
     if stamps == 'host' or not np.isfinite(device).any():
         return host, True
-    return device + float(np.nanmin(host - device)), True
+    order = np.argsort(host, kind='stable')  # lines may be in another order than they came
+    count = _restarts(device[order])
+    for number in np.unique(count):
+        rows_of_it = order[count == number]
+        late = host[rows_of_it] - device[rows_of_it]
+        if np.isfinite(late).any():
+            device[rows_of_it] += np.nanmin(late)
+    return device, True
+
+
+def _restarts(counter: Array) -> NDArray[np.int64]:
+    """How often a counter has restarted before each of its values: it falls by more than a second.
+
+    Where there are many falls, rows are in no order, and no counter restarts.
+    """
+    known = np.flatnonzero(np.isfinite(counter))
+    falls = np.zeros(counter.size, dtype=np.int64)
+    falls[known[1:]] = np.diff(counter[known]) < -1.0
+    if falls.sum() > MOST_RESTARTS:
+        return np.zeros_like(falls)
+    return np.asarray(np.cumsum(falls))
 
 
 def _continued(counter: Array) -> Array:
-    """A counter that goes on where it restarts: a fall by more than a second is a restart."""
-    steps = np.diff(counter, prepend=counter[:1])
-    falls = np.where(steps < -1.0, -steps, 0.0)
-    return np.asarray(counter + np.cumsum(np.nan_to_num(falls)))
+    """A counter that goes on from its last value where it restarts."""
+    count, out, last = _restarts(counter), counter.copy(), 0.0
+    for number in np.unique(count)[1:]:
+        before = counter[count == number - 1]
+        rows = count == number
+        last += np.nanmax(before) - np.nanmin(counter[rows])
+        out[rows] += last
+    return out
 
 
 def _session(path: str, pieces: Sequence[tuple[str, Array, Array, Array]]) -> PoseSession:
