@@ -14,6 +14,7 @@ from anser_ros.cli.pose_report import pose_verdict
 from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.poses import search
 from anser_ros.poses.diagnosis import diagnose_poses
+from anser_ros.poses.document import to_document
 from anser_ros.poses.effect import PoseSetting, Role
 from anser_ros.poses.recording import write_pose_session
 from anser_ros.poses.registry import effect_with
@@ -124,6 +125,15 @@ def swapped(world):
     world.after = swap
 
 
+def swapped_half(world):
+    def swap(streams):
+        for one, other in zip(streams['sensor_0'], streams['sensor_1'], strict=True):
+            one[300:], other[300:] = other[300:].copy(), one[300:].copy()
+        return streams
+
+    world.after = swap
+
+
 CASES = [
     (late, {'time_offset': ('offset_s', 0.04, 5e-4)}),
     (fast, {'time_offset': ('offset_s', 0.02, 1e-3), 'clock_rate': ('rate_ppm', 900.0, 100.0)}),
@@ -138,6 +148,7 @@ CASES = [
     (shrunk, {'field_distortion': ('degree', 0, 0.1)}),
     (mirrored, {'outliers': ('fraction', 0.02, 0.005)}),
     (swapped, {'swapped_sensors': ('fraction', 0.1, 0.01)}),
+    (swapped_half, {'swapped_sensors': ('fraction', 0.5, 0.01)}),
 ]
 
 
@@ -187,6 +198,28 @@ def test_another_order_or_sense_of_quaternions_is_named_and_undone(change, conve
     assert set(named(found)) == {'frame_convention'}
     assert named(found)['frame_convention'].parameters['quaternion'] == convention
     assert found.after.position_m < 1e-3
+
+
+def test_another_sense_is_named_of_a_body_that_turns_too_little_for_places_to_tell():
+    world = World(2, sensors=1)
+    turn = world._turn
+    world._turn = lambda time: 0.25 * turn(time)
+    world.after = read_as([3, 0, 1, 2])
+    found = diagnose_poses(world.session())
+    assert named(found)['frame_convention'].parameters['quaternion'] == 'wxyz'
+
+
+def test_a_sensor_that_shares_no_time_with_the_reference_is_told():
+    world = World(2, sensors=2)
+
+    def shift(streams):
+        streams['sensor_0'][0] += 1000.0
+        return streams
+
+    world.after = shift
+    found = diagnose_poses(world.session())
+    assert found.left_out == ('sensor_0',)
+    assert 'Left out' in pose_verdict(to_document(found))
 
 
 def test_inches_are_named():
@@ -336,16 +369,16 @@ def test_errors_of_a_poll_are_not_as_uncertain_as_random_ones():
     assert abs(offset.parameters['offset_s'] - 0.015) < 4 * sigma
 
 
-@pytest.mark.parametrize(
-    ('lever', 'is_open'), [([None, 0.02, None], True), ([0.0, 0.02, 0], False)]
-)
-def test_the_verdict_says_why_nothing_of_place_is_named(lever, is_open):
+@pytest.mark.parametrize('knows_levers', [True, False])
+def test_the_verdict_says_why_nothing_of_place_is_named(knows_levers):
     document = {
         'held_out': {'position_rmse_before_m': 1e-3, 'position_rmse_after_m': 1e-3},
         'unexplained': {'fraction': 0.0, 'depends_on': []},
-        'effects': [{'name': 'hand_eye', 'parameters': {'lever_arm_m': lever}}],
+        'effects': [],
+        'left_out': [],
+        'knows_levers': knows_levers,
     }
-    assert ('turn the body about two axes' in pose_verdict(document)) == is_open
+    assert ('turn the body about two axes' in pose_verdict(document)) != knows_levers
 
 
 def test_a_slow_filter_whose_error_hides_the_lever_arm_is_found():

@@ -5,21 +5,24 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pose_world import World
+from pose_world import FRAME, SHIFT, World
 from scipy.spatial.transform import Rotation
 
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.poses.clock_records import one_clock
-from anser_ros.poses.effect import PoseSetting
+from anser_ros.poses.effect import PoseSetting, Role, is_of
 from anser_ros.poses.effects.clock import PoseClockRate
 from anser_ros.poses.effects.episodes import PoseMovingMetal
 from anser_ros.poses.effects.field_distortion import FieldDistortion
 from anser_ros.poses.effects.noise import power_law
 from anser_ros.poses.effects.stamps import ReceiptJitter, stamp_step
+from anser_ros.poses.lever_arms import is_lever_determined
 from anser_ros.poses.path import OpticalPath
+from anser_ros.poses.prices import doubt
+from anser_ros.poses.search import with_noise
 from anser_ros.poses.sequence import PoseSession, sequence_of
-from anser_ros.poses.start import pose_problem, started
+from anser_ros.poses.start import coarse_offset, first_fit, pose_problem, started
 from anser_ros.poses.structure import depends_on
 
 SETTING = PoseSetting(('sensor_0', 'sensor_1'), 0.0, 40.0, np.zeros(3), 0.06)
@@ -143,6 +146,14 @@ def test_metal_deep_in_the_volume_is_told_by_the_other_sensors(last, pulled_m, n
     assert [name for r in records for name in r.parameters['sensors']] == named
 
 
+def test_metal_is_told_by_the_body_where_stamps_jitter_more_than_it_pulls():
+    # One error of the stamps moves all sensors alike, so that it is in no difference of two.
+    (record,) = episodes_of(((26, 38, (0.0, 0.0, 4e-3)),), shared_m=1e-3)
+    assert record.parameters['sensors'] == ['sensor_2']
+    assert record.parameters['t_start_s'] == pytest.approx(26.0, abs=1.1)
+    assert not episodes_of(((26, 38, (4e-3, 4e-3, 4e-3)),), shared_m=1e-3)
+
+
 def test_metal_at_one_sensor_leaves_the_episodes_of_others_at_other_times():
     away, near = (30, 40, (0.0, 0.0, 4e-3)), (4, 8, (4e-3, 0.0, 0.0))
     first, second = episodes_of((near, away), returns=True)
@@ -154,17 +165,19 @@ def test_metal_at_one_sensor_leaves_the_episodes_of_others_at_other_times():
     assert second.parameters['t_start_s'] == pytest.approx(30.0, abs=1.0)
 
 
-def episodes_of(spans, *, returns=False):
+def episodes_of(spans, *, returns=False, shared_m=0.0):
     """Moving metal of three sensors that are off by so much in some spans of 40 s.
 
-    A body that ``returns`` is at each place again, and the metal is not.
+    A body that ``returns`` is at each place again, and the metal is not. All sensors are off by
+    ``shared_m`` in common.
     """
     rng, time = np.random.default_rng(5), np.arange(0, 40, 0.1)
     depth = 0.03 * np.sin(2 * time) if returns else 0.01 * time
     place = np.column_stack([0 * time, 0 * time, -depth])
+    shared = shared_m * np.repeat(rng.normal(size=(time.size // 5, 6)), 5, axis=0)
     sensors = []
     for k in range(3):
-        residual = 3e-4 * rng.normal(size=(time.size, 6))
+        residual = 3e-4 * rng.normal(size=(time.size, 6)) + shared
         for first, last, sizes in spans:
             residual[(time > first) & (time < last), 0] += sizes[k]
         view = SimpleNamespace(sensor=f'sensor_{k}', time=time, measured=place)
@@ -188,3 +201,62 @@ def test_the_exponent_of_noise_is_found_with_an_honest_sigma():
         found.append((exponent - 4) / sigma)
     assert 0.4 < np.sqrt(np.mean(np.square(found))) < 1.6
     assert abs(np.mean(found)) < 0.9
+
+
+def test_a_map_is_as_large_as_it_moves_the_poses_beside_a_rigid_motion():
+    effect, rng = FieldDistortion(), np.random.default_rng(3)
+    term = effect.at(SETTING, 1, None)
+    place = np.column_stack([0.05 * rng.normal(size=(500, 2)), np.zeros(500)])
+    views = [SimpleNamespace(sensor='sensor_0', measured=place)]
+    stretch = np.zeros((3, 3))
+    stretch[0, 0], stretch[1, 0], stretch[0, 1] = 2.0, 1.0, -1.0  # and a turn, which is none
+    stretch[2, 2] = 50.0  # along an axis that no pose is off
+    term = term.with_theta(stretch.ravel())
+    record = effect.seen_at(effect.record(term, np.eye(9)), term, 0.01 * np.eye(9), views)
+    expected = 2e-3 * np.std(place[:, 0]) / SETTING.size
+    assert record.parameters['rms_m'] == pytest.approx(expected, rel=0.02)
+    assert 0 < record.uncertainty['rms_m'] < 2e-4
+
+
+def test_an_offset_of_all_sensors_that_is_less_than_known_is_doubted():
+    for offset, is_doubted in ((0.0, True), (0.03, False)):
+        world = World(4, duration=15.0, sensors=1)
+        world.offset = offset
+        problem = pose_problem(world.session())
+        fit = with_noise(first_fit(problem, coarse_offset(problem), False))
+        index = next(i for i, t in enumerate(fit.terms) if is_of(t, Role.OFFSET))
+        assert bool(doubt(fit, index)) == is_doubted
+
+
+def test_recordings_at_rest_one_after_the_other_are_compared_whole():
+    # The reference is recorded for a second, and the tracker after it: they share no time.
+    world, rng = World(5, duration=200.0, sensors=1), np.random.default_rng(5)
+    streams = {'sensor_0': [], 'optical': []}
+    for k in range(12):
+        place, turn = world.sensor(0, np.full(30, 10.0 * k))
+        place = place + 2e-4 * rng.normal(size=place.shape)
+        streams['sensor_0'].append((10.0 * k + 2.0 + 0.05 * np.arange(30), place, turn.as_quat()))
+        place, turn = world.body(np.full(20, 10.0 * k))
+        place = FRAME.inv().apply(place - SHIFT)
+        streams['optical'].append(
+            (10.0 * k + 0.05 * np.arange(20), place, (FRAME.inv() * turn).as_quat())
+        )
+    made = {
+        name: sequence_of(name, *(np.concatenate(v) for v in zip(*rows, strict=True)))
+        for name, rows in streams.items()
+    }
+    session = PoseSession('', 10**9, {'sensor_0': made['sensor_0']}, made['optical'])
+    problem = pose_problem(session)
+    assert problem.path.is_at_rest
+    assert problem.path.at(problem.sensors[0].time)[3].all()
+    fit = with_noise(first_fit(problem, 0.0, False))
+    assert fit.state.rms()[0] < 1e-3
+
+
+def test_a_short_motion_with_little_error_gives_no_lever_arm():
+    world = World(6, duration=12.0, sensors=1)
+    world.noise_m, slow = 5e-5, world._turn
+    world._turn = lambda time: 0.06 * slow(time)
+    problem = pose_problem(world.session())
+    fit = with_noise(first_fit(problem, coarse_offset(problem), False))
+    assert not is_lever_determined(fit.state.parts[0], 0.0).any()

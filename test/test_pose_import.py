@@ -205,3 +205,50 @@ def test_axes_in_different_units_are_refused(tmp_path):
     )
     with pytest.raises(ParameterError, match='columns'):
         import_poses([table])
+
+
+def device_line(stamp_s, frame):
+    q = ' '.join(map(str, TURN.as_quat()))
+    host = round(1e9 * stamp_s)
+    return f'Position: {stamp_s} 2 3 Orientation: {q} AuroraFrame: {frame} NetworkTime: {host}'
+
+
+def test_rows_in_any_order_have_the_device_stamps_of_their_own(tmp_path):
+    lines = [device_line(100 + 0.05 * k, 1000 + 16 * k) for k in range(60)]
+    mixed = [lines[k] for k in np.random.default_rng(1).permutation(60)]
+    sessions = [
+        import_poses([write(tmp_path / f'{n}.txt', *rows)], stamps='device')
+        for n, rows in (('a', lines), ('b', mixed))
+    ]
+    ordered, found = (next(iter(s.sensors.values())) for s in sessions)
+    np.testing.assert_allclose(found.time, ordered.time, atol=1e-9)
+    np.testing.assert_array_equal(found.position, ordered.position)
+
+
+def test_a_device_that_restarts_after_a_pause_is_put_on_the_hosts_axis_again(tmp_path):
+    before = [device_line(100 + 0.05 * k, 5000 + 16 * k) for k in range(40)]
+    after = [device_line(110 + 0.05 * k, 16 * k) for k in range(40)]
+    session = import_poses([write(tmp_path / 'a.txt', *before, *after)], stamps='device')
+    time = next(iter(session.sensors.values())).time
+    np.testing.assert_allclose(time[40:] - time[:40], 10.0, atol=1e-6)
+
+
+def test_a_title_and_lines_that_are_no_poses_are_left_out_and_told(tmp_path, capsys):
+    q = TURN.as_quat()
+    rows = [line(0, k, q, 10**9 * (k + 1)) for k in range(6)]
+    path = write(tmp_path / 'a.txt', 'Recorded on a Tuesday', *rows[:3], 'connection lost',
+                 'Position: 1 2', *rows[3:])  # fmt: skip
+    session = import_poses([path])
+    assert session.sensors['sensor_0'].size == 6
+    assert session.lost.endswith(': 3')
+    out = tmp_path / 'a.mcap'
+    assert run_verb('import_poses', [str(path), '--out', str(out)]) == 0
+    assert session.lost in capsys.readouterr().out
+
+
+def test_a_tool_tracker_file_with_its_header_once_more_goes_on(tmp_path):
+    path = tool_tracker(tmp_path / 'a.tsv', [(cell(3200 + 320 * k), cell(3200)) for k in range(4)])
+    text = path.read_text(encoding='utf-8')
+    session = import_poses([write(path, text.strip(), text.strip())])
+    np.testing.assert_allclose(session.sensors['port_10'].time, [0, 1, 2, 3, 3, 4, 5, 6])
+    assert not session.lost

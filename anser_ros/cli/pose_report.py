@@ -40,8 +40,7 @@ def pose_verdict(document: dict[str, Any]) -> str:
         text += f'{before:.2f} mm without and {after:.2f} mm with their correction.'
     else:
         text = f'No effect is found: with hand-eye alone the held-out error is {after:.2f} mm.'
-    levers = [e['parameters']['lever_arm_m'] for e in document['effects'] if e['name'] == HAND_EYE]
-    if all(lever.count(None) > 1 for lever in levers):
+    if not document['knows_levers']:
         text += (
             ' The motion hardly determines where the sensors sit on the body, so that no effect'
         )

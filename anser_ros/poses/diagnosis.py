@@ -99,6 +99,8 @@ class PoseDiagnosis:
         The held-out poses before and after.
     left_out : tuple of str
         Sensors that have too few poses at times with a reference.
+    knows_levers : bool
+        Whether the motion determines enough of a lever arm to look for effects of place.
     """
 
     session: PoseSession
@@ -112,7 +114,8 @@ class PoseDiagnosis:
     depends_on: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]
     states: tuple[PoseState, PoseState]
-    left_out: tuple[str, ...] = ()
+    left_out: tuple[str, ...]
+    knows_levers: bool
 
 
 def diagnose_poses(
@@ -184,6 +187,7 @@ def diagnose_poses(
         refused=search.refused,
         states=(before, after),
         left_out=_left_out(session, problem),
+        knows_levers=search.knows_levers,
     )
 
 

@@ -48,6 +48,7 @@ def to_document(found: PoseDiagnosis) -> dict[str, Any]:
             'fraction': found.unexplained, 'depends_on': list(found.depends_on),
         },
         'left_out': list(found.left_out),
+        'knows_levers': found.knows_levers,
         'refused': [{'candidate': label, 'why': why} for label, why in found.refused],
     }  # fmt: skip
     return dict(finite(document))
