@@ -4,13 +4,15 @@ The stages are those of a diagnosis of fluxes: read and set up, search on four f
 of time, judge on the fifth that took no part; then the parameters are fitted to all poses.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.diagnosis.prepare import TEST_EVERY
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.clock_records import one_clock
@@ -18,6 +20,7 @@ from anser_ros.poses.convention import read_rightly
 from anser_ros.poses.effect import (
     Frames,
     PoseResiduals,
+    PoseView,
     Role,
     Sensing,
     effect_of,
@@ -40,7 +43,7 @@ from anser_ros.poses.lever_arms import (
     most_poses,
     turn_jitter,
 )
-from anser_ros.poses.problem import PoseProblem, PoseState
+from anser_ros.poses.problem import PosePart, PoseProblem, PoseState
 from anser_ros.poses.registry import effect_with, pose_effects
 from anser_ros.poses.search import PoseEvidence, frame_terms, search_effects
 from anser_ros.poses.sequence import PoseSession
@@ -62,6 +65,11 @@ what differs between neighbours, and errors of a tracker are never quite alike t
 jitter is then 0.8 of it (the root of 1.3 squared less one); less than that moves no pose by as
 much as it jitters. Smaller always leaves something unexplained; larger says of half-explained
 sessions that all is well."""
+
+FEWEST_RECORDINGS = 8
+"""Recordings at rest from which each is judged by a fit of others: of fewer the rest does not
+determine all frames, and errs by what that makes. Fewer report that for a tracker's error; more
+report what two or three places happen to be."""
 
 
 @dataclass(frozen=True)
@@ -151,11 +159,8 @@ def diagnose_poses(
         alone_fit = fit_poses(search.fit.state.problem, frame_terms(search.fit.terms))
         search = replace(search, fit=alone_fit, evidence=(None,) * len(alone_fit.terms))
     found = search.fit
-    frames = fit_poses(_without_stamps(found.state.problem), frame_terms(found.terms))
     whole = _whole(problem, found)
-    unseen = _judged(replace(problem, noise=found.state.problem.noise).in_blocks(test), found)
-    before, after = unseen.state(frames.terms), unseen.state(found.terms)
-    registered = _registered(frames, unseen)
+    before, after, registered = _held_out(problem, found, test)
     floor = _floor(after)
     residuals = _residuals(session, problem, whole)
     records = _records(whole, search.evidence, session)
@@ -215,27 +220,85 @@ def _leaves_more(state: PoseState) -> bool:
     return state.rms()[0] > ABOVE_FLOOR * _floor(state)
 
 
-def _registered(frames: PoseFit, unseen: PoseProblem) -> HeldOutErrors:
-    """What registering the places of each sensor alone leaves, with no lever arm.
+def _held_out(
+    problem: PoseProblem, found: PoseFit, test: NDArray[np.int64]
+) -> tuple[PoseState, PoseState, HeldOutErrors]:
+    """Poses that took no part in a fit: before, after, and what registration alone leaves.
 
-    The rotations are those of a mount, which positions do not determine.
+    Recordings at rest are few, and a fifth of them says little: each is judged by a fit of others.
     """
-    after, squares = unseen.state(frames.terms), {}
-    for fitted, part in zip(frames.state.parts, after.parts, strict=True):
+    noisy, folds = replace(problem, noise=found.state.problem.noise), [(found, test)]
+    if problem.path.is_at_rest and np.unique(problem.blocks[0]).size >= FEWEST_RECORDINGS:
+        every, known = np.unique(np.concatenate(problem.blocks)), _judged(noisy, found)
+        parts = [every[k::TEST_EVERY] for k in range(min(TEST_EVERY, every.size))]
+        folds = [
+            (fit_poses(known.in_blocks(np.setdiff1d(every, part)), found.terms), part)
+            for part in parts
+        ]
+    before, after, squares = [], [], []
+    for fit, part in folds:
+        frames = fit_poses(_without_stamps(fit.state.problem), frame_terms(fit.terms))
+        unseen = _judged(noisy.in_blocks(part), fit)
+        before.append(unseen.state(frames.terms))
+        after.append(unseen.state(fit.terms))
+        squares.append(_registered(frames, unseen))
+    first, last = _joined(before), _joined(after)
+    by_sensor = {
+        part.view.sensor: np.concatenate([square[k] for square in squares])
+        for k, part in enumerate(last.parts)
+    }
+
+    def rms(square: Array) -> float:
+        return float(np.sqrt(square.mean())) if square.size else float('nan')
+
+    registered = HeldOutErrors(
+        rms(np.concatenate(list(by_sensor.values()))),
+        last.rms()[1],
+        {name: (rms(square), last.rms(name)[1]) for name, square in by_sensor.items()},
+    )
+    return first, last, registered
+
+
+def _joined(states: list[PoseState]) -> PoseState:
+    """One state of several of the same sensors, in the order of time."""
+    if len(states) == 1:
+        return states[0]
+    parts = []
+    for same in zip(*(state.parts for state in states), strict=True):
+        order = np.argsort(np.concatenate([p.view.time for p in same]), kind='stable')
+
+        def put(values: Sequence[NDArray[Any]], order: NDArray[np.int64] = order) -> NDArray[Any]:
+            return np.concatenate(values)[order]
+
+        poses = {
+            field.name: put([getattr(p.view, field.name) for p in same])
+            for field in fields(PoseView)
+            if field.name not in ('sensor', 'frame', 'lever')
+        }
+        parts.append(
+            PosePart(
+                replace(same[0].view, **poses), put([p.residual for p in same]),
+                put([p.weight for p in same]), same[0].noise, put([p.blocks for p in same]),
+                put([p.places for p in same]),
+            )
+        )  # fmt: skip
+    return replace(states[0], parts=tuple(parts))
+
+
+def _registered(frames: PoseFit, unseen: PoseProblem) -> list[Array]:
+    """Squared distances that registering the places of each sensor alone leaves, with no lever
+    arm; the rotations are those of a mount, which positions do not determine.
+    """
+    squares = []
+    for fitted, part in zip(frames.state.parts, unseen.state(frames.terms).parts, strict=True):
         optical, place = fitted.view.optical[fitted.used], fitted.view.measured[fitted.used]
         off = part.view.measured[part.used]
         if len(place):
             rotation = frames_from_places(place, optical)
             shift = np.mean(place - optical @ rotation.T, axis=0)
             off = off - part.view.optical[part.used] @ rotation.T - shift
-        squares[part.view.sensor] = np.sum(off**2, axis=1)
-
-    def rms(square: Array) -> float:
-        return float(np.sqrt(square.mean())) if square.size else float('nan')
-
-    by_sensor = {name: (rms(square), after.rms(name)[1]) for name, square in squares.items()}
-    whole = rms(np.concatenate(list(squares.values())))
-    return HeldOutErrors(whole, after.rms()[1], by_sensor)
+        squares.append(np.sum(off**2, axis=1))
+    return squares
 
 
 def _without_stamps(problem: PoseProblem) -> PoseProblem:
@@ -283,8 +346,11 @@ def _floor(state: PoseState) -> float:
     """Distance that jitter alone makes, m: from differences between neighbours."""
     squares = []
     for part in state.parts:
-        sensing = Sensing(part.view, part.residual, part.used, ~part.used, 0.0, 0.0, 0.0, 0.0)
-        square, _ = jitter(sensing)
+        is_resting = not part.view.velocity.any()  # each recording has an error of its own
+        groups = np.unique(part.blocks) if is_resting else (None,)
+        rows = [part.used if k is None else part.used & (part.blocks == k) for k in groups]
+        sensings = [Sensing(part.view, part.residual, r, ~r, 0.0, 0.0, 0.0, 0.0) for r in rows]
+        square = np.concatenate([jitter(sensing)[0] for sensing in sensings])
         noise = part.noise
         along = noise.stamp_s * np.linalg.norm(part.view.velocity[part.used, :3], axis=1)
         if square.size and along.size:
