@@ -52,6 +52,11 @@ def pose_verdict(document: dict[str, Any]) -> str:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         text += f' {rest["fraction"]:.0%} of the squared error above the jitter stays'
         text += f' unexplained; it depends on {on}.'
+        if 'distance' in rest['depends_on']:
+            text += (
+                ' It is larger far from the field generator, as at the edge of its volume or '
+                'beside metal that is deep in it: work nearer to it.'
+            )
     return text
 
 
@@ -64,7 +69,8 @@ def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -
         '<h2>What is wrong, and what to do</h2>',
         _effects(document),
         '<h2>Error before and after</h2><p>Distance between both trackers, root mean square. '
-        'Every fifth stretch of time took no part in choosing or fitting; these are its errors. '
+        'Every fifth stretch of time took no part in choosing or fitting; these are its errors '
+        '(of eight or more recordings at rest each, by a fit of the others). '
         '<i>Before</i> is with the lever arm and mount of each sensor, <i>after</i> with what was '
         'found as well.</p>',
         _by_sensor(document),
@@ -125,7 +131,7 @@ def _effects(document: dict[str, Any]) -> str:
             continue
         evidence, sigma = effect['evidence'], effect['uncertainty']
         values = [
-            f'{key} = {value_text(value)}'
+            f'{key} = {_value(value)}'
             + (f' ± {value_text(sigma[key])}' if sigma.get(key) is not None else '')
             for key, value in short_ones(effect['parameters'])
             if key not in UNSHOWN and value not in (None, [], {})
@@ -140,6 +146,13 @@ def _effects(document: dict[str, Any]) -> str:
         return '<p>Nothing was found.</p>'
     head = ['name', 'what it is', 'how much, ± 1 sigma', 'takes the error from, mm', 'what to do']
     return table(head, rows).replace('\n', '<br>')
+
+
+def _value(value: Any) -> str:
+    """A parameter in words; one that each sensor has, sensor by sensor."""
+    if isinstance(value, dict):
+        return ', '.join(f'{name}\xa0{value_text(one)}' for name, one in value.items())
+    return value_text(value)
 
 
 def _frames(document: dict[str, Any]) -> str:
@@ -173,16 +186,17 @@ def _triple(values: dict[str, Any], sigma: dict[str, Any], key: str, scale: floa
 
 def _groups(before: PoseState, after: PoseState) -> Figure:
     """Errors by distance, speed and orientation, in groups of equal numbers of poses."""
-    figure, panels = plt.subplots(1, 3, figsize=(9, 3), layout='constrained', sharey=True)
-    for panel, (label, measure) in zip(
-        panels,
-        (
-            ('distance from the field generator, mm', _distance),
-            ('speed, mm/s', _speed),
-            ('turn from the mean orientation, deg', _turn),
-        ),
-        strict=True,
-    ):
+    measures = {
+        'distance from the field generator, mm': _distance,
+        'speed, mm/s': _speed,
+        'turn from the mean orientation, deg': _turn,
+    }
+    if not any(part.view.velocity.any() for part in after.parts):
+        del measures['speed, mm/s']  # all is at rest
+    figure, panels = plt.subplots(
+        1, len(measures), figsize=(9, 3), layout='constrained', sharey=True
+    )
+    for panel, (label, measure) in zip(panels, measures.items(), strict=True):
         for state, colour, way, name in (
             (before, BEFORE, -0.2, 'before'), (after, AFTER, 0.2, 'after'),
         ):  # fmt: skip
