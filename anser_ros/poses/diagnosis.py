@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.prepare import TEST_EVERY
+from anser_ros.effects.term import Term
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.clock_records import one_clock
@@ -45,7 +46,7 @@ from anser_ros.poses.lever_arms import (
 )
 from anser_ros.poses.problem import PosePart, PoseProblem, PoseState
 from anser_ros.poses.registry import effect_with, pose_effects
-from anser_ros.poses.search import PoseEvidence, frame_terms, search_effects
+from anser_ros.poses.search import PoseEvidence, PoseSearch, frame_terms, search_effects
 from anser_ros.poses.sequence import PoseSession
 from anser_ros.poses.start import (
     coarse_offset,
@@ -66,6 +67,9 @@ jitter is then 0.8 of it (the root of 1.3 squared less one); less than that move
 much as it jitters. Smaller always leaves something unexplained; larger says of half-explained
 sessions that all is well."""
 
+LEAST_TOLD_M = 0.3e-3
+"""Held-out error, m, below which nothing is said to be unexplained: no tracker promises less. Of
+one place at rest, which jitters by micrometres, something always is."""
 FEWEST_RECORDINGS = 8
 """Recordings at rest from which each is judged by a fit of others: of fewer the rest does not
 determine all frames, and errs by what that makes. Fewer report that for a tracker's error; more
@@ -158,6 +162,7 @@ def diagnose_poses(
     if not search.knows_levers and _leaves_more(search.fit.state):
         alone_fit = fit_poses(search.fit.state.problem, frame_terms(search.fit.terms))
         search = replace(search, fit=alone_fit, evidence=(None,) * len(alone_fit.terms))
+    search = _confirmed(search, problem, test)
     found = search.fit
     whole = _whole(problem, found)
     before, after, registered = _held_out(problem, found, test)
@@ -178,7 +183,7 @@ def diagnose_poses(
     errors = _errors(after)
     excess = max(errors.position_m**2 - floor**2, 0.0)
     possible = max(_errors(before).position_m ** 2 - floor**2, excess, 1e-18)
-    significant = errors.position_m > ABOVE_FLOOR * floor
+    significant = errors.position_m > max(ABOVE_FLOOR * floor, LEAST_TOLD_M)
     return PoseDiagnosis(
         session=session,
         fit=whole,
@@ -218,6 +223,32 @@ def _left_out(session: PoseSession, problem: PoseProblem) -> tuple[str, ...]:
 def _leaves_more(state: PoseState) -> bool:
     """Whether more is left than jitter, so that a clock may stand for what else there is."""
     return state.rms()[0] > ABOVE_FLOOR * _floor(state)
+
+
+def _confirmed(search: PoseSearch, problem: PoseProblem, test: NDArray[np.int64]) -> PoseSearch:
+    """The search without effects of place that make the held-out poses worse.
+
+    Poses near each other err alike, and a few places may ask for what no others confirm.
+    """
+    for index, term in enumerate(search.fit.terms):
+        if not effect_of(term).blocks_in_space:
+            continue
+        fit = search.fit
+        noisy = replace(problem, noise=fit.state.problem.noise)
+        unseen = _judged(noisy.in_blocks(test), fit)
+        rest = fit_poses(fit.state.problem, [t for t in fit.terms if t is not term])
+        if _square(unseen.state(rest.terms), term) < _square(unseen.state(fit.terms), term):
+            evidence = tuple(e for k, e in enumerate(search.evidence) if k != index)
+            why = (term.label, 'held-out poses are worse with it')
+            left = replace(search, fit=rest, evidence=evidence, refused=(*search.refused, why))
+            return _confirmed(left, problem, test)
+    return search
+
+
+def _square(state: PoseState, term: Term) -> float:
+    """Squared errors of the positions, m^2, of the sensors that a term is about."""
+    parts = [p for p in state.parts if effect_of(term).acts_on(term, p.view.sensor)]
+    return float(sum(np.sum(p.residual[p.used, :3] ** 2) for p in parts))
 
 
 def _held_out(
