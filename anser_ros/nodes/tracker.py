@@ -260,7 +260,7 @@ class TrackerNode(AnserNode):
             return
         begin_s = time.perf_counter()
         stamp_ns, points = frame
-        estimates, changed, now_ns = [], False, 0
+        estimates, now_ns = [], 0
         conflict = sender_words(self._sources)
         if conflict:  # the frame may be another sender's: its stamp does not tell the model's age
             standing = FrameModel(None, Withheld(TWO_SOURCES, conflict))
@@ -276,16 +276,18 @@ class TrackerNode(AnserNode):
                 stamp_ns, points.channel, points.flux, points.flags, standing.withheld
             ):
                 now_ns = now_ns or self.get_clock().now().nanoseconds
-                changed |= self._topics[estimate.name].take(estimate, now_ns)
+                self._topics[estimate.name].publish(estimate)
                 estimates.append(estimate)
                 tip = self._tips.get(estimate.name)
                 if tip is not None:
                     estimates.append(tip.of_body(estimate))
-                    changed |= self._topics[tip.name].take(estimates[-1], now_ns)
+                    self._topics[tip.name].publish(estimates[-1])
         except AnserError as error:
             self._refuse('fluxes_refused', error)
             return
+        changed = False
         for estimate in estimates:
+            changed |= self._topics[estimate.name].note(estimate, now_ns)
             self._topics[estimate.name].publish_covariance()
         if self._transforms is not None:
             moved = [self._topics[e.name] for e in estimates if e.state == OK]

@@ -14,6 +14,7 @@ from anser_ros.tracking.coil_track import (
     MOST_STEPS,
     SUSPICIOUS_JUMP_M,
     CoilResult,
+    distance,
     take_errors,
 )
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
@@ -242,7 +243,7 @@ def track_body(
     result = _judge(track, name, stamp_ns, fit, fits[1:], coils, context, settings)
     if result.state == states.OK:
         last, track.before = track.good, None
-        moved = math.inf if last is None else math.dist(last.position, fit.solution.position)
+        moved = math.inf if last is None else distance(last.position, fit.solution.position)
         if last is not None and moved < SUSPICIOUS_JUMP_M:
             track.before = (track.good_ns, last)
         track.good, track.good_ns = fit.solution, stamp_ns

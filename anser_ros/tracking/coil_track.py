@@ -44,6 +44,11 @@ ERROR_REACH = 0.05
 up to which the model's error at a pose is reused."""
 
 
+def distance(one: Array, other: Array) -> float:
+    """Return the distance of two points, m: of lists in a fifth of the time of arrays."""
+    return math.dist(one.tolist(), other.tolist())
+
+
 @dataclass(frozen=True)
 class PoseErrors:
     """Says what the model's uncertainty does to a sensor at a pose.
@@ -84,8 +89,8 @@ class PoseErrors:
         if own.sigma is not context.sigma and not np.array_equal(own.sigma, context.sigma):
             return False
         return context.modes is None or (
-            math.dist(position, self.position) < self.reach_m
-            and math.dist(axis, self.axis) < ERROR_REACH
+            distance(position, self.position) < self.reach_m
+            and distance(axis, self.axis) < ERROR_REACH
         )
 
 
@@ -150,10 +155,7 @@ class _CoilFrame:
     flux: Array
     context: SolveContext
     settings: TrackerSettings
-
-    @property
-    def freedom(self) -> int:
-        return max(self.flux.size - UNKNOWNS, 1)
+    freedom: int
 
     @property
     def limit(self) -> float:
@@ -192,34 +194,7 @@ def take_errors(
     return list(map(PoseErrors, repeat(context), *rows))
 
 
-def prepare(
-    tracks: list[CoilTrack],
-    lengths: Array,
-    stamp_ns: int,
-    context: SolveContext,
-    settings: TrackerSettings,
-) -> None:
-    """Look up the model's error where all sensors are expected, before they are tracked.
-
-    For all coils together this takes a third of the time.
-    """
-    if context.modes is None:
-        return
-    rows, starts = [], []
-    for i, track in enumerate(tracks):
-        expected = track.expected(stamp_ns)
-        if expected is None or (stamp_ns - track.good_ns) * NANO > settings.warm_age_s:
-            continue
-        if track.error is None or not track.error.holds(context, *expected):
-            rows.append(i)
-            starts.append(expected)
-    if rows:
-        points, axes = (np.array(part) for part in zip(*starts, strict=True))
-        for i, error in zip(rows, take_errors(context, points, axes, lengths[rows]), strict=True):
-            tracks[i].error = error
-
-
-def _whitening(
+def whitening_at(
     track: CoilTrack, context: SolveContext, position: Array, axis: Array, length: float
 ) -> Array:
     """Whitening with the model's error at a pose, reused while the sensor stays near."""
@@ -267,8 +242,12 @@ def track_coil(
     flux: Array,
     context: SolveContext,
     settings: TrackerSettings,
+    warm: CoilSolution | None,
 ) -> CoilResult:
-    """Estimate a sensor's pose from one frame's fluxes, shape (2K,), finite, T."""
+    """Estimate a sensor's pose from one frame's fluxes, shape (2K,), finite, T.
+
+    ``warm`` is its solution near where it was expected; None where it was expected nowhere.
+    """
     loudness = flux / context.sigma
     signal = math.sqrt(float(loudness @ loudness) / loudness.size)
     if signal < settings.min_signal:
@@ -280,8 +259,9 @@ def track_coil(
         reason = f'{context.readings} readings are too few for the {UNKNOWNS} unknowns of a pose'
         unknown = no_pose(name, stamp_ns, states.AMBIGUOUS, context.model_id, reason)
         return CoilResult(unknown, None, is_received=True)
-    frame = _CoilFrame(name, length, stamp_ns, flux, context, settings)
-    solution = _from_good(track, frame)
+    freedom = max(flux.size - UNKNOWNS, 1)
+    frame = _CoilFrame(name, length, stamp_ns, flux, context, settings, freedom)
+    solution = _confirmed(track, frame, warm)
     if solution is not None:
         return _finish(track, frame, solution, [], False)
     if track.suspect is not None and stamp_ns < track.retry_ns:
@@ -305,14 +285,14 @@ def _finish(
     judged = _judge(track, frame, solution, rivals)
     if judged.state == states.OK:
         last = track.good
-        moved = last is not None and math.dist(last.position, solution.position)
+        moved = last is not None and distance(last.position, solution.position)
         track.before = None
         if last is not None and moved < SUSPICIOUS_JUMP_M:
             track.before = (track.good_ns, last.position, last.axis)
         track.good, track.good_ns = solution, frame.stamp_ns
         track.suspect, track.failures = None, 0
         place = solution.position, solution.axis
-        weights = _whitening(track, frame.context, *place, frame.length)
+        weights = whitening_at(track, frame.context, *place, frame.length)
         residual = solution.residual
         whitened = weights[0] * residual if len(weights) == 1 else weights @ residual
         track.noise.add(judged.chi2, whitened, frame.freedom)
@@ -325,7 +305,7 @@ def _finish(
 
 def _descend(track: CoilTrack, frame: _CoilFrame, position: Array, axis: Array) -> CoilSolution:
     context = frame.context
-    weights = _whitening(track, context, position, axis, frame.length)
+    weights = whitening_at(track, context, position, axis, frame.length)
     return solve_coil(
         context.field,
         frame.flux,
@@ -338,17 +318,14 @@ def _descend(track: CoilTrack, frame: _CoilFrame, position: Array, axis: Array) 
     )
 
 
-def _from_good(track: CoilTrack, frame: _CoilFrame) -> CoilSolution | None:
-    """Solution near the last good pose; None when there is none that a scan need not confirm."""
-    start, expected = track.good, track.expected(frame.stamp_ns)
-    old = (frame.stamp_ns - track.good_ns) * NANO > frame.settings.warm_age_s
-    if start is None or expected is None or old:
+def _confirmed(
+    track: CoilTrack, frame: _CoilFrame, warm: CoilSolution | None
+) -> CoilSolution | None:
+    """The solution near the last good pose; None where there is none that needs no scan."""
+    start = track.good
+    if start is None or warm is None or warm.chi2 > frame.limit or not warm.converged:
         return None
-    solution = _descend(track, frame, *expected)
-    jump = math.dist(solution.position, start.position)
-    if solution.chi2 > frame.limit or not solution.converged or jump > SUSPICIOUS_JUMP_M:
-        return None
-    return solution
+    return warm if distance(warm.position, start.position) <= SUSPICIOUS_JUMP_M else None
 
 
 def _judge(

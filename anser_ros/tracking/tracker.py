@@ -24,13 +24,14 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.pose_states import Withheld
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_track import BodyResult, BodyTrack, track_body
-from anser_ros.tracking.coil_track import CoilResult, CoilTrack, prepare, track_coil
+from anser_ros.tracking.coil_track import CoilResult, CoilTrack, track_coil
 from anser_ros.tracking.emitters import FEWEST_EMITTERS, ReducedScene, without_dead
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
 from anser_ros.tracking.rigid import BodyCoils
 from anser_ros.tracking.solve_context import SolveContext, build_context
 from anser_ros.tracking.source_track import SourceFrame, SourceTrack, track_source
+from anser_ros.tracking.warm_solve import solve_warm
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -362,7 +363,9 @@ class Tracker:
         """Solve each sensor by itself, from flux components (S, 2K)."""
         table, results = self._table, []
         tracks = [self._coil_tracks[name] for name in table.name]
-        prepare(tracks, table.length, stamp_ns, context, self.settings)
+        warm = solve_warm(
+            tracks, table.length, stamp_ns, values, codes == GOOD, context, self.settings
+        )
         for i, (name, code) in enumerate(zip(table.name, codes.tolist(), strict=True)):
             fault = FAULTS[code]
             if fault is not None:
@@ -373,7 +376,7 @@ class Tracker:
             else:
                 result = track_coil(
                     tracks[i], name, float(table.length[i]), stamp_ns, values[i], context,
-                    self.settings,
+                    self.settings, warm[i],
                 )  # fmt: skip
                 self.counters['cold_starts'] += result.cold
             results.append(result)

@@ -106,15 +106,19 @@ class PoseTopic:
         node.destroy_publisher(self._pose)
         node.destroy_publisher(self._uncertain)
 
-    def take(self, estimate: PoseEstimate, now_ns: int) -> bool:
-        """Publish an estimate that is good; return whether the state is another than before."""
+    def publish(self, estimate: PoseEstimate) -> None:
+        """Publish an estimate that is good, and nothing else: other topics wait for it."""
+        if estimate.state == OK:
+            self._publish(estimate)
+
+    def note(self, estimate: PoseEstimate, now_ns: int) -> bool:
+        """Count an estimate of a time, ns; return whether the state is another than before."""
         changed = self.estimate is None or self.estimate.state != estimate.state
         self.estimate = estimate
         self.states[estimate.state] += 1
         self.tally.frames += 1
         self.tally.latest_s = time.monotonic()
         if estimate.state == OK:
-            self._publish(estimate)
             self.tally.poses += 1
             if is_live(estimate.stamp_ns, now_ns) and estimate.stamp_ns <= now_ns:
                 self.tally.latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
@@ -129,10 +133,10 @@ class PoseTopic:
         self._pose.publish(self._plain.packed(estimate.stamp_ns, *self._values))
 
     def publish_covariance(self) -> None:
-        """Publish the good pose just taken once more, with its covariance.
+        """Publish the good pose just noted once more, with its covariance.
 
-        This is a separate step, so that no sensor's plain pose waits for the other messages of
-        another sensor.
+        Noting and this are separate steps, so that no sensor's plain pose waits for what is done
+        with another's.
         """
         if self.estimate is None or self.estimate.state != OK:
             return
