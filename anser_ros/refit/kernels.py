@@ -93,7 +93,7 @@ def fill_evidence(  # type: ignore[no-untyped-def]
         log_evidence[h] += _fill_probabilities(curve[h, :, 1], strength[h, 1])
 
 
-@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=FAST)
 def fill_scores(directions, white, inside, rest, log_det, scores):  # type: ignore[no-untyped-def]
     """Write the approximate log evidence of bodies (L,) from whitened readings (2, n).
 

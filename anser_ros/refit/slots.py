@@ -42,12 +42,15 @@ references and eight emitters is 2.4 standard deviations below it, and exceeds i
 100. Smaller looks for bodies in noise; larger misses the first of a body that comes."""
 
 
-class _Coming(NamedTuple):
-    """A body whose hypothesis is being worked out, and the slot that it is for."""
+Choice = tuple[int, int] | None
+"""A slot and the body for it; None if there is no better one than those that have slots."""
 
-    slot: int
-    body: int
-    eigenbasis: BackgroundTask[Eigenbasis]
+
+class _Look(NamedTuple):
+    """A look at all bodies, and the hypothesis of the body that it chooses, if any."""
+
+    choice: BackgroundTask[Choice]
+    eigenbasis: BackgroundTask[Eigenbasis | None]
 
 
 class BodySlots:
@@ -65,21 +68,25 @@ class BodySlots:
         self._first = len(bank.priors) - SLOTS + 1
         self._search = BodySearch(tables.factors, bank.rows, bank.whitening, STRENGTHS[::2])
         self._bodies: list[int] = []
-        self._coming: _Coming | None = None
+        self._look: _Look | None = None
         self._wait = 0
         self._known: dict[int, Eigenbasis] = {}
 
+    def warm_up(self, readings: Array, noise: float) -> None:
+        """Look at all bodies once and choose none, so that the first look takes no longer."""
+        self._search.scores(readings, noise)
+
     def clear(self) -> None:
         """Empty all slots of bodies."""
-        self._bodies, self._coming, self._wait = [], None, 0
+        self._bodies, self._look, self._wait = [], None, 0
         for slot in range(SLOTS):
             self._bank.vacate(self._first + slot)
 
     def fill(self, readings: Array, noise: float, stamp_ns: int) -> None:
         """Take in one frame; every few frames a body may be replaced by a better one.
 
-        The chosen body's hypothesis is computed in parallel with the frames, and takes its slot in
-        a later frame.
+        All bodies are compared, and the hypothesis of the chosen one is computed, in parallel with
+        the frames; it takes its slot in a later frame.
 
         Parameters
         ----------
@@ -94,15 +101,16 @@ class BodySlots:
         if float((readings**2).mean()) < PRESENT * noise**2:
             return
         self._wait -= 1
-        if self._wait > 0 or self._coming is not None:
+        if self._wait > 0 or (self._look is not None and self._look.choice.result() is not None):
             return
         self._wait = EVERY
-        chosen = self._choose(self._search.scores(readings, noise))
-        if chosen is not None:
-            slot, body = chosen
-            self._coming = _Coming(
-                slot, body, BackgroundTask(partial(self._eigenbasis, body), stamp_ns)
-            )
+        choice = BackgroundTask(partial(self._choose, readings, noise, (*self._bodies,)), stamp_ns)
+        self._look = _Look(choice, BackgroundTask(partial(self._eigenbasis_of, choice), stamp_ns))
+
+    def _eigenbasis_of(self, choice: BackgroundTask[Choice]) -> Eigenbasis | None:
+        """Return the hypothesis of the chosen body; the thread that has chosen it calls this."""
+        chosen = choice.result()
+        return None if chosen is None else self._eigenbasis(chosen[1])
 
     def _eigenbasis(self, body: int) -> Eigenbasis:
         """Return the hypothesis of a body; one thread in the background calls it."""
@@ -115,20 +123,22 @@ class BodySlots:
 
     def _put_in(self, stamp_ns: int) -> None:
         """Put a body into its slot whose time has come."""
-        coming = self._coming
-        if coming is None or not coming.eigenbasis.is_due(stamp_ns):
+        look = self._look
+        if look is None or not look.eigenbasis.is_due(stamp_ns):
             return
-        self._bank.replace_prior(self._first + coming.slot, coming.eigenbasis.result())
-        self._bodies[coming.slot : coming.slot + 1] = [coming.body]
-        self._coming = None
+        self._look = None
+        choice, eigenbasis = look.choice.result(), look.eigenbasis.result()
+        if choice is not None and eigenbasis is not None:
+            slot, body = choice
+            self._bank.replace_prior(self._first + slot, eigenbasis)
+            self._bodies[slot : slot + 1] = [body]
 
-    def _choose(self, scores: Array) -> tuple[int, int] | None:
-        """Return the next slot to be filled and the body for it, if there is a better one."""
+    def _choose(self, readings: Array, noise: float, bodies: tuple[int, ...]) -> Choice:
+        """Return the next slot to be filled and the body for it, beside those in slots."""
+        scores = self._search.scores(readings, noise)
         order = np.argsort(-scores, kind='stable').tolist()
-        best = next(body for body in order if body not in self._bodies)
-        if len(self._bodies) < SLOTS:
-            return len(self._bodies), best
-        worst = min(range(SLOTS), key=lambda slot: float(scores[self._bodies[slot]]))
-        return (
-            (worst, best) if scores[best] > scores[self._bodies[worst]] + SLOT_EVIDENCE else None
-        )
+        best = next(body for body in order if body not in bodies)
+        if len(bodies) < SLOTS:
+            return len(bodies), best
+        worst = min(range(SLOTS), key=lambda slot: float(scores[bodies[slot]]))
+        return (worst, best) if scores[best] > scores[bodies[worst]] + SLOT_EVIDENCE else None
