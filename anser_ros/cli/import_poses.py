@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
             f'{name}: {one["poses"]} poses, {one["missing"]} missing, '
             f'{one["out_of_order"]} out of order'
         )
-    for note in filter(None, [session.lost]):
-        print(note)
+    if session.lost:
+        print(session.lost)
     say_written(args.out)
     return 0
