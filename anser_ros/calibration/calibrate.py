@@ -34,6 +34,7 @@ from anser_ros.calibration.survey_records import (
 )
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
+from anser_ros.parallel import in_order
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -114,7 +115,8 @@ def fit_scan(
     def tested(candidate: LayoutCandidate) -> HeldOut:
         return _tested(candidate, thin, folds, generator, options, nominal, selection)
 
-    chosen, held_out = _better([(one, tested(one)) for one in selection.finalists])
+    finalists = selection.finalists
+    chosen, held_out = _better(list(zip(finalists, in_order(tested, finalists), strict=True)))
     if options.damping is None:
         chosen, held_out = best_damped(chosen, held_out, tested)
     damping = _damping(chosen, options)
@@ -252,16 +254,19 @@ def best_damped(
     Layouts were compared at poses that a rich layer corrected. Those of the winner itself are more
     exact, so that it may need less damping.
     """
-    for direction in (-1, 1):
-        start, index = candidate.damping, DAMPINGS.index(candidate.damping) + direction
-        while 0 <= index < len(DAMPINGS):
-            other = replace(candidate, damping=DAMPINGS[index])
-            result = tested(other)
-            if result.score_t >= held_out.score_t:
-                break
-            candidate, held_out, index = other, result, index + direction
-        if candidate.damping != start:
+    start = DAMPINGS.index(candidate.damping)
+    around = [*DAMPINGS[max(start - 1, 0) : start], *DAMPINGS[start + 1 : start + 2]]
+    near = [replace(candidate, damping=damping) for damping in around]
+    other, result = min(
+        zip(near, in_order(tested, near), strict=True), key=lambda pair: pair[1].score_t
+    )
+    while result.score_t < held_out.score_t:
+        ahead = 2 * DAMPINGS.index(other.damping) - DAMPINGS.index(candidate.damping)
+        candidate, held_out = other, result
+        if not 0 <= ahead < len(DAMPINGS):
             break
+        other = replace(candidate, damping=DAMPINGS[ahead])
+        result = tested(other)
     return candidate, held_out
 
 

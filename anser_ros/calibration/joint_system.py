@@ -82,6 +82,10 @@ class FieldModes:
         moments = vectors[:, keep] / scale[:, None] / np.sqrt(values[keep] / count)
         return FieldModes(sites, moments, size[keep])
 
+    def strongest(self, count: int) -> 'FieldModes':
+        """Return so many of the modes."""
+        return FieldModes(self.sites, self.vectors[:, :count], self.size[:count])
+
 
 @dataclass(frozen=True)
 class Linear:
@@ -188,7 +192,7 @@ class JointSystem:
                 [as_real(columns), linear.residual[block][:, :, None, :]], axis=2
             )
             right = right * root[:, :, None, None]
-            rows = linear.rows[block] * root[:, :, None]
+            rows = linear.rows[block][..., :modes] * root[:, :, None]
             slope = linear.slope[block] * root[:, :, None, None]
             count, sensors = root.shape
             flat = slope.reshape(count, -1, 6)

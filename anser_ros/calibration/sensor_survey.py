@@ -63,6 +63,10 @@ COARSE_ROWS = 5000
 """Readings of the first steps, which only bring field and parameters near where they belong."""
 MOST_ROWS = 22_000
 """Readings of the last steps; more are thinned. Their time grows in proportion."""
+COARSE_MODES = 120
+"""Modes of the field, the strongest, that the first steps solve for; the time of a step grows with
+the third power. The others stay as drawn, and what that leaves in the parameters the last steps
+undo."""
 COARSE_STEPS = 6
 """First steps at most, with `COARSE_ROWS`; `SMALL_STEP` ends them earlier."""
 FINE_STEPS = 6
@@ -186,12 +190,13 @@ class SensorSurveyor:
             self.parameters = self.parameters.fixed()
             self.population = Population(self.parameters)
             self.values = np.zeros(0)
+        self.solved = min(COARSE_MODES, self.modes.size.size)
         for step in range(COARSE_STEPS):
             self._report(step / total)
             size = self._step(tools, inspect=step > 0)
             if step > 2 and size < 10.0 * SMALL_STEP:
                 break
-        tools = self._tools(MOST_ROWS)
+        tools, self.solved = self._tools(MOST_ROWS), self.modes.size.size
         for step in range(FINE_STEPS):
             self._report((COARSE_STEPS + 3 * step) / total)
             # Metal is looked for once field and sensors fit: where neither is known yet, both look
@@ -227,13 +232,14 @@ class SensorSurveyor:
         self, tools: Sequence[_Tool], parameters: SensorParameters, linear: Sequence[Linear]
     ) -> Eliminated:
         """What the tools say about some parameters, with the field unknown."""
-        system = JointSystem(parameters, self.modes, self.field.shape[1])
+        modes = self.modes.strongest(self.solved)
+        system = JointSystem(parameters, modes, self.field.shape[1])
         noise_t = float(np.sqrt(self.inflation)) * self.noise_t
         for tool, at in zip(tools, linear, strict=True):
             share = interpolation_share(at.part)
             system.add(at, tool.weights, noise_t, self.optical.jitter, share)
-        precision = 1.0 / (self.field_width * self.flux_rms * self.modes.size) ** 2
-        return system.eliminate(precision, self.middle - self.field)
+        precision = 1.0 / (self.field_width * self.flux_rms * modes.size) ** 2
+        return system.eliminate(precision, (self.middle - self.field)[: self.solved])
 
     def _contradictions(
         self, tools: Sequence[_Tool], kinds: Sequence[str]
@@ -330,8 +336,8 @@ class SensorSurveyor:
         # Nothing is held here: while a clock is off, poses look too bad to tell it.
         self.posterior = self.population.fit(self.likelihood)
         step = self.posterior.values - self.values
-        change = rest.field_step(step, self.modes.size.size)
-        self.values, self.field = self.posterior.values, self.field + change
+        self.values, self.field = self.posterior.values, self.field.copy()
+        self.field[: self.solved] += rest.field_step(step, self.solved)
         if self.nominal is not None:
             self._learn_field_width(rest.field_variance)
         sigma = np.sqrt(np.maximum(np.diag(self.posterior.covariance), 1e-300))
@@ -353,9 +359,9 @@ class SensorSurveyor:
 
     def _learn_field_width(self, variance: Array) -> None:
         """Set the field's prior width to what makes its amplitudes most probable."""
-        scale = (self.flux_rms * self.modes.size)[:, None]
-        power = float((((self.field - self.middle) / scale) ** 2).sum())
-        freedom = self.field.size - float((variance / (self.field_width * scale) ** 2).sum())
+        scale = (self.flux_rms * self.modes.size)[: self.solved, None]
+        power = float((((self.field - self.middle)[: self.solved] / scale) ** 2).sum())
+        freedom = variance.size - float((variance / (self.field_width * scale) ** 2).sum())
         self.field_width = max(float(np.sqrt(power / max(freedom, 1.0))), LEAST_FIELD_WIDTH)
 
     @property
@@ -394,7 +400,7 @@ class SensorSurveyor:
             variances.append(variance)
             shares.append(share)
             kept.append(sound & seen)
-        free = self.modes.size.size * self.field.shape[1]
+        free = self.solved * self.field.shape[1]
         self.noise_t = max(np.sqrt(power / max(count - free, 0.2 * count)), SMALLEST_NOISE_T)
         self.optical = estimate_noise(steps, variances, shares, kept, self.optical)
 

@@ -2,12 +2,9 @@
 
 from pathlib import Path
 
-from matplotlib import pyplot as plt
-
 from anser_ros.calibration.result import Calibration
 from anser_ros.cli.diagnosis_words import flux_unit
 from anser_ros.cli.populations import population_figure
-from anser_ros.pictures import save
 
 
 def draw_choice(calibration: Calibration, path: Path) -> None:
@@ -16,6 +13,10 @@ def draw_choice(calibration: Calibration, path: Path) -> None:
     """
     if not calibration.candidates:
         return
+    from matplotlib import pyplot as plt
+
+    from anser_ros.pictures import save
+
     picked = calibration.chosen
     factor, unit = flux_unit(picked.score)
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5.4), layout='constrained')
@@ -45,4 +46,6 @@ def draw_populations(calibration: Calibration, path: Path) -> None:
     """Draw how the sensors differ; nothing is drawn where the scan contains no population."""
     figure = population_figure(calibration.scan.corrections)
     if figure is not None:
+        from anser_ros.pictures import save
+
         save(figure, path)

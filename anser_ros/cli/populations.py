@@ -1,14 +1,16 @@
 """Shows populations of sensors' errors as a table and a picture of each channel's values."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from anser_ros.effects.registry import effect_named
 from anser_ros.field.model import EffectRecord
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -51,7 +53,7 @@ def population_table(
     return head, [list(row) for row in zip(*columns, strict=True)]
 
 
-def population_figure(records: Sequence[EffectRecord]) -> Figure | None:
+def population_figure(records: Sequence[EffectRecord]) -> 'Figure | None':
     """Draw each channel's values with one sigma, and the population's width behind them.
 
     Returns None where no record is a population.
@@ -59,6 +61,8 @@ def population_figure(records: Sequence[EffectRecord]) -> Figure | None:
     found = populations(records)
     if not found:
         return None
+    from matplotlib import pyplot as plt
+
     width = 4 * len(found)
     figure, panels = plt.subplots(
         1, len(found), figsize=(width, 3.5), squeeze=False, layout='constrained'
