@@ -102,19 +102,31 @@ def error_modes(
         Modes R.
     """
     layer = posterior.prior.layer
-    draws = []
+    size, width = len(layer.positions), bank.width
+    draws, powers, directions = [], [], []
     for part in range(2):
         error = error_draws(bank, posterior, level.noise, level.strengths[part], part)
-        draws.append(error.reshape(len(layer.positions), bank.width, -1))
-    half = draws[0].shape[2]
-    gram = np.zeros((2 * half, 2 * half))
-    for part in range(2):
-        felt = np.einsum('nm,mkd->dnk', layer.metric, draws[part], optimize=True)
-        felt = felt.reshape(half, -1)
-        here = slice(part * half, (part + 1) * half)
-        gram[here, here] = felt @ felt.T
-    vectors = np.linalg.eigh(gram)[1][:, ::-1] / np.sqrt(half)
-    moments = (draws[0] @ vectors[:half] + 1j * (draws[1] @ vectors[half:])).transpose(2, 0, 1)
-    field = np.einsum('qn,rnk->qrk', layer.middle, moments[count:], optimize=True)
-    rest = np.sqrt(np.median((np.abs(field) ** 2).sum(axis=1)) / 2.0)
-    return PosteriorModes(np.ascontiguousarray(moments[:count]), float(rest))
+        felt = (layer.metric @ error.reshape(size, -1)).reshape(error.shape)
+        power, direction = np.linalg.eigh(felt.T @ felt)
+        draws.append(error)
+        powers.append(power)
+        directions.append(direction / np.sqrt(len(power)))
+    # The real and the imaginary part are independent: each mode is of one of them.
+    half = len(powers[0])
+    largest = np.argsort(-np.concatenate(powers), kind='stable')[:count]
+    moments = np.zeros((len(largest), size, width), dtype=complex)
+    left = np.zeros((len(layer.middle), width))
+    for part, unit in enumerate((1.0, 1j)):
+        ranks = np.flatnonzero(largest // half == part)
+        modes = draws[part] @ directions[part][:, largest[ranks] % half]
+        moments[ranks] = unit * modes.T.reshape(-1, size, width)
+        # What all directions together make of the field, less what the modes do.
+        left += _power_of(layer.middle, draws[part], width) / half
+        left -= _power_of(layer.middle, modes, width)
+    return PosteriorModes(moments, float(np.sqrt(np.median(np.maximum(left, 0.0)) / 2.0)))
+
+
+def _power_of(middle: Array, moments: Array, width: int) -> Array:
+    """Return the power (Q, K) of the field of moments (N K, D), summed over the last axis."""
+    field = middle @ moments.reshape(middle.shape[1], -1)
+    return np.asarray((field.reshape(len(middle), width, -1) ** 2).sum(axis=2))

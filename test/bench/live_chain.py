@@ -102,11 +102,11 @@ from anser_ros.wire.frames import encode
 from anser_ros.wire.records import SampleBlock, Start
 
 def main():
-    link, blocks = sys.argv[1], int(sys.argv[2])
+    link, blocks, topics = sys.argv[1], int(sys.argv[2]), sys.argv[3:]
     rclpy.init()
     node = rclpy.create_node('floor')
-    publisher = node.create_publisher(PoseStamped, '/anser/floor/pose', qos.STREAM)
-    while not publisher.get_subscription_count():
+    publishers = [node.create_publisher(PoseStamped, topic, qos.STREAM) for topic in topics]
+    while not all(publisher.get_subscription_count() for publisher in publishers):
         rclpy.spin_once(node, timeout_sec=0.1)
     line = os.open(link, os.O_RDWR | os.O_NOCTTY)
     tty.setraw(line)
@@ -117,7 +117,8 @@ def main():
             payload = record.payload
             if isinstance(payload, SampleBlock) and (payload.sequence + 1) % blocks == 0:
                 message.header.stamp.sec = (payload.sequence + 1) // blocks
-                publisher.publish(message)
+                for publisher in publishers:
+                    publisher.publish(message)
 
 main()
 """
@@ -197,7 +198,8 @@ class Layout:
     composed : acquisition, field model and tracker in one process, or in three
     follows : the refit in force from a baseline on, or a model that stays as it was
     metal : whether metal comes and goes without a rest; its bytes must have been made with it
-    is_floor : nothing of these, but a node that reads the port and publishes a pose
+    is_floor : nothing of these, but a node that reads the port and publishes poses
+    floor_poses : how many poses that node publishes a window
     """
 
     rate_hz: float = 50.0
@@ -205,6 +207,12 @@ class Layout:
     follows: bool = True
     metal: bool = True
     is_floor: bool = False
+    floor_poses: int = 1
+
+    @property
+    def poses(self) -> int:
+        """Poses that a window gives."""
+        return self.floor_poses if self.is_floor else TOOL_SENSORS
 
 
 @dataclass(frozen=True)
@@ -245,11 +253,11 @@ def _command(name: str, /, **parameters: object) -> list[str]:
     return command
 
 
-def _chain(layout: Layout, link: Path, folder: str) -> dict[str, list[str]]:
+def _chain(layout: Layout, link: Path, folder: str, topics: list[str]) -> dict[str, list[str]]:
     """Return the commands of the processes by name."""
     if layout.is_floor:
         blocks = str(round(1 / layout.rate_hz / BLOCK_S))
-        return {'floor': [sys.executable, '-c', FLOOR, str(link), blocks]}
+        return {'floor': [sys.executable, '-c', FLOOR, str(link), blocks, *topics]}
     model = config_path('demo_model.yaml')
     refit = {'refit': layout.follows, 'baseline_at_start': layout.follows}
     port = {'device': link, 'rate_hz': layout.rate_hz, 'window_s': WINDOW_S}
@@ -281,7 +289,8 @@ def run_chain(layout: Layout, sent: list[bytes], measure_s: float) -> Run:
     for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):  # as `anser` does for its nodes
         os.environ.setdefault(variable, '1')
     setup = parse_setup(read_config('demo_setup.yaml'))
-    names = ['floor'] if layout.is_floor else [topic_of(s.name) for s in setup.tool_sensors]
+    names = [topic_of(sensor.name) for sensor in setup.tool_sensors]
+    names = names[: layout.poses]
     topics = [f'/anser/{name}/pose' for name in names]
     with tempfile.TemporaryDirectory() as folder:
         link, output = Path(folder) / 'cu', Path(folder) / 'poses.npy'
@@ -290,7 +299,7 @@ def run_chain(layout: Layout, sent: list[bytes], measure_s: float) -> Run:
         # the supervisor ends them all, also when this process is killed
         with contextlib.closing(port), Supervisor(Path(folder) / 'logs') as supervisor:
             supervisor.start('listener', [sys.executable, '-c', LISTENER, str(output), *topics])
-            commands = _chain(layout, link, folder)
+            commands = _chain(layout, link, folder, topics)
             chain = {name: supervisor.start(name, words) for name, words in commands.items()}
             feeder.start()
             _wait_for(Path(f'{output}.first'))
@@ -343,8 +352,7 @@ def _latencies(
         stamps = poses[:, 1] - (time.time_ns() - time.monotonic_ns())
         window = np.searchsorted(middles, stamps - 0.5 * hop_ms * 1e6)
     known = (window >= 0) & (window < len(ends))
-    sensors = 1 if layout.is_floor else TOOL_SENSORS
-    latency_ms = np.full((len(ends), sensors), np.inf)
+    latency_ms = np.full((len(ends), layout.poses), np.inf)
     rows = poses[known]
     latency_ms[window[known], rows[:, 0]] = (rows[:, 2] - taken[window[known]]) / 1e6
     return latency_ms[(taken > from_ns) & (taken < until_ns)].ravel()
