@@ -178,6 +178,42 @@ def test_weak_directions_are_bounded():
     assert covariance[2, 2] == pytest.approx(UNKNOWN_VARIANCE)
 
 
+@pytest.mark.parametrize('weakest', [1.0, 1e-6, 1e-11, 0.0])
+def test_covariances_are_inverses_however_weak_a_direction_is(rng, weakest):
+    """By factor or by eigenvectors: a weak direction leaves the others as they are."""
+    for _ in range(20):
+        turn = np.linalg.qr(rng.normal(size=(5, 5)))[0]
+        # Values of 1 m^2 and below, which no bound changes.
+        values = np.array([1.0, 2.0, 5.0, 20.0, max(weakest, 1e-30)]) * 1e12
+        information = (turn * values) @ turn.T
+        covariance = bounded_inverse(0.5 * (information + information.T))
+        np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
+        assert (np.diag(covariance) <= UNKNOWN_VARIANCE * (1 + 1e-9)).all()
+        along = turn.T @ covariance @ turn
+        if weakest >= 1e-6:
+            np.testing.assert_allclose(along, np.diag(1.0 / values), atol=2e-5 / values.min())
+        else:
+            assert along[4, 4] > 1e3 / values[0]
+
+
+def test_a_coil_s_covariance_turns_about_its_axis_by_the_roll_alone(rng):
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    root = rng.normal(size=(40, 6)) * [1e5, 1e5, 1e5, 1e3, 1e3, 1e3]
+    covariance = coil_covariance(root.T @ root, axis, 0.7)
+    assert axis @ covariance[3:, 3:] @ axis == pytest.approx(0.7)
+    np.testing.assert_allclose(covariance[:3, 3:] @ axis, 0.0, atol=1e-12)
+    # A turn w moves the axis by w x n: of the free axis' covariance what is along it is not seen.
+    t = np.linalg.svd(axis[None])[2][1:]
+    back = np.zeros((6, 5))
+    back[:3, :3], back[3:, 3:] = np.eye(3), t.T
+    inner = np.linalg.inv(back.T @ (root.T @ root) @ back)
+    np.testing.assert_allclose(covariance[:3, :3], inner[:3, :3], rtol=1e-9)
+    moves = back @ inner @ back.T
+    cross = np.cross(np.eye(3), axis)  # row i: the i-th unit vector times the axis
+    np.testing.assert_allclose(cross.T @ covariance[3:, 3:] @ cross, moves[3:, 3:], atol=1e-15)
+
+
 def test_gate_is_the_chi_square_quantile():
     assert chi2_limit(11, 0.05) == pytest.approx(19.675, abs=1e-3)
     assert chi2_limit(0, 0.05) == chi2_limit(1, 0.05)

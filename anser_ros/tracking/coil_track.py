@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from itertools import repeat
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -49,8 +50,7 @@ def distance(one: Array, other: Array) -> float:
     return math.dist(one.tolist(), other.tolist())
 
 
-@dataclass(frozen=True)
-class PoseErrors:
+class PoseErrors(NamedTuple):
     """Says what the model's uncertainty does to a sensor at a pose.
 
     Attributes
@@ -145,8 +145,7 @@ class CoilTrack:
         return start
 
 
-@dataclass(frozen=True)
-class _CoilFrame:
+class _CoilFrame(NamedTuple):
     """One sensor's fluxes (2K,) in one frame, and what they are tracked with."""
 
     name: str
@@ -163,8 +162,7 @@ class _CoilFrame:
         return self.settings.gate**2 * self.freedom
 
 
-@dataclass(frozen=True)
-class CoilResult:
+class CoilResult(NamedTuple):
     """Holds an estimate with its solution and the errors reckoned with (None: not solved).
 
     ``is_received`` is whether the fluxes of a coil are good although nothing was solved for it.

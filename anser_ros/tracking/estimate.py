@@ -20,6 +20,8 @@ and poses are lost to the model's own small errors; larger, and distorted poses 
 NO_GATE = 1e6
 """A gate of so much or more is no gate: no pose is refused for what it contradicts."""
 
+DEFAULT_VOLUME = TrackedVolume()
+
 MEMORY_FRAMES = 100.0
 """Good frames over which the noise is averaged, 2 s at 50 Hz: it is then known to a tenth with one
 coil of eight emitters. Fewer follow the noise of single frames; more are late when it changes."""
@@ -111,7 +113,7 @@ class TrackerSettings:
     @property
     def box(self) -> TrackedVolume:
         """Return the volume where tools may be."""
-        return self.volume or TrackedVolume()
+        return self.volume or DEFAULT_VOLUME
 
     def margin(self, ratio: float) -> float:
         """Return the chi-square by which a rival must be worse, ``ratio`` being the residual power
@@ -176,11 +178,9 @@ class PoseEstimate:
 
     def with_sigma(self, sigma_position_m: float) -> 'PoseEstimate':
         """Return the same estimate with another sigma of the position."""
-        return PoseEstimate(
-            self.name, self.stamp_ns, self.state, self.position, self.axis, self.rotation,
-            self.covariance, sigma_position_m, self.residual_t, self.chi2, self.model_id,
-            self.reason,
-        )  # fmt: skip
+        other = PoseEstimate.__new__(PoseEstimate)
+        other.__dict__.update(self.__dict__, sigma_position_m=sigma_position_m)
+        return other
 
     def with_shift(self, sigma_m: float) -> 'PoseEstimate':
         """Return the estimate with a shift, m along each axis, in its sigma and covariance."""

@@ -10,6 +10,7 @@ Optimization, section 10.3); each trial costs one evaluation of the field and of
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,8 +81,7 @@ class RealField:
         return int(self.moments.shape[1]) // 2
 
 
-@dataclass(frozen=True)
-class CoilSolution:
+class CoilSolution(NamedTuple):
     """States where a coil's solve ended.
 
     Attributes

@@ -30,6 +30,47 @@ def chi2_limit(degrees_of_freedom: int, probability: float) -> float:
     return float(chdtri(max(degrees_of_freedom, 1), probability))
 
 
+SMALLEST_PIVOT = 1e-9
+"""Pivot of a scaled information matrix from which on its factor is inverted; with a smaller one
+rounding is felt, and what the fluxes hardly determine is looked for among the eigenvectors."""
+
+
+@numba.njit(cache=True, error_model='numpy')
+def inverse_by_factor(matrix, inverse):  # type: ignore[no-untyped-def]
+    """Write the inverse of a symmetric matrix (n, n) of unit diagonal into ``inverse``.
+
+    Returns whether all pivots were large enough; otherwise what is written means nothing.
+    """
+    n = matrix.shape[0]
+    root = np.zeros((n, n))  # the inverse of the lower triangular factor, from the factor itself
+    for j in range(n):
+        pivot = matrix[j, j]
+        for k in range(j):
+            pivot -= root[j, k] * root[j, k]
+        if not pivot > SMALLEST_PIVOT:
+            return False
+        root[j, j] = math.sqrt(pivot)
+        for i in range(j + 1, n):
+            left = matrix[i, j]
+            for k in range(j):
+                left -= root[i, k] * root[j, k]
+            root[i, j] = left / root[j, j]
+    for j in range(n):
+        root[j, j] = 1.0 / root[j, j]
+        for i in range(j + 1, n):
+            left = 0.0
+            for k in range(j, i):
+                left -= root[i, k] * root[k, j]
+            root[i, j] = left / root[i, i]
+    for i in range(n):
+        for j in range(i, n):
+            total = 0.0
+            for k in range(j, n):
+                total += root[k, i] * root[k, j]
+            inverse[i, j] = inverse[j, i] = total
+    return True
+
+
 @numba.njit(cache=True, error_model='numpy')
 def bounded_inverse(information):  # type: ignore[no-untyped-def]
     """Return the covariance of a symmetric, positive semidefinite information matrix.
@@ -37,13 +78,20 @@ def bounded_inverse(information):  # type: ignore[no-untyped-def]
     Directions that it hardly determines get `UNKNOWN_VARIANCE`.
     """
     n = information.shape[0]
-    scale = np.empty(n)
+    scale, scaled, covariance = np.empty(n), np.empty((n, n)), np.empty((n, n))
     for i in range(n):
         scale[i] = 1.0 / math.sqrt(max(information[i, i], 1e-30))
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     for i in range(n):
-        values[i] = 1.0 / max(values[i], 1e-14)
-    covariance = np.dot(vectors * values, vectors.T) * np.outer(scale, scale)
+        for j in range(n):
+            scaled[i, j] = information[i, j] * scale[i] * scale[j]
+    if not inverse_by_factor(scaled, covariance):
+        values, vectors = np.linalg.eigh(scaled)
+        for i in range(n):
+            values[i] = 1.0 / max(values[i], 1e-14)
+        covariance[:] = np.dot(vectors * values, vectors.T)
+    for i in range(n):
+        for j in range(n):
+            covariance[i, j] *= scale[i] * scale[j]
     for i in range(n):
         if covariance[i, i] > UNKNOWN_VARIANCE:
             shrink = math.sqrt(UNKNOWN_VARIANCE / covariance[i, i])
@@ -72,18 +120,34 @@ def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def
     """
     t = np.empty((2, 3))
     fill_tangent(axis, t)
-    # A turn w moves the axis by w x n: about t[0] by -t[1], about t[1] by t[0].
-    reduced, back = np.zeros((5, 6)), np.zeros((6, 5))
-    for i in range(3):
-        reduced[i, i] = 1.0
-        back[i, i] = 1.0
-        reduced[3, 3 + i], reduced[4, 3 + i] = -t[1, i], t[0, i]
-        back[3 + i, 3], back[3 + i, 4] = t[0, i], t[1, i]
-    inner = bounded_inverse(np.dot(np.dot(reduced, normal), reduced.T))
-    covariance = np.dot(np.dot(back, inner), back.T)
+    # A turn w moves the axis by w x n: about t[0] by -t[1], about t[1] by t[0]. So of the six
+    # columns of the normal matrix five are left, and two of them become three of a turn.
+    half, information = np.empty((5, 6)), np.empty((5, 5))
+    for j in range(6):
+        for i in range(3):
+            half[i, j] = normal[i, j]
+        half[3, j] = half[4, j] = 0.0
+        for c in range(3):
+            half[3, j] -= t[1, c] * normal[3 + c, j]
+            half[4, j] += t[0, c] * normal[3 + c, j]
+    for i in range(5):
+        for j in range(3):
+            information[i, j] = half[i, j]
+        information[i, 3] = information[i, 4] = 0.0
+        for c in range(3):
+            information[i, 3] -= half[i, 3 + c] * t[1, c]
+            information[i, 4] += half[i, 3 + c] * t[0, c]
+    inner, covariance = bounded_inverse(information), np.empty((6, 6))
     for i in range(3):
         for j in range(3):
-            covariance[3 + i, 3 + j] += roll_variance * axis[i] * axis[j]
+            covariance[i, j] = inner[i, j]
+            turned = inner[i, 3] * t[0, j] + inner[i, 4] * t[1, j]
+            covariance[i, 3 + j] = covariance[3 + j, i] = turned
+            turns = roll_variance * axis[i] * axis[j]
+            for k in range(2):
+                for m in range(2):
+                    turns += t[k, i] * inner[3 + k, 3 + m] * t[m, j]
+            covariance[3 + i, 3 + j] = turns
     return covariance
 
 
