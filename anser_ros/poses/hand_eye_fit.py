@@ -16,7 +16,6 @@ from anser_ros.effects.term import Term
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
-from anser_ros.poses.diagnosis import hand_eye_record
 from anser_ros.poses.effect import Role, effect_of, frames_of, is_of
 from anser_ros.poses.fit import PoseFit, fit_poses
 from anser_ros.poses.lever_arms import (
@@ -26,6 +25,7 @@ from anser_ros.poses.lever_arms import (
     turn_jitter,
 )
 from anser_ros.poses.problem import PoseProblem
+from anser_ros.poses.records import hand_eye_record
 from anser_ros.poses.registry import effect_with
 from anser_ros.poses.search import frame_terms, with_noise
 from anser_ros.poses.sequence import PoseSession

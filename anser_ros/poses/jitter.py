@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.poses.effect import Sensing
+from anser_ros.poses.problem import PoseState
 
 Array = NDArray[np.float64]
 
@@ -41,3 +42,19 @@ def jitter(sensing: Sensing) -> tuple[Array, Array]:
 def _across(vectors: Array, along: Array) -> Array:
     """Vectors (n, 3) without their part along unit vectors (n, 3)."""
     return np.asarray(vectors - np.sum(vectors * along, axis=1, keepdims=True) * along)
+
+
+def floor_of(state: PoseState) -> float:
+    """Return the distance that jitter alone makes, m, from differences between neighbours."""
+    squares = []
+    for part in state.parts:
+        is_resting = not part.view.velocity.any()  # each recording has an error of its own
+        groups = np.unique(part.blocks) if is_resting else (None,)
+        rows = [part.used if k is None else part.used & (part.blocks == k) for k in groups]
+        sensings = [Sensing(part.view, part.residual, r, ~r, 0.0, 0.0, 0.0, 0.0) for r in rows]
+        square = np.concatenate([jitter(sensing)[0] for sensing in sensings])
+        noise = part.noise
+        along = noise.stamp_s * np.linalg.norm(part.view.velocity[part.used, :3], axis=1)
+        if square.size and along.size:
+            squares.append(3 * float(np.mean(square)) + float(np.mean(along**2)))
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0

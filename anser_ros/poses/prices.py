@@ -41,6 +41,16 @@ LEAST_CLOCK_SIGMAS = 3.0
 what is known of it; larger misses slight ones of a slow tracker."""
 
 
+def gain_of(before: PoseFit, after: PoseFit, term: Term) -> float:
+    """Return what a term takes off the cross-validated sum of squares, in units of the misfit.
+
+    Blocks of space decide as well on an effect that depends on place.
+    """
+    effect = effect_of(term)
+    ways = (False, True) if effect.blocks_in_space else (False,)
+    return min((before.held_out(w) - after.held_out(w)) / after.misfit for w in ways)
+
+
 def price(term: Term, total: float, fit: PoseFit) -> float:
     """Return the gain, in units of the misfit, that a term needs; ``total`` is the squared sum."""
     misfit, share = fit.misfit, LEAST_EXPLAINED

@@ -7,11 +7,9 @@ blocks of space, because a map looks too good on neighbours in time.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from anser_ros.calibration.blocks import FOLDS
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
@@ -24,10 +22,11 @@ from anser_ros.poses.fit import (
     fit_poses,
     noise_of,
     unexplained_poses,
-    with_time_constants,
 )
+from anser_ros.poses.lag_search import finest_lag, with_lag
 from anser_ros.poses.lever_arms import knows_levers, most_poses
-from anser_ros.poses.prices import LEAST_EXPLAINED, doubt, price
+from anser_ros.poses.one_scale import is_one_scale
+from anser_ros.poses.prices import LEAST_EXPLAINED, doubt, gain_of, price
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
 from anser_ros.poses.sequence import PoseSession
@@ -38,21 +37,16 @@ Array = NDArray[np.float64]
 POSES_A_PARAMETER = 6
 """Poses that a parameter needs: neighbours in time are hardly new. More leave metal unnamed on a
 hundred poses that a slow tracker gives in a minute; blocks judge what fewer would do."""
-LAG_STEPS = (1.4, 1.4, 1.2, 1.1, 1.05)  # factors of a time constant by which it is neared
 MOST_EFFECTS = 6  # effects in force after which the search ends: more would be stand-ins
 FULL_FITS = 3  # candidates fitted in full in each round, which takes most of the time
 NOISE_ROUNDS = 3  # times that noise and what stands out, which depend on each other, are found
 STAMP_GAIN = 25.0
 """Minus twice the log likelihood that an error of the stamps must take off, a sensor, to be
 believed; chance takes off one."""
-SAME_SCALE = 1 / 370
-"""Chance that noise makes the scales of any two sensors of one reference differ so much: of one
-pair, three standard deviations. Larger takes noise for a difference; smaller misses some."""
 PART_OF_MAP = 2 / 3
 """Share of what a map gains below which a scale is a part of it: a map contains the scale, and so
 gains as much where there is nothing else. Smaller calls a bent space a scale; larger takes the
 noise that a map follows for a bend."""
-SCALE_DIFFERS = 0.003  # difference of scales that matters: 1 mm in a tracked volume
 
 
 @dataclass(frozen=True)
@@ -204,11 +198,11 @@ def _best_addition(
     if not knows_levers:
         return best
     # A filter rounds off turning points, which looks like a scale or a map.
-    lagging, filtered = _with_lag(fit, refused)
+    lagging, filtered = with_lag(fit, refused)
     if best is not None and filtered is not None and filtered.held_out() < best.held_out():
         term = best.terms[-1]
         both = fit_poses(fit.state.problem, [*filtered.terms, term])
-        if _gain(filtered, both, term) > price(term, filtered.held_out(), filtered):
+        if gain_of(filtered, both, term) > price(term, filtered.held_out(), filtered):
             return best
         refused.append((best.terms[-1].label, 'a filter explains as much'))
         return lagging
@@ -226,7 +220,7 @@ def _simplest(accepted: list[tuple[float, PoseFit]]) -> PoseFit:
     """The one that gains most; a map only when no effect with few numbers is left.
 
     A scale that gains much less than a map is a part of that, unless several sensors vouch for it,
-    which see the same one (`_one_scale`) at different places.
+    which see the same one (`is_one_scale`) at different places.
     """
     ends = [(gain, fit.terms[-1]) for gain, fit in accepted]
     maps = [gain for gain, t in ends if is_of(t, Role.MAP)]
@@ -246,7 +240,7 @@ def _accepted(
     """What a candidate gains when fitted in full, and that fit, if it pays for itself."""
     rest = [t for t in fit.terms if not term.effect.covers(term, t)]
     trial = fit_poses(fit.state.problem, [*rest, term])
-    gain = _gain(fit, trial, term)
+    gain = gain_of(fit, trial, term)
     need = price(term, fit.held_out(), fit)
     if gain < need:
         refused.append((term.label, f'gain {gain:.0f} of {need:.0f}'))
@@ -255,72 +249,10 @@ def _accepted(
     if why_not:
         refused.append((term.label, why_not))
         return None
-    if is_of(term, Role.SCALE) and not _one_scale(trial):
+    if is_of(term, Role.SCALE) and not is_one_scale(trial):
         refused.append((term.label, 'sensors of one reference see different scales'))
         return None
     return gain - AS_GOOD_PER_PARAMETER * term.complexity, trial
-
-
-def _is_covered(term: Term, force: Sequence[Term]) -> bool:
-    """Whether a term in force stands for a candidate already."""
-    return any(one.effect.covers(one, term) for one in force)
-
-
-def _with_lag(
-    fit: PoseFit, refused: list[tuple[str, str]]
-) -> tuple[PoseFit | None, PoseFit | None]:
-    """The fit with a low pass, where neither a delay nor a smooth reference does as well.
-
-    Also the best fit with a low pass or a smooth reference, whether it pays or not.
-    """
-    if any(is_of(term, Role.FILTER) for term in fit.terms):
-        return None, None
-    trials = [
-        fit_poses(fit.state.problem, [*fit.terms, term], 3)
-        for effect in pose_effects().values()
-        if effect.role is Role.FILTER
-        for term in effect.sites(fit.state.problem.setting)
-    ]
-    trial = _finest_lag(min(trials, key=lambda t: t.state.sum_of_squares))
-    term = trial.terms[-1]
-    noisy = _is_smoothing(fit, trial)
-    widths = [term.with_theta(factor * term.theta) for factor in (0.5, 1.0, 2.0) if noisy]
-    rivals = [fit_poses(fit.state.problem, [*fit.terms, effect_of(t).rival(t)], 3) for t in widths]
-    best = min([fit, *rivals], key=lambda f: f.held_out())
-    gain = _gain(best, trial, term)
-    need = price(term, fit.held_out(), fit)
-    left = min(trial, best, key=lambda one: one.held_out())
-    if gain < need:
-        if _gain(fit, trial, term) > need:
-            refused.append((term.label, 'a smoother reference explains as much'))
-        return None, left
-    if not _all_gain(best, trial):
-        refused.append((term.label, 'not all sensors of the tracker show it'))
-        return None, left
-    return trial, left
-
-
-def _is_smoothing(before: PoseFit, after: PoseFit) -> bool:
-    """Whether a filter takes off no more than a smoother reference can.
-
-    That is the noise of its poses, and what errors of its stamps make of its velocity where those
-    of the tracker have errors: one host stamps both.
-    """
-    path, taken, noise = before.state.problem.path, 0.0, 0.0
-    for old, new in zip(before.state.parts, after.state.parts, strict=True):
-        both = old.used & new.used
-        squares = [np.sum(part.residual[both, :3] ** 2) for part in (old, new)]
-        taken += float(squares[0] - squares[1])
-        noise += 3 * np.count_nonzero(both) * path.jitter(old.view.lever) ** 2
-        noise += float(np.sum((old.noise.stamp_s * old.view.velocity[both, :3]) ** 2))
-    return taken < noise
-
-
-def _all_gain(before: PoseFit, after: PoseFit) -> bool:
-    """Whether an effect of the tracker itself takes off errors of each of its sensors."""
-    pairs = zip(before.state.parts, after.state.parts, strict=True)
-    gains = [float(np.sum(old.white**2) - np.sum(new.white**2)) for old, new in pairs]
-    return min(gains) > LEAST_GAIN * after.misfit
 
 
 def _probe(fit: PoseFit, term: Term) -> float:
@@ -335,56 +267,9 @@ def _probe(fit: PoseFit, term: Term) -> float:
     return min(gains)
 
 
-def _gain(before: PoseFit, after: PoseFit, term: Term) -> float:
-    effect = effect_of(term)
-    ways = (False, True) if effect.blocks_in_space else (False,)
-    return min((before.held_out(w) - after.held_out(w)) / after.misfit for w in ways)
-
-
-def _finest_lag(fit: PoseFit) -> PoseFit:
-    """The fit at the best time constant: ever smaller steps to the least, then by its slopes."""
-    best = fit
-    for factor in LAG_STEPS:
-        for direction in (factor, 1 / factor):
-            trial = _slower(best, direction)
-            if trial.state.sum_of_squares < best.state.sum_of_squares:
-                best = trial
-                break
-    return with_time_constants(best)
-
-
-def _slower(fit: PoseFit, factor: float) -> PoseFit:
-    """The fit with time constants so many times as long, and all else fitted again."""
-    terms = [t.with_theta(factor * t.theta) if is_of(t, Role.FILTER) else t for t in fit.terms]
-    return fit_poses(fit.state.problem, terms, 3)
-
-
-def _one_scale(fit: PoseFit) -> bool:
-    """Whether each sensor alone sees the same scale as the others do."""
-    problem, found = fit.state.problem, []
-    if len(problem.sensors) < 2:
-        return True
-    for i, poses in enumerate(problem.sensors):
-        alone = replace(
-            problem,
-            **{key: getattr(problem, key)[i : i + 1]
-               for key in ('sensors', 'blocks', 'places', 'weight', 'noise')},
-        )  # fmt: skip
-        # A map of its own would take up what differs.
-        terms = [
-            t for t in fit.terms
-            if effect_of(t).acts_on(t, poses.name) and not is_of(t, Role.MAP)
-        ]  # fmt: skip
-        one = fit_poses(alone, terms)
-        index = next(k for k, t in enumerate(one.terms) if is_of(t, Role.SCALE))
-        scale = 1e-3 * float(one.terms[index].theta[0])
-        found.append((scale, 1e-3 * float(np.sqrt(one.covariance_of(index)[0, 0]))))
-    pairs = list(combinations(found, 2))
-    times = -float(ndtri(SAME_SCALE / (2 * len(pairs))))
-    return all(
-        abs(scale - other) <= max(times * float(np.hypot(sigma, apart)), SCALE_DIFFERS)
-        for (scale, sigma), (other, apart) in pairs
-    )
+def _is_covered(term: Term, force: Sequence[Term]) -> bool:
+    """Whether a term in force stands for a candidate already."""
+    return any(one.effect.covers(one, term) for one in force)
 
 
 def _one_map(fit: PoseFit) -> PoseFit:
@@ -415,8 +300,8 @@ def _settled(
             rest = [t for t in fit.terms if t is not term]
             without = fit_poses(fit.state.problem, rest)
             if any(is_of(t, Role.FILTER) for t in rest):
-                without = _finest_lag(without)
-            gain = _gain(without, fit, term)
+                without = finest_lag(without)
+            gain = gain_of(without, fit, term)
             left = without.held_out()
             need = price(term, left, without)
             # Beside others the parameters may have become what no instrument has.
