@@ -28,6 +28,11 @@ class World:
         self.spread = lambda sensor, place: np.ones(len(place))
         self.shift = lambda sensor, time: np.zeros((time.size, 3))
         self.after = lambda streams: streams
+        self.when = lambda time: time  # of the reference's poses
+
+    def follow(self, place, turn):
+        """Move another way: places (m, about the middle) and turns (rad) as functions of time."""
+        self._place, self._turn = place, turn
 
     def body(self, time):
         """Place and turn of the body in the tracker's frame, behind the low pass."""
@@ -61,7 +66,7 @@ class World:
             stamp = stamp + self.jitter * rng.normal(size=true.size)
             streams[f'sensor_{number}'] = [stamp, place, turn.as_quat()]
         tau, self.tau = self.tau, 0.0
-        time = np.arange(-0.5, self.duration + 0.5, 1 / self.optical_rate)
+        time = self.when(np.arange(-0.5, self.duration + 0.5, 1 / self.optical_rate))
         place, turn = self.body(time)
         self.tau = tau
         place = self.scale * FRAME.inv().apply(place - SHIFT)

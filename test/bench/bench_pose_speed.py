@@ -1,4 +1,4 @@
-"""Processor time of a diagnosis of poses and of a corrected pose: sessions of `bench_poses.py`."""
+"""Processor time of a diagnosis of poses (with faults of `bench_poses.py`) and of a correction."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 sys.path[1:1] = [str(HERE), str(HERE.parents[1]), str(HERE.parent)]
 
-from bench_poses import KINDS, World  # noqa: E402
+from pose_faults import KINDS  # noqa: E402
+from pose_world import World  # noqa: E402
 
 from anser_ros.poses.corrector import PoseCorrector  # noqa: E402
 from anser_ros.poses.diagnosis import diagnose_poses  # noqa: E402

@@ -1,0 +1,237 @@
+"""What is put into simulated sessions of poses: every effect that `interfaces.md` lists, at three
+sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableMapping
+from dataclasses import dataclass
+
+import numpy as np
+from pose_world import World
+from scipy.spatial.transform import Rotation
+
+MIDDLE = np.array([0.05, 0.02, -0.3])
+
+Truth = MutableMapping[str, tuple[str, float] | None]
+"""By the name of an effect its parameter and true value, or None where only the name is judged."""
+Stream = list[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One thing that is wrong, at three sizes.
+
+    Attributes
+    ----------
+    change : callable
+        Takes a world and a size, makes it so, and returns what has to be found.
+    sensors : int
+        Fewest sensors that it needs.
+    parts : tuple of str
+        What of a world it uses; two kinds that share one make no pair.
+    """
+
+    change: Callable[[World, float], Truth]
+    sizes: tuple[float, ...]
+    parts: tuple[str, ...]
+    sensors: int = 1
+
+
+def _each(world: World, change: Callable[[str, Stream], None], *, also: bool = False) -> None:
+    """Change the tracked streams of a world, or the reference's alone."""
+    before = world.after
+
+    def after(streams: dict[str, Stream]) -> dict[str, Stream]:
+        streams = before(streams)
+        for name, rows in streams.items():
+            if (name == 'optical') == also:
+                change(name, rows)
+        return streams
+
+    world.after = after
+
+
+def late(world: World, size: float) -> Truth:
+    world.offset = 1e-3 * size
+    return {'time_offset': ('offset_s', world.offset)}
+
+
+def fast(world: World, size: float) -> Truth:
+    world.rate_ppm = size
+    return {'clock_rate': ('rate_ppm', size)}
+
+
+def scaled(world: World, size: float) -> Truth:
+    world.scale = size
+    return {'optical_scale': ('scale', size)}
+
+
+def jittery(world: World, size: float) -> Truth:
+    world.jitter = 1e-3 * size
+    return {'stamp_jitter': ('rms_s', world.jitter)}
+
+
+def filtered(world: World, size: float) -> Truth:
+    world.tau = 1e-3 * size
+    return {'tracker_lag': ('tau_s', world.tau)}
+
+
+def _bend(world: World, size: float, first: int) -> Truth:
+    def bend(sensor: int, place: np.ndarray) -> np.ndarray:
+        away = (place - MIDDLE) / 0.06
+        return place + (1e-3 * size * away[:, [0]] * away if sensor >= first else 0.0)
+
+    world.bend = bend
+    return {'field_distortion': None}
+
+
+def bent(world: World, size: float) -> Truth:
+    return _bend(world, size, 0)
+
+
+def bent_one(world: World, size: float) -> Truth:
+    return _bend(world, size, len(world.levers) - 1)
+
+
+def shrunk_one(world: World, size: float) -> Truth:
+    last = len(world.levers) - 1
+    world.bend = lambda sensor, place: (
+        MIDDLE + (1 - size) * (place - MIDDLE) if sensor == last else place
+    )
+    return {'field_distortion': None}
+
+
+def far_noise(world: World, size: float) -> Truth:
+    world.spread = lambda sensor, place: (np.linalg.norm(place, axis=1) / 0.3) ** size
+    return {'range_noise': ('exponent', size)}
+
+
+def noisy(world: World, size: float) -> Truth:
+    world.spread = lambda sensor, place: np.full(len(place), size if sensor == 0 else 1.0)
+    return {'excess_noise': ('factor', size)}
+
+
+def stale(world: World, size: float) -> Truth:
+    every = round(1 / size)
+
+    def change(name: str, rows: Stream) -> None:
+        for one in rows[1:]:
+            again = np.arange(every - 1, len(one), every)
+            one[again] = one[again - 1]
+
+    _each(world, change, also=True)
+    return {'stale_poses': ('fraction', 1 / every)}
+
+
+def missing(world: World, size: float) -> Truth:
+    def change(name: str, rows: Stream) -> None:
+        if name == 'sensor_0':
+            first = len(rows[0]) // 3
+            rows[1][first : first + round(size * len(rows[0]))] = -3.697314e28
+
+    _each(world, change)
+    return {'missing_poses': ('fraction', size)}
+
+
+def mirrored(world: World, size: float) -> Truth:
+    every = round(1 / size)
+
+    def change(name: str, rows: Stream) -> None:
+        rows[1][::every] += [0.057, 0, 0]
+        flipped = Rotation.from_quat(rows[2][::every]) * Rotation.from_rotvec([1.5, 0, 0])
+        rows[2][::every] = flipped.as_quat()
+
+    _each(world, change, also=True)
+    return {'outliers': None}
+
+
+def loose(world: World, size: float) -> Truth:
+    turn = world.rng.uniform(0, 2 * np.pi)
+
+    def shift(sensor: int, time: np.ndarray) -> np.ndarray:
+        wave = np.sin(0.5 * time + turn)[:, None] * [1.0, -0.5, 0.3]
+        return 1e-3 * size * wave if sensor == 0 else np.zeros((time.size, 3))
+
+    world.shift = shift
+    return {'loose_mount': None}
+
+
+def metal(world: World, size: float) -> Truth:
+    first = 0.35 * world.duration
+
+    def change(name: str, rows: Stream) -> None:
+        near = np.exp(-(((rows[0] - first) / (0.05 * world.duration)) ** 4))[:, None]
+        rows[1] += 1e-3 * size * near * [0.6, -0.5, 0.6]
+
+    _each(world, change)
+    return {'moving_metal': None}
+
+
+def polled(world: World, size: float) -> Truth:
+    step = 1e-3 * size
+    truth: Truth = {
+        'quantised_stamps': ('step_s', step),
+        'time_offset': ('offset_s', step / 2),
+    }
+    delays: Stream = []
+
+    def change(name: str, rows: Stream) -> None:
+        on_grid = np.ceil(rows[0] / step) * step
+        delays.append(on_grid - rows[0])
+        rows[0] = on_grid
+        # Half a step, but for what is left of the last tooth of the sawtooth.
+        truth['time_offset'] = 'offset_s', float(np.mean(np.concatenate(delays)))
+
+    _each(world, change)
+    return truth
+
+
+def misread(world: World, size: float) -> Truth:
+    """Scalar first, the other way round, or both: the orders and senses that devices write."""
+    order = [0, 1, 2, 3] if size == 2 else [3, 0, 1, 2]
+    sign = 1.0 if size == 1 else -1.0
+
+    def change(name: str, rows: Stream) -> None:
+        rows[2] = (rows[2] * [sign, sign, sign, 1.0])[:, order]
+
+    _each(world, change)
+    return {'frame_convention': None}
+
+
+def exchanged(world: World, size: float) -> Truth:
+    """Two sensors under each other's names for a share of the session."""
+    before = world.after
+
+    def after(streams: dict[str, Stream]) -> dict[str, Stream]:
+        streams = before(streams)
+        one, other = streams['sensor_0'], streams['sensor_1']
+        first = len(one[0]) // 3
+        span = slice(first, first + round(size * len(one[0])))
+        for mine, yours in zip(one, other, strict=True):
+            mine[span], yours[span] = yours[span].copy(), mine[span].copy()
+        return streams
+
+    world.after = after
+    return {'swapped_sensors': ('fraction', size)}
+
+
+KINDS = {
+    'late': Kind(late, (8, 30, 100), ('offset',)),
+    'fast': Kind(fast, (600, 1200, 2500), ('rate',)),
+    'scaled': Kind(scaled, (1.006, 0.987, 1.03), ('scale',)),
+    'jittery': Kind(jittery, (4, 8, 14), ('stamps',)),
+    'filtered': Kind(filtered, (40, 80, 160), ('offset', 'stamps')),
+    'bent': Kind(bent, (1, 2, 4), ('place', 'scale')),
+    'bent_one': Kind(bent_one, (1, 2, 4), ('place', 'scale'), 2),
+    'shrunk_one': Kind(shrunk_one, (0.01, 0.02, 0.04), ('place', 'scale'), 2),
+    'far_noise': Kind(far_noise, (3, 4, 5), ('noise',)),
+    'noisy': Kind(noisy, (2.5, 4, 6), ('noise',), 3),
+    'stale': Kind(stale, (0.1, 0.25, 0.5), ('reference',)),
+    'missing': Kind(missing, (0.02, 0.05, 0.1), ('tracked',)),
+    'mirrored': Kind(mirrored, (0.01, 0.02, 0.04), ('reference',)),
+    'loose': Kind(loose, (2, 4, 8), ('place', 'noise'), 2),
+    'metal': Kind(metal, (4, 8, 16), ('place', 'noise', 'tracked')),
+    'polled': Kind(polled, (10, 16, 30), ('offset', 'stamps')),
+    'misread': Kind(misread, (1, 2, 3), ('reading',)),
+    'exchanged': Kind(exchanged, (0.05, 0.1, 0.3), ('place', 'tracked'), 2),
+}
