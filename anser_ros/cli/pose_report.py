@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.cli.diagnosis_figures import AFTER, BEFORE
-from anser_ros.cli.diagnosis_words import short_ones, value_text
 from anser_ros.cli.html_page import page, table
+from anser_ros.cli.pose_values import sizes
 from anser_ros.pictures import image, legend_below
 from anser_ros.poses.diagnosis import PoseDiagnosis
 from anser_ros.poses.effect import Role
@@ -25,7 +25,6 @@ Array = NDArray[np.float64]
 
 GROUPS = 5  # groups of equal numbers of poses by distance, speed and orientation
 HAND_EYE = effect_with(Role.MOUNT).name
-UNSHOWN = ('centre_m', 'size_m', 'lowest', 'middle_s')  # tell how a map is written, and not what
 LIMITS = 1.96  # standard deviations within which 95 % of normal differences lie
 
 
@@ -129,30 +128,17 @@ def _effects(document: dict[str, Any]) -> str:
     for effect in document['effects']:
         if effect['name'] == HAND_EYE:
             continue
-        evidence, sigma = effect['evidence'], effect['uncertainty']
-        values = [
-            f'{key} = {_value(value)}'
-            + (f' ± {value_text(sigma[key])}' if sigma.get(key) is not None else '')
-            for key, value in short_ones(effect['parameters'])
-            if key not in UNSHOWN and value not in (None, [], {})
-        ]
+        evidence = effect['evidence']
         error = ' to '.join(_mm(evidence.get(f'position_rmse_{k}_m')) for k in ('without', 'with'))
         rows.append([
             effect['name'], str(evidence.get('summary') or ''),
-            '\n'.join(values).replace(' = ', '\xa0=\xa0').replace(' ± ', '\xa0±\xa0'),
+            '\n'.join(sizes(effect['parameters'], effect['uncertainty'])),
             '' if error == '- to -' else error, str(evidence.get('advice') or ''),
         ])  # fmt: skip
     if not rows:
         return '<p>Nothing was found.</p>'
     head = ['name', 'what it is', 'how much, ± 1 sigma', 'takes the error from, mm', 'what to do']
     return table(head, rows).replace('\n', '<br>')
-
-
-def _value(value: Any) -> str:
-    """A parameter in words; one that each sensor has, sensor by sensor."""
-    if isinstance(value, dict):
-        return ', '.join(f'{name}\xa0{value_text(one)}' for name, one in value.items())
-    return value_text(value)
 
 
 def _frames(document: dict[str, Any]) -> str:

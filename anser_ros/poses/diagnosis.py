@@ -16,8 +16,10 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
 from anser_ros.poses.effect import (
     PoseResiduals,
+    Role,
     Sensing,
     effect_of,
+    is_of,
 )
 from anser_ros.poses.fit import (
     PoseFit,
@@ -32,6 +34,7 @@ from anser_ros.poses.lever_arms import (
     knows_levers,
     most_poses,
 )
+from anser_ros.poses.prices import LEAST_MAP_M
 from anser_ros.poses.problem import PoseProblem, PoseState
 from anser_ros.poses.records import records_of
 from anser_ros.poses.registry import pose_effects
@@ -201,29 +204,44 @@ def _leaves_more(state: PoseState) -> bool:
 
 
 def _confirmed(search: PoseSearch, problem: PoseProblem, test: NDArray[np.int64]) -> PoseSearch:
-    """The search without effects of place that make the held-out poses worse.
-
-    Poses near each other err alike, and a few places may ask for what no others confirm.
-    """
-    for index, term in enumerate(search.fit.terms):
+    """The search without effects of place that positions do not confirm."""
+    fit = search.fit
+    for index, term in enumerate(fit.terms):
         if not effect_of(term).blocks_in_space:
             continue
-        fit = search.fit
-        noisy = replace(problem, noise=fit.state.problem.noise)
-        unseen = judged(noisy.in_blocks(test), fit)
         rest = fit_poses(fit.state.problem, [t for t in fit.terms if t is not term])
-        if _square(unseen.state(rest.terms), term) < _square(unseen.state(fit.terms), term):
+        noisy = replace(problem, noise=fit.state.problem.noise)
+        why = unconfirmed(rest, fit, term, judged(noisy.in_blocks(test), fit))
+        if why:
             evidence = tuple(e for k, e in enumerate(search.evidence) if k != index)
-            why = (term.label, 'held-out poses are worse with it')
-            left = replace(search, fit=rest, evidence=evidence, refused=(*search.refused, why))
+            refused = (*search.refused, (term.label, why))
+            left = replace(search, fit=rest, evidence=evidence, refused=refused)
             return _confirmed(left, problem, test)
     return search
 
 
+def unconfirmed(rest: PoseFit, fit: PoseFit, term: Term, unseen: PoseProblem) -> str:
+    """Return why an effect of place is not believed beside the rest; empty where it is.
+
+    ``rest`` is the fit without it, and ``unseen`` the held-out poses.
+
+    Poses near each other err alike, and a few places may ask for what no others confirm. Where
+    stamps jitter, an error of places weighs little beside one across the velocity or of turns; a
+    map that moves poses but takes nothing off their errors makes up for frames that it has moved.
+    """
+    if _square(unseen.state(rest.terms), term) < _square(unseen.state(fit.terms), term):
+        return 'held-out poses are worse with it'
+    taken = _square(rest.state, term) - _square(fit.state, term)
+    if is_of(term, Role.MAP) and taken < LEAST_MAP_M**2:
+        return f'takes less than {1e3 * LEAST_MAP_M:g} mm off the errors of positions'
+    return ''
+
+
 def _square(state: PoseState, term: Term) -> float:
-    """Squared errors of the positions, m^2, of the sensors that a term is about."""
+    """Mean squared error of the positions, m^2, of the sensors that a term is about."""
     parts = [p for p in state.parts if effect_of(term).acts_on(term, p.view.sensor)]
-    return float(sum(np.sum(p.residual[p.used, :3] ** 2) for p in parts))
+    total = sum(float(np.sum(p.residual[p.used, :3] ** 2)) for p in parts)
+    return total / max(sum(np.count_nonzero(p.used) for p in parts), 1)
 
 
 def _whole(problem: PoseProblem, found: PoseFit) -> PoseFit:

@@ -28,8 +28,8 @@ SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
 """The same of a scale of one sensor alone, which is few numbers and follows hardly anything: this
 share, or more where that is less than `SCALE_M`."""
 LEAST_MAP_M = 0.5e-3
-"""How far a map must move poses, m rms: no tracker claims less of itself. Smaller names what is
-within its accuracy."""
+"""How far a map must move poses, and what it must take off their errors, m rms: no tracker claims
+less of itself. Smaller names what is within its accuracy."""
 
 LEAST_SCALE_SIGMAS = 5.0
 """Standard deviations by which a scale must differ from one, or a sensor's clock from the others'.
