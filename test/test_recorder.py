@@ -67,13 +67,16 @@ def call(node, name):
     return future.result()
 
 
-def test_the_model_error_is_left_out_unless_wanted(start, source, tmp_path):
+def test_another_tracker_is_recorded_and_the_model_error_is_not(start, source, tmp_path):
+    from geometry_msgs.msg import PoseStamped
     from std_msgs.msg import String
 
     for topic in ('field_model', 'field_model_error'):
         source.create_publisher(String, f'/anser/{topic}', 10)
+    source.create_publisher(PoseStamped, '/tracked/tip/pose', 10)
     process = begin(start, source, tmp_path)
     time.sleep(0.8)
+    assert source.count_subscribers('/tracked/tip/pose') == 1
     assert source.count_subscribers('/anser/field_model') == 1
     assert source.count_subscribers('/anser/field_model_error') == 0
     assert process.interrupt(signal.SIGTERM) == 0

@@ -14,6 +14,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.shared_names import tracked_parameter
 from anser_ros.poses.corrector import OK, OUTSIDE, PoseCorrector
 from anser_ros.stamps import set_stamp, stamp_of
 from anser_ros.wire.model_file import read_document
@@ -28,7 +29,7 @@ class CorrectorParameters:
     """Holds the parameters of the corrector."""
 
     model: str = parameter('', 'model.yaml of `anser diagnose --poses`')
-    tracked: str = parameter('/tracked', 'what the topics of tracked poses begin with')
+    tracked: str = tracked_parameter()
     frame_id: str = parameter('tracker', 'frame of the corrected poses')
 
 

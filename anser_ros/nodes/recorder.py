@@ -17,7 +17,7 @@ from anser_ros.nodes.bag_parts.definitions import definition, message_class, typ
 from anser_ros.nodes.bag_parts.recording_log import TopicLog, report
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
 from anser_ros.nodes.runtime.parameters import parameter
-from anser_ros.nodes.runtime.shared_names import optical_parameter
+from anser_ros.nodes.runtime.shared_names import optical_parameter, tracked_parameter
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag_metadata import qos_profile, write_metadata
 from anser_ros.wire.bag_writer import BagWriter
@@ -49,6 +49,7 @@ class RecorderParameters:
         0.25, 'longest time that a crash may lose, s', minimum=0.05, maximum=1.0
     )
     optical: str = optical_parameter()
+    tracked: str = tracked_parameter()
     topics: tuple[str, ...] = parameter((), 'topics to record besides those of docs/interfaces.md')
     without: tuple[str, ...] = parameter(
         ('field_model_error',),
@@ -195,8 +196,9 @@ class Recorder(AnserNode):
             return True
         if topic.rsplit('/', 1)[-1] in self.parameters.without:
             return False
-        optical = self.parameters.optical.rstrip('/') + '/'
-        return topic.startswith((own, optical)) or topic in COMMON_TOPICS
+        others = (self.parameters.optical, self.parameters.tracked)
+        folders = (own, *(name.rstrip('/') + '/' for name in others))
+        return topic.startswith(folders) or topic in COMMON_TOPICS
 
     def _add(self, topic: str, type_name: str) -> bool:
         """Subscribe to one topic; return whether it is recorded from now on."""
