@@ -264,6 +264,8 @@ class FieldModelNode(AnserNode):
     def _follow(self, baseline: NDArray[np.complex128], is_awaited: bool = False) -> None:
         """Refit to what differs from a baseline, shape (S, K), T, as soon as that can be done."""
         self._refit.begin(baseline, is_awaited)
+        if self._refit.current is None:
+            self.get_logger().info(refit_status.PREPARING)
         self._no_baseline = ''
         self._announce_changes()
         self.count('baselines')
@@ -274,6 +276,7 @@ class FieldModelNode(AnserNode):
             if not self._refit.take():
                 return
             self._received_s = time.monotonic()
+            self.get_logger().info(refit_status.IN_FORCE)
         except FitError as error:
             self._refuse_baseline(error)
         self._announce_changes()

@@ -9,6 +9,11 @@ from anser_ros.refit.result import WITHHELD, RefitResult
 
 TROUBLED = tuple(WITHHELD)
 """States of the refit that an operator is warned of."""
+PREPARING = (
+    'a baseline is there, the refit is being prepared: until it is in force the model does not '
+    'follow the references, and metal makes poses vanish (state residual)'
+)
+IN_FORCE = 'the refit is in force: the model follows the references'
 
 
 def no_baseline(namespace: str) -> str:
