@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FILES = sorted(PACKAGE.rglob('*.py'))
 CORE = {
     'physics', 'signals', 'wire', 'frames', 'field', 'metal', 'calibration', 'refit', 'effects',
-    'tracking', 'diagnosis', 'sessions', 'integrity', 'poses', 'assessment',
+    'known_metal', 'tracking', 'diagnosis', 'sessions', 'integrity', 'poses', 'assessment',
 }  # fmt: skip
 # What each layer may import of ours, itself and the errors aside.
 ALLOWED = {
@@ -30,12 +30,13 @@ ALLOWED = {
     'calibration': {'field', 'physics'},
     'integrity': {'frames', 'field', 'physics'},
     'refit': {'integrity', 'frames', 'field', 'metal', 'physics'},
+    'known_metal': {'refit', 'field', 'physics'},
     'effects': {'field', 'metal', 'physics'},
     'tracking': {'integrity', 'frames', 'effects', 'field', 'physics'},
     'diagnosis': {'effects', 'field', 'metal', 'physics'},
     'sessions': {
         'wire', 'frames', 'integrity', 'diagnosis', 'tracking', 'calibration', 'refit', 'effects',
-        'field', 'metal', 'physics',
+        'known_metal', 'field', 'metal', 'physics',
     },
     'poses': {'sessions', 'diagnosis', 'calibration', 'effects', 'field', 'physics', 'wire'},
     'assessment': {'poses', 'sessions', 'tracking', 'field', 'physics', 'wire'},

@@ -40,6 +40,7 @@ OFFLINE = {
     'handeye': 'frames, lever arm, mount and clocks of two streams of poses, jointly',
     'import': "make a bag of tables (CSV, NumPy, MATLAB), or of another program's bag",
     'import_poses': 'files of poses as trackers write them, to a bag',
+    'known_metal': 'learn a piece of metal from a session, for evaluate --known-metal',
     'loop': 'put an effect into simulated samples, find it blind, correct it, measure again',
     'measured': "other people's measurements: what they contain, and the error before and after",
     'paper': "redo the article's experiments: Tables II to V, Figs. 2 and 5 to 10",

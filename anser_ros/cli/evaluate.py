@@ -16,6 +16,7 @@ from anser_ros.cli.progress import Tell, progress_of
 from anser_ros.cli.session_runs import finish, perform, runs_of
 from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
 from anser_ros.errors import ParameterError
+from anser_ros.known_metal.known import read_known_metal
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.chosen_references import parse_references, with_references
 from anser_ros.sessions.evaluation import track_session
@@ -79,6 +80,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'references',
     )
     parser.add_argument(
+        '--known-metal',
+        type=Path,
+        metavar='FILE',
+        help='metal that anser known_metal has learnt: let the model follow it by the tools, '
+        'without references',
+    )
+    parser.add_argument(
         '--patch',
         action='append',
         default=[],
@@ -136,12 +144,18 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     session = load_session(args.session).with_stated(stated_values(args))
     if args.witnesses and not args.refit:
         raise ParameterError('--witnesses extends the refit; it needs --refit')
+    if args.known_metal is not None and (args.refit or args.baseline or args.patch):
+        raise ParameterError(
+            '--known-metal follows metal without references; leave out --refit, --baseline and '
+            '--patch'
+        )
     if args.references is not None:
         if not args.refit:
             raise ParameterError('--references chooses those of a refit; it needs --refit')
         session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None
+    known = None if args.known_metal is None else read_known_metal(args.known_metal)
     make_folder(args.out)
     evaluation = track_session(
         session,
@@ -152,6 +166,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         in_phase=args.in_phase,
         patches=parse_patches(args.patch),
         witnesses=args.witnesses,
+        known_metal=known,
         progress=lambda share: tell('tracking', share),
     )
     document = {**to_document(evaluation), 'recording': recording_of(session)}
@@ -170,7 +185,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     )[-1:]  # fmt: skip
     shown: list[Any] = [_table(document)]
     if 'refit' in document:
-        shown.append(_refit_line(document['refit']))
+        shown.append(_refit_line(document['refit'], known is not None))
     notes = (
         *snapshot_notes(args.model, model), *loss_notes(args.session, session.lost),
         *(_few_notes(session) if args.refit and not args.patch else ()),
@@ -190,10 +205,12 @@ def _few_notes(session: Session) -> tuple[str, ...]:
     )
 
 
-def _refit_line(refit: dict[str, dict[str, int]]) -> str:
+def _refit_line(refit: dict[str, dict[str, int]], known: bool) -> str:
     """What the refit did, in a line."""
     states = ', '.join(f'{name} in {count} frames' for name, count in refit['states'].items())
     out = ', '.join(f'{name} in {count}' for name, count in refit['left_out'].items())
+    if known:
+        return f'known metal: {states}'
     return f'refit: {states or "no frame"}; left out: {out or "no reference"}'
 
 

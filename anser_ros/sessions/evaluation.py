@@ -10,8 +10,10 @@ import numpy as np
 
 from anser_ros.field.model import FieldModel
 from anser_ros.field.symmetry import symmetry_axis
+from anser_ros.known_metal.known import KnownMetal
 from anser_ros.sessions.baseline import check_place
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
+from anser_ros.sessions.known_metal import KnownMetalModels
 from anser_ros.sessions.pose_errors import PoseSeries, body_series, sensor_series
 from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
 from anser_ros.sessions.session import Session
@@ -55,6 +57,7 @@ def track_session(
     progress: Progress | None = None,
     patches: dict[str, str] | None = None,
     witnesses: bool = False,
+    known_metal: KnownMetal | None = None,
 ) -> Evaluation:
     """Track every tool sensor and body of a session at every frame, and compare with the optics.
 
@@ -78,6 +81,8 @@ def track_session(
         Bodies that carry further reference coils, each with the topic of its poses in the bag.
     witnesses : bool
         Whether the refit also uses what the coils of rigid tools contradict.
+    known_metal : KnownMetal, optional
+        Metal that the model follows by the tools alone, instead of a refit.
 
     Raises
     ------
@@ -91,7 +96,11 @@ def track_session(
         check_place(model, session)
     used = in_phase_model(model) if in_phase else model
     prepared = prepare(session, used, baseline if refit else None)
-    follower = ModelFollower(prepared, patches, witnesses) if refit else None
+    follower: ModelFollower | KnownMetalModels | None = None
+    if known_metal is not None:
+        follower = KnownMetalModels(prepared, known_metal)
+    elif refit:
+        follower = ModelFollower(prepared, patches, witnesses)
     tracked = track(prepared, settings, follower, in_phase, progress)
     return compare(prepared, tracked)
 

@@ -9,6 +9,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.integrity.ageing import UNCHANGED_MODEL
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.frames import frames_of
+from anser_ros.sessions.known_metal import KnownMetalModels
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
@@ -48,7 +49,7 @@ def in_phase_model(model: FieldModel) -> FieldModel:
 def track(
     prepared: PreparedSession,
     settings: TrackerSettings | None = None,
-    follower: ModelFollower | None = None,
+    follower: ModelFollower | KnownMetalModels | None = None,
     in_phase: bool = False,
     progress: Progress | None = None,
 ) -> TrackedSession:

@@ -154,9 +154,8 @@ class Scene:
         """Rows of what the references read."""
         table, place = self.references, self.places[frame]
         by = self.body.columns(place, self.exc, table.position, table.axis, table.length)
-        points, turn, driving = self.body.placed(place, self.exc)
-        moments = (driving @ self.body.response.T).reshape(len(driving), -1, 3) @ turn.T
-        count, k = len(table), len(driving)
+        points, moments = self.body.moments(place, self.exc)
+        count, k = len(table), len(moments)
         flux, d_at, d_axis = flux_jacobian(
             table.position, table.axis, table.length, np.repeat(points, 3, axis=0),
             np.tile(np.eye(3), (len(points), 1)), moments.transpose(1, 2, 0).reshape(-1, k),

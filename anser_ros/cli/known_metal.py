@@ -1,0 +1,71 @@
+"""Learn a piece of metal from a recorded session, to follow it in others."""
+
+import argparse
+from pathlib import Path
+
+from anser_ros.cli.carry_out import carry_out
+from anser_ros.cli.output import Result, check_file, loss_notes
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.errors import ParameterError
+from anser_ros.known_metal.known import write_known_metal
+from anser_ros.sessions.metal_frames import learn
+from anser_ros.sessions.prepared import prepare
+from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import model_for
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = (
+        'example: anser known_metal bags/metal.mcap --model config/demo_model.yaml'
+        ' --baseline bags/scan.mcap --name c_arm --out c_arm.yaml'
+    )
+    parser.add_argument(
+        'session', metavar='BAG',
+        help='bag in which one rigid piece of metal moves, seen by reference sensors and a tool '
+        'with optical poses',
+    )  # fmt: skip
+    parser.add_argument(
+        '--model', required=True, help="model file, or 'nominal' for the setup's own geometry"
+    )
+    parser.add_argument(
+        '--baseline', required=True, help='recording of the same board without the metal'
+    )
+    parser.add_argument('--name', required=True, help='name of the metal')
+    parser.add_argument(
+        '--out', required=True, type=Path, help='file to write; its folder is made if missing'
+    )
+    add_stated_values(parser, 'accuracy', 'refit', 'tools')
+    parser.add_argument('--json', action='store_true', help='print what was learnt on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    if not args.name.strip():
+        raise ParameterError('--name must not be empty')
+    return carry_out('known_metal', 'learning', work, args)
+
+
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Learn the metal of the session, and write it."""
+    check_file(args.out)
+    session = load_session(args.session).with_stated(stated_values(args))
+    model = model_for(args.model, session)
+    prepared = prepare(session, model, load_session(args.baseline))
+    known = learn(prepared, args.name.strip(), tell)
+    write_known_metal(args.out, known)
+    document = {
+        'name': known.name,
+        'points': len(known.lattice),
+        'misfit': known.misfit,
+        'strongest_t': known.strongest_t,
+        'nearest_m': known.nearest_m,
+    }
+    size = known.lattice.points.max(axis=0) - known.lattice.points.min(axis=0)
+    words = (
+        f'{known.name}: {len(known.lattice)} points over '
+        f'{" x ".join(f"{side * 1e2:.0f}" for side in size)} cm; in frames that took no part '
+        f"{known.misfit:.1%} of the references' readings are left"
+    )
+    return Result(document, loss_notes(args.session, session.lost), (words,), (args.out,))

@@ -1,0 +1,1 @@
+"""Metal that is known from another recording: learnt once, followed by tools alone."""

@@ -1,0 +1,86 @@
+"""Lets the field model follow known metal through a recorded session, by its tools."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from anser_ros.errors import BagError
+from anser_ros.integrity.ageing import FrameModel
+from anser_ros.known_metal.follower import KnownMetalFollower
+from anser_ros.known_metal.known import KnownMetal
+from anser_ros.pose_states import OK
+from anser_ros.refit.excitation import excitation_for
+from anser_ros.sessions.follower import RefitSummary
+from anser_ros.sessions.frames import FrameReadings, SessionFrame
+from anser_ros.sessions.prepared import PreparedSession
+from anser_ros.sessions.session import tracking_noise
+from anser_ros.sessions.tool_readings import tool_readings
+from anser_ros.sessions.tracker_settings import settings_for
+from anser_ros.sessions.volume import stated_volume
+from anser_ros.tracking.estimate import NO_GATE, PoseEstimate, TrackerSettings
+from anser_ros.tracking.tracker import Tracker
+
+FOLLOWED, SEARCHED = 'followed', 'not_found'
+"""States in the summary."""
+
+
+class KnownMetalModels:
+    """Gives each frame of a session the field with known metal where its tools say that it is.
+
+    Parameters
+    ----------
+    prepared : PreparedSession
+    known : KnownMetal
+
+    Attributes
+    ----------
+    summary : RefitSummary
+        In how many frames the metal was followed.
+
+    Raises
+    ------
+    BagError
+        When the session has no tool fluxes.
+    """
+
+    def __init__(self, prepared: PreparedSession, known: KnownMetal) -> None:
+        session = prepared.session
+        if not session.tools:
+            raise BagError(f'{session.path}: known metal is followed by tools, there are none')
+        excitation, _ = excitation_for(
+            prepared.model, prepared.drawing.field, stated_volume(session.setup)
+        )
+        self._correction = prepared.correction
+        sensors = self._correction.sensors()
+        self._follower = KnownMetalFollower(
+            known, prepared.model, excitation, sensors, session.setup.refit.tools,
+            prepared.volume, tracking_noise(session.setup),
+        )  # fmt: skip
+        # Where a pose is withheld, a tracker that withholds none tells where the tool is, nearly.
+        settings = settings_for(session.setup, TrackerSettings(gate=NO_GATE))
+        self._rough = Tracker(
+            prepared.model, prepared.sensors, replace(settings, volume=prepared.volume)
+        )
+        self._stamp_ns = 0
+        self.summary = RefitSummary()
+
+    def at(self, frame: SessionFrame) -> FrameModel:
+        """Return what a frame is tracked with."""
+        self._stamp_ns = frame.stamp_ns
+        self.summary.states[FOLLOWED if self._follower.is_followed else SEARCHED] += 1
+        model, withheld = self._follower.at(frame.stamp_ns)
+        if model is not self._rough.model:
+            self._rough = self._rough.with_model(model)
+        return FrameModel(model, withheld)
+
+    def witnessed(self, tools: FrameReadings, found: Sequence[PoseEstimate]) -> None:
+        """Take in what a frame's tools read, at poses near theirs."""
+        rough = self._rough.update(self._stamp_ns, tools.channels, tools.flux, tools.flags)
+        poses = {
+            one.name: (one.position, one.rotation)
+            for one in (*rough, *(one for one in found if one.state == OK))
+            if one.state == OK and one.rotation is not None
+        }
+        self._follower.take(
+            self._stamp_ns,
+            tool_readings(self._correction, tools.channels, tools.flux, tools.flags, poses),
+        )
