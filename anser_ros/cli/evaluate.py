@@ -16,11 +16,11 @@ from anser_ros.cli.progress import Tell, progress_of
 from anser_ros.cli.session_runs import finish, perform, runs_of
 from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
 from anser_ros.errors import ParameterError
-from anser_ros.known_metal.known import read_known_metal
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.chosen_references import parse_references, with_references
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import recording_of, to_document
+from anser_ros.sessions.known_metal_file import load_known_metal
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.pose_table import (
     BODIES_FILE,
@@ -155,7 +155,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None
-    known = None if args.known_metal is None else read_known_metal(args.known_metal)
+    known = None if args.known_metal is None else load_known_metal(args.known_metal)
     make_folder(args.out)
     evaluation = track_session(
         session,

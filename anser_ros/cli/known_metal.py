@@ -8,7 +8,7 @@ from anser_ros.cli.output import Result, check_file, loss_notes
 from anser_ros.cli.progress import Tell
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import ParameterError
-from anser_ros.known_metal.known import write_known_metal
+from anser_ros.sessions.known_metal_file import save_known_metal
 from anser_ros.sessions.metal_frames import learn
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import load_session
@@ -49,12 +49,12 @@ def run(args: argparse.Namespace) -> int:
 
 def work(args: argparse.Namespace, tell: Tell) -> Result:
     """Learn the metal of the session, and write it."""
-    check_file(args.out)
     session = load_session(args.session).with_stated(stated_values(args))
     model = model_for(args.model, session)
     prepared = prepare(session, model, load_session(args.baseline))
+    check_file(args.out)
     known = learn(prepared, args.name.strip(), tell)
-    write_known_metal(args.out, known)
+    save_known_metal(args.out, known)
     document = {
         'name': known.name,
         'points': len(known.lattice),

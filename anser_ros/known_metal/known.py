@@ -1,11 +1,9 @@
-"""Holds metal that was learnt, and writes and reads it as a document."""
+"""Holds metal that was learnt, and makes a document of it and the reverse."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import ModelFileError
@@ -87,10 +85,10 @@ def directions_of(
     return np.asarray(factor @ vectors[:, ::-1][:, :DIRECTIONS])
 
 
-def write_known_metal(path: Path, known: KnownMetal) -> None:
-    """Write a document of metal that was learnt."""
+def to_document(known: KnownMetal) -> dict[str, Any]:
+    """Return metal that was learnt as plain data."""
     lattice = known.lattice
-    document = {
+    return {
         'schema': SCHEMA,
         'name': known.name,
         'units': {'point': 'm', 'unit': 'A m^2/T', 'driving': 'T'},
@@ -106,62 +104,60 @@ def write_known_metal(path: Path, known: KnownMetal) -> None:
         'parameters': lattice.parameters.tolist(),
         'directions': known.directions.T.tolist(),
     }
-    text = yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=1000)
-    path.write_text(text, encoding='utf-8')
 
 
-def read_known_metal(path: Path) -> KnownMetal:
-    """Read a document of metal that was learnt.
+def from_document(document: Any) -> KnownMetal:
+    """Return metal that was learnt from plain data.
 
     Raises
     ------
     ModelFileError
         When it is none, with what is wrong.
     """
-    try:
-        document: Any = yaml.load(path.read_text(encoding='utf-8'), Loader=_LOADER)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ModelFileError(f'{path}: known metal cannot be read: {error}') from error
     if not isinstance(document, dict) or document.get('schema') != SCHEMA:
-        raise ModelFileError(f'{path}: no known metal, its schema must be {SCHEMA!r}')
-    try:
-        points = _table(document, 'points', (-1, 3))
-        n = len(points)
-        bare = Lattice(
-            points, _positive(document, 'unit'), np.zeros(n, complex), np.zeros(n, complex),
-            _positive(document, 'frequency_hz'),
-        )  # fmt: skip
-        return KnownMetal(
-            str(document['name']),
-            bare.with_parameters(_table(document, 'parameters', (4 * n,))),
-            np.ascontiguousarray(_table(document, 'directions', (-1, 4 * n)).T),
-            _positive(document, 'misfit'),
-            _positive(document, 'strongest_t'),
-            _positive(document, 'nearest_m'),
-            _table(document, 'low_m', (3,)),
-            _table(document, 'high_m', (3,)),
-            _table(document, 'turn_rad', (3,)),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise ModelFileError(f'{path}: known metal: {error}') from error
-
-
-_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+        raise ModelFileError(f'no known metal: its schema must be {SCHEMA!r}')
+    name = document.get('name')
+    if not isinstance(name, str) or not name.strip():
+        raise ModelFileError(f'known metal: name must be a text, got {name!r}')
+    points = _table(document, 'points', (-1, 3))
+    n = len(points)
+    bare = Lattice(
+        points, _positive(document, 'unit'), np.zeros(n, complex), np.zeros(n, complex),
+        _positive(document, 'frequency_hz'),
+    )  # fmt: skip
+    return KnownMetal(
+        name,
+        bare.with_parameters(_table(document, 'parameters', (4 * n,))),
+        np.ascontiguousarray(_table(document, 'directions', (-1, 4 * n)).T),
+        _positive(document, 'misfit'),
+        _positive(document, 'strongest_t'),
+        _positive(document, 'nearest_m'),
+        _table(document, 'low_m', (3,)),
+        _table(document, 'high_m', (3,)),
+        _table(document, 'turn_rad', (3,)),
+    )
 
 
 def _positive(document: dict[str, Any], key: str) -> float:
-    value = float(document[key])
-    if not 0.0 < value < np.inf:
-        raise ValueError(f'{key} must be positive, got {value}')
-    return value
+    value = _table(document, key, ())
+    if value <= 0.0:
+        raise ModelFileError(f'known metal: {key} must be positive, got {value:g}')
+    return float(value)
 
 
 def _table(document: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
-    table = np.array(document[key], dtype=np.float64)
+    if key not in document:
+        raise ModelFileError(f'known metal: {key} is missing')
+    try:
+        table = np.array(document[key], dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        what = 'a table of numbers' if shape else 'a number'
+        raise ModelFileError(f'known metal: {key} is not {what}') from error
     if table.ndim != len(shape) or any(
         want not in (-1, got) for want, got in zip(shape, table.shape, strict=True)
     ):
-        raise ValueError(f'{key} must have the shape {shape}, got {table.shape}')
+        wanted = ' x '.join('any' if side < 0 else str(side) for side in shape) or 'one number'
+        raise ModelFileError(f'known metal: {key} must be {wanted}, got the shape {table.shape}')
     if not np.isfinite(table).all():
-        raise ValueError(f'{key} holds values that are not finite')
+        raise ModelFileError(f'known metal: {key} holds values that are not finite')
     return table
