@@ -101,10 +101,10 @@ class KnownMetalFollower:
 
     def at(self, stamp_ns: int) -> tuple[FieldModel, Withheld | None]:
         """Return the field model for a frame, and why it is none to give poses by."""
-        seconds = (stamp_ns - self._last_ns) * NANO
-        if self._chosen is None or not self._near.size:
+        seconds = self._seconds_to(stamp_ns)
+        if self._chosen is None:
             return self.model, None
-        state = predicted(self._chosen.state, max(seconds, 0.0))
+        state = predicted(self._chosen.state, seconds)
         growth = max(self._chosen.ratio, 1.0)
         model, placed = field_of(self._scene, state, self._near, MODES, growth)
         reason = ''
@@ -128,14 +128,12 @@ class KnownMetalFollower:
 
     def take(self, stamp_ns: int, readings: Sequence[ToolReading]) -> None:
         """Take in what rigid tools read in a frame, at poses that are near theirs."""
+        seconds = self._seconds_to(stamp_ns)
         if not readings:
             return
-        seconds = (stamp_ns - self._last_ns) * NANO
         self._last_ns = stamp_ns
         if 0.0 < seconds < TRIAL_S:
             self._step_s = seconds
-        else:
-            self._forget()
         if self._chosen is not None:
             self._advance(self._chosen, seconds, readings)
             if self._chosen.ratio > HOPELESS:
@@ -149,8 +147,15 @@ class KnownMetalFollower:
             self._search(stamp_ns, readings)
         self._near = near_points(readings)
 
+    def _seconds_to(self, stamp_ns: int) -> float:
+        """Return the time since the last readings, and forget the metal where it is too long."""
+        seconds = (stamp_ns - self._last_ns) * NANO
+        if not 0.0 <= seconds < TRIAL_S:
+            self._forget()
+        return seconds
+
     def _forget(self) -> None:
-        self._tracks, self._chosen = [], None
+        self._tracks, self._chosen, self._searched_ns = [], None, 0
 
     def _search(self, stamp_ns: int, readings: Sequence[ToolReading]) -> None:
         """Begin tracks where metal would explain the readings of the first tool best."""

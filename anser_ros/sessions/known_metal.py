@@ -66,8 +66,8 @@ class KnownMetalModels:
     def at(self, frame: SessionFrame) -> FrameModel:
         """Return what a frame is tracked with."""
         self._stamp_ns = frame.stamp_ns
-        self.summary.states[FOLLOWED if self._follower.is_followed else SEARCHED] += 1
         model, withheld = self._follower.at(frame.stamp_ns)
+        self.summary.states[FOLLOWED if self._follower.is_followed else SEARCHED] += 1
         if model is not self._rough.model:
             self._rough = self._rough.with_model(model)
         return FrameModel(model, withheld)
