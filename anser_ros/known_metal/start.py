@@ -7,7 +7,7 @@ from scipy.linalg import solve_triangular
 from anser_ros.known_metal.known import KnownMetal
 from anser_ros.known_metal.lattice import Coils
 from anser_ros.known_metal.rows import coil_spread, real_parts
-from anser_ros.known_metal.track import Scene
+from anser_ros.known_metal.track import Scene, posed
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.tool_readings import ToolReading, linearised
 from anser_ros.settings import ToolSettings
@@ -58,8 +58,11 @@ def likely_starts(
     gain : float
         Logarithm of how much more likely the best one makes the readings than no metal does.
     """
+    sigma = coil_spread(len(reading.table), tools)
+    # What a pose that is off leaves beyond the first order would be taken for metal.
+    reading = posed(scene, scene.model, reading, 0.0 * sigma, np.diag(sigma**2))
     rows = linearised(reading, scene.model, scene.model.moments, scene.turn)
-    own = real_parts(rows.own) * coil_spread(len(rows.at), tools)
+    own = real_parts(rows.own) * sigma
     pose = real_parts(rows.pose)
     spread = pose @ pose.T + own @ own.T
     spread[np.diag_indices(len(spread))] += scene.noise**2

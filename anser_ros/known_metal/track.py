@@ -234,9 +234,25 @@ def _posed(
     lattice = scene.lattice(state.answers)
     whole = scene.setting.in_field(lattice, scene.setting.placed(lattice, state.pose), scene.model)
     own = 12 + len(state.answers) + columns
-    errors, spread = state.own[columns], state.covariance[np.ix_(own, own)]
+    return posed(scene, whole, reading, state.own[columns], state.covariance[np.ix_(own, own)])
+
+
+def posed(
+    scene: Scene, model: FieldModel, reading: ToolReading, errors: Array, spread: Array
+) -> ToolReading:
+    """Return a reading at the pose that fits with a model.
+
+    Parameters
+    ----------
+    scene : Scene
+    model : FieldModel
+    reading : ToolReading
+        At a pose that is right to some centimetres.
+    errors, spread : ndarray, shapes (7 S,), (7 S, 7 S)
+        Mean and covariance of the errors of its coils, as `CoilErrors`.
+    """
     for _ in range(POSE_ROUNDS):
-        rows = linearised(reading, whole, whole.moments, scene.turn)
+        rows = linearised(reading, model, model.moments, scene.turn)
         by_own, pose = real_parts(rows.own), real_parts(rows.pose)
         expected = by_own @ spread @ by_own.T + pose @ pose.T
         expected[np.diag_indices(len(expected))] += scene.noise**2
