@@ -1,0 +1,683 @@
+"""Known metal: physics of a lattice, its file, learning it, and following it by tools alone."""
+
+import json
+import re
+from contextlib import redirect_stdout
+from copy import deepcopy
+from dataclasses import replace
+from io import StringIO
+from types import SimpleNamespace
+
+import known_metal_world as world
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+from tracking_world import NOISE_T, certain_model
+
+from anser_ros.cli.main import main
+from anser_ros.errors import BagError, FitError, ModelFileError
+from anser_ros.known_metal import fit, follower
+from anser_ros.known_metal.fit import learn_metal
+from anser_ros.known_metal.follower import KnownMetalFollower
+from anser_ros.known_metal.known import KnownMetal, from_document, to_document
+from anser_ros.known_metal.lattice import (
+    Coils,
+    Lattice,
+    Setting,
+    ball_answer,
+    lattice_points,
+    moved,
+    step_between,
+)
+from anser_ros.physics.constants import MU_0
+from anser_ros.pose_states import MODEL_DOUBTFUL
+from anser_ros.sessions import metal_frames
+from anser_ros.sessions.chosen_references import with_references
+from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.known_metal_file import load_known_metal, save_known_metal
+from anser_ros.sessions.model_file import save_model
+from anser_ros.sessions.prepared import prepare
+from anser_ros.sessions.session import load_session
+from anser_ros.tracking.estimate import TrackerSettings
+
+TILT = np.log(np.array(certain_model().frequencies_hz) / 6500.0)
+POSE = np.array([0.03, -0.02, -0.11, 0.2, -0.1, 0.4])
+
+
+def lattice_of(points, unit=20.0, seed=2) -> Lattice:
+    """A lattice with any answers, about those of a conductor."""
+    rng = np.random.default_rng(seed)
+    n = len(points)
+    answers = -0.8 + 0.3 * rng.normal(size=n) + 0.3j * rng.normal(size=n)
+    slopes = 0.2 * rng.normal(size=n) + 0.2j * rng.normal(size=n)
+    return Lattice(np.asarray(points, dtype=float), unit, answers, slopes, 6500.0)
+
+
+@pytest.fixture(scope='module')
+def lattice() -> Lattice:
+    return lattice_of(lattice_points((2, 2, 2), 0.03), ball_answer(0.03))
+
+
+@pytest.fixture(scope='module')
+def setting() -> Setting:
+    return Setting(world.excitation(), TILT)
+
+
+@pytest.fixture(scope='module')
+def coils() -> Coils:
+    table = world.references()
+    return Coils(table.position, table.axis, np.full(len(table), 0.008))
+
+
+def by_hand(moment, away):
+    """The textbook's field of a dipole (Jackson, eq. 5.56), T."""
+    r = np.linalg.norm(away)
+    return MU_0 / (4 * np.pi) * (3 * away * (away @ moment) / r**5 - moment / r**3)
+
+
+class TestLattice:
+    """What a lattice makes of a field."""
+
+    def test_one_point_is_a_dipole_of_its_answer_times_the_field(self, setting):
+        one = Lattice(np.zeros((1, 3)), 20.0, np.array([-0.7 + 0.2j]), np.array([0.3j]), 6500.0)
+        at, axis = np.array([[0.05, -0.08, 0.15]]), np.array([[0.6, 0.0, 0.8]])
+        pose = np.concatenate([[0.02, 0.01, -0.1], [0.3, 0.2, 0.1]])
+        flux = setting.flux(one, setting.placed(one, pose), Coils(at, axis, None))
+        field = world.anser_board().field(pose[None, :3])[0]
+        for k, tilt in enumerate(TILT):
+            moment = 20.0 * (-0.7 + 0.2j + 0.3j * tilt) * field[k]
+            parts = [by_hand(part, at[0] - pose[:3]) for part in (moment.real, moment.imag)]
+            expected = (parts[0] + 1j * parts[1]) @ axis[0]
+            assert flux[0, k] == pytest.approx(expected, rel=1e-4)
+
+    def test_two_points_solve_the_coupled_equations(self):
+        points = np.array([[0.0, 0.0, 0.0], [0.02, 0.01, -0.015]])
+        two = lattice_of(points)
+        driving = np.random.default_rng(1).normal(size=6)
+        (moments,) = two.moments(driving[None], np.zeros(1))
+        first, second = moments[:3], moments[3:]
+        for here, there, own, answer in (
+            (first, second, driving[:3], two.answers[0]),
+            (second, first, driving[3:], two.answers[1]),
+        ):
+            away = points[0] - points[1]
+            felt = own + by_hand(there.real, away) + 1j * by_hand(there.imag, away)
+            np.testing.assert_allclose(here, 20.0 * answer * felt, rtol=1e-9)
+        alone = 20.0 * np.repeat(two.answers, 3) * driving
+        assert np.abs(moments - alone).max() > 0.05 * np.abs(alone).max(), 'they drive each other'
+
+    def test_points_far_apart_do_not_drive_each_other(self):
+        two = lattice_of([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0]])
+        driving = np.ones((1, 6))
+        alone = 20.0 * np.repeat(two.answers, 3)
+        np.testing.assert_allclose(two.moments(driving, np.zeros(1))[0], alone, rtol=1e-8)
+
+    def test_the_response_is_reciprocal_at_any_frequency(self, lattice):
+        _, response, _ = lattice.scattering
+        base, sloped = lattice.responses
+        for matrix in (response, base, sloped):
+            np.testing.assert_allclose(matrix, matrix.T, rtol=0, atol=1e-9 * abs(matrix).max())
+        assert np.abs(response - np.diag(np.diag(response))).max() > 0.01 * np.abs(response).max()
+
+    def test_the_slope_is_the_change_with_the_frequency(self, lattice):
+        driving, step = np.random.default_rng(3).normal(size=(1, 24)), 1e-4
+        there = replace(lattice, answers=lattice.answers + step * lattice.slopes)
+        change = (there.moments(driving, np.zeros(1)) - lattice.moments(driving, np.zeros(1)))[0]
+        sloped = lattice.moments(driving, np.ones(1)) - lattice.moments(driving, np.zeros(1))
+        np.testing.assert_allclose(change / step, sloped[0], atol=1e-3 * np.abs(sloped).max())
+
+    def test_a_small_change_of_the_answers_is_right_to_first_order(self, lattice):
+        rng = np.random.default_rng(4)
+        driving, change = rng.normal(size=(8, 24)), rng.normal(size=4 * len(lattice))
+        # The slopes themselves are first order: what both do together is left out.
+        tilt = np.full(8, 1e-9)
+        left = []
+        for size in (0.02, 0.01):
+            whole = lattice.with_parameters(lattice.parameters + size * change)
+            near = lattice.near(size * change)
+            exact = whole.moments(driving, tilt)
+            left.append(np.abs(near.moments(driving, tilt) - exact).max())
+            assert left[-1] < 0.2 * np.abs(exact - lattice.moments(driving, tilt)).max()
+        assert left[0] / left[1] == pytest.approx(4.0, rel=0.1), 'of second order'
+
+    def test_no_change_near_is_the_same_lattice(self, lattice):
+        driving = np.random.default_rng(5).normal(size=(8, 24))
+        near = lattice.near(np.zeros(4 * len(lattice)))
+        np.testing.assert_allclose(
+            near.moments(driving, TILT), lattice.moments(driving, TILT), rtol=1e-9
+        )
+
+    def test_a_change_of_the_slopes_alone_is_right_in_full(self, lattice):
+        rng, n = np.random.default_rng(5), len(lattice)
+        driving = rng.normal(size=(8, 3 * n))
+        change = np.concatenate([np.zeros(2 * n), rng.normal(size=2 * n)])
+        whole = lattice.with_parameters(lattice.parameters + change)
+        near = lattice.near(change).moments(driving, TILT)
+        np.testing.assert_allclose(near, whole.moments(driving, TILT), rtol=1e-9)
+
+    def test_parameters_are_what_they_make(self, lattice):
+        again = lattice.with_parameters(lattice.parameters)
+        np.testing.assert_array_equal(again.answers, lattice.answers)
+        np.testing.assert_array_equal(again.slopes, lattice.slopes)
+
+    def test_columns_by_the_pose_are_the_differences(self, lattice, setting, coils):
+        columns = setting.pose_columns(lattice, POSE, coils)
+        for i, size in enumerate([2e-5] * 3 + [2e-4] * 3):
+            step = size * np.eye(6)[i]
+            ends = [
+                setting.flux(lattice, setting.placed(lattice, moved(POSE, way)), coils)
+                for way in (step, -step)
+            ]
+            slope = (ends[0] - ends[1]) / (2 * size)
+            np.testing.assert_allclose(
+                columns[..., i], slope, rtol=0, atol=2e-3 * np.abs(slope).max()
+            )
+
+    def test_columns_by_the_answers_are_the_differences(self, lattice, setting, coils):
+        # With slopes, they leave out what a changed answer makes of these: that is second order.
+        flat = replace(lattice, slopes=0.0 * lattice.slopes)
+        placed = setting.placed(flat, POSE)
+        columns = setting.answer_columns(lattice, placed, coils)
+        for i, step in enumerate(1e-4 * np.eye(4 * len(flat))):
+            ends = [
+                setting.flux(flat.with_parameters(flat.parameters + way), placed, coils)
+                for way in (step, -step)
+            ]
+            atol = 1e-6 * np.abs(columns).max()
+            np.testing.assert_allclose(columns[..., i], (ends[0] - ends[1]) / 2e-4, 0, atol)
+
+    def test_a_model_with_it_reads_what_it_adds(self, lattice, setting, coils):
+        placed, model = setting.placed(lattice, POSE), certain_model()
+        whole = setting.in_field(lattice, placed, model)
+        told = (coils.at, coils.axes, coils.lengths)
+        added = whole.flux(*told) - model.flux(*told)
+        flux = setting.flux(lattice, placed, coils) * setting.excitation.phase
+        np.testing.assert_allclose(added, flux, rtol=0, atol=1e-9 * np.abs(flux).max())
+
+    def test_many_poses_at_once_are_one_after_the_other(self, lattice, setting, coils):
+        poses = np.array([POSE, moved(POSE, np.full(6, 0.05))])
+        one_by_one = [setting.flux(lattice, setting.placed(lattice, p), coils) for p in poses]
+        np.testing.assert_allclose(setting.fluxes(lattice, poses, coils), one_by_one, rtol=1e-9)
+
+    def test_a_step_leads_where_it_says(self):
+        other = np.array([0.1, 0.2, -0.3, -0.5, 0.4, 0.9])
+        step = step_between(POSE, other)
+        np.testing.assert_allclose(moved(POSE, step), other, atol=1e-12)
+        turned = Rotation.from_rotvec(step[3:]) * Rotation.from_rotvec(POSE[3:])
+        np.testing.assert_allclose(turned.as_rotvec(), other[3:], atol=1e-12)
+
+    def test_a_ball_answers_as_a_perfect_conductor(self):
+        polarizability = world.of_world('spheres').polarizability
+        theirs = polarizability(0.02, 1e13, 1.0, 2 * np.pi * 6500)
+        assert -ball_answer(0.04) == pytest.approx(theirs.real, rel=2e-3)
+
+
+def known_of(lattice, directions=3) -> KnownMetal:
+    """Metal that nobody has learnt."""
+    rng = np.random.default_rng(6)
+    return KnownMetal(
+        'lump', lattice, rng.normal(size=(4 * len(lattice), directions)), 0.01 / 3, 3.1e-6 / 7,
+        0.1, *rng.normal(size=(3, 3)),
+    )  # fmt: skip
+
+
+class TestFile:
+    """The document of known metal."""
+
+    def test_it_comes_back_bit_by_bit(self, lattice, tmp_path):
+        known = known_of(lattice)
+        save_known_metal(tmp_path / 'new' / 'a.yaml', known)
+        again = load_known_metal(tmp_path / 'new' / 'a.yaml')
+        for name in ('directions', 'low', 'high', 'turn'):
+            np.testing.assert_array_equal(getattr(again, name), getattr(known, name))
+        for name in ('name', 'misfit', 'strongest_t', 'nearest_m'):
+            assert getattr(again, name) == getattr(known, name)
+        for name in ('points', 'answers', 'slopes', 'unit', 'frequency_hz'):
+            np.testing.assert_array_equal(
+                getattr(again.lattice, name), getattr(known.lattice, name)
+            )
+
+    @pytest.mark.parametrize(
+        ('key', 'value', 'words'),
+        [
+            ('schema', 'anser_model/1', "its schema must be 'anser_known_metal/1'"),
+            ('name', 5, 'name must be a text, got 5'),
+            ('name', ' ', "name must be a text, got ' '"),
+            ('unit', -1.0, 'unit must be positive, got -1'),
+            ('unit', None, 'unit is missing'),
+            ('misfit', 'small', 'misfit is not a number'),
+            pytest.param('misfit', 10**400, 'misfit is not a number', id='too large'),
+            ('nearest_m', [0.1], 'nearest_m must be one number, got the shape (1,)'),
+            ('strongest_t', float('nan'), 'strongest_t holds values that are not finite'),
+            ('frequency_hz', 0, 'frequency_hz must be positive, got 0'),
+            ('points', [], 'points must be any x 3, got the shape (0,)'),
+            ('points', [[0.0, 1.0]], 'points must be any x 3, got the shape (1, 2)'),
+            ('points', [[0.0], [1.0, 2.0]], 'points is not a table of numbers'),
+            ('points', None, 'points is missing'),
+            ('parameters', [0.0] * 31, 'parameters must be 32, got the shape (31,)'),
+            ('parameters', [float('inf')] * 32, 'parameters holds values that are not finite'),
+            ('directions', [[0.0] * 31], 'directions must be any x 32, got the shape (1, 31)'),
+            ('low_m', [0.0, 1.0], 'low_m must be 3, got the shape (2,)'),
+            ('high_m', {'x': 1.0}, 'high_m is not a table of numbers'),
+            ('turn_rad', None, 'turn_rad is missing'),
+        ],
+    )
+    def test_what_is_wrong_with_it_is_a_line(self, lattice, tmp_path, key, value, words):
+        document = to_document(known_of(lattice))
+        from_document(document)
+        if value is None:
+            del document[key]
+        else:
+            document[key] = value
+        path = tmp_path / 'a.yaml'
+        path.write_text(yaml.safe_dump(document), encoding='utf-8')
+        with pytest.raises(ModelFileError) as raised:
+            load_known_metal(path)
+        said = str(raised.value)
+        assert said.startswith(f'{path}: ') and said.endswith(words) and '\n' not in said
+
+    @pytest.mark.parametrize(
+        ('content', 'words'),
+        [(b'\xff\xfe\xff', 'not a text'), (b'a: [1\nb: ]', 'not YAML'), (b'- 1', 'its schema')],
+    )
+    def test_a_file_of_something_else_is_a_line(self, tmp_path, content, words):
+        path = tmp_path / 'a.yaml'
+        path.write_bytes(content)
+        with pytest.raises(ModelFileError, match=words) as raised:
+            load_known_metal(path)
+        assert str(raised.value).startswith(f'{path}: ') and '\n' not in str(raised.value)
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory):
+    """The lump on two ways, the board without it, and the board's model, as files."""
+    folder, lump = tmp_path_factory.mktemp('known_metal'), world.lump()
+    save_model(folder / 'model.yaml', certain_model())
+    world.write(folder / 'scan.mcap', world.session(world.SWEEP, None, 10, 1))
+    world.write(folder / 'sweep.mcap', world.session(world.SWEEP, lump, 38, 2, rate_hz=4.5))
+    return folder
+
+
+@pytest.fixture(scope='module', autouse=True)
+def small():
+    """A small lattice of few frames, and a follower that decides soon among few places."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, 'COUNTS', (3, 3, 2))
+        patch.setattr(fit, 'SPACINGS_M', (0.02, 0.03))
+        patch.setattr(fit, 'TRIAL_FRAMES', 6)
+        patch.setattr(fit, 'TRIAL_ROUNDS', 6)
+        patch.setattr(fit, 'ROUNDS', 12)
+        patch.setattr(metal_frames, 'FRAMES', 30)
+        patch.setattr(metal_frames, 'SMOOTHED', 2)
+        patch.setattr(follower, 'CANDIDATES', 2)
+        patch.setattr(follower, 'TRIAL_S', 0.5)
+        yield
+
+
+@pytest.fixture(scope='module')
+def seen():
+    """What the refit would find, which takes half a minute to prepare, is stated."""
+    with pytest.MonkeyPatch.context() as patch:
+        tables = SimpleNamespace(excitation=world.excitation())
+        patch.setattr(metal_frames, 'build_tables', lambda *given, report: tables)
+        patch.setattr(
+            metal_frames, 'LiveRefit', lambda *given, **told: world.RefitThatSees(world.SWEEP)
+        )
+        yield
+
+
+def learn_words(bags, out):
+    return [
+        'known_metal', str(bags / 'sweep.mcap'), '--model', str(bags / 'model.yaml'),
+        '--baseline', str(bags / 'scan.mcap'), '--name', 'lump', '--out', str(out),
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def learnt(bags, seen):
+    """What the command says that it has learnt from the sweep, and writes into a new folder."""
+    with redirect_stdout(StringIO()) as said:
+        assert main([*learn_words(bags, bags / 'made' / 'lump.yaml'), '--json']) == 0
+    return json.loads(said.getvalue()), load_known_metal(bags / 'made' / 'lump.yaml')
+
+
+@pytest.fixture(scope='module')
+def known(learnt) -> KnownMetal:
+    """The lump, learnt from the sweep."""
+    return learnt[1]
+
+
+@pytest.mark.long
+class TestLearning:
+    """What is learnt of the lump, and of what nothing is."""
+
+    def test_it_tells_where_the_lump_was_and_what_drove_it(self, known):
+        places, turns = world.SWEEP(np.linspace(0.0, 8.0, 30))
+        spheres = places[:, None] + world.lump()[0] @ turns.swapaxes(1, 2)
+        field = world.anser_board().field(spheres.reshape(-1, 3))
+        driven = np.sqrt((field**2).sum(axis=2).mean(axis=1).max())
+        away = spheres.reshape(-1, 1, 3) - world.references().position
+        assert known.name == 'lump' and len(known.lattice) == 18
+        assert 0.0 < known.misfit < 0.03
+        assert known.strongest_t == pytest.approx(driven, rel=0.3)
+        assert known.nearest_m == pytest.approx(np.linalg.norm(away, axis=2).min(), abs=0.02)
+        extent = places.max(axis=0) - places.min(axis=0)
+        np.testing.assert_allclose(known.high - known.low, extent, atol=0.03)
+
+    def test_the_size_that_explains_it_is_chosen(self, known):
+        spacing = np.ptp(known.lattice.points, axis=0)[0] / 2
+        assert spacing == pytest.approx(0.02), 'the lump is 10 cm wide, its currents less'
+
+    def test_what_no_piece_explains_is_refused(self, bags, seen, monkeypatch):
+        monkeypatch.setattr(fit, 'TRIAL_ROUNDS', 1)
+        monkeypatch.setattr(fit, 'ROUNDS', 2)
+        frames, rng = frames_of(bags, 8), np.random.default_rng(9)
+        torn = []
+        for frame in frames:
+            reading, *tools = frame.readings
+            signs = rng.choice([-1.0, 1.0], reading.change.shape)
+            torn.append(
+                replace(frame, readings=(replace(reading, change=reading.change * signs), *tools))
+            )
+        given = world.excitation(), certain_model().frequencies_hz, volume_of(bags), NOISE_T
+        with pytest.raises(FitError, match=r'^no rigid piece of metal .* \d+% of it is left'):
+            learn_metal(torn, *given, 'lump')
+
+    def test_a_session_without_what_is_needed_is_refused(self, bags, seen):
+        session, scan = load_session(bags / 'sweep.mcap'), load_session(bags / 'scan.mcap')
+        prepared = prepare(session, certain_model(), scan)
+        (tool,) = session.tools
+        blind = replace(tool, has_pose=np.zeros_like(tool.has_pose), track=None)
+        for wrong, words in (
+            (replace(prepared, session=with_references(session, [])), 'there are none'),
+            (replace(prepared, session=replace(session, reference=None)), 'there are none'),
+            (replace(prepared, baseline=None), 'metal is learnt against --baseline'),
+            (
+                replace(prepared, session=replace(session, tools=(blind,))),
+                'no tool has optical poses while metal is there',
+            ),
+            (
+                replace(
+                    prepared,
+                    session=replace(session, reference=session.reference.frames(slice(0, 20))),
+                ),
+                'the references see metal in 20 frames, 30 are needed',
+            ),
+        ):
+            with pytest.raises(BagError, match=words):
+                metal_frames.learn(wrong, 'lump')
+
+
+def volume_of(bags):
+    return prepare(load_session(bags / 'scan.mcap'), certain_model()).volume
+
+
+def frames_of(bags, count):
+    """So many frames of the sweep, as they are learnt from."""
+    scan = load_session(bags / 'scan.mcap')
+    prepared = prepare(load_session(bags / 'sweep.mcap'), certain_model(), scan)
+    refit = world.RefitThatSees(world.SWEEP)
+    return metal_frames.metal_frames(prepared, refit, world.PHASE, count)
+
+
+@pytest.mark.long
+def test_frames_hold_what_metal_adds_to_references_and_tools(bags, seen):
+    frames = frames_of(bags, 5)
+    assert len(frames) == 5 and frames[0].time == 0.0 and len(frames[0].readings) == 2
+    table, tool = world.references(), world.TOOL
+    for frame in frames:
+        place, turn = (one[0] for one in world.SWEEP(np.array([frame.time])))
+        np.testing.assert_allclose(frame.place, place + world.HIDDEN, atol=0.03)
+        position, rotation = (one[0] for one in world.tool_path(np.array([frame.time])))
+        geometry = (table.position, table.axis), tool.placed(position, rotation)
+        for reading, (at, axes) in zip(frame.readings, geometry, strict=True):
+            np.testing.assert_allclose(reading.coils.at, at, atol=1e-5)
+            true = world.metal_flux(world.lump(), place, turn, at, axes) / world.PHASE
+            assert np.abs(reading.change - true).max() < 8 * NOISE_T
+    assert frames[0].readings[0].shared.shape[1] == 0
+    assert frames[0].readings[1].shared.shape == (2 * 9 * 8, 6 + 7 * 9)
+
+
+def follower_of(known, made) -> KnownMetalFollower:
+    model, setup = certain_model(), made.setup
+    prepared = prepare(made, model)
+    return KnownMetalFollower(
+        known, model, world.excitation(), made.sensors, setup.refit.tools, prepared.volume, NOISE_T
+    )
+
+
+def stamp(made, row) -> int:
+    return world.START_NS + round(made.tools[0].time[row] * 1e9)
+
+
+def followed(subject, made, rows):
+    """Run over frames: whether the metal was followed, its place, and why no pose is given."""
+    out = []
+    for row in rows:
+        model, withheld = subject.at(stamp(made, row))
+        assert (model is not subject.model) == subject.is_followed
+        place = None if subject.place is None else subject.place.copy()
+        subject.take(stamp(made, row), world.readings(made, row))
+        out.append((subject.is_followed, place, withheld))
+    return out
+
+
+@pytest.fixture(scope='module')
+def dive():
+    return world.session(world.DIVE, world.lump(), 25, 4)
+
+
+@pytest.fixture(scope='module')
+def begun(known, dive):
+    """A follower after nine frames of metal that comes nearer and nearer, and what it did."""
+    subject = follower_of(known, dive)
+    return subject, followed(subject, dive, range(9))
+
+
+@pytest.fixture
+def subject(begun):
+    """A follower that follows the lump after nine frames."""
+    return deepcopy(begun[0])
+
+
+@pytest.mark.long
+class TestFollowing:
+    """The field model of every frame."""
+
+    def test_without_metal_the_calibrated_model_stays_in_force(self, known):
+        made = world.session(world.APPROACH, None, 12, 5)
+        subject = follower_of(known, made)
+        for row in range(12):
+            model, withheld = subject.at(stamp(made, row))
+            assert model is subject.model and withheld is None
+            subject.take(stamp(made, row), world.readings(made, row))
+            assert not subject.is_followed and subject.place is None
+            assert not subject._tracks, 'not even a trial'
+
+    def test_metal_is_followed_until_it_is_driven_too_strongly(self, begun, subject, dive):
+        run = begun[1] + followed(subject, dive, range(9, 25))
+        assert [is_followed for is_followed, *_ in run] == [False] * 7 + [True] * 18
+        assert not any(withheld for *_, withheld in run[:12])
+        for *_, withheld in run[-3:]:
+            assert withheld is not None and withheld.state == MODEL_DOUBTFUL
+            words = r'lump is driven [12]\.\d times as strongly as it was learnt'
+            assert re.fullmatch(words, withheld.reason)
+
+    def test_metal_nearer_to_a_coil_than_learnt_withholds_poses(self, subject, dive):
+        assert subject.at(stamp(dive, 9))[1] is None
+        subject._known = replace(subject._known, nearest_m=0.5)
+        _, withheld = subject.at(stamp(dive, 9))
+        assert withheld is not None and withheld.state == MODEL_DOUBTFUL
+        words = r'a coil is \d+ mm from lump, nearer than it was learnt'
+        assert re.fullmatch(words, withheld.reason)
+
+    def test_metal_that_answers_otherwise_withholds_poses_and_is_given_up(self, subject, dive):
+        (tool,) = dive.tools
+        clean = world.session(world.DIVE, None, 13, 4).tools[0].flux
+        flux = tool.flux.copy()
+        flux[9:13] = clean[9:] - 1.6 * (tool.flux[9:13] - clean[9:])
+        run = followed(subject, replace(dive, tools=(replace(tool, flux=flux),)), range(9, 13))
+        assert not run[0][2], 'the first such frame is not known yet'
+        withheld = run[1][2]
+        assert withheld is not None and withheld.state == MODEL_DOUBTFUL
+        words = r'lump leaves \d\.\d times as much of the readings as expected'
+        assert re.fullmatch(words, withheld.reason)
+        assert not run[-1][0], 'given up'
+
+    def test_a_gap_in_time_forgets(self, subject, dive):
+        assert subject.is_followed
+        later = stamp(dive, 8) + 600_000_000
+        model, withheld = subject.at(later)
+        assert model is subject.model and withheld is None and not subject.is_followed
+
+    def test_frames_without_readings_are_a_gap_too(self, subject, dive):
+        for row in range(9, 12):
+            subject.take(stamp(dive, row), [])
+            assert subject.is_followed
+        seen, real = [], follower.predicted
+
+        def noting(state, seconds):
+            seen.append(seconds)
+            return real(state, seconds)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(follower, 'predicted', noting)
+            subject.take(stamp(dive, 12), world.readings(dive, 12))
+        assert seen == pytest.approx([0.32]), 'four steps, not one'
+        for row in range(13, 21):
+            subject.take(stamp(dive, row), [])
+        assert not subject.is_followed
+
+    def test_an_earlier_recording_is_begun_anew(self, subject, dive):
+        run = followed(subject, dive, range(9))
+        assert not run[0][0] and run[8][0], 'forgotten, and found again'
+
+
+def jumping(time):
+    """The approach, with a jump sideways."""
+    place, turn = world.APPROACH(time)
+    return place + (time > 2.5)[:, None] * [-0.1, 0.05, 0.01], turn
+
+
+def body_errors(evaluation):
+    """Errors of the body's poses over their sigmas, and in m; NaN where there is none."""
+    (series,) = evaluation.bodies.values()
+    sigma = np.array([one.sigma_position_m for one in series.estimates])
+    return series.position_error / sigma, series.position_error
+
+
+@pytest.mark.long
+class TestTracking:
+    """Poses of the tool, by the field that it has itself found the metal with."""
+
+    def test_its_poses_are_as_good_as_without_metal_and_honest(self, known):
+        session, model = world.session(world.APPROACH, world.lump(), 50, 3), certain_model()
+        tracked = track_session(session, model, known_metal=known)
+        frozen = track_session(session, model)
+        late = np.arange(50) > 25
+        score, error = body_errors(tracked)
+        assert tracked.refit.states['followed'] >= 40
+        assert np.isfinite(error).all() and score.max() < 3.0
+        assert np.sqrt(np.mean(error[late] ** 2)) < 0.05e-3
+        _, without = body_errors(frozen)
+        assert np.isfinite(without[late]).mean() < 0.5, 'its poses are withheld'
+        ungated = track_session(session, model, TrackerSettings(gate=np.inf))
+        _, without = body_errors(ungated)
+        assert np.sqrt(np.mean(error[late] ** 2)) < 0.1 * np.sqrt(np.mean(without[late] ** 2))
+
+    def test_no_pose_is_given_where_the_metal_was(self, known):
+        session = world.session(jumping, world.lump(), 50, 11)
+        score, error = body_errors(track_session(session, certain_model(), known_metal=known))
+        good = np.isfinite(error)
+        assert good[:30].all() and good[-8:].all()
+        assert score[good].max() < 3.0
+
+    @pytest.mark.parametrize(
+        'metal', [None, ('ferrite_steel', 0.06, 5)], ids=['no metal', 'other metal']
+    )
+    def test_without_the_metal_all_is_as_with_the_calibrated_model(self, known, metal):
+        lump = None if metal is None else world.lump(*metal)
+        session, model = world.session(world.APPROACH, lump, 12, 12), certain_model()
+        tracked = track_session(session, model, known_metal=known)
+        frozen = track_session(session, model)
+        assert tracked.refit.states == {'not_found': 12}
+        both = {**tracked.bodies, **tracked.sensors}
+        for name, series in {**frozen.bodies, **frozen.sensors}.items():
+            others = both[name].estimates
+            for one, other in zip(series.estimates, others, strict=True):
+                assert one.state == other.state
+                np.testing.assert_array_equal(one.position, other.position)
+                np.testing.assert_array_equal(one.rotation, other.rotation)
+
+
+@pytest.mark.long
+class TestCommands:
+    """What the two commands say and write."""
+
+    def test_the_command_says_what_it_has_learnt(self, learnt):
+        said, known = learnt
+        assert said['name'] == 'lump' and said['points'] == 18
+        for name in ('misfit', 'strongest_t', 'nearest_m'):
+            assert said[name] == getattr(known, name)
+
+    def test_evaluate_says_in_how_many_frames_it_was_followed(
+        self, bags, known, capsys, monkeypatch
+    ):
+        monkeypatch.setattr('anser_ros.cli.evaluate.write_figures', lambda *given, **told: [])
+        world.write(bags / 'short.mcap', world.session(world.APPROACH, world.lump(), 12, 3))
+        words = ['evaluate', str(bags / 'short.mcap'), '--model', str(bags / 'model.yaml')]
+        out = bags / 'followed'
+        words += ['--known-metal', str(bags / 'made' / 'lump.yaml'), '--out', str(out)]
+        assert main(words) == 0
+        states = json.loads((out / 'evaluation.json').read_text())['refit']['states']
+        assert states == {'followed': 4, 'not_found': 8}
+        said = 'known metal: not_found in 8 frames, followed in 4 frames'
+        assert said in ' '.join(capsys.readouterr().out.split())
+        assert (out / 'poses.csv').read_text().count('\n') > 12 * 9
+
+    @pytest.mark.parametrize(
+        ('changes', 'words'),
+        [
+            ({'--baseline': 'sweep.mcap'}, 'baseline'),
+            ({'--baseline': 'none.mcap'}, 'none.mcap: no such bag'),
+            ({'--model': 'none.yaml'}, 'none.yaml: No such file'),
+            ({'--name': ' '}, '--name must not be empty'),
+            ({'--out': 'scan.mcap/x.yaml'}, 'scan.mcap'),
+            ({'known_metal': 'plain.mcap'}, 'there are none'),
+        ],
+    )
+    def test_what_nothing_is_learnt_from_is_a_line(
+        self, bags, seen, monkeypatch, capsys, changes, words
+    ):
+        monkeypatch.chdir(bags)
+        if not (bags / 'plain.mcap').exists():
+            made = world.session(world.SWEEP, None, 3, 1)
+            world.write(bags / 'plain.mcap', replace(made, reference=None))
+        arguments = learn_words(bags, bags / 'new.yaml')
+        for option, value in changes.items():
+            arguments[arguments.index(option) + 1] = value
+        assert main(arguments) == 2
+        said = capsys.readouterr()
+        assert said.err.startswith('anser known_metal: ') and words in said.err
+        assert said.out == '' and said.err.count('\n') == 1 and not (bags / 'new.yaml').exists()
+
+    @pytest.mark.parametrize(
+        ('others', 'words'),
+        [
+            (['--refit', '--baseline', 'scan.mcap'], 'leave out --refit, --baseline and --patch'),
+            (['--baseline', 'scan.mcap'], 'leave out --refit, --baseline and --patch'),
+            (['--known-metal', 'none.yaml'], 'none.yaml: No such file'),
+            (['--known-metal', 'model.yaml'], "its schema must be 'anser_known_metal/1'"),
+            (['--known-metal', 'scan.mcap'], 'scan.mcap: not'),
+        ],
+    )
+    def test_what_is_not_evaluated_with_it_is_a_line(
+        self, bags, known, monkeypatch, capsys, others, words
+    ):
+        monkeypatch.chdir(bags)
+        arguments = ['evaluate', 'sweep.mcap', '--model', 'model.yaml', '--out', 'refused']
+        assert main([*arguments, '--known-metal', 'made/lump.yaml', *others]) == 2
+        said = capsys.readouterr()
+        assert said.err.startswith('anser evaluate: ') and words in said.err
+        assert said.err.count('\n') == 1 and not (bags / 'refused').exists()
