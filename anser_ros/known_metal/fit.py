@@ -43,6 +43,7 @@ PLACE_SIGMA_M, TURN_SIGMA = 0.06, 0.3
 MOVE_M, MOVE_RAD = 0.06, 0.1
 """How far it may move and turn between two of the frames."""
 ROUNDS, TRIAL_ROUNDS = 24, 10
+"""Most rounds of the fit, and of a trial of a size."""
 ENOUGH, STAGE_ENOUGH = 3e-3, 0.1
 """Relative gain of a round below which the fit, or a stage of it, has ended."""
 

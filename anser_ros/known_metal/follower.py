@@ -32,11 +32,13 @@ Array = NDArray[np.float64]
 CANDIDATES = 4
 """Tracks that are followed at once until one is chosen."""
 TRIAL_S, SEARCH_AGAIN_S = 1.0, 1.0
-"""How long they are followed, and how long a search that found nothing is not repeated."""
+"""How long they are followed, which is also the longest time without readings for which metal is
+still known to be there, and how long a search that found nothing is not repeated."""
 CERTAIN = 10.0
 """Logarithm of how much more likely the chosen one must make the readings than no metal, or metal
 `ELSEWHERE_M` away."""
 ELSEWHERE_M = 0.04
+"""Distance from which on two tracks are of different places, m."""
 DOUBTFUL, HOPELESS = 3.0, 9.0
 """Squared misfit, over what is expected, from which on no pose is given, and the track is given
 up."""

@@ -48,11 +48,13 @@ POSE_ROUNDS, ROUNDS = 2, 2
 """Steps of the tool's pose with the metal as predicted, and of both: the first step of a tool that
 is displaced by millimetres must not move the metal."""
 NEAR_M = 0.01
+"""How far around a coil's place."""
 _AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 """Where the field's uncertainty is worked out: a coil's place, and a tetrahedron around it."""
 FAR = 1.0
 """Change of the answers' factors from which on their screening is worked out anew."""
 RATES = slice(6, 12)
+"""Of a state's step, the change of the rates."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ FRAMES = 80
 SMOOTHED = 12
 """Frames before and after over which the refit's place of the metal is averaged, half a second."""
 SAME_TIME_S = 1e-4
+"""Difference of the stamps of references and tools in one frame, at most."""
 
 
 def learn(
