@@ -13,6 +13,7 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.tables import RefitTables
 from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised
+from anser_ros.refit.witness import CONTRADICTION_S, _Errors, _Filter, _kalman
 from anser_ros.sessions.chosen_references import with_references
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model
@@ -172,6 +173,24 @@ def test_the_errors_of_coils_have_the_sigma_that_they_say():
         scores.append((mean - true) / np.sqrt(np.diagonal(covariance)))
     assert 0.2 < np.sqrt(np.mean(np.square(scores))) < 1.1
     assert np.sqrt(np.diagonal(covariance)).max() < scale.max()
+
+
+@pytest.mark.parametrize('size', [0.0, 4.0])
+def test_a_contradiction_that_lasts_is_not_counted_in_every_frame(size):
+    """Errors in units of their sigma after fifty frames that are off by nearly the same."""
+    rng, step_s, n, d = np.random.default_rng(5), 0.04, 40, 6
+    keep, scores = np.exp(-step_s / CONTRADICTION_S), []
+    repeated = 1.0 + 2.0 * CONTRADICTION_S / step_s
+    errors = _Errors(np.eye(n), np.zeros((n, n)), np.zeros((n, n)), 1.0, repeated)
+    for _ in range(20):
+        true, off = rng.normal(size=d), size * rng.normal(size=n)
+        state = _Filter(np.zeros((d, 2)), np.stack([np.eye(d)] * 2), np.stack([np.eye(d)] * 2))
+        for _ in range(50):
+            off = keep * off + np.sqrt(1.0 - keep**2) * size * rng.normal(size=n)
+            rows = np.linspace(-1.0, 1.0, n)[:, None] ** np.arange(d)
+            _kalman(state, 0, errors, rows, rows @ true + off + rng.normal(size=n))
+        scores.append((state.mean[:, 0] - true) / np.sqrt(np.diagonal(state.covariance[0])))
+    assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.2
 
 
 def test_witnesses_need_a_refit_and_references(tmp_path, capsys):
