@@ -50,7 +50,7 @@ TARGETS = {
     ('approach', 'coils', 32): 0.15, ('sweep', 'coils', 4): 0.3, ('sweep', 'coils', 8): 0.17,
     ('sweep', 'body', 0): 1.0, ('sweep', 'coils', 32): 0.124,
 }  # fmt: skip
-REPORTED_SEED = 101
+REPORTED_SEED = 102
 
 
 def few(session: Session, count: int) -> Session:
