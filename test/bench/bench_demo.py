@@ -76,9 +76,8 @@ def _told(bag: str) -> tuple[dict[str, dict[int, int]], list[tuple[float, float]
     ages: list[tuple[float, float]] = []
     decoder = MessageDecoder()
     for raw in iter_messages(bag, Salvage()):
-        if raw.topic.startswith(OTHERS):
-            continue
-        if raw.topic.endswith('/pose'):
+        is_own = raw.topic.startswith('/anser/') and not raw.topic.startswith(OTHERS)
+        if is_own and raw.topic.endswith('/pose'):
             stamp = decoder.decode(raw).header.stamp
             of_topic = poses.setdefault(raw.topic, {})
             of_topic[stamp.sec * SECOND_NS + stamp.nanosec] = raw.log_time_ns
