@@ -586,7 +586,7 @@ class TestTracking:
         _, without = body_errors(ungated)
         assert np.sqrt(np.mean(error[late] ** 2)) < 0.1 * np.sqrt(np.mean(without[late] ** 2))
 
-    def test_no_pose_is_given_where_the_metal_was(self, known):
+    def test_metal_that_jumps_is_caught_up_with_and_its_poses_are_honest(self, known):
         session = world.session(jumping, world.lump(), 50, 11)
         score, error = body_errors(track_session(session, certain_model(), known_metal=known))
         good = np.isfinite(error)
