@@ -525,6 +525,26 @@ class TestFollowing:
         assert re.fullmatch(words, withheld.reason)
         assert not run[-1][0], 'given up'
 
+    def test_the_uncertainty_of_the_field_is_that_of_the_metal(self, subject, dive):
+        scene, state = subject._scene, subject._chosen.state
+        scene.misfit = 1e-6
+        at, axes = world.TOOL.placed(dive.tools[0].position[8], dive.tools[0].rotation[8])
+        model, placed = follower.field_of(scene, state, at, 24, 1.0)
+        modes = [replace(model, moments=one, modes=None).flux(at, axes) for one in model.modes]
+        which = np.r_[0:6, 12 : 12 + len(state.answers)]
+        spread = 0.01 * state.covariance[np.ix_(which, which)]
+        draws = np.random.default_rng(13).multivariate_normal(np.zeros(len(which)), spread, 200)
+        coils, change = Coils(at, axes, None), []
+        before = scene.setting.flux(scene.lattice(state.answers), placed, coils)
+        for draw in draws:
+            lattice = scene.lattice(state.answers + draw[6:])
+            there = scene.setting.placed(lattice, moved(state.pose, draw[:6]))
+            change.append(scene.setting.flux(lattice, there, coils) - before)
+        told, drawn = (
+            np.abs(values).ravel() @ np.abs(values).ravel() for values in (modes, change)
+        )
+        assert told == pytest.approx(100.0 * drawn / 200, rel=0.25)
+
     def test_a_gap_in_time_forgets(self, subject, dive):
         assert subject.is_followed
         later = stamp(dive, 8) + 600_000_000
