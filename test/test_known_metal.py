@@ -543,7 +543,7 @@ class TestFollowing:
         told, drawn = (
             np.abs(values).ravel() @ np.abs(values).ravel() for values in (modes, change)
         )
-        assert told == pytest.approx(100.0 * drawn / 200, rel=0.25)
+        assert 2.0 * told / drawn == pytest.approx(1.0, rel=0.25)
 
     def test_a_gap_in_time_forgets(self, subject, dive):
         assert subject.is_followed
