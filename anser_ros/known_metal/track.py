@@ -38,8 +38,9 @@ Array = NDArray[np.float64]
 
 MEMORY_S = 2.0
 """Time over which a lattice's misfit stays the same: it counts once in it, not in every frame."""
-MISFIT_ELSEWHERE = 2.0
-"""Misfit where the metal was not learnt, over that of frames between the learnt ones."""
+MISFIT_ELSEWHERE, LEAST_MISFIT = 2.0, 0.05
+"""Misfit where the metal was not learnt, over that of frames between the learnt ones, and the least
+that is reckoned with: frames at contact, which are strong, say little of others."""
 SPEED_M_S, SPIN_RAD_S, SPEED_MEMORY_S = 0.05, 0.02, 3.0
 """Usual speed and turn of the metal, and the time for which they last."""
 PLACE_M, TURN_RAD = 0.08, 0.15
@@ -125,7 +126,7 @@ class Scene:
         self.setting = Setting(excitation, known.lattice.tilt(model.frequencies_hz))
         self.turn = excitation.phase.conj() / noise_t
         self.noise = math.hypot(noise_t, model.flux_error_t) / noise_t
-        self.misfit = MISFIT_ELSEWHERE * known.misfit
+        self.misfit = max(MISFIT_ELSEWHERE * known.misfit, LEAST_MISFIT)
         self._lattice, self._about = known.lattice, np.zeros(known.directions.shape[1])
         self._own_row = {name: row for row, name in enumerate(sensors.name)}
         self._own_sigma = coil_spread(len(sensors), tools)
