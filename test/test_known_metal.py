@@ -259,6 +259,9 @@ class TestFile:
             ('parameters', [float('inf')] * 32, 'parameters holds values that are not finite'),
             ('directions', [[0.0] * 31], 'directions must be any x 32, got the shape (1, 31)'),
             ('low_m', [0.0, 1.0], 'low_m must be 3, got the shape (2,)'),
+            ('low_m', [0.5, 0.5, 0.5], 'must be the corners of a box within 3 m'),
+            ('high_m', [500.0, 500.0, 500.0], 'must be the corners of a box within 3 m'),
+            ('misfit', 50.0, 'misfit must be a share below 1, got 50'),
             ('high_m', {'x': 1.0}, 'high_m is not a table of numbers'),
             ('turn_rad', None, 'turn_rad is missing'),
         ],
@@ -685,8 +688,10 @@ class TestCommands:
     @pytest.mark.parametrize(
         ('others', 'words'),
         [
-            (['--refit', '--baseline', 'scan.mcap'], 'leave out --refit, --baseline and --patch'),
-            (['--baseline', 'scan.mcap'], 'leave out --refit, --baseline and --patch'),
+            (['--refit', '--baseline', 'scan.mcap'], 'leave out --refit, --baseline'),
+            (['--baseline', 'scan.mcap'], 'leave out --baseline'),
+            (['--witnesses'], 'leave out --witnesses'),
+            (['--in-phase'], 'leave out --in-phase'),
             (['--known-metal', 'none.yaml'], 'none.yaml: No such file'),
             (['--known-metal', 'model.yaml'], "its schema must be 'anser_known_metal/1'"),
             (['--known-metal', 'scan.mcap'], 'scan.mcap: not'),

@@ -138,17 +138,18 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     tell : callable
         Called with the stage, and the finished share of it where that is known.
     """
+    others = ('refit', 'baseline', 'patch', 'references', 'witnesses', 'in_phase', 'poses')
+    given = [f'--{name.replace("_", "-")}' for name in others if getattr(args, name)]
+    if args.known_metal is not None and given:
+        raise ParameterError(
+            f'--known-metal follows metal by the tools alone; leave out {", ".join(given)}'
+        )
     if args.poses:
         return evaluate_pose_session(args, tell)
     need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
     if args.witnesses and not args.refit:
         raise ParameterError('--witnesses extends the refit; it needs --refit')
-    if args.known_metal is not None and (args.refit or args.baseline or args.patch):
-        raise ParameterError(
-            '--known-metal follows metal without references; leave out --refit, --baseline and '
-            '--patch'
-        )
     if args.references is not None:
         if not args.refit:
             raise ParameterError('--references chooses those of a refit; it needs --refit')

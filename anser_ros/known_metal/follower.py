@@ -101,6 +101,11 @@ class KnownMetalFollower:
         """Return whether the metal's place is known."""
         return self._chosen is not None
 
+    @property
+    def place(self) -> Array | None:
+        """Return where the metal's middle is, m, shape (3,); None while that is not known."""
+        return None if self._chosen is None else self._chosen.state.pose[:3]
+
     def at(self, stamp_ns: int) -> tuple[FieldModel, Withheld | None]:
         """Return the field model for a frame, and why it is none to give poses by."""
         seconds = self._seconds_to(stamp_ns)
@@ -128,8 +133,18 @@ class KnownMetalFollower:
             )
         return model, Withheld(MODEL_DOUBTFUL, reason) if reason else None
 
-    def take(self, stamp_ns: int, readings: Sequence[ToolReading]) -> None:
-        """Take in what rigid tools read in a frame, at poses that are near theirs."""
+    def take(
+        self, stamp_ns: int, readings: Sequence[ToolReading], near: Array | None = None
+    ) -> None:
+        """Take in what rigid tools read in a frame, at poses that are near theirs.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        readings : sequence of ToolReading
+        near : ndarray, shape (P, 3), optional
+            Where all coils are, m, those of no rigid tool among them; by default those that read.
+        """
         seconds = self._seconds_to(stamp_ns)
         if not readings:
             return
@@ -147,7 +162,7 @@ class KnownMetalFollower:
                 self._choose()
         elif (stamp_ns - self._searched_ns) * NANO > SEARCH_AGAIN_S:
             self._search(stamp_ns, readings)
-        self._near = near_points(readings)
+        self._near = near_points(readings) if near is None else near
 
     def _seconds_to(self, stamp_ns: int) -> float:
         """Return the time since the last readings, and forget the metal where it is too long."""
@@ -160,11 +175,10 @@ class KnownMetalFollower:
         self._tracks, self._chosen, self._searched_ns = [], None, 0
 
     def _search(self, stamp_ns: int, readings: Sequence[ToolReading]) -> None:
-        """Begin tracks where metal would explain the readings of the first tool best."""
+        """Begin tracks where metal would explain the readings of the largest tool best."""
         self._searched_ns = self._since_ns = stamp_ns
-        starts, gain = likely_starts(
-            self._scene, self._tools, readings[0], self._places, CANDIDATES
-        )
+        largest = max(readings, key=lambda reading: len(reading.table))
+        starts, gain = likely_starts(self._scene, self._tools, largest, self._places, CANDIDATES)
         if gain < CERTAIN:
             return
         self._tracks = [_Track(self._scene.start(start)) for start in starts]

@@ -21,6 +21,9 @@ ANSWER_ERROR = 0.05
 lattice is not the metal's true shape."""
 SAMPLES = 3, 3
 """Samples across and up the volume where the effect of answers on the field is compared."""
+LARGEST_M, FARTHEST_M = 2.0, 3.0
+"""Largest body, and farthest place, that a file may state: more is a file in millimetres, and the
+search for the metal would not end."""
 EVERY = 8
 """Of the poses of the fit, for the same."""
 
@@ -125,15 +128,27 @@ def from_document(document: Any) -> KnownMetal:
         points, _positive(document, 'unit'), np.zeros(n, complex), np.zeros(n, complex),
         _positive(document, 'frequency_hz'),
     )  # fmt: skip
+    size = float(np.ptp(points, axis=0).max())
+    low, high = _table(document, 'low_m', (3,)), _table(document, 'high_m', (3,))
+    if not 0.0 < size < LARGEST_M:
+        raise ModelFileError(f'known metal: its points extend over {size:g} m')
+    if not (low <= high).all() or np.abs([low, high]).max() > FARTHEST_M:
+        raise ModelFileError(
+            f'known metal: low_m {low.tolist()} and high_m {high.tolist()} must be the corners of '
+            f'a box within {FARTHEST_M:g} m'
+        )
+    misfit = _positive(document, 'misfit')
+    if misfit >= 1.0:
+        raise ModelFileError(f'known metal: misfit must be a share below 1, got {misfit:g}')
     return KnownMetal(
         name,
         bare.with_parameters(_table(document, 'parameters', (4 * n,))),
         np.ascontiguousarray(_table(document, 'directions', (-1, 4 * n)).T),
-        _positive(document, 'misfit'),
+        misfit,
         _positive(document, 'strongest_t'),
         _positive(document, 'nearest_m'),
-        _table(document, 'low_m', (3,)),
-        _table(document, 'high_m', (3,)),
+        low,
+        high,
         _table(document, 'turn_rad', (3,)),
     )
 

@@ -1,10 +1,10 @@
-"""Follows known metal by what tools read, with or without reference sensors.
+"""Follows known metal by what tools read, without reference sensors.
 
 An extended Kalman filter holds the metal's pose and speeds, the `KnownMetal.directions` in which
 its answers may be wrong, and the errors of the tools' own coils. A tool's pose is free in every
 frame: it is solved for together with the metal, and what is left of the readings updates the
 filter. The pose that is given out is not this one: a tracker finds it with the field that the
-filter predicted from the frames before (`Track.predicted`), so that no reading counts twice.
+filter predicted from the frames before (`predicted`), so that no reading counts twice.
 """
 
 import math
@@ -39,8 +39,8 @@ Array = NDArray[np.float64]
 MEMORY_S = 2.0
 """Time over which a lattice's misfit stays the same: it counts once in it, not in every frame."""
 MISFIT_ELSEWHERE, LEAST_MISFIT = 2.0, 0.05
-"""Misfit where the metal was not learnt, over that of frames between the learnt ones, and the least
-that is reckoned with: frames at contact, which are strong, say little of others."""
+"""Misfit where the metal was not learnt, over that of frames between the learnt ones, and the
+least that is reckoned with: frames at contact, which are strong, say little of others."""
 SPEED_M_S, SPIN_RAD_S, SPEED_MEMORY_S = 0.05, 0.02, 3.0
 """Usual speed and turn of the metal, and the time for which they last."""
 PLACE_M, TURN_RAD = 0.08, 0.15

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.symmetry import symmetry_axis
 from anser_ros.known_metal.known import KnownMetal
@@ -88,6 +89,8 @@ def track_session(
     ------
     BagError
         When the session has no tool fluxes, or a refit lacks references or a baseline.
+    ParameterError
+        When known metal is to be followed beside a refit, or by one phase of the fluxes.
     ModelFileError
         When the model's emitters are not the session's, or the session's references locate the
         board elsewhere. With the gate switched off the latter is not checked.
@@ -96,6 +99,10 @@ def track_session(
         check_place(model, session)
     used = in_phase_model(model) if in_phase else model
     prepared = prepare(session, used, baseline if refit else None)
+    if known_metal is not None and (refit or in_phase):
+        raise ParameterError(
+            'known metal is followed without a refit, by both phases of the fluxes'
+        )
     follower: ModelFollower | KnownMetalModels | None = None
     if known_metal is not None:
         follower = KnownMetalModels(prepared, known_metal)

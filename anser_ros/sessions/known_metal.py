@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from anser_ros.errors import BagError
+import numpy as np
+
+from anser_ros.errors import BagError, ModelFileError
 from anser_ros.integrity.ageing import FrameModel
 from anser_ros.known_metal.follower import KnownMetalFollower
 from anser_ros.known_metal.known import KnownMetal
@@ -40,12 +42,20 @@ class KnownMetalModels:
     ------
     BagError
         When the session has no tool fluxes.
+    ModelFileError
+        When the metal was learnt at other frequencies than the emitters'.
     """
 
     def __init__(self, prepared: PreparedSession, known: KnownMetal) -> None:
         session = prepared.session
         if not session.tools:
             raise BagError(f'{session.path}: known metal is followed by tools, there are none')
+        mean_hz = float(np.exp(np.log(prepared.model.frequencies_hz).mean()))
+        if not 0.5 < mean_hz / known.lattice.frequency_hz < 2.0:
+            raise ModelFileError(
+                f'{known.name} was learnt at {known.lattice.frequency_hz:.0f} Hz, the emitters '
+                f'have {mean_hz:.0f} Hz'
+            )
         excitation, _ = excitation_for(
             prepared.model, prepared.drawing.field, stated_volume(session.setup)
         )
@@ -80,7 +90,9 @@ class KnownMetalModels:
             for one in (*rough, *(one for one in found if one.state == OK))
             if one.state == OK and one.rotation is not None
         }
+        at = [one.position for one in rough if np.isfinite(one.position).all()]
         self._follower.take(
             self._stamp_ns,
             tool_readings(self._correction, tools.channels, tools.flux, tools.flags, poses),
+            np.array(at) if at else None,
         )

@@ -80,7 +80,9 @@ def track(
             f'{prepared.session.path}: the session has no tool fluxes to track, on a topic that '
             f'ends with /tool/flux'
         )
-    tracker = _tracker(prepared, settings or TrackerSettings(), follows=follower is not None)
+    tracker = _tracker(
+        prepared, settings or TrackerSettings(), follows=isinstance(follower, ModelFollower)
+    )
     estimates: dict[str, list[PoseEstimate]] = {}
     sources: dict[str, list[PoseEstimate]] = {}
     frames = list(frames_of(prepared.session))
