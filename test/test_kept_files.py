@@ -136,7 +136,6 @@ def started(ros, tmp_path, monkeypatch):
     sender.destroy_node()
 
 
-@pytest.mark.processes
 def test_a_node_that_is_started_near_metal_follows_the_references_again(started):
     from std_msgs.msg import String
 
@@ -159,7 +158,6 @@ def test_a_node_that_is_started_near_metal_follows_the_references_again(started)
     assert rig.node._refit.result.state == 'refit' and rig.codes[-1] == 0
 
 
-@pytest.mark.processes
 def test_a_baseline_that_references_contradict_is_not_taken_up(started):
     from std_msgs.msg import String
 

@@ -1,11 +1,11 @@
 """Makes a refit in the background, while the callbacks go on.
 
 Its tables, seconds of work, need the model and the references' places only, so they are begun
-before there is a baseline, and kept on disk. Another process makes them there, as frames would
-be late beside the work; where nothing is kept, a thread of this one does. What a baseline adds is
-half a second more, for each baseline again.
+before there is a baseline, and kept on disk. What a baseline adds is half a second more, for each
+baseline again.
 """
 
+import contextlib
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from anser_ros.field.model import FieldModel
 from anser_ros.nodes.field_model_parts.kept_files import KeptTables, ReadAhead
 from anser_ros.nodes.field_model_parts.patches import Patches
-from anser_ros.nodes.field_model_parts.tables_process import TablesProcess
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.tracks import loop_field
 from anser_ros.refit import tables
@@ -85,9 +84,9 @@ class RefitStart:
         moving = tuple(s for s in setup.tool_sensors if s.body in bodies)
         self._moving = sensor_table(moving) if moving else None
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=WORKER)
-        self._process = TablesProcess()
         self._tables: Future[tables.RefitTables] | None = None
         self._made: Future[Started] | None = None
+        self._kept: Future[None] | None = None
         self._share, self._is_over = 0.0, False
         self.is_awaited = False
 
@@ -110,6 +109,8 @@ class RefitStart:
         if self._made is not None:
             self._made.cancel()
         self._made, self.is_awaited = self._worker.submit(self._make, baseline), is_awaited
+        if self._kept is None and self._folder is not None:
+            self._kept = self._worker.submit(self._keep, self._folder)  # nobody waits for it
 
     def taken(self) -> Started | None:
         """Return the refit once, as soon as it is made.
@@ -144,8 +145,7 @@ class RefitStart:
         """Give the work up; return whether it ended within some seconds."""
         self._is_over = True
         self._worker.shutdown(wait=False, cancel_futures=True)
-        self._process.end()
-        works: tuple[Future[Any] | None, ...] = (self._tables, self._made)
+        works: tuple[Future[Any] | None, ...] = (self._tables, self._made, self._kept)
         # What was given up before it began is done, but `wait` would wait for it.
         going_on = [work for work in works if work is not None and not work.done()]
         return not wait(going_on, longest_s).not_done
@@ -156,25 +156,23 @@ class RefitStart:
         fixed, moving = self._fixed, self._moving
         return fixed if moving is None else fixed.joined(start_table(moving))
 
-    def _kept_tables(self, folder: Path) -> tables.RefitTables | None:
-        """Return the tables that are kept, or that another process makes and keeps now."""
-        setup, model, references = self._setup, self._model, self._references
-        file = KeptTables(folder, setup, model, references, self._ahead)
-        kept = file.read()
-        if kept is None and self._process.run((folder, setup, model, references), self._report):
-            kept = file.read()
-        return kept
+    def _file(self, folder: Path) -> KeptTables:
+        return KeptTables(folder, self._setup, self._model, self._references, self._ahead)
 
     def _work_tables_out(self) -> tables.RefitTables:
-        kept = None if self._folder is None else self._kept_tables(self._folder)
+        kept = None if self._folder is None else self._file(self._folder).read()
         if kept is not None:
             return kept
-        self._report(0.0)
         drawing, volume = Drawing.of(self._setup).field, stated_volume(self._setup)
         settings = self._setup.refit
         return tables.build_tables(
             self._model, self._references, settings, drawing, volume, report=self._report
         )
+
+    def _keep(self, folder: Path) -> None:
+        assert self._tables is not None
+        with contextlib.suppress(OSError):  # a full disk only makes the next start slower
+            self._file(folder).write(self._tables.result())
 
     def _report(self, share: float) -> None:
         if self._is_over:
