@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.known_metal.lattice import Coils
-from anser_ros.settings import ToolSettings
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -53,9 +52,3 @@ class MetalFrame:
 def real_parts(values: NDArray[Any]) -> Array:
     """Return real and imaginary parts of rows, one after the other: (n, ...) to (2n, ...)."""
     return np.concatenate([values.real, values.imag])
-
-
-def coil_spread(count: int, tools: ToolSettings) -> Array:
-    """Return the standard deviations (7 S,) of the errors of tool coils, as `ToolRows.own`."""
-    gain, place, axis = tools.tool_coil_gain, tools.tool_coil_position_m, tools.tool_coil_axis_rad
-    return np.tile([gain, gain, place, place, place, axis, axis], count)

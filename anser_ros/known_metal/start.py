@@ -6,10 +6,10 @@ from scipy.linalg import solve_triangular
 
 from anser_ros.known_metal.known import KnownMetal
 from anser_ros.known_metal.lattice import Coils
-from anser_ros.known_metal.rows import coil_spread, real_parts
+from anser_ros.known_metal.rows import real_parts
 from anser_ros.known_metal.track import Scene, posed
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.refit.tool_readings import ToolReading, linearised
+from anser_ros.refit.tool_readings import ToolReading, coil_spread, linearised
 from anser_ros.settings import ToolSettings
 
 Array = NDArray[np.float64]

@@ -27,11 +27,18 @@ from anser_ros.known_metal.lattice import (
     moved,
     step_between,
 )
-from anser_ros.known_metal.rows import coil_spread, real_parts
+from anser_ros.known_metal.rows import real_parts
 from anser_ros.physics.sensor import SensorTable, along_each_axis
 from anser_ros.refit.excitation import Excitation
 from anser_ros.refit.references import vector_basis
-from anser_ros.refit.tool_readings import FREE_M, FREE_RAD, ToolReading, linearised
+from anser_ros.refit.tool_readings import (
+    FREE_M,
+    FREE_RAD,
+    ToolReading,
+    coil_spread,
+    linearised,
+    surroundings,
+)
 from anser_ros.settings import ToolSettings
 
 Array = NDArray[np.float64]
@@ -48,10 +55,6 @@ PLACE_M, TURN_RAD = 0.08, 0.15
 POSE_ROUNDS, ROUNDS = 2, 2
 """Steps of the tool's pose with the metal as predicted, and of both: the first step of a tool that
 is displaced by millimetres must not move the metal."""
-NEAR_M = 0.01
-"""How far around a coil's place."""
-_AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-"""Where the field's uncertainty is worked out: a coil's place, and a tetrahedron around it."""
 FAR = 1.0
 """Change of the answers' factors from which on their screening is worked out anew."""
 RATES = slice(6, 12)
@@ -328,7 +331,7 @@ def field_of(
     setting, lattice = scene.setting, scene.lattice(state.answers)
     placed = setting.placed(lattice, state.pose)
     model = setting.in_field(lattice, placed, scene.model)
-    at = np.unique(np.round((near[:, None] + NEAR_M * _AROUND).reshape(-1, 3), 4), axis=0)
+    at = np.unique(np.round(surroundings(near), 4), axis=0)
     coils = Coils(*along_each_axis(at), None)
     by_pose = setting.pose_columns(lattice, state.pose, coils)
     by = setting.answer_columns(lattice, placed, coils) @ scene.known.directions

@@ -24,11 +24,26 @@ ComplexArray = NDArray[np.complex128]
 
 FREE_M, FREE_RAD = 0.02, 0.2
 """Error of the pose at which a tool's readings are compared: any that matters."""
+NEAR_M = 0.01
+"""How far around the coils the field's uncertainty is worked out, m."""
+_AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+"""A coil's own place and the corners of a tetrahedron around it, in units of `NEAR_M`."""
 KEPT = 0.03
 """Share of a tool's stated errors that is never learnt away."""
 SHARE = 0.1
 """Weight of a frame from which a tool's errors are learnt: the model's own error hardly changes
 from one frame to the next."""
+
+
+def coil_spread(count: int, tools: ToolSettings) -> Array:
+    """Return the standard deviations (7 S,) of the errors of tool coils, as `ToolRows.own`."""
+    gain, place, axis = tools.tool_coil_gain, tools.tool_coil_position_m, tools.tool_coil_axis_rad
+    return np.tile([gain, gain, place, place, place, axis, axis], count)
+
+
+def surroundings(points: Array) -> Array:
+    """Return coils' places (P, 3), m, and four around each, (5 P, 3): where modes are chosen."""
+    return np.asarray((points[:, None] + NEAR_M * _AROUND).reshape(-1, 3))
 
 
 @dataclass(frozen=True)
@@ -63,13 +78,8 @@ class CoilErrors:
     """
 
     def __init__(self, table: SensorTable, tools: ToolSettings) -> None:
-        gain, place, axis = (
-            tools.tool_coil_gain, tools.tool_coil_position_m, tools.tool_coil_axis_rad
-        )  # fmt: skip
         self.names = table.name
-        self._prior = np.maximum(
-            np.tile([gain, gain, place, place, place, axis, axis], len(table)), 1e-9
-        )
+        self._prior = np.maximum(coil_spread(len(table), tools), 1e-9)
         self._precision = np.diag(self._prior**-2.0)
         self._pull = np.zeros(len(self._prior))
         self._solved: tuple[Array, Array] | None = None
@@ -78,7 +88,7 @@ class CoilErrors:
     def posterior(self) -> tuple[Array, Array]:
         """Return mean (7 S,) and covariance of gain (re, im), place (3, m) and axis (2, rad)."""
         if self._solved is None:
-            covariance = np.linalg.inv(self._precision)
+            covariance: Array = np.asarray(np.linalg.inv(self._precision))
             mean = covariance @ self._pull
             covariance[np.diag_indices_from(covariance)] += (KEPT * self._prior) ** 2
             self._solved = mean, covariance

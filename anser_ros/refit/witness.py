@@ -28,7 +28,7 @@ from anser_ros.refit.posterior import Bank
 from anser_ros.refit.prior import CloudPrior
 from anser_ros.refit.reduced import ReducedPrior
 from anser_ros.refit.tables import RefitTables
-from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised
+from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised, surroundings
 from anser_ros.settings import ToolSettings
 from anser_ros.stamps import NANO
 
@@ -51,13 +51,9 @@ LEAST_PROBABILITY = 1e-3
 hardly changes the mean, whatever a tool says of it."""
 ELSEWHERE = 0.1
 """Weight of the whole volume beside the surroundings of the tools, where modes are chosen."""
-NEAR_M = 0.01
-"""How far around the coils that is, m."""
 FIRST_SAMPLE_STEP = 30
 """Every so many of a layer's samples stand for the volume before a tool was seen, and tell the
 size of an error until it is known: thirty points, a millisecond's work at the most."""
-_AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-"""A coil's own place and the corners of a tetrahedron around it, in units of `NEAR_M`."""
 
 
 @dataclass
@@ -307,7 +303,7 @@ class Witness:
                     evidence[name] += _kalman(state, i, errors[i], design, values - own @ mean)
             for rows_of_errors, values in known:
                 learnt.learn(rows_of_errors, values)
-            near.append((rows.at[:, None] + NEAR_M * _AROUND).reshape(-1, 3))
+            near.append(surroundings(rows.at))
         self._near = np.concatenate(near)
         return evidence
 

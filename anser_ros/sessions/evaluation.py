@@ -95,14 +95,14 @@ def track_session(
         When the model's emitters are not the session's, or the session's references locate the
         board elsewhere. With the gate switched off the latter is not checked.
     """
-    if settings is None or settings.has_gate:
-        check_place(model, session)
-    used = in_phase_model(model) if in_phase else model
-    prepared = prepare(session, used, baseline if refit else None)
     if known_metal is not None and (refit or in_phase):
         raise ParameterError(
             'known metal is followed without a refit, by both phases of the fluxes'
         )
+    if settings is None or settings.has_gate:
+        check_place(model, session)
+    used = in_phase_model(model) if in_phase else model
+    prepared = prepare(session, used, baseline if refit else None)
     follower: ModelFollower | KnownMetalModels | None = None
     if known_metal is not None:
         follower = KnownMetalModels(prepared, known_metal)

@@ -8,11 +8,17 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.known_metal.fit import Report, learn_metal
 from anser_ros.known_metal.known import KnownMetal
 from anser_ros.known_metal.lattice import Coils
-from anser_ros.known_metal.rows import CoilReadings, MetalFrame, coil_spread, real_parts
+from anser_ros.known_metal.rows import CoilReadings, MetalFrame, real_parts
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.tables import build_tables
-from anser_ros.refit.tool_readings import FREE_M, FREE_RAD, ToolReading, linearised
+from anser_ros.refit.tool_readings import (
+    FREE_M,
+    FREE_RAD,
+    ToolReading,
+    coil_spread,
+    linearised,
+)
 from anser_ros.sessions.prepared import PreparedSession, correct
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.settings import Accuracy, ToolSettings
