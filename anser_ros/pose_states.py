@@ -53,6 +53,8 @@ STATES = (
     OK, NO_MODEL, NO_SIGNAL, RESIDUAL, OUTSIDE_VOLUME, AMBIGUOUS, STALE, SATURATED, DROPPED,
     *OF_MODEL, TWO_SOURCES, INCONSISTENT, UNCONFIRMED, MODEL_DOUBTFUL,
 )  # fmt: skip
+FRAMES_IN = 'frames_'
+"""What the count of frames in a state is called in `/diagnostics`, followed by the state."""
 
 
 class Withheld(NamedTuple):

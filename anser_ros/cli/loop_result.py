@@ -11,6 +11,7 @@ from anser_ros.cli.loop_run import AFTER, BEFORE, UNGATED
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.prepared import prepare
+from anser_ros.sessions.recorded_health import ok_share
 from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session
 
@@ -84,15 +85,16 @@ def second_run(session: Session, corrected: FieldModel, known: FieldModel) -> di
     """Return each tracker's live errors over all sensors and bodies, and its share of poses.
 
     A tracker with a wrong model withholds the poses that its gate catches, so that its error must
-    be judged together with its share of frames with a pose; `ungated` has those poses as well.
+    be judged together with the share of poses that it published of those that it judged;
+    `ungated` has the withheld poses as well.
     """
     figures = {}
     for name, namespace, model in (
         ('ungated', UNGATED, known), ('before', BEFORE, known), ('after', AFTER, corrected)
     ):  # fmt: skip
         errors = list(live_errors(prepare(session, model), namespace).values())
-        poses, frames = sum(e.position.size for e in errors), sum(e.frames for e in errors)
-        figures[name] = {'published_share': poses / max(frames, 1), **_figures(errors)}
+        share = ok_share(session.path, f'{namespace}/tracker'.strip('/'))
+        figures[name] = {'published_share': share, **_figures(errors)}
     return figures
 
 

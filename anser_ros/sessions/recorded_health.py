@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from anser_ros.errors import BagError
+from anser_ros.pose_states import FRAMES_IN, OK
 from anser_ros.sessions.session import Session
 from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
 
@@ -42,6 +43,27 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
     except BagError:
         return {}
     return found
+
+
+def ok_share(path: str | os.PathLike[str], tracker: str) -> float:
+    """Return the share of poses in state ok among all that a tracker judged; 0 if it judged none.
+
+    Frames that it never saw, because the machine was too slow for them, do not count.
+
+    Parameters
+    ----------
+    path : path
+        The recording.
+    tracker : str
+        The node, whose statuses of sensors and bodies are named ``NODE: SENSOR``.
+    """
+    ok = judged = 0
+    for name, values in last_words(path).items():
+        if name.startswith(f'{tracker}: '):
+            counts = {key: int(n) for key, n in values.items() if key.startswith(FRAMES_IN)}
+            ok += counts.get(f'{FRAMES_IN}{OK}', 0)
+            judged += sum(counts.values())
+    return ok / judged if judged else 0.0
 
 
 def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:

@@ -30,13 +30,10 @@ class LiveErrors:
         Distance from the optical pose, m, where there is one.
     orientation : ndarray, shape (n,)
         Angle, rad: of a coil between the axes, of a body the whole turn.
-    frames : int
-        Frames of the recording in which there could have been a pose.
     """
 
     position: Array
     orientation: Array
-    frames: int
 
 
 def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict[str, PoseStream]:
@@ -102,9 +99,8 @@ def _compared(
     time = np.asarray((poses.stamp_ns - session.start_ns) * NANO, dtype=np.float64)
     position, rotation, valid = tool.track.at(time)
     turned = Rotation.from_quat(poses.quaternion[valid]).as_matrix() if valid.any() else None
-    frames = int(tool.has_pose.sum())
     if turned is None:
-        return LiveErrors(np.zeros(0), np.zeros(0), frames)
+        return LiveErrors(np.zeros(0), np.zeros(0))
     if column is None:
         truth = position[valid]
         turn = rotation_angles(rotation[valid].transpose(0, 2, 1) @ turned)
@@ -113,4 +109,4 @@ def _compared(
         truth = centres[:, column]
         turn = axis_angles(turned[:, :, 2], axes[:, column])
     distance = np.linalg.norm(poses.position[valid] - truth, axis=1)
-    return LiveErrors(distance, turn, frames)
+    return LiveErrors(distance, turn)

@@ -12,7 +12,7 @@ from rclpy.serialization import serialize_message
 
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status
-from anser_ros.pose_states import OK, STALE
+from anser_ros.pose_states import FRAMES_IN, OK, STALE
 from anser_ros.stamps import SECOND_NS, is_live, set_stamp
 from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.tracking.rotations import quaternion_of_axis, quaternion_of_rotation
@@ -174,7 +174,7 @@ class PoseTopic:
             'chi2_per_freedom': estimate.chi2,
             'model': estimate.model_id,
         }
-        values.update({f'frames_{name}': count for name, count in sorted(self.states.items())})
+        values.update({f'{FRAMES_IN}{name}': count for name, count in sorted(self.states.items())})
         level = Level.OK if state == OK else Level.STALE if state == STALE else Level.WARN
         return Status(self.name, level, state, values)
 
