@@ -138,7 +138,7 @@ class FieldModelNode(AnserNode):
         if self._baseline_bag is not None and len(self._references):
             try:
                 baseline = clean_flux(self._baseline_bag, self._references, base)
-                self._follow(baseline, is_awaited=True)
+                self._follow(baseline)
             except AnserError as error:
                 self._refuse_baseline(error)
         elif len(self._references) and table.refit:
@@ -261,9 +261,9 @@ class FieldModelNode(AnserNode):
             withheld = self._refit.withheld if self._follows else ''
             self._serve(self._model, self.get_clock().now().nanoseconds, withheld)
 
-    def _follow(self, baseline: NDArray[np.complex128], is_awaited: bool = False) -> None:
+    def _follow(self, baseline: NDArray[np.complex128]) -> None:
         """Refit to what differs from a baseline, shape (S, K), T, as soon as that can be done."""
-        self._refit.begin(baseline, is_awaited)
+        self._refit.begin(baseline)
         if self._refit.current is None:
             self.get_logger().info(refit_status.PREPARING)
         self._no_baseline = ''

@@ -91,15 +91,16 @@ class RefitInForce:
         """Drop the baseline: the readings are to be others."""
         self._baseline = None
 
-    def begin(self, baseline: NDArray[np.complex128], is_awaited: bool = False) -> None:
+    def begin(self, baseline: NDArray[np.complex128]) -> None:
         """Begin to make a refit to what differs from a baseline.
+
+        No pose is given before the first one is there, since metal may come meanwhile; one that is
+        in force goes on until the next one is there.
 
         Parameters
         ----------
         baseline : ndarray, shape (S, K), complex
             T.
-        is_awaited : bool
-            Whether no pose is to be given before it is there. Otherwise what is in force goes on.
 
         Raises
         ------
@@ -110,25 +111,24 @@ class RefitInForce:
             raise FitError('the setup has no reference sensors')
         self._kept.drop()
         self._baseline = baseline
-        self._start.begin(baseline, is_awaited)
+        self._start.begin(baseline)
 
     def begin_again(self) -> None:
-        """Begin to make one to the last baseline, if there is one; it is awaited."""
+        """Begin to make one to the last baseline, if there is one."""
         if self._baseline is not None:
-            self.begin(self._baseline, is_awaited=True)
+            self.begin(self._baseline)
 
     def resume(self, is_wanted: bool) -> None:
         """Begin with the baseline of a process before this one, where there is one.
 
-        It is looked for once for a setup and model, as soon as the sender is known. No pose is
-        given before the refit is there: metal may be near.
+        It is looked for once for a setup and model, as soon as the sender is known.
         """
         has_one = self.current is not None or self.is_making
         if not is_wanted or self._start is None or self._has_looked or has_one:
             return
         self._has_looked, baseline = self._kept.is_known, self._kept.read()
         if baseline is not None:
-            self.begin(baseline, is_awaited=True)
+            self.begin(baseline)
             self._count('baselines_resumed')
 
     def confirm(self) -> None:
@@ -188,8 +188,8 @@ class RefitInForce:
 
     @property
     def is_awaited(self) -> bool:
-        """Return whether no refit is there yet, and no pose is to be given before one is."""
-        return self.current is None and self._start is not None and self._start.is_awaited
+        """Return whether the first refit is being made, before which no pose is given."""
+        return self.current is None and self.is_making
 
     @property
     def withheld(self) -> str:

@@ -62,11 +62,6 @@ class RefitStart:
         Of this folder.
     witness_noise_t : float, optional
         Noise of a component of what tools read, T, if they are witnesses.
-
-    Attributes
-    ----------
-    is_awaited : bool
-        Whether no pose is to be given before the refit is there that is being made.
     """
 
     def __init__(
@@ -88,27 +83,24 @@ class RefitStart:
         self._made: Future[Started] | None = None
         self._kept: Future[None] | None = None
         self._share, self._is_over = 0.0, False
-        self.is_awaited = False
 
     def prepare(self) -> None:
         """Begin with what needs no baseline, unless that is done."""
         if self._tables is None:
             self._tables = self._worker.submit(self._work_tables_out)
 
-    def begin(self, baseline: NDArray[np.complex128], is_awaited: bool) -> None:
+    def begin(self, baseline: NDArray[np.complex128]) -> None:
         """Begin to make the refit to what differs from a baseline, in place of one being made.
 
         Parameters
         ----------
         baseline : ndarray, shape (R, K), complex
             Readings of the fixed references without metal, T.
-        is_awaited : bool
-            Whether no pose is to be given before it is there.
         """
         self.prepare()
         if self._made is not None:
             self._made.cancel()
-        self._made, self.is_awaited = self._worker.submit(self._make, baseline), is_awaited
+        self._made = self._worker.submit(self._make, baseline)
         if self._kept is None and self._folder is not None:
             self._kept = self._worker.submit(self._keep, self._folder)  # nobody waits for it
 
@@ -123,7 +115,7 @@ class RefitStart:
         made = self._made
         if made is None or not made.done():
             return None
-        self._made, self.is_awaited = None, False
+        self._made = None
         return made.result()
 
     def wait(self) -> None:

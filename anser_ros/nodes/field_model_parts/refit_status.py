@@ -10,8 +10,8 @@ from anser_ros.refit.result import WITHHELD, RefitResult
 TROUBLED = tuple(WITHHELD)
 """States of the refit that an operator is warned of."""
 PREPARING = (
-    'a baseline is there, the refit is being prepared: until it is in force the model does not '
-    'follow the references, and metal makes poses vanish (state residual)'
+    'a baseline is there, the refit is being prepared: until it is in force there are no poses '
+    '(state references_lost), as metal may come meanwhile'
 )
 IN_FORCE = 'the refit is in force: the model follows the references'
 
