@@ -33,7 +33,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
 from anser_ros.nodes.runtime.process import TURN_S
-from anser_ros.nodes.streams.backlog import Backlog
+from anser_ros.nodes.streams.backlog import Backlog, Deference
 from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.nodes.streams.overload import too_slow
 from anser_ros.wire.channel_calibration import parse_channels
@@ -101,7 +101,7 @@ class Acquisition(AnserNode):
         self._sensor_flags: np.ndarray | None = None
         self._past: Counter[str] = Counter()
         self._duplicates = self._skipped = 0
-        self._backlog = Backlog()
+        self._backlog, self._deference = Backlog(), Deference()
         self._published_setup = ''
         self._said: Level | None = None
         self._accuracy = MeasuredAccuracy()
@@ -289,8 +289,13 @@ class Acquisition(AnserNode):
             self._tool_publisher.publish(self._cloud.message(frame.tool, stamp_ns))
         if len(frame.reference.channel):
             self._reference_publisher.publish(self._cloud.message(frame.reference, stamp_ns))
-        # The model is refitted when the poses and all messages are on their way.
-        self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)
+        # The model is refitted when the poses and all messages are on their way, and no further
+        # frame waits.
+        age_s = (time.monotonic_ns() - arrival_ns) / 1e9
+        if self.hands_over and self._deference.gives_way(age_s, stream.rate_hz if stream else 0.0):
+            self.count('refits_left_out')
+        else:
+            self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)
         self._frame = frame
         self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
         self.pause()

@@ -22,6 +22,24 @@ MEMORY = 25
 FEWEST_MESSAGES = 10
 """Messages that must have been worked on before a backlog is judged: the first ones are slow."""
 
+MOST_LEFT_OUT = 2
+"""Frames in a row that are left out by what gives way to newer ones. Fewer, and poses of a
+computer that is a tenth too slow fall behind; more, and the model is older than metal in a hand
+allows."""
+
+
+class Deference:
+    """Decides which frames are left out by work that can wait, while newer frames wait already."""
+
+    def __init__(self) -> None:
+        self._left_out = 0
+
+    def gives_way(self, age_s: float, rate_hz: float) -> bool:
+        """Return whether to leave a frame out that is so old, s, of so many a second."""
+        is_behind = age_s * rate_hz > 1.0 and self._left_out < MOST_LEFT_OUT
+        self._left_out = self._left_out + 1 if is_behind else 0
+        return is_behind
+
 
 class Backlog:
     """Estimates the typical spacing of messages, and the time that each takes.
