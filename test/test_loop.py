@@ -24,7 +24,7 @@ from anser_ros.cli.main import main
 from anser_ros.effects.registry import all_effects, effect_named
 from anser_ros.effects.saturation import FLUX, VOLTAGE
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions import recorded_health
+from anser_ros.sessions.recorded_health import ok_share
 from anser_ros.simulation.effect_draw import CATALOGUE, draw
 from anser_ros.simulation.raw_effects import CompressingAmplifier
 from anser_ros.wire.channel_calibration import parse_channels
@@ -62,16 +62,15 @@ def test_an_effect_is_found_and_the_next_run_is_better(domain, tmp_path, capsys)
     assert held['flux_rms_after_t'] < 0.2 * held['flux_rms_before_t']
 
 
-def test_frames_that_a_tracker_never_saw_do_not_count_as_withheld(monkeypatch):
+def test_frames_that_a_tracker_never_saw_do_not_count_as_withheld():
     words = {
         'anser/tracker': {'frames': '10', 'frames_skipped': '7'},
         'anser/tracker: a': {'state': 'ok', 'frames_ok': '9', 'frames_residual': '1'},
         'anser/tracker: b': {'frames_ok': '10'},
         'anser/before/tracker: a': {'frames_ok': '1'},
     }
-    monkeypatch.setattr(recorded_health, 'last_words', lambda _path: words)
-    assert recorded_health.ok_share('a bag', 'anser/tracker') == 19 / 20
-    assert recorded_health.ok_share('a bag', 'anser/other') == 0.0
+    assert ok_share(words, 'anser/tracker') == 19 / 20
+    assert ok_share(words, 'anser/other') == 0.0
 
 
 def diagnosis(*effects, unexplained=0.0):

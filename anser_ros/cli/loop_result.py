@@ -11,7 +11,7 @@ from anser_ros.cli.loop_run import AFTER, BEFORE, UNGATED
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.recorded_health import ok_share
+from anser_ros.sessions.recorded_health import last_words, ok_share
 from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session
 
@@ -88,12 +88,12 @@ def second_run(session: Session, corrected: FieldModel, known: FieldModel) -> di
     be judged together with the share of poses that it published of those that it judged;
     `ungated` has the withheld poses as well.
     """
-    figures = {}
+    figures, words = {}, last_words(session.path)
     for name, namespace, model in (
         ('ungated', UNGATED, known), ('before', BEFORE, known), ('after', AFTER, corrected)
     ):  # fmt: skip
         errors = list(live_errors(prepare(session, model), namespace).values())
-        share = ok_share(session.path, f'{namespace}/tracker'.strip('/'))
+        share = ok_share(words, f'{namespace}/tracker'.strip('/'))
         figures[name] = {'published_share': share, **_figures(errors)}
     return figures
 

@@ -223,7 +223,7 @@ class Acquisition(AnserNode):
         begin_ns = time.monotonic_ns()
         skips = self._backlog.is_hopeless((begin_ns - arrival_ns) / 1e9)
         for frame in stream.push(block, arrival_ns, skips=skips):
-            self._publish_frame(frame, arrival_ns)
+            self._publish_frame(stream, frame, arrival_ns)
             now_ns = time.monotonic_ns()
             self._backlog.worked((now_ns - begin_ns) / 1e9)
             begin_ns = now_ns
@@ -276,11 +276,8 @@ class Acquisition(AnserNode):
             self._published_setup = text
             self._setup_publisher.publish(String(data=text))
 
-    def _publish_frame(self, frame: FluxFrame, arrival_ns: int) -> None:
-        stream = self._stream
-        if stream is not None and self._accuracy.must_republish(
-            frame, stream.clock.sigma_s, time.monotonic()
-        ):
+    def _publish_frame(self, stream: FluxStream, frame: FluxFrame, arrival_ns: int) -> None:
+        if self._accuracy.must_republish(frame, stream.clock.sigma_s, time.monotonic()):
             self._publish_setup(self._accuracy.stated_in(self._setup, stream.rate_hz))
         # The system's clock may be set while we run; the offset is taken again for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
@@ -292,7 +289,7 @@ class Acquisition(AnserNode):
         # The model is refitted when the poses and all messages are on their way, and no further
         # frame waits.
         age_s = (time.monotonic_ns() - arrival_ns) / 1e9
-        if self.hands_over and self._deference.gives_way(age_s, stream.rate_hz if stream else 0.0):
+        if self.hands_over and self._deference.gives_way(age_s, stream.rate_hz):
             self.count('refits_left_out')
         else:
             self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)

@@ -45,20 +45,20 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
     return found
 
 
-def ok_share(path: str | os.PathLike[str], tracker: str) -> float:
+def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
     """Return the share of poses in state ok among all that a tracker judged; 0 if it judged none.
 
     Frames that it never saw, because the machine was too slow for them, do not count.
 
     Parameters
     ----------
-    path : path
-        The recording.
+    words : mapping
+        Of `last_words`.
     tracker : str
         The node, whose statuses of sensors and bodies are named ``NODE: SENSOR``.
     """
     ok = judged = 0
-    for name, values in last_words(path).items():
+    for name, values in words.items():
         if name.startswith(f'{tracker}: '):
             counts = {key: int(n) for key, n in values.items() if key.startswith(FRAMES_IN)}
             ok += counts.get(f'{FRAMES_IN}{OK}', 0)

@@ -96,7 +96,7 @@ def _told(bag: str) -> tuple[list[int], dict[str, dict[int, int]], list[tuple[fl
             windows.append(stamp_of(decoder.decode(raw)))
         elif raw.topic == '/diagnostics':
             message = decoder.decode(raw)
-            at = message.header.stamp.sec + NANO * message.header.stamp.nanosec
+            at = NANO * stamp_of(message)
             for status in message.status:
                 values = {pair.key: pair.value for pair in status.values}
                 with contextlib.suppress(KeyError):
