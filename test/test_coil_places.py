@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.calibration.coil_places import CoilPlacer
 from anser_ros.calibration.held_out import rms
-from anser_ros.calibration.layout_fit import fit_layout, placed, rich_layout
+from anser_ros.calibration.layout_fit import LayoutFitter, placed, rich_layout
 from anser_ros.calibration.layout_score import LayoutScorer
 from anser_ros.calibration.layouts import Layout, place
 from anser_ros.calibration.prior import DrawnBoard
@@ -99,7 +99,7 @@ def test_held_out_blocks_choose_placed_coils(world, drawing):
         for layout in (coils, still)
     ]
     assert scores[0] < 0.7 * scores[1]
-    whole = fit_layout(told, coils, 1e-2, world.generator, Accuracy(), drawing)
+    whole = LayoutFitter(told, world.generator, Accuracy(), drawing).fit(coils, 1e-2)
     points, axes, truth = below(world)
     model = FieldModel(
         whole.dipoles.positions, whole.dipoles.directions, whole.fit.moments, drawing.emitters,

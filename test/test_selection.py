@@ -12,7 +12,7 @@ from anser_ros.calibration.blocks import FOLDS, fold_of_frames
 from anser_ros.calibration.calibrate import Options, best_damped, fit_scan, survey
 from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
 from anser_ros.calibration.held_out import rms
-from anser_ros.calibration.layout_fit import fit_layout
+from anser_ros.calibration.layout_fit import LayoutFitter
 from anser_ros.calibration.layout_score import DAMPINGS, LayoutCandidate, LayoutScorer
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.local import Regions
@@ -328,11 +328,8 @@ def test_shares_of_regions_add_up_to_one(rng):
 def test_joined_regions_make_the_common_field_where_one_model_does(world):
     layout = Layout('layer', 9, 1.5, 0.0, local=True)
     plain = replace(layout, local=False)
-    common = (Accuracy(), None, 3, False)
-    local, whole = (
-        fit_layout([world.measurements], one, 1e-3, world.generator, *common)
-        for one in (layout, plain)
-    )
+    fitter = LayoutFitter([world.measurements], world.generator, Accuracy())
+    local, whole = (fitter.fit(one, 1e-3, 3, exact=False) for one in (layout, plain))
     points = rng_points()
     axes = np.tile([0.0, 0.6, 0.8], (len(points), 1))
     fluxes = [

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.calibration.held_out import HeldOut, predict_held_out
-from anser_ros.calibration.layout_fit import LayoutFit, fit_layout
+from anser_ros.calibration.layout_fit import LayoutFit, LayoutFitter
 from anser_ros.calibration.layout_score import DAMPINGS, LayoutCandidate
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.moments import Progress
@@ -34,7 +34,6 @@ from anser_ros.calibration.survey_records import (
 )
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
-from anser_ros.parallel import in_order
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -112,16 +111,14 @@ def fit_scan(
         thin, folds, generator, options.accuracy, progress, options.layout, drawn
     )
 
-    def tested(candidate: LayoutCandidate) -> HeldOut:
-        return _tested(candidate, thin, folds, generator, options, nominal, selection)
-
-    finalists = selection.finalists
-    chosen, held_out = _better(list(zip(finalists, in_order(tested, finalists), strict=True)))
+    fold_fits = _FoldFits(thin, folds, generator, options, nominal, selection)
+    tested, finalists = fold_fits.tested, selection.finalists
+    chosen, held_out = _better([(finalist, tested(finalist)) for finalist in finalists])
     if options.damping is None:
         chosen, held_out = best_damped(chosen, held_out, tested)
     damping = _damping(chosen, options)
-    whole = fit_layout(
-        posed, chosen.layout, damping, generator, options.accuracy, nominal, progress=progress
+    whole = LayoutFitter(posed, generator, options.accuracy, nominal).fit(
+        chosen.layout, damping, progress=progress
     )
     dipoles, fit = whole.dipoles, whole.fit
     sizes = source_sizes(
@@ -217,33 +214,56 @@ def _damping(candidate: LayoutCandidate, options: Options) -> float:
 def _fitter(
     candidate: LayoutCandidate, generator: Generator, options: Options, nominal: FieldModel | None
 ) -> Callable[[list[Measurements]], LayoutFit]:
-    damping = _damping(candidate, options)
-
     def fit(part: list[Measurements]) -> LayoutFit:
-        return fit_layout(
-            part, candidate.layout, damping, generator, options.accuracy, nominal,
-            alternations=3, exact=False,
-        )  # fmt: skip
+        return _fitted(
+            LayoutFitter(part, generator, options.accuracy, nominal), candidate, options
+        )
 
     return fit
 
 
-def _tested(
-    candidate: LayoutCandidate,
-    thin: Sequence[Measurements],
-    folds: Sequence[NDArray[np.int64]],
-    generator: Generator,
-    options: Options,
-    nominal: FieldModel | None,
-    selection: Selection,
-) -> HeldOut:
-    """Return a candidate's held-out error with every fold fitted from the start."""
-    fitter = _fitter(candidate, generator, options, nominal)
-    reference = selection.reference
-    return predict_held_out(
-        thin, folds, fitter, options.accuracy, reference.noise_t, reference.quadrature_noise_t,
-        None if candidate.layout.local else _damping(candidate, options),
-    )  # fmt: skip
+def _fitted(fitter: LayoutFitter, candidate: LayoutCandidate, options: Options) -> LayoutFit:
+    damping = _damping(candidate, options)
+    return fitter.fit(candidate.layout, damping, alternations=3, exact=False)
+
+
+class _FoldFits:
+    """Fits candidates to all folds but one, each fold from the start.
+
+    The folds are shared among the threads, since all candidates' fits to the same folds have the
+    larger part in common.
+    """
+
+    def __init__(
+        self,
+        thin: Sequence[Measurements],
+        folds: Sequence[NDArray[np.int64]],
+        generator: Generator,
+        options: Options,
+        nominal: FieldModel | None,
+        selection: Selection,
+    ) -> None:
+        self.thin, self.folds, self.options = thin, folds, options
+        self.reference = selection.reference
+        self._fitters = {
+            fold: LayoutFitter(
+                [m.frames(f != fold) for m, f in zip(thin, folds, strict=True)],
+                generator, options.accuracy, nominal,
+            )
+            for fold in np.unique(np.concatenate(list(folds))).tolist()
+        }  # fmt: skip
+
+    def tested(self, candidate: LayoutCandidate) -> HeldOut:
+        """Return a candidate's held-out error."""
+        return predict_held_out(
+            self.thin,
+            self.folds,
+            lambda fold: _fitted(self._fitters[fold], candidate, self.options),
+            self.options.accuracy,
+            self.reference.noise_t,
+            self.reference.quadrature_noise_t,
+            None if candidate.layout.local else _damping(candidate, self.options),
+        )
 
 
 def best_damped(
@@ -257,9 +277,7 @@ def best_damped(
     start = DAMPINGS.index(candidate.damping)
     around = [*DAMPINGS[max(start - 1, 0) : start], *DAMPINGS[start + 1 : start + 2]]
     near = [replace(candidate, damping=damping) for damping in around]
-    other, result = min(
-        zip(near, in_order(tested, near), strict=True), key=lambda pair: pair[1].score_t
-    )
+    other, result = min(((one, tested(one)) for one in near), key=lambda pair: pair[1].score_t)
     while result.score_t < held_out.score_t:
         ahead = 2 * DAMPINGS.index(other.damping) - DAMPINGS.index(candidate.damping)
         candidate, held_out = other, result

@@ -80,7 +80,7 @@ def _complex_rows(values: Array, used: NDArray[np.bool_]) -> ComplexArray:
 def predict_held_out(
     measurements: Sequence[Measurements],
     folds: Sequence[NDArray[np.int64]],
-    fit: Callable[[list[Measurements]], LayoutFit],
+    fit: Callable[[int], LayoutFit],
     accuracy: Accuracy,
     noise_t: float | None = None,
     flux_noise_t: float | None = None,
@@ -95,7 +95,7 @@ def predict_held_out(
     folds : sequence of ndarray, shape (F,)
         Fold of each frame, an array for each of the measurements.
     fit : callable
-        Fits a model to measurements from the start.
+        Fits a model to the other folds than one.
     accuracy : Accuracy
         Flux noise and pose jitter.
     noise_t : float, optional
@@ -109,15 +109,13 @@ def predict_held_out(
         are larger than the moments' covariance makes them.
     """
 
-    def fitted(fold: int) -> tuple[int, LayoutFit]:
-        return fold, fit([m.frames(f != fold) for m, f in zip(measurements, folds, strict=True)])
-
-    fits = in_order(fitted, np.unique(np.concatenate(list(folds))).tolist())
-    noise = min(part.fit.noise_t for _, part in fits) if noise_t is None else noise_t
-    quadrature = min(part.fit.quadrature_noise_t for _, part in fits)
+    blocks = np.unique(np.concatenate(list(folds))).tolist()
+    fits = in_order(fit, blocks)
+    noise = min(part.fit.noise_t for part in fits) if noise_t is None else noise_t
+    quadrature = min(part.fit.quadrature_noise_t for part in fits)
     flux_noise = min(noise, quadrature if flux_noise_t is None else flux_noise_t)
-    tally = HeldOutTally(noise, flux_noise, accuracy, len(fits[0][1].dipoles))
-    for fold, part_fit in fits:
+    tally = HeldOutTally(noise, flux_noise, accuracy, len(fits[0].dipoles))
+    for fold, part_fit in zip(blocks, fits, strict=True):
         left = None if damping is None else open_moments(part_fit, damping)
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))

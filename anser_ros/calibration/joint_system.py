@@ -6,6 +6,10 @@ S J^T``, whose inverse takes a 6 x 6 matrix a frame (Golub and Van Loan, Matrix 
 section 2.1.4). Field and parameters are weighed with it together, so that one solution divides
 correctly what a pose, the field and a parameter could each explain. To keep the system small the
 field is written in those modes of a rich layer of dipoles that the readings determine.
+
+Poses tie the parts of the field together, real and imaginary of every emitter. Without metal the
+imaginary parts are nearly zero wherever a sensor is, so no pose has to do with them: they are
+solved one by one then, in a small part of the time.
 """
 
 from collections.abc import Sequence
@@ -39,6 +43,13 @@ LEAST_MODE = 1e-8
 """Singular value of a mode at least, relative to the largest."""
 SYSTEM_ROWS = 1200
 """Readings in memory at a time: each has a row for every parameter."""
+POSE_ROWS = 1800
+"""Rows of the open poses, six a frame, that are subtracted together at least: with fewer, moving
+the large matrix takes as long as the products; more only take memory."""
+LEAST_OPEN = 1e-4
+"""Variance that open poses add to a part's readings on average, relative to the noise's, up to
+which they have nothing to do with it: 1e-9 without metal, 4e-5 to 1e-4 a few centimetres from
+large pieces. A larger one begins to change what readings weigh."""
 STRETCHES = 20
 """Stretches of a body's frames at least: how much their scores scatter tells the weight of the
 fluxes, of which two stretches tell nothing. Many more are shorter than the way over which errors
@@ -139,6 +150,42 @@ def linearise(part: Measurements, modes: FieldModes, field: Array) -> Linear:
     )
 
 
+def open_directions(
+    linear: Linear, weights: Array, noise_t: float, jitter: Array, share: Array
+) -> Array:
+    """Return what the poses, as far as they are open, do to the readings, shape (F, 6, S, 2K).
+
+    In units of the noise; the readings' inverse covariance is the unit matrix less the product of
+    a frame's six rows with themselves.
+
+    Parameters
+    ----------
+    linear : Linear
+        F frames.
+    weights : ndarray, shape (F, S)
+        Weights of the readings in [0, 1].
+    noise_t : float
+        Flux noise of a phasor component, T.
+    jitter : ndarray, shape (6,)
+        Standard deviations of an optical pose, m and rad.
+    share : ndarray, shape (F,)
+        Share of its variance that is left after interpolation.
+    """
+    slope = linear.slope * (np.sqrt(weights) / noise_t)[:, :, None, None]
+    flat = slope.reshape(len(slope), -1, 6)
+    prior = 1.0 / (np.maximum(jitter, 1e-9) ** 2 * share[:, None])
+    precision = flat.transpose(0, 2, 1) @ flat + prior[:, :, None] * np.eye(6)
+    # The inverse of the transposed factor is a root of the pose's covariance.
+    along = np.linalg.solve(np.linalg.cholesky(precision), flat.transpose(0, 2, 1))
+    return np.asarray(along.reshape(len(slope), 6, *slope.shape[1:3]))
+
+
+def tied_parts(along: Sequence[Array]) -> NDArray[np.bool_]:
+    """Return to which parts (2K,) open poses add more than `LEAST_OPEN`, in any of the bodies."""
+    added = np.array([(a**2).sum(axis=1).mean(axis=(0, 1)) for a in along])
+    return np.asarray((added > LEAST_OPEN).any(axis=0))
+
+
 class JointSystem:
     """Sums of the weighted readings: what they say of field and parameters together.
 
@@ -148,20 +195,25 @@ class JointSystem:
         Q of them.
     modes : FieldModes
         M of them.
-    parts : int
-        Real and imaginary parts of all emitters, 2K.
+    tied : ndarray of bool, shape (2K,)
+        Real and imaginary parts of the emitters' field that poses tie together.
     """
 
-    def __init__(self, parameters: SensorParameters, modes: FieldModes, parts: int) -> None:
-        self.parameters, self.modes, self.parts = parameters, modes, parts
-        self.fields = parts * modes.size.size
-        width = self.fields + len(parameters) + 1
-        self.normal = np.zeros((width, width))  # its upper triangle
+    def __init__(
+        self, parameters: SensorParameters, modes: FieldModes, tied: NDArray[np.bool_]
+    ) -> None:
+        self.parameters, self.modes, self.tied = parameters, modes, tied
+        self.parts, self.count = tied.size, modes.size.size
+        rest = len(parameters) + 1
+        width = int(tied.sum()) * self.count + rest
+        # The poses' part of the normal matrix of tied parts and parameters, its upper triangle.
+        self.open = np.zeros((width, width))
+        self.gram = np.zeros((self.count, self.count))  # of every part of the field
+        self.mixed = np.zeros((self.parts, self.count, rest))
+        self.own = np.zeros((rest, rest))
         self.scores: list[Array] = []
 
-    def add(
-        self, linear: Linear, weights: Array, noise_t: float, jitter: Array, share: Array
-    ) -> None:
+    def add(self, linear: Linear, weights: Array, noise_t: float, along: Array) -> None:
         """Take in the frames of a body.
 
         Parameters
@@ -172,16 +224,14 @@ class JointSystem:
             Weights of the readings in [0, 1].
         noise_t : float
             Flux noise of a phasor component, T.
-        jitter : ndarray, shape (6,)
-            Standard deviations of an optical pose, m and rad.
-        share : ndarray, shape (F,)
-            Share of its variance that is left after interpolation.
+        along : ndarray, shape (F, 6, S, 2K)
+            Of `open_directions`.
         """
-        velocity = velocity_of(linear.part)
-        modes = self.modes.size.size
+        velocity, along = velocity_of(linear.part), np.where(self.tied, along, 0.0)
         count, sensors = weights.shape
         stretches = max(STRETCHES, len(frame_blocks(count, sensors, SYSTEM_ROWS)))
         edges = np.unique(np.linspace(0, count, stretches + 1).astype(int)).tolist()
+        held: list[Array] = []
         for block in (slice(*pair) for pair in pairwise(edges)):
             part, root = linear.part.frames(block), np.sqrt(weights[block]) / noise_t
             columns = self.parameters.derivatives(
@@ -192,37 +242,41 @@ class JointSystem:
                 [as_real(columns), linear.residual[block][:, :, None, :]], axis=2
             )
             right = right * root[:, :, None, None]
-            rows = linear.rows[block][..., :modes] * root[:, :, None]
-            slope = linear.slope[block] * root[:, :, None, None]
-            count, sensors = root.shape
-            flat = slope.reshape(count, -1, 6)
-            prior = 1.0 / (np.maximum(jitter, 1e-9) ** 2 * share[block, None])
-            precision = flat.transpose(0, 2, 1) @ flat + prior[:, :, None] * np.eye(6)
-            # The inverse of the transposed factor is a root of the pose's covariance.
-            lower = np.linalg.cholesky(precision)
-            along = np.linalg.solve(lower, flat.transpose(0, 2, 1))
-            along = along.reshape(count, 6, sensors, self.parts)
-            by_field = along.transpose(0, 1, 3, 2).reshape(count, -1, sensors) @ rows
-            by_rest = along.reshape(count, 6, -1) @ right.transpose(0, 1, 3, 2).reshape(
-                count, sensors * self.parts, -1
-            )
-            taken = np.concatenate([by_field.reshape(count, 6, -1), by_rest], axis=2)
-            taken = taken.reshape(6 * count, -1)
-            score = -(taken[:, :-1].T @ taken[:, -1])
-            subtract_gram(self.normal, taken)
-            flat_rows = rows.reshape(-1, modes)
-            gram = flat_rows.T @ flat_rows
-            mixed = np.tensordot(rows, right, axes=([0, 1], [0, 1]))
-            for c in range(self.parts):
-                own = slice(c * modes, (c + 1) * modes)
-                self.normal[own, own] += gram
-                self.normal[own, self.fields :] += mixed[:, :, c]
-                score[own] += mixed[:, -1, c]
+            rows = linear.rows[block][..., : self.count] * root[:, :, None]
+            taken = self._taken(along[block], rows, right)
+            held.append(taken)
+            if sum(map(len, held)) >= POSE_ROWS:
+                subtract_gram(self.open, np.concatenate(held))
+                held = []
+            flat_rows = rows.reshape(-1, self.count)
+            self.gram += flat_rows.T @ flat_rows
+            mixed = np.tensordot(right, rows, axes=([0, 1], [0, 1])).transpose(1, 2, 0)
+            self.mixed += mixed
             columns_flat = right.transpose(2, 0, 1, 3).reshape(right.shape[2], -1)
             inner = columns_flat @ columns_flat.T
-            self.normal[self.fields :, self.fields :] += inner
-            score[self.fields :] += inner[:-1, -1]
-            self.scores.append(score)
+            self.own += inner
+            self.scores.append(self._score(mixed[:, :, -1], inner[:-1, -1], taken))
+        if held:
+            subtract_gram(self.open, np.concatenate(held))
+
+    def _taken(self, along: Array, rows: Array, right: Array) -> Array:
+        """Return what open poses take, six rows a frame: of tied parts, parameters, residual."""
+        count, _, sensors, parts = along.shape
+        tied = np.ascontiguousarray(along[..., self.tied].transpose(0, 1, 3, 2))
+        by_field = tied.reshape(count, -1, sensors) @ rows
+        by_rest = along.reshape(count, 6, -1) @ right.transpose(0, 1, 3, 2).reshape(
+            count, sensors * parts, -1
+        )
+        taken = np.concatenate([by_field.reshape(count, 6, -1), by_rest], axis=2)
+        return np.asarray(taken.reshape(6 * count, -1))
+
+    def _score(self, by_field: Array, by_parameters: Array, taken: Array) -> Array:
+        """Return a stretch's gradient: of the fields (2K M) part by part, and parameters (Q)."""
+        gone = taken[:, :-1].T @ taken[:, -1]
+        field = by_field.copy()
+        tied = int(self.tied.sum())
+        field[self.tied] -= gone[: tied * self.count].reshape(tied, -1)
+        return np.concatenate([field.ravel(), by_parameters - gone[tied * self.count :]])
 
     def eliminate(self, field_precision: Array, pull: Array) -> 'Eliminated':
         """Return what is left for the parameters when the field is eliminated.
@@ -234,20 +288,34 @@ class JointSystem:
         pull : ndarray, shape (M, 2K)
             Prior mean minus present amplitude, T.
         """
-        n = self.fields
-        precision = np.tile(field_precision, self.parts)
-        inner = self.normal[:n, :n].copy()
-        inner[np.diag_indices(n)] += precision
-        factor = NormalFactor(inner)
-        right = self.normal[:n, n:].copy()
-        right[:, -1] += precision * pull.T.ravel()
-        inside = factor.solve(right)
-        own = np.triu(self.normal[n:, n:])
-        rest = own + np.triu(own, 1).T - self.normal[:n, n:].T @ inside
-        gradient = self.normal[n:-1, -1] - inside[:, :-1].T @ right[:, -1]
-        scores = np.array([s[n:] - inside[:, :-1].T @ s[:n] for s in self.scores])
-        variance = factor.inverse_diagonal().reshape(self.parts, -1).T.copy()
-        return Eliminated(rest[:-1, :-1], gradient, inside, scores, variance)
+        tied, n = self.tied, int(self.tied.sum()) * self.count
+        block = self.gram + np.diag(field_precision)
+        right = self.mixed.copy()
+        right[tied] += self.open[:n, n:].reshape(-1, self.count, right.shape[2])
+        right[:, :, -1] += (field_precision[:, None] * pull).T
+        inside, variance = np.empty_like(right), np.empty((self.parts, self.count))
+        inner = self.open[:n, :n].copy()
+        for start in range(0, n, self.count):
+            own = slice(start, start + self.count)
+            inner[own, own] += block
+        for parts, matrix in ((tied, inner), (~tied, block)):
+            if not parts.any():
+                continue
+            factor = NormalFactor(matrix)
+            alike = right[parts].reshape(-1, len(matrix), right.shape[2])
+            # Parts that nothing ties have one matrix, and are right-hand sides beside each other.
+            beside = np.concatenate(list(alike), axis=1)
+            found = np.split(factor.solve(beside), len(alike), axis=1)
+            inside[parts] = np.reshape(found, inside[parts].shape)
+            variance[parts] = factor.inverse_diagonal().reshape(-1, self.count)
+        flat, answers = right.reshape(-1, right.shape[2]), inside.reshape(-1, right.shape[2])
+        taken = np.triu(self.open[n:, n:])
+        rest = self.own + taken + np.triu(taken, 1).T - answers.T @ flat
+        # Its last column alone knows of the prior mean, as the gradient has to.
+        scores = np.array(
+            [s[len(flat) :] - answers[:, :-1].T @ s[: len(flat)] for s in self.scores]
+        )
+        return Eliminated(rest[:-1, :-1], rest[:-1, -1], answers, scores, variance.T.copy())
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,54 +139,85 @@ def optimise_positions(
     return moved, prior_of(layout, moved, drawn)
 
 
-def fit_layout(
-    measurements: Sequence[Measurements],
-    layout: Layout,
-    damping: float,
-    generator: Generator,
-    accuracy: Accuracy,
-    nominal: FieldModel | None = None,
-    alternations: int = 6,
-    exact: bool = True,
-    progress: Progress | None = None,
-) -> LayoutFit:
-    """Fit a layout from the start, without using the result of any other fit.
+class LayoutFitter:
+    """Fits layouts to the same measurements; what several fits have in common is done once.
 
     Parameters
     ----------
     measurements : sequence of Measurements
         Tool measurements with poses, one per body and session.
-    layout : Layout
-        The layout.
-    damping : float
-        Damping of the moments.
     generator : Generator
         Places of the coils.
     accuracy : Accuracy
         Flux noise and pose jitter.
     nominal : FieldModel, optional
         The drawn board, for layouts that are pulled towards it.
-    alternations, exact, progress
-        As for `MomentFitter.fit`.
     """
-    drawn = None
-    if nominal is not None and layout.prior == 'nominal':
-        drawn = DrawnBoard(nominal, measurements)
-    dipoles, prior = placed(layout, generator, drawn)
-    rich = None
-    if layout.moved:
-        layer = place(rich_layout(measurements, generator), generator)
-        rich = MomentFitter(measurements, layer, RICH_DAMPING, accuracy)
-        reference = rich.fit(3, exact=False)
-        dipoles, prior = optimise_positions(
-            reference.measurements, reference.weights, dipoles, prior, layout, drawn
-        )
-    fitter = MomentFitter(measurements, dipoles, damping, accuracy, prior)
-    if rich is not None:
-        fitter.start_at(rich)
-    fit = fitter.fit(alternations, progress, exact)
-    if not layout.local:
-        return LayoutFit(dipoles, prior, fit)
-    layer = place(rich_layout(measurements, generator), generator)
-    moments = join_regions(measurements, dipoles, fit, damping, layer)
-    return LayoutFit(layer, None, replace(fit, moments=moments))
+
+    def __init__(
+        self,
+        measurements: Sequence[Measurements],
+        generator: Generator,
+        accuracy: Accuracy,
+        nominal: FieldModel | None = None,
+    ) -> None:
+        self.measurements, self.generator = measurements, generator
+        self.accuracy, self.nominal = accuracy, nominal
+        self._placed: dict[Layout, tuple[DipoleSites, ComplexArray | None]] = {}
+
+    def fit(
+        self,
+        layout: Layout,
+        damping: float,
+        alternations: int = 6,
+        exact: bool = True,
+        progress: Progress | None = None,
+    ) -> LayoutFit:
+        """Fit a layout from the start, without using any other data.
+
+        Parameters
+        ----------
+        layout : Layout
+            The layout.
+        damping : float
+            Damping of the moments.
+        alternations, exact, progress
+            As for `MomentFitter.fit`.
+        """
+        dipoles, prior = self._sites(layout)
+        fitter = MomentFitter(self.measurements, dipoles, damping, self.accuracy, prior)
+        if layout.moved:
+            fitter.start_at(self._rich[0])
+        fit = fitter.fit(alternations, progress, exact)
+        if not layout.local:
+            return LayoutFit(dipoles, prior, fit)
+        layer = self._layer
+        moments = join_regions(self.measurements, dipoles, fit, damping, layer)
+        return LayoutFit(layer, None, replace(fit, moments=moments))
+
+    def _sites(self, layout: Layout) -> tuple[DipoleSites, ComplexArray | None]:
+        """A layout's dipoles where the measurements put them, and what they are pulled to."""
+        if layout not in self._placed:
+            drawn = self._drawn if layout.prior == 'nominal' else None
+            dipoles, prior = placed(layout, self.generator, drawn)
+            if layout.moved:
+                _, fit = self._rich
+                dipoles, prior = optimise_positions(
+                    fit.measurements, fit.weights, dipoles, prior, layout, drawn
+                )
+            self._placed[layout] = dipoles, prior
+        return self._placed[layout]
+
+    @cached_property
+    def _drawn(self) -> DrawnBoard | None:
+        return None if self.nominal is None else DrawnBoard(self.nominal, self.measurements)
+
+    @cached_property
+    def _layer(self) -> DipoleSites:
+        return place(rich_layout(self.measurements, self.generator), self.generator)
+
+    @cached_property
+    def _rich(self) -> tuple[MomentFitter, MomentFit]:
+        """The fit of a rich layer, at whose poses dipoles are moved."""
+        fitter = MomentFitter(self.measurements, self._layer, RICH_DAMPING, self.accuracy)
+        return fitter, fitter.fit(3, exact=False)

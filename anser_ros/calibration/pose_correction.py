@@ -92,12 +92,16 @@ def pose_slopes(
     by_place, by_axis : ndarray, shape (F, S, 3, K), complex
         Derivatives by the sensors' centres (T/m) and axes (T).
     """
-    place = as_real(by_place).transpose(0, 1, 3, 2)
-    axis = as_real(by_axis).transpose(0, 1, 3, 2)
-    arms = (points - position[:, None, :])[:, :, None, :]
-    turn = np.cross(np.broadcast_to(arms, place.shape), place)
-    turn += np.cross(np.broadcast_to(axes[:, :, None, :], axis.shape), axis)
-    return np.concatenate([place, turn], axis=3)
+    place, turn = as_real(by_place), as_real(by_axis)
+    arms = points - position[:, None, :]
+    out = np.empty((*place.shape[:2], place.shape[3], 6))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., i] = place[:, :, i]
+        # The cross products, in a small part of the time of `numpy.cross`.
+        moved_by = arms[..., j, None] * place[:, :, k] - arms[..., k, None] * place[:, :, j]
+        turned_by = axes[..., j, None] * turn[:, :, k] - axes[..., k, None] * turn[:, :, j]
+        out[..., 3 + i] = moved_by + turned_by
+    return out
 
 
 def most_probable_step(

@@ -32,6 +32,8 @@ from anser_ros.calibration.joint_system import (
     JointSystem,
     Linear,
     linearise,
+    open_directions,
+    tied_parts,
 )
 from anser_ros.calibration.layout_fit import RICH_DAMPING, rich_layout
 from anser_ros.calibration.layouts import Generator, place
@@ -233,11 +235,16 @@ class SensorSurveyor:
     ) -> Eliminated:
         """What the tools say about some parameters, with the field unknown."""
         modes = self.modes.strongest(self.solved)
-        system = JointSystem(parameters, modes, self.field.shape[1])
         noise_t = float(np.sqrt(self.inflation)) * self.noise_t
-        for tool, at in zip(tools, linear, strict=True):
-            share = interpolation_share(at.part)
-            system.add(at, tool.weights, noise_t, self.optical.jitter, share)
+        along = [
+            open_directions(
+                at, tool.weights, noise_t, self.optical.jitter, interpolation_share(at.part)
+            )
+            for tool, at in zip(tools, linear, strict=True)
+        ]
+        system = JointSystem(parameters, modes, tied_parts(along))
+        for tool, at, directions in zip(tools, linear, along, strict=True):
+            system.add(at, tool.weights, noise_t, directions)
         precision = 1.0 / (self.field_width * self.flux_rms * modes.size) ** 2
         return system.eliminate(precision, (self.middle - self.field)[: self.solved])
 
