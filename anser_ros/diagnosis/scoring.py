@@ -10,10 +10,13 @@ from scipy.linalg import cho_factor, cho_solve
 from anser_ros.diagnosis.decisions import TIME_FOLDS
 from anser_ros.diagnosis.problem import State
 from anser_ros.effects.term import Term
+from anser_ros.parallel import in_order, slices
 
 Array = NDArray[np.float64]
 Columns = Sequence[Array | None]
 
+BLOCKS_A_THREAD = 4
+"""Blocks that one thread sums up, half a millisecond's work."""
 MOST_COLUMNS = 60
 """Columns that a term in force may have to be fitted again with each candidate. A term with more
 is what metal left, and no effect's rival."""
@@ -146,19 +149,26 @@ def block_sums(state: State, columns: Columns, block_numbers: NDArray[np.int64])
     normal = np.zeros((block_numbers.size, size, size))
     right = np.zeros((block_numbers.size, size))
     squares = np.zeros(block_numbers.size)
-    for part, column in zip(state.parts, columns, strict=True):
-        for i, rows in enumerate(spans(part.blocks, block_numbers)):
-            white = part.white[rows].ravel()
-            squares[i] += white @ white
-            if column is not None:
-                flat = column[rows].reshape(-1, size)
-                normal[i] += flat.T @ flat
-                right[i] += flat.T @ white
+    rows_of = [spans(part.blocks, block_numbers) for part in state.parts]
+
+    def work(mine: slice) -> None:
+        for part, column, rows in zip(state.parts, columns, rows_of, strict=True):
+            for i in range(mine.start, mine.stop):
+                white = part.white[rows[i]].ravel()
+                squares[i] += white @ white
+                if column is not None:
+                    flat = column[rows[i]].reshape(-1, size)
+                    normal[i] += flat.T @ flat
+                    right[i] += flat.T @ white
+
+    in_order(work, slices(block_numbers.size, BLOCKS_A_THREAD))
     return BlockSums(normal, right, squares)
 
 
 def joined(groups: Sequence[Columns]) -> list[Array | None]:
     """Return columns of several groups side by side; zeros where a group has none."""
+    if len(groups) == 1:
+        return list(groups[0])
     out: list[Array | None] = []
     for pieces in zip(*groups, strict=True):
         known = [p for p in pieces if p is not None]

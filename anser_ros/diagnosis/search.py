@@ -9,6 +9,7 @@ decided are in `anser_ros.diagnosis.decisions`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +28,13 @@ from anser_ros.diagnosis.structure import noise_scale
 from anser_ros.effects.effect import Family
 from anser_ros.effects.registry import all_effects
 from anser_ros.effects.term import Term
+from anser_ros.parallel import in_order, slices
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
+
+CANDIDATES_A_THREAD = 16
+"""Candidates that one thread scores, some 100 ms of work."""
 
 
 @dataclass(frozen=True)
@@ -271,7 +276,7 @@ def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
     taken, ours = scorer.state.terms, problem.apparatus.tool_channels
     metals = sum(term.effect.family.is_metal for term in taken)
     moving = any(term.effect.family is Family.MOVING_METAL for term in taken)
-    out = []
+    candidates = []
     for effect in all_effects().values():
         if effect.family.is_metal and (moving or metals >= decisions.MOST_METALS):
             continue
@@ -281,12 +286,20 @@ def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
             if metals and not all(channel in ours for channel in term.channels):
                 # Beside metal a reference's survey error looks like a fault of its channel.
                 continue
-            if left_over(scorer.state, term) < decisions.DISTINGUISHABLE:
-                continue
-            score = scorer.score(term)
-            if score is not None:
-                out.append((term, score))
-    return sorted(out, key=lambda pair: pair[1].held_out)
+            candidates.append(term)
+
+    def score(few: slice) -> list[Score | None]:
+        return [
+            None
+            if left_over(scorer.state, term) < decisions.DISTINGUISHABLE
+            else scorer.score(term)
+            for term in candidates[few]
+        ]
+
+    parts = in_order(score, slices(len(candidates), CANDIDATES_A_THREAD))
+    pairs = zip(candidates, chain.from_iterable(parts), strict=True)
+    scored = [(term, found) for term, found in pairs if found is not None]
+    return sorted(scored, key=lambda pair: pair[1].held_out)
 
 
 def _covered(candidate: Term, other: Term) -> bool:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from anser_ros.effects.body_term import BodyTerm, Richness
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
+from anser_ros.parallel import in_order
 
 Array = NDArray[np.float64]
 
@@ -78,13 +80,14 @@ class Shaping:
         if restarted is not None:
             linear = trial.fitter.fit(_with(fit.terms, index, restarted.hold()), 1)
             starts.append(trial.fitter.fit([t.free() for t in linear.terms], 0))
-        shaped = [
-            other
-            for start in starts
-            for kinds in families
-            if (body := _body(start.terms[index])) is not None
-            and (other := trial.shaped_as(start, index, body, kinds))
-        ]
+
+        def shape(pair: tuple[Fit, list[str]]) -> Fit | None:
+            start, kinds = pair
+            body = _body(start.terms[index])
+            return None if body is None else trial.shaped_as(start, index, body, kinds)
+
+        found = in_order(shape, product(starts, families))
+        shaped = [fit for fit in found if fit is not None]
         if not shaped:
             return fit
         best = min(shaped, key=self.fitter.held_out)

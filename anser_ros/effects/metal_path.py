@@ -1,6 +1,7 @@
 """Computes where moving metal is at each time: straight from rest to rest, or along a spline."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -16,6 +17,9 @@ FINE_STEP_S = 0.05
 """Step (s) in which the length of a way is summed up, a quarter of the shortest way."""
 NODES, NODES_PER_KNOT = 41, 6
 """Nodes on a path, in which fields are found; between them they are interpolated."""
+KEPT_SPLINES = 64
+"""Sets of spline weights that are kept, 0.2 MB each: those of a few paths that are fitted side by
+side, for the frames of a few bodies. Fewer, and they are worked out anew in every step."""
 NEGLIGIBLE_WAY = 0.02
 """Share (0 to 1) of a way that counts as not yet begun, or as over: 2 to 5 mm of a hand's way,
 less than metal that matters is large. Smaller takes ripples of a fitted path at rest for its
@@ -123,8 +127,7 @@ class FreePath:
     def _weights(self, time: Array) -> Array:
         """Share of each knot in the centre at each time, (F, n)."""
         knots = np.array(self.knots)
-        spline = CubicSpline(knots, np.eye(knots.size), bc_type='natural')
-        return np.asarray(spline(np.clip(time, knots[0], knots[-1])))
+        return spline_weights(knots, np.clip(time, knots[0], knots[-1]), 'natural')
 
     def centre(self, theta: Array, time: Array) -> Array:
         """Return the body's centre at each time, shape (F, 3), m."""
@@ -159,6 +162,32 @@ class FreePath:
         normal = weights.T @ weights + bend.T @ bend
         course = np.linalg.solve(normal, weights.T @ centres)
         return path, np.asarray(course.ravel(), dtype=np.float64)
+
+
+def spline_weights(nodes: Array, at: Array, ends: str) -> Array:
+    """Return what each node's value weighs in a cubic spline's values, shape (F, N); to be read.
+
+    Many splines through the same nodes are wanted at the same places one after the other: the
+    weights are kept for a while.
+
+    Parameters
+    ----------
+    nodes : ndarray, shape (N,)
+        Ascending.
+    at : ndarray, shape (F,)
+        Where values are wanted.
+    ends : str
+        Condition at the ends, as scipy's ``bc_type``.
+    """
+    return _spline_weights(nodes.tobytes(), at.tobytes(), ends)
+
+
+@lru_cache(maxsize=KEPT_SPLINES)
+def _spline_weights(nodes: bytes, at: bytes, ends: str) -> Array:
+    grid = np.frombuffer(nodes)
+    weights = np.asarray(CubicSpline(grid, np.eye(grid.size), bc_type=ends)(np.frombuffer(at)))
+    weights.flags.writeable = False
+    return weights
 
 
 def distance_travelled(path: MetalPath, theta: Array, time: Array) -> tuple[Array, Array]:

@@ -6,7 +6,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.body_term import LARGEST, BodyTerm
@@ -20,7 +19,13 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
 )
-from anser_ros.effects.metal_path import FreePath, MetalPath, StraightPath, moving_times
+from anser_ros.effects.metal_path import (
+    FreePath,
+    MetalPath,
+    StraightPath,
+    moving_times,
+    spline_weights,
+)
 from anser_ros.effects.static_metal import STATIC_METAL
 from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
@@ -87,7 +92,10 @@ class MovingTerm(BodyTerm):
         nodes, on_way, at = self.path.nodes(self.course, view.time)
         grid = (on_way + shift)[:, None, :] + self.shapes.offsets
         field = view.illumination.field(grid.reshape(-1, 3)).reshape(*grid.shape, -1)
-        drive = CubicSpline(nodes, self.shapes.driven(field))(at)
+        driven = np.ascontiguousarray(self.shapes.driven(field), dtype=np.complex128)
+        flat = driven.reshape(nodes.size, -1).view(np.float64)  # real and imaginary by turns
+        along = spline_weights(nodes, at, 'not-a-knot') @ flat
+        drive = along.view(np.complex128).reshape(at.size, *driven.shape[1:])
         centre = self.centres(view.time) + shift
         return self.shapes.received(centre, view.centres, view.axes, view.sensors.length), drive
 

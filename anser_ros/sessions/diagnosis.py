@@ -17,6 +17,7 @@ from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.whitening import Spread
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import FieldModel
+from anser_ros.parallel import in_order
 from anser_ros.sessions.evaluation import compare
 from anser_ros.sessions.follower import ModelFollower
 from anser_ros.sessions.prepared import PreparedSession, correct, prepare
@@ -186,11 +187,16 @@ def track_held_out(
     floor = max(found.flux_rms_floor_t, 1e-30)
     after = unseen.with_model(found.model)
     moves = any(term.effect.followed for term in found.terms)
-    follower = ModelFollower(after) if moves and after.baseline is not None else None
-    return (
-        _errors(unseen, found.flux_rms_before_t / floor),
-        _errors(after, found.flux_rms_after_t / floor, follower),
-    )
+
+    def with_effects() -> TrackingErrors:
+        follower = ModelFollower(after) if moves and after.baseline is not None else None
+        return _errors(after, found.flux_rms_after_t / floor, follower)
+
+    def without() -> TrackingErrors:
+        return _errors(unseen, found.flux_rms_before_t / floor)
+
+    later, earlier = in_order(lambda work: work(), [with_effects, without])
+    return earlier, later
 
 
 def _errors(
