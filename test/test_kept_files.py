@@ -11,18 +11,17 @@ from refit_rig import HEAD, Rig, setup_text
 from refit_world import anser_world
 from test_refit_start import given_baseline
 
-from anser_ros.nodes.field_model_parts import kept_files
-from anser_ros.nodes.field_model_parts.kept_files import (
-    BASELINE_S,
-    MOST_TABLES,
-    KeptBaseline,
-    KeptTables,
-    ReadAhead,
-)
+from anser_ros.cli import warm_up
+from anser_ros.nodes.field_model_parts.kept_baseline import BASELINE_S, KeptBaseline
 from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
+from anser_ros.sessions import kept_tables
 from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.kept_tables import MOST_TABLES, KeptTables, ReadAhead
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.volume import stated_volume
+from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import parse_setup
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
@@ -60,7 +59,7 @@ def test_tables_are_read_as_they_were_written(tmp_path):
     (path,) = tmp_path.iterdir()
     ahead = ReadAhead(tmp_path, world.model)
     again = KeptTables(tmp_path, setup, world.model, world.references, ahead)
-    with patch.object(kept_files, '_read', side_effect=OSError('read twice')):
+    with patch.object(kept_tables, 'read_arrays', side_effect=OSError('read twice')):
         early = again.read()
         assert again.read() is None, 'what was read early is used once'
     assert all(same(*pair) for pair in zip(made.factors, early.factors, strict=True))
@@ -177,3 +176,15 @@ def test_a_baseline_that_references_contradict_is_not_taken_up(started):
     rig = started()
     rig.node._on_setup(String(data=setup_text(rig.world)))
     assert rig.node.counters['baselines_resumed'] == 0 and rig.node._refit.words == ''
+
+
+@pytest.mark.long
+def test_the_warm_up_leaves_the_tables_with_which_the_demo_starts(tmp_path, monkeypatch):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    setup = parse_setup(read_config('demo_setup.yaml'))
+    model = load_model(config_path('demo_model.yaml'))
+    references = sensor_table(setup.reference_sensors)
+    of_the_demo = KeptTables(tmp_path / 'anser_ros', setup, model, references)
+    assert of_the_demo.read() is None
+    warm_up._refit()
+    assert of_the_demo.read() is not None

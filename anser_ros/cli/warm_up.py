@@ -175,10 +175,13 @@ def _solve_body() -> None:
 
 
 def _refit() -> None:
-
+    """Make a refit of the demo's board; its tables, most of the work, are kept for the demo."""
     from anser_ros.refit.live_refit import LiveRefit
+    from anser_ros.refit.tables import build_tables
+    from anser_ros.sessions.drawing import Drawing
+    from anser_ros.sessions.kept_tables import KeptTables, kept_folder
     from anser_ros.sessions.session import sensor_table
-    from anser_ros.sessions.starting_model import board_of
+    from anser_ros.sessions.volume import stated_volume
     from anser_ros.simulation.board_source import board_source
     from anser_ros.simulation.metal import steel_disc
     from anser_ros.simulation.motion import Approach
@@ -191,7 +194,14 @@ def _refit() -> None:
         World(setup, source, metal=metal).flux(0.0)[len(setup.tool_sensors) :]
         for metal in ([], [steel_disc(near)])
     )
-    refit = LiveRefit(_demo_model(), references, clean, drawing=board_of(setup).field)
+    model, folder = _demo_model(), kept_folder()
+    tables = build_tables(
+        model, references, setup.refit, Drawing.of(setup).field, stated_volume(setup)
+    )
+    refit = LiveRefit(model, references, clean, setup.refit, tables=tables)
+    if folder is not None:
+        with contextlib.suppress(OSError):  # a full disk only makes the demo's first start slower
+            KeptTables(folder, setup, model, references).write(tables)
     for frame, flux in enumerate((clean, bent, bent, bent)):
         refit.update(SECOND_NS + frame * 20_000_000, references.channel, flux)
 

@@ -20,12 +20,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.nodes.field_model_parts import refit_status
 from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelParameters
-from anser_ros.nodes.field_model_parts.kept_files import (
-    CONFIRM_S,
-    KeptBaseline,
-    ReadAhead,
-    kept_folder,
-)
+from anser_ros.nodes.field_model_parts.kept_baseline import CONFIRM_S, KeptBaseline
 from anser_ros.nodes.field_model_parts.metal_view import MetalView
 from anser_ros.nodes.field_model_parts.model_output import ModelOutput
 from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
@@ -42,6 +37,7 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow, check_enough
 from anser_ros.refit.change import Pace
 from anser_ros.sessions.baseline import clean_flux, clean_mean
+from anser_ros.sessions.kept_tables import ReadAhead, kept_folder
 from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame
-from anser_ros.nodes.field_model_parts.kept_files import KeptBaseline
+from anser_ros.nodes.field_model_parts.kept_baseline import KeptBaseline
 from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
 from anser_ros.nodes.field_model_parts.refit_start import RefitStart, warm_up
 from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses

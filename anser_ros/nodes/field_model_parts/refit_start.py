@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
-from anser_ros.nodes.field_model_parts.kept_files import KeptTables, ReadAhead
 from anser_ros.nodes.field_model_parts.patches import Patches
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.tracks import loop_field
@@ -22,6 +21,7 @@ from anser_ros.refit import tables
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.patches import start_table
 from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.kept_tables import KeptTables, ReadAhead
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.setup import Setup

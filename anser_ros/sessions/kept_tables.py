@@ -1,17 +1,12 @@
-"""Keeps on disk what a field_model that was killed needs to follow the references again at once.
+"""Keeps the tables of refits on disk, which take seconds to compute.
 
-The tables of a refit take seconds to compute. A baseline cannot be taken while metal is near. The
-tables hold as long as model, setup and code are the same. A baseline holds as long as the sender
-of the references goes on and nothing speaks against it: the node confirms it every second, and
-whoever starts soon after the last time takes it up.
+They hold as long as model, setup and code are the same.
 """
 
-import contextlib
 import json
 import os
-import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
@@ -35,13 +30,6 @@ TABLES = 'refit_tables_'
 """How the names of files with tables begin; the model's fingerprint follows."""
 MOST_TABLES = 3
 """Files of tables that are kept, the last used: each has about 140 MB."""
-BASELINE_S = 60.0
-"""How long after it was last confirmed, s, a baseline is taken up. Shorter, and a process that a
-supervisor starts again on a busy machine is too late; longer, and coils that somebody moved
-meanwhile are taken for metal."""
-CONFIRM_S = 1.0
-"""Time from one confirmation of a baseline to the next, s. Smaller costs more; larger, and what
-the references said shortly before the process was killed is not known to the next one."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, FitError)
 """What the reading of a file raises that is not there, cut, or another one's."""
 LONGEST_HEAD = 1_000_000
@@ -76,17 +64,17 @@ class ReadAhead:
         self._read: Future[dict[str, NDArray[Any]]] | None = None
         if folder is not None and model is not None:
             kept = folder.glob(f'{_tables_name(model)}*')
-            self._path = max(kept, key=_used_s, default=None)
+            self._path = max(kept, key=used_s, default=None)
         if self._path is not None:
             worker = ThreadPoolExecutor(1, thread_name_prefix='read_ahead')
-            self._read = worker.submit(_read, self._path)
+            self._read = worker.submit(read_arrays, self._path)
             worker.shutdown(wait=False)
 
     def arrays_of(self, path: Path) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a file, which may have been read; raises what `_read` does."""
+        """Return the arrays of a file, which may have been read; raises as `read_arrays`."""
         read = self._read
         self.drop()
-        return _read(path) if read is None or path != self._path else read.result()
+        return read_arrays(path) if read is None or path != self._path else read.result()
 
     def drop(self) -> None:
         """Forget what was read: it is used once, or not wanted."""
@@ -143,95 +131,10 @@ class KeptTables:
             When the disk is full, or must not be written.
         """
         if not self._path.exists():
-            _write(self._path, arrays_of(tables))
-        files = sorted(self._folder.glob(f'{TABLES}*'), key=_used_s, reverse=True)
+            write_arrays(self._path, arrays_of(tables))
+        files = sorted(self._folder.glob(f'{TABLES}*'), key=used_s, reverse=True)
         for old in files[MOST_TABLES:]:
             old.unlink(missing_ok=True)
-
-
-class KeptBaseline:
-    """Keeps the baseline of a running node.
-
-    Attributes
-    ----------
-    folder : Path or None
-        Where files are kept; None where they are not.
-    ahead : ReadAhead
-        Of the tables in it.
-
-    Parameters
-    ----------
-    folder : Path or None
-    node : str
-        Whole name of the node.
-    sender : callable
-        Returns what identifies the only sender of the references; empty where there is none.
-    ahead : ReadAhead, optional
-    """
-
-    def __init__(
-        self,
-        folder: Path | None,
-        node: str,
-        sender: Callable[[], str],
-        ahead: ReadAhead | None = None,
-    ) -> None:
-        self.folder, self._node, self._sender = folder, node, sender
-        self.ahead = ahead or ReadAhead(None, None)
-        self._of: tuple[str, ...] = ()
-        self._kept: Path | None = None
-
-    def expect(self, setup: Setup, model: FieldModel) -> None:
-        """Have to do with the references of a setup and with a model from now on."""
-        identity = setup.identity
-        self._of = identity.board, *identity.bodies.values(), model.fingerprint
-        self._kept = None
-
-    @property
-    def is_known(self) -> bool:
-        """Return whether the references have one sender, and the setup is known."""
-        return self._path() is not None
-
-    def read(self) -> NDArray[np.complex128] | None:
-        """Return the baseline that another process confirmed lately; None where there is none."""
-        path = self._path()
-        with contextlib.suppress(*DAMAGED):
-            if path is not None and 0.0 <= time.time() - _used_s(path) <= BASELINE_S:
-                return np.asarray(_read(path)['flux'], dtype=np.complex128)
-        return None
-
-    def confirm(self, flux: NDArray[np.complex128]) -> None:
-        """Keep a baseline, shape (R, K), T, to which nothing is opposed at this moment.
-
-        Raises
-        ------
-        OSError
-            When the disk is full, or must not be written.
-        """
-        path = self._path()
-        if path != self._kept:
-            self.drop()
-        if path is not None and self._kept is None:
-            _write(path, {'flux': flux})
-            self._kept = path
-            for old in path.parent.glob('baseline_*'):
-                if time.time() - _used_s(old) > BASELINE_S:
-                    old.unlink(missing_ok=True)
-        elif path is not None:
-            os.utime(path)
-
-    def drop(self) -> None:
-        """Keep none: another one is in force, or something speaks against it."""
-        if self._kept is not None:
-            self._kept.unlink(missing_ok=True)
-        self._kept = None
-
-    def _path(self) -> Path | None:
-        sender = self._sender() if self.folder is not None and self._of else ''
-        if self.folder is None or not sender:
-            return None
-        key = fingerprint_of([self._node, sender, *self._of])
-        return self.folder / f'baseline_{key}'
 
 
 def _tables_name(model: FieldModel) -> str:
@@ -245,7 +148,7 @@ def _code() -> list[Any]:
     return [np.__version__, *([str(f), f.stat().st_mtime_ns, f.stat().st_size] for f in files)]
 
 
-def _used_s(path: Path) -> float:
+def used_s(path: Path) -> float:
     """Return when a file was last used, s since 1970; 0 if it has gone."""
     try:
         return path.stat().st_mtime
@@ -253,8 +156,14 @@ def _used_s(path: Path) -> float:
         return 0.0
 
 
-def _read(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file; they share one memory, as reading them one by one is slow."""
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file; they share one memory, as reading them one by one is slow.
+
+    Raises
+    ------
+    OSError, ValueError, KeyError, TypeError
+        When it is not there, damaged, or another one's; see `DAMAGED`.
+    """
     with path.open('rb') as file:
         head = json.loads(file.readline(LONGEST_HEAD))
         data = np.fromfile(file, dtype=np.uint8)
@@ -266,8 +175,14 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     }
 
 
-def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a file that is whole or not there."""
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write a file that is whole or not there.
+
+    Raises
+    ------
+    OSError
+        When the disk is full, or must not be written.
+    """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     rows, parts, begin = {}, [], 0
     for name, array in arrays.items():
