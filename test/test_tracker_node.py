@@ -194,6 +194,43 @@ def test_the_volume_of_the_setup_holds_unless_a_parameter_says_another(tracker):
         settings_of(TrackerParameters(volume_low_m=low))
 
 
+def test_what_acquisition_measures_meanwhile_changes_settings_only(tracker):
+    """Rate, noise and stamps: topics that were made again would be discovered again first."""
+    rng, node = np.random.default_rng(11), tracker.node
+
+    def say_flux():
+        pose = np.array([0.0, 0.0, 0.15]), np.eye(3)
+        tracker.say_flux(fluxes(certain_model(), SENSORS, *pose, rng))
+
+    ready(tracker)
+    say_flux()
+    wait_frame(tracker, 1)
+    topics, context = dict(node._topics), node._tracker._context
+    noise = node._tracker.settings.flux_noise_t
+    plain = setup_of(SENSORS, reference_specs())
+
+    def measured(**values):
+        text = dump_setup(replace(plain, flux_rate_hz=49.0, extra=values))
+        tracker.say_setup(text)
+        tracker.spin_until(lambda: node._setup_text == text)
+        say_flux()
+
+    measured(stamp_sigma_s=3e-4)
+    wait_frame(tracker, 2)
+    assert node._tracker.settings.stamp_sigma_s == 3e-4
+    assert node._tracker._context is context, 'which takes a tenth of a second to make'
+    assert node._tracker.counters['cold_starts'] == len(SENSORS.name)
+    measured(stamp_sigma_s=3e-4, flux_noise_t=2.0 * noise)
+    wait_frame(tracker, 3)
+    assert node._tracker.settings.flux_noise_t == 2.0 * noise
+    assert np.all(node._tracker._context.sigma > context.sigma)
+    assert node._topics == topics
+    assert {topic.estimate.state for topic in topics.values()} == {'ok'}
+
+    tracker.say_setup(dump_setup(setup_of(SENSORS.select(np.arange(3)), reference_specs())))
+    tracker.spin_until(lambda: len(node._topics) < len(topics))
+
+
 def test_a_wrong_parameter_ends_the_node_with_one_line(start):
     process = start('tracker', '--ros-args', '-p', 'volume_low_m:=[0.1]')
     assert process.popen.wait(20) == 2

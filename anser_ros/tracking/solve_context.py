@@ -227,6 +227,11 @@ def model_digest(model: FieldModel) -> str:
     return digest.hexdigest()
 
 
+def depends_on(settings: TrackerSettings) -> tuple[object, ...]:
+    """Return the settings that `build_context` makes a difference by."""
+    return settings.flux_noise_t, settings.box, settings.grid_spacing_m
+
+
 def build_context(
     model: FieldModel,
     settings: TrackerSettings,

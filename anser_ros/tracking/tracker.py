@@ -29,7 +29,7 @@ from anser_ros.tracking.emitters import FEWEST_EMITTERS, ReducedScene, without_d
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
 from anser_ros.tracking.rigid import BodyCoils
-from anser_ros.tracking.solve_context import SolveContext, build_context
+from anser_ros.tracking.solve_context import SolveContext, build_context, depends_on
 from anser_ros.tracking.source_track import SourceFrame, SourceTrack, track_source
 from anser_ros.tracking.warm_solve import solve_warm
 
@@ -197,6 +197,8 @@ class Tracker:
         other = Tracker.__new__(Tracker)
         other.__dict__.update(self.__dict__)
         other.settings = settings
+        if depends_on(settings) == depends_on(self.settings):
+            return other
         if self._model is not None and self._context is not None:
             model_id, other._context, other._reduced = self._context.model_id, None, None
             other._use(self._model, model_id)

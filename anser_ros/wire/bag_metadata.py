@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from anser_ros.wire.yaml_text import read_yaml
+from anser_ros.wire.yaml_text import DUMPER, read_yaml
 
 METADATA_VERSION = 9
 """Version of rosbag2's metadata.yaml that is written, as ROS 2 Jazzy reads it."""
@@ -121,11 +121,7 @@ def plain_yaml(document: Any) -> str:
     return yaml.dump(document, Dumper=_Dumper, sort_keys=False)
 
 
-# libyaml's is several times as fast, where it is there.
-_SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
-
-
-class _Dumper(_SafeDumper):  # type: ignore[misc]
+class _Dumper(DUMPER):  # type: ignore[misc]
     def ignore_aliases(self, data: Any) -> bool:
         return True
 

@@ -7,9 +7,7 @@ from typing import Any
 import yaml
 
 from anser_ros.errors import ModelFileError
-from anser_ros.wire.yaml_text import MOST_CHARACTERS, read_yaml
-
-_DUMPER = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+from anser_ros.wire.yaml_text import DUMPER, MOST_CHARACTERS, read_yaml
 
 
 def read_document(path: str | os.PathLike[str]) -> Any:
@@ -34,7 +32,7 @@ def write_document(path: str | os.PathLike[str], document: Any) -> None:
         os.makedirs(folder, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=folder, suffix='.tmp')
         with os.fdopen(handle, 'w', encoding='utf-8') as stream:
-            yaml.dump(document, stream, Dumper=_DUMPER, sort_keys=False, width=4000)
+            yaml.dump(document, stream, Dumper=DUMPER, sort_keys=False, width=4000)
         os.chmod(temporary, 0o644)
         os.replace(temporary, name)
     except OSError as error:

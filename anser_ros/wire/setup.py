@@ -29,7 +29,7 @@ from anser_ros.wire.setup_values import (
     refuse_repeats,
     take,
 )
-from anser_ros.wire.yaml_text import read_yaml
+from anser_ros.wire.yaml_text import DUMPER, read_yaml
 
 SCHEMA = 'anser_setup/1'
 KEYS = (
@@ -397,4 +397,4 @@ def dump_setup(setup: Setup) -> str:
         **_stated_sections(setup.stated),
         **setup.extra,
     }
-    return yaml.safe_dump(document, sort_keys=False)
+    return str(yaml.dump(document, Dumper=DUMPER, sort_keys=False))

@@ -4,7 +4,10 @@ from typing import Any
 
 import yaml
 
+# libyaml's are several times as fast, where it is there.
 _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+DUMPER: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+"""What plain data is written with."""
 MOST_CHARACTERS = 32_000_000
 """Longest text that is read. A model of 4000 dipoles with forty modes is half as long; the time to
 read grows with it, by a second for each megabyte."""
