@@ -182,7 +182,7 @@ def open_directions(
 
 def tied_parts(along: Sequence[Array]) -> NDArray[np.bool_]:
     """Return to which parts (2K,) open poses add more than `LEAST_OPEN`, in any of the bodies."""
-    added = np.array([(a**2).sum(axis=1).mean(axis=(0, 1)) for a in along])
+    added = np.array([(a**2).sum(axis=(0, 1, 2)) / max(len(a) * a.shape[2], 1) for a in along])
     return np.asarray((added > LEAST_OPEN).any(axis=0))
 
 
@@ -275,7 +275,7 @@ class JointSystem:
         gone = taken[:, :-1].T @ taken[:, -1]
         field = by_field.copy()
         tied = int(self.tied.sum())
-        field[self.tied] -= gone[: tied * self.count].reshape(tied, -1)
+        field[self.tied] -= gone[: tied * self.count].reshape(tied, self.count)
         return np.concatenate([field.ravel(), by_parameters - gone[tied * self.count :]])
 
     def eliminate(self, field_precision: Array, pull: Array) -> 'Eliminated':
@@ -291,7 +291,7 @@ class JointSystem:
         tied, n = self.tied, int(self.tied.sum()) * self.count
         block = self.gram + np.diag(field_precision)
         right = self.mixed.copy()
-        right[tied] += self.open[:n, n:].reshape(-1, self.count, right.shape[2])
+        right[tied] += self.open[:n, n:].reshape(right[tied].shape)
         right[:, :, -1] += (field_precision[:, None] * pull).T
         inside, variance = np.empty_like(right), np.empty((self.parts, self.count))
         inner = self.open[:n, :n].copy()
