@@ -70,4 +70,10 @@ def in_order(work: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list[R
 
 def slices(count: int, size: int) -> list[slice]:
     """Return the slices of so many rows, each but the last of one size."""
-    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+    return slices_of(slice(0, count), size)
+
+
+def slices_of(whole: slice, size: int) -> list[slice]:
+    """Return the slices of a slice of known ends, each but the last of one size."""
+    starts = range(whole.start, whole.stop, size)
+    return [slice(start, min(start + size, whole.stop)) for start in starts]

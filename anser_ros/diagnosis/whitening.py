@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.view import View
-from anser_ros.parallel import in_order, slices
+from anser_ros.parallel import in_order, slices, slices_of
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -143,8 +143,7 @@ class Whitener:
         out = np.empty(columns.shape)
 
         def work(mine: slice) -> None:
-            for few in slices(mine.stop - mine.start, FRAMES_AT_ONCE):
-                rows = slice(mine.start + few.start, mine.start + few.stop)
+            for rows in slices_of(mine, FRAMES_AT_ONCE):
                 np.multiply(columns[rows], self.weight[rows, :, None], out=out[rows])
                 if self.basis is not None and self.inner is not None:
                     basis = self.basis[rows]

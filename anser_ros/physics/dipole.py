@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.parallel import in_order, slices
+from anser_ros.parallel import in_order, slices, slices_of
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 
 Array = NDArray[np.float64]
@@ -294,9 +294,8 @@ def dipole_field(
 
     def work(rows: slice) -> None:
         basis = np.empty((AT_ONCE, 3, q.shape[0]))
-        for part in slices(rows.stop - rows.start, AT_ONCE):
-            here = slice(rows.start + part.start, rows.start + part.stop)
-            few = basis[: part.stop - part.start]
+        for here in slices_of(rows, AT_ONCE):
+            few = basis[: here.stop - here.start]
             _fill_field_basis(r[here], dipoles, few)
             np.matmul(
                 few.reshape(3 * len(few), len(m)), m, out=out[here].reshape(3 * len(few), -1)
