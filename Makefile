@@ -3,6 +3,7 @@ VENV ?= .venv
 VENV_OLDEST ?= .venv-oldest
 ANSER = $(VENV)/bin/anser
 READY = $(VENV)/.installed-newest
+READY_DEMO = $(VENV)/.installed-demo
 READY_OLDEST = $(VENV_OLDEST)/.installed-oldest
 # One thread each: two cores are shared with the processes under test.
 # Compiled bytecode is kept, as every process under test would compile all modules again.
@@ -30,15 +31,21 @@ help:
 	@echo 'make docs                the documentation as a site, out/docs/index.html'
 	@echo 'make paper|loop|measured the studies; options with ARGS=...'
 
-$(READY): .ci/requirements-newest.txt .ci/requirements-oldest.txt .ci/bootstrap $(PACKAGING)
-	@.ci/bootstrap $(VENV) newest
+# What the nodes and commands need; what all else needs is installed on top of it.
+$(READY_DEMO): .ci/requirements-newest.txt .ci/requirements-oldest.txt .ci/bootstrap $(PACKAGING)
+	@.ci/bootstrap $(VENV) demo
 	@touch $@
+
+$(READY): .ci/requirements-newest.txt .ci/requirements-development.txt .ci/requirements-oldest.txt .ci/bootstrap $(PACKAGING)
+	@.ci/bootstrap $(VENV) newest
+	@touch $@ $(READY_DEMO)
 
 $(READY_OLDEST): .ci/requirements-oldest.txt .ci/bootstrap $(PACKAGING)
 	@.ci/bootstrap $(VENV_OLDEST) oldest
 	@touch $@
 
-demo: $(READY)
+# The live view in a browser is an option with packages of its own.
+demo: $(if $(findstring dashboard,$(ARGS)),$(READY),$(READY_DEMO))
 	@$(VENV)/bin/python .ci/foreground $(ANSER) demo $(if $(DURATION),--duration $(DURATION)) $(ARGS)
 
 lint: $(READY)

@@ -48,10 +48,9 @@ setup(
         'rich>=13',
         'matplotlib>=3.8',
         'allantools>=2024.6',
-        'dask>=2024.8',
-        'distributed>=2024.8',
     ],
     extras_require={
+        'batch': ['dask>=2024.8', 'distributed>=2024.8'],
         'dashboard': ['nicegui>=3.0', 'fastapi>=0.110', 'uvicorn>=0.30'],
         'docs': ['sphinx>=9', 'myst-parser>=5', 'furo>=2025.9'],
     },

@@ -65,8 +65,9 @@ def required():
 
 
 def optional():
-    """Return the distributions that the live view in the browser needs."""
-    return names_of(asked_for('extras_require')['dashboard'])
+    """Return the distributions that only some commands and nodes need."""
+    extras = asked_for('extras_require')
+    return names_of(extras['batch'] + extras['dashboard'])
 
 
 def package(tag):
@@ -153,7 +154,9 @@ def test_what_a_single_step_needs_is_not_needed_to_read_the_help():
 
 @pytest.mark.parametrize('kind', ['newest', 'oldest'])
 def test_the_pinned_environments_have_all_of_it(kind):
-    text = (REPO / '.ci' / f'requirements-{kind}.txt').read_text().lower()
+    files = {'newest': ('newest', 'development'), 'oldest': ('oldest',)}[kind]
+    locks = [REPO / '.ci' / f'requirements-{name}.txt' for name in files]
+    text = ''.join(lock.read_text() for lock in locks).lower()
     pinned = set(re.findall('^([a-z0-9_-]+)==', text, re.MULTILINE))
     ros = {f'ros-{name.replace("_", "-")}' for name in package('exec_depend')}
     missing = (required() | optional()) - pinned

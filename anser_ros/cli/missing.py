@@ -14,8 +14,8 @@ PYPI = {
     'nicegui': 'nicegui',
 }
 """Modules without a key of rosdep, and what they are called on PyPI."""
-OPTIONAL = ('nicegui',)
-"""Of these, what only somebody needs who wants the live view in a browser."""
+OPTIONAL = ('dask', 'distributed', 'nicegui')
+"""Of these, what only `anser batch` and the live view in a browser need."""
 ROS = 'rclpy'
 """Module that every node needs, and that pip does not install with this package."""
 ROS_REMEDY = 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
