@@ -31,8 +31,8 @@ from anser_ros.nodes.acquisition_parts.stream_status import (
 from anser_ros.nodes.acquisition_parts.wall_clock import WallClock
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.handover import HandedFlux
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
-from anser_ros.nodes.runtime.process import TURN_S
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
+from anser_ros.nodes.runtime.process import TURN_S, main
 from anser_ros.nodes.streams.backlog import Backlog, Deference
 from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.nodes.streams.overload import too_slow

@@ -12,8 +12,9 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import tracked_parameter
 from anser_ros.poses.corrector import OK, OUTSIDE, PoseCorrector
 from anser_ros.stamps import set_stamp, stamp_of

@@ -12,8 +12,9 @@ from anser_ros.nodes.output_parts.live_view import LiveView
 from anser_ros.nodes.output_parts.polled import polling_node
 from anser_ros.nodes.output_parts.view_source import ViewSource
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.wire.tcp_ports import LIVE_VIEW
 

@@ -20,8 +20,9 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes.output_parts.causes import LastStatus, causes
 from anser_ros.nodes.output_parts.traces import OpticalTrace, Row, Traces, latency_of, targets_of
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of

@@ -14,8 +14,9 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.output_parts.igtl_server import IgtlServer
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters
 from anser_ros.pose_states import OK, STALE
 from anser_ros.wire import igtl
@@ -220,10 +221,7 @@ def check_templates(table: OpenIGTLinkParameters) -> None:
 def devices_of(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
     """Return the device of each body, of its tip and, where they are wanted, of each coil.
 
-    Raises
-    ------
-    ParameterError
-        As `anser_ros.wire.igtl.device_names`.
+    Raises `ParameterError` as `anser_ros.wire.igtl.device_names`.
     """
     named = {
         sensor.name: table.coil_name.format(

@@ -15,8 +15,9 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.nodes.runtime.stated_parameters import stated, stated_by
 from anser_ros.nodes.streams.flux_reader import read_frame
@@ -173,10 +174,7 @@ class Watcher(AnserNode):
     def _begin(self, text: str) -> None:
         """Watch what a setup's fluxes say, from an empty window on.
 
-        Raises
-        ------
-        AnserError
-            When the text is not a setup, or model or baseline do not fit it.
+        Raises `AnserError` when the text is not a setup, or model or baseline do not fit it.
         """
         setup = parse_setup(text).with_stated(self._stated)
         # An empty window has a session's setup already, and a model must fit that.
@@ -270,7 +268,7 @@ class Watcher(AnserNode):
         """End the thread after the look that it is at."""
         self._tasks.put(None)
 
-    # What is told -------------------------------------------------------------------------
+    # What is reported ---------------------------------------------------------------------
 
     def _is_silent(self, now_s: float) -> bool:
         received_s = self._received_s if self._poses is None else self._poses.received_s

@@ -25,22 +25,8 @@ PATIENCE_S = 3.0
 class Job:
     """Runs a command once.
 
-    Parameters
-    ----------
-    kind : str
-        The command's name, such as ``diagnose``.
-    arguments : sequence of str
-    folder : Path
-        Gets its results, and what it prints as ``output.txt``.
-
-    Attributes
-    ----------
-    exit_code : int or None
-        None while it runs.
-    share : float
-        How much is done, 0 to 1; NaN where it does not say.
-    stage : str
-        What it does, in its own words.
+    What it prints goes to ``output.txt`` in the folder of its results. ``exit_code`` is None while
+    it runs; ``share`` is how much is done, 0 to 1, and NaN where it does not say.
     """
 
     def __init__(self, kind: str, arguments: Sequence[str], folder: Path) -> None:

@@ -49,17 +49,7 @@ class Chain(Protocol):
 class Found:
     """Holds what a command has found.
 
-    Attributes
-    ----------
-    kind : `CALIBRATE` or `DIAGNOSE`
-    recording : str
-        Name of the bag.
-    folder : Path
-        Its results.
-    words : str
-        The finding in a short paragraph.
-    rows : tuple of (label, before, after)
-        Figures on data held out, as text.
+    ``rows`` have a label and, as text, a figure before and after, on data held out.
     """
 
     kind: str
@@ -86,20 +76,8 @@ class Loaded:
 class CorrectionLoop:
     """Holds the loop's state, one for all pages; every step says in words how it went.
 
-    Attributes
-    ----------
-    chosen : str
-        The recording that commands work on.
-    job : Job or None
-        The command that runs, or ran last.
-    found : Found or None
-        What the last one that succeeded has found.
-    names : tuple of str
-        The recordings that there are, the newest first.
-    message, is_trouble : str, bool
-        How the last step went, and whether badly.
-    model : str
-        The file of the model in force, as ``field_model`` has it.
+    ``names`` are the recordings, the newest first, and ``chosen`` is the one that commands work
+    on; ``model`` is the active model's file, as ``field_model`` has it.
     """
 
     def __init__(self, chain: Chain, folder: RecordingFolder) -> None:
@@ -121,7 +99,7 @@ class CorrectionLoop:
 
     @property
     def can_load(self) -> bool:
-        """Return whether there is a model to load that is not in force."""
+        """Return whether there is a model to load that is not active."""
         return self.found is not None and str(self.found.model) != self.model
 
     @property
@@ -131,7 +109,7 @@ class CorrectionLoop:
 
     @property
     def model_name(self) -> str:
-        """Return the model in force: its place in the recordings' folder, else its whole path."""
+        """Return the active model: its place in the recordings' folder, else its whole path."""
         path = Path(self.model)
         inside = path.is_relative_to(self.folder.path)
         return str(path.relative_to(self.folder.path)) if inside else self.model
@@ -153,15 +131,15 @@ class CorrectionLoop:
         await self._step(self._start(CALIBRATE))
 
     async def diagnose(self) -> None:
-        """Find what the model in force lacks on the chosen recording."""
+        """Find what the active model lacks on the chosen recording."""
         await self._step(self._start(DIAGNOSE))
 
     async def load(self) -> None:
-        """Put the model that was found in force."""
+        """Activate the model that was found."""
         await self._step(self._load())
 
     async def undo(self) -> None:
-        """Put the model in force that was there before."""
+        """Activate the model that was there before."""
         await self._step(self._undo())
 
     def refresh_names(self) -> None:
@@ -176,7 +154,7 @@ class CorrectionLoop:
             self.job.cancel()
 
     async def look(self) -> None:
-        """Ask which model is in force."""
+        """Ask which model is active."""
         self.model = (await self._chain.model_files()).get('field_model', '')
 
     # How it is done -----------------------------------------------------------------------

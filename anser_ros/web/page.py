@@ -290,12 +290,7 @@ def _table(title: str, rows: Any) -> str:
 class Pages:
     """Holds all open pages, and what drives them.
 
-    Parameters
-    ----------
-    source : ShownGraph
-    loop : CorrectionLoop
-    guarded : callable
-        Makes of a function one that outlives its errors, and tells of them.
+    ``guarded`` makes of a function one that outlives its errors, and reports them.
     """
 
     def __init__(
@@ -334,7 +329,7 @@ class Pages:
             await asyncio.sleep(due_s - clock.time())
 
     async def _watch(self) -> None:
-        """See now and then which recordings there are, and which model is in force.
+        """See now and then which recordings there are, and which model is active.
 
         Others may record and change models too.
         """

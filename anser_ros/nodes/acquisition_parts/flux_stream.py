@@ -36,12 +36,8 @@ class FluxStream:
     """Turns samples into fluxes; it is made again for every hello that differs from the one
     before.
 
-    Parameters
-    ----------
-    hello : what the control unit says that it sends
-    setup : which sensors are wanted
-    calibration : response of the channels
-    options : window and rate
+    Raises `SetupError` when the control unit has none of the channels, or other emitters than the
+    setup, and `ParameterError` when the window cannot be demodulated.
 
     Attributes
     ----------
@@ -50,13 +46,6 @@ class FluxStream:
     rate_hz : windows a second, a whole number of samples apart
     clock, ticks : host time of the samples, and what the device's own clock says beside them
     waiting : frames whose stamps are not confirmed yet
-
-    Raises
-    ------
-    SetupError
-        When the control unit has none of the channels, or other emitters than the setup.
-    ParameterError
-        When the window cannot be demodulated.
     """
 
     def __init__(

@@ -30,19 +30,8 @@ def signal_troubles(
 ) -> list[tuple[Level, str]]:
     """Return what is wrong with the signals, by the names of emitters and sensors.
 
-    Parameters
-    ----------
-    coils : sequence of Coil
-        The emitters, in the order of the setup document.
-    stream : FluxStream
-        Of the connection.
-    frame : FluxFrame or None
-        The newest one.
-    flags : ndarray, shape (S,), or None
-        Flag bits that the sensors had since the last look. Lost samples are not told here: the
-        counters of the line say where they were lost.
-    staleness : Staleness, optional
-        Why they were stale.
+    ``flags``, shape (S,), are the bits that the sensors had since the last look. Lost samples are
+    not reported here: the counters of the line say where they were lost.
     """
     found = []
     if stream.missing:

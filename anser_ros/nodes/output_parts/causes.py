@@ -13,7 +13,7 @@ MOST_NAMES = 3
 MOST_TEXT = 160
 """Characters of a cause: two lines of a terminal."""
 LEAST_LOSS = 0.05
-"""Share of frames missing that is told: a rate counted over a second is off by a few percent."""
+"""Share of missing frames that is reported: a rate over a second is off by a few percent."""
 
 
 class LastStatus(NamedTuple):
@@ -29,14 +29,8 @@ def causes(
 ) -> list[str]:
     """Name what is wrong: nodes that complain, then sensors without pose, by their reasons.
 
-    Parameters
-    ----------
-    statuses : mapping
-        What was said last, by ``node`` or ``node: part``.
-    namespace : str
-        Of the nodes that are asked, without slashes around it.
-    flux_rate_hz : float
-        Frames a second that there should be; 0 where that is not known.
+    ``statuses`` has what was reported last, by ``node`` or ``node: part``; the namespace is
+    without slashes around it, and the rate of frames is 0 where it is not known.
     """
     found: list[tuple[int, str]] = []
     silent: dict[tuple[int, str], list[str]] = {}

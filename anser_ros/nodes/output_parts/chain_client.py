@@ -30,14 +30,7 @@ class ChainError(AnserError):
 class ChainClient:
     """Reaches the nodes of a namespace, as `anser_ros.web.loop.Chain` has them.
 
-    Parameters
-    ----------
-    node : Node
-        Asks; its executor must be spinning in another thread than that of the page.
-    view : callable
-        Returns what is shown now, None before there is a setup.
-    mark : callable
-        Marks this moment, with a word, in the curves.
+    The node's executor must be spinning in another thread than that of the page.
     """
 
     def __init__(
@@ -59,10 +52,7 @@ class ChainClient:
     async def trigger(self, service: str) -> str:
         """Call a service without arguments and return its answer.
 
-        Raises
-        ------
-        ChainError
-            When no node offers it, answers in time, or when it refuses.
+        Raises `ChainError` when no node offers it, answers in time, or when it refuses.
         """
         answer = await _ask(self._triggers[service], Trigger.Request(), ANSWER_S)
         if not answer.success:
@@ -80,10 +70,7 @@ class ChainClient:
     async def load_model(self, files: Mapping[str, str]) -> None:
         """Give nodes other model files.
 
-        Raises
-        ------
-        ChainError
-            When one refuses; those before it have theirs already.
+        Raises `ChainError` when one refuses; those before it have theirs already.
         """
         for name, path in files.items():
             value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=path)

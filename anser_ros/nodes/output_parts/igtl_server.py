@@ -154,24 +154,9 @@ def _set_options(connection: socket.socket) -> None:
 class IgtlServer:
     """Listens on one address and sends to all who connect.
 
-    Parameters
-    ----------
-    host : str
-        Address to listen on.
-    port : int
-        TCP port; 0 for a free one.
-    answer : callable
-        Gives the reply to a request by its header; called by the threads of clients.
-
-    Attributes
-    ----------
-    refused : int
-        Connections closed because there were `MOST_CLIENTS` already.
-
-    Raises
-    ------
-    PortError
-        The address can't be listened on.
+    ``answer`` is called by the threads of clients; ``refused`` counts connections that were closed
+    because there were `MOST_CLIENTS` already. Port 0 stands for a free one. Raises `PortError`:
+    the address can't be listened on.
     """
 
     def __init__(self, host: str, port: int, answer: Answer) -> None:

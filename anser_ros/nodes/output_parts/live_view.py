@@ -38,10 +38,7 @@ POSE, COVARIANCE = 7, 36
 def read_pose(data: bytes) -> tuple[float, Array]:
     """Return stamp (s) and the numbers (7 or 43) of a serialised pose, with covariance or without.
 
-    Raises
-    ------
-    ValueError, struct.error
-        When the bytes are no such message.
+    Raises `ValueError`, `struct.error` when the bytes are no such message.
     """
     order = '<' if data[1] & 1 else '>'
     sec, nanosec, length = struct.unpack_from(f'{order}iII', data, 4)
@@ -57,12 +54,8 @@ def read_pose(data: bytes) -> tuple[float, Array]:
 class Figures:
     """States how well it goes, over all coils and a stretch of time; NaN where nothing is known.
 
-    Attributes
-    ----------
-    tracked : mean share of frames with a pose
-    error_m : root mean square distance to the optical pose, of those with a pose
-    residual_t : root mean square residual of the fluxes, T, whether with a pose or without
-    seconds : the stretch
+    ``tracked`` is the mean share of frames with a pose, ``error_m`` the root mean square distance
+    of these from the optical poses, ``residual_t`` that of all fluxes from the model, T.
     """
 
     tracked: float
@@ -74,18 +67,7 @@ class Figures:
 class LiveView:
     """Holds arrays of all targets, by their numbers.
 
-    Parameters
-    ----------
-    setup : Setup
-    namespace : str
-        Of the chain, without slashes around it.
-
-    Attributes
-    ----------
-    targets : list of Target
-        Tool coils first, then the bodies with several.
-    statuses : dict
-        What nodes said last, by ``node`` or ``node: part``.
+    ``statuses`` has what nodes reported last, by ``node`` or ``node: part``.
     """
 
     def __init__(self, setup: Setup, namespace: str) -> None:
@@ -173,7 +155,7 @@ class LiveView:
         return self.statuses.get(f'{self.namespace}/tracker: {name}', LastStatus(1, 'waiting', {}))
 
     def figure(self, node: str, key: str) -> float:
-        """Return a number that a node of the chain told, NaN where it did not."""
+        """Return a number that a node of the chain reported, NaN where it did not."""
         status = self.statuses.get(f'{self.namespace}/{node}')
         return _number(status, key)
 

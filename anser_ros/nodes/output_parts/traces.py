@@ -28,10 +28,8 @@ def latency_of(now_s: float, stamp_s: float) -> float:
 class Target:
     """Names a sensor or a body that is tracked.
 
-    Attributes
-    ----------
-    name, body : its own name and that of the body that it sits on
-    position_m, axis : in the body's frame; a body's own axis is its z
+    ``position_m`` and ``axis`` are in the frame of the body that it sits on; a body's own axis is
+    z.
     """
 
     name: str
@@ -87,11 +85,7 @@ class OpticalTrace:
 class PoseTrace:
     """Keeps poses of one target by one tracker.
 
-    Attributes
-    ----------
-    target : what is tracked
-    stamp_s, sigma_m, latency_s : a value per pose; latency from the middle of the window
-    position, axis : three values per pose
+    Every list has an item per pose; latency is counted from the middle of the window.
     """
 
     target: Target
@@ -120,12 +114,8 @@ class PoseTrace:
 class Row:
     """Holds the newest of one target, for a table.
 
-    Attributes
-    ----------
-    name : of the target
-    position_m : NaN when nothing came lately
-    error_m, latency_s, sigma_m : medians of the poses of the interval, NaN without any
-    rate_hz : poses a second of the interval
+    Error, latency and sigma are medians over the interval, NaN without a pose in it, and so is the
+    place.
     """
 
     name: str

@@ -43,25 +43,8 @@ COIL_M = 0.07
 class ViewSource:
     """Shows the graph to the page, as `anser_ros.web.page.ShownGraph` has it.
 
-    Parameters
-    ----------
-    node : Node
-        That of `polling_node`.
-    optical : str
-        Namespace of the optical poses.
-    refused : callable
-        Called for what can't be read.
-    is_there : callable
-        Whether somebody offers a service.
-
-    Attributes
-    ----------
-    setup_text : str
-        The setup document that came last; another thread may put it there.
-    view : LiveView or None
-        What is shown of it.
-    version : int
-        Changes with the view.
+    ``refused`` is called for what can't be read. ``setup_text`` is the setup document that came
+    last, which another thread may put there; ``version`` changes with the view.
     """
 
     def __init__(

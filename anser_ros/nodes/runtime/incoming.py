@@ -36,10 +36,7 @@ def is_bounded(message_type: type) -> bool:
 def opened(data: bytes, message_type: type) -> Any:
     """Return the message that serialised bytes hold.
 
-    Raises
-    ------
-    LayoutError
-        When there are more bytes, points or fields than a sensible message has.
+    Raises `LayoutError` when there are more bytes, points or fields than a sensible message has.
     """
     most = MOST_BYTES[message_type]
     if len(data) > most:

@@ -39,7 +39,6 @@ from anser_ros.errors import AnserError
 from anser_ros.nodes.runtime import incoming, parameters, qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status, Throttle, diagnostic_array
 from anser_ros.nodes.runtime.handover import DirectSubscription, Handover, NewestWorker
-from anser_ros.nodes.runtime.process import main
 
 Callback = Callable[..., Any]
 
@@ -64,23 +63,17 @@ class NoParameters:
 class AnserNode(Node):
     """Gives all nodes their parameters, diagnostics and guarded callbacks.
 
+    ``beside`` are the other nodes of the process: values that are given to all of them may be
+    meant for one.
+
     Attributes
     ----------
     parameters : instance of ``PARAMETERS``
-        The values in force, frozen; a change that is allowed swaps the whole instance.
+        The present values, frozen; a change that is allowed swaps the whole instance.
     counters : collections.Counter
         Events by name; all of them are shown in ``/diagnostics``.
     exit_code : int or None
         What the process ends with once :meth:`stop` was called.
-
-    Parameters
-    ----------
-    handover : Handover, optional
-        What nodes of the same process give each other directly.
-    beside : sequence of type, optional
-        The other nodes of the process: values that are given to all of them may be meant for one.
-    **options : object
-        As `rclpy.node.Node` takes them.
     """
 
     NAME: ClassVar[str]
@@ -407,4 +400,4 @@ def _failed(response: Any, reason: str) -> Any:
     return response
 
 
-__all__ = ['AnserNode', 'Level', 'Status', 'main']
+__all__ = ['AnserNode', 'Level', 'Status']

@@ -90,10 +90,8 @@ def types(table: type) -> dict[str, Any]:
 def build(table: type, values: Mapping[str, Any]) -> Any:
     """Return a table's instance from values of the ROS graph, a file or a command line.
 
-    Raises
-    ------
-    ParameterError
-        A name that the table does not have, a value of the wrong type, or one out of its range.
+    Raises `ParameterError`: a name that the table does not have, a value of the wrong type, or one
+    out of its range.
     """
     known = types(table)
     unknown = sorted(set(values) - set(known))
@@ -110,10 +108,7 @@ def check(name: str, kind: Any, rule: Rule, value: Any) -> Any:
 
     A whole number will do for a float: a YAML file that says ``rate_hz: 25`` is right.
 
-    Raises
-    ------
-    ParameterError
-        The value has another type, or breaks the parameter's rule.
+    Raises `ParameterError`: the value has another type, or breaks the parameter's rule.
     """
     if kind in LIST_ITEMS:
         if isinstance(value, str | bytes) and len(value):

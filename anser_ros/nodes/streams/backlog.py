@@ -42,13 +42,7 @@ class Deference:
 
 
 class Backlog:
-    """Estimates the typical spacing of messages, and the time that each takes.
-
-    Parameters
-    ----------
-    spacing_s : float, optional
-        The spacing, s, where it is known.
-    """
+    """Estimates the typical spacing of messages, and the time that each takes."""
 
     def __init__(self, spacing_s: float | None = None) -> None:
         known = () if spacing_s is None else (spacing_s,)

@@ -114,10 +114,7 @@ def layout_of(message: PointCloud2) -> list[PointFieldTuple]:
 def width_of(message: PointCloud2) -> int:
     """Return the number of points of a cloud that has one row.
 
-    Raises
-    ------
-    LayoutError
-        When the cloud has more rows.
+    Raises `LayoutError` when the cloud has more rows.
     """
     if message.height != 1:
         raise LayoutError(f'the cloud must have height 1, got {message.height}')
@@ -127,10 +124,8 @@ def width_of(message: PointCloud2) -> int:
 def read_dipoles(message: PointCloud2) -> DipolePoints:
     """Read a ``field_model`` message.
 
-    Raises
-    ------
-    LayoutError
-        When it is not a field model, has no dipole, or a direction is no unit vector.
+    Raises `LayoutError` when it is not a field model, has no dipole, or a direction is no unit
+    vector.
     """
     points = decode_field_model(
         layout_of(message), message.point_step, width_of(message), message.data,

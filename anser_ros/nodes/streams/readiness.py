@@ -49,19 +49,8 @@ class _Report:
 class Readiness:
     """Watches the graph and ``/diagnostics`` from a node whose executor spins elsewhere.
 
-    Parameters
-    ----------
-    node : AnserNode
-    fluxes : list of Publisher
-        What is going to be published.
-    setup_text : str
-        The setup that has been published; empty where there is none.
-
-    Attributes
-    ----------
-    is_starting : bool
-        Whether :meth:`missing` found a node that has not said a word yet: it may be compiling its
-        kernels for the first time.
+    ``is_starting`` says whether `missing` found a node that has not reported anything yet: it may
+    be compiling its kernels for the first time.
     """
 
     def __init__(self, node: AnserNode, fluxes: list[Any], setup_text: str) -> None:

@@ -46,12 +46,7 @@ class PackedMessage:
     Bytes are published in half the time of a message, whose fields are taken from Python objects
     one by one.
 
-    Parameters
-    ----------
-    message : PoseStamped or PoseWithCovarianceStamped
-        With all that stays; the stamp and the numbers are written over.
-    count : int
-        Numbers at its end, in double precision.
+    The stamp and the ``count`` numbers at its end, in double precision, are written over.
     """
 
     def __init__(self, message: Any, count: int) -> None:

@@ -17,13 +17,7 @@ frame comes."""
 
 
 class Rehearsal:
-    """Has a tracker of its own, whose poses nobody gets.
-
-    Parameters
-    ----------
-    sensors : SensorTable
-    settings : TrackerSettings
-    """
+    """Has a tracker of its own, whose poses nobody gets."""
 
     def __init__(self, sensors: SensorTable, settings: TrackerSettings) -> None:
         self._past = Tracker(None, sensors, settings)

@@ -93,12 +93,8 @@ class TrackerParameters:
 def settings_of(table: TrackerParameters) -> TrackerSettings:
     """Return settings of the core.
 
-    Raises
-    ------
-    ParameterError
-        When a corner of the volume is not three numbers, or only one of the two is given.
-    TrackingError
-        When the corners make no box.
+    Raises `ParameterError` when a corner of the volume is not three numbers, or only one of the
+    two is given, and `TrackingError` when the corners make no box.
     """
     low, high = table.volume_low_m, table.volume_high_m
     volume = None
@@ -120,12 +116,7 @@ def settings_of(table: TrackerParameters) -> TrackerSettings:
 def tips_of_file(path: str) -> dict[str, TipSpec]:
     """Return tips of a file by body; none where no file is named.
 
-    Raises
-    ------
-    ParameterError
-        When it can't be read.
-    SetupError
-        When it has no tips.
+    Raises `ParameterError` when it can't be read, and `SetupError` when it has no tips.
     """
     try:
         return read_tips(read_text(path)) if path else {}

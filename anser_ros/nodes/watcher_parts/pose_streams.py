@@ -32,17 +32,8 @@ def sensor_of(topic: str) -> str:
 class PoseStreams:
     """Subscribes to topics of tracked poses and of a reference, into one window.
 
-    Attributes
-    ----------
-    window : PoseWindow
-    sources : list of OneSource
-    received_s : float
-        When the last tracked pose came, by the monotonic clock.
-
-    Raises
-    ------
-    ParameterError
-        When two topics give sensors of the same name, or the reference is tracked as well.
+    Raises `ParameterError` when two topics give sensors of the same name, or the reference is
+    tracked as well.
     """
 
     def __init__(
