@@ -67,7 +67,7 @@ class NewestSource(OneSource):
 
 def take_waiting(subscription: Any) -> list[tuple[bytes, dict[str, int]]]:
     """Take the messages that wait in a queue, oldest first, as bytes with their information."""
-    taken = []
+    taken: list[tuple[bytes, dict[str, int]]] = []
     with subscription.handle:
         while True:
             item = subscription.handle.take_message(subscription.msg_type, subscription.raw)
