@@ -10,14 +10,13 @@ import time
 from collections import Counter
 from typing import Any
 
-import numpy as np
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes.acquisition_parts.acquisition_parameters import AcquisitionParameters
 from anser_ros.nodes.acquisition_parts.fault_memory import FAULTS, RecentFaults, device_words
-from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame, Staleness
+from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame
 from anser_ros.nodes.acquisition_parts.flux_stream import FluxStream, StreamOptions
 from anser_ros.nodes.acquisition_parts.measured_accuracy import MeasuredAccuracy
 from anser_ros.nodes.acquisition_parts.stream_interval import Interval
@@ -97,10 +96,9 @@ class Acquisition(AnserNode):
         self._refusal = ''
         self._rebuild = self._woken_early = False
         self._frame: FluxFrame | None = None
-        self._interval = Interval(time.monotonic())
-        self._sensor_flags: np.ndarray | None = None
+        self._interval = self._last = Interval(time.monotonic())
         self._past: Counter[str] = Counter()
-        self._duplicates = self._skipped = 0
+        self._totals: dict[str, int] = {}
         self._backlog, self._deference = Backlog(), Deference()
         self._published_setup = ''
         self._said: Level | None = None
@@ -108,7 +106,6 @@ class Acquisition(AnserNode):
         self._wall_clock = WallClock()
         self._asked_ns = 0
         self._start_sent_ns: int | None = None
-        self._staleness: Staleness | None = None
         self._faults = RecentFaults()
         self._publish_setup(self._setup)
         self._port: ControlUnitPort | None = None
@@ -256,12 +253,8 @@ class Acquisition(AnserNode):
     def _make_stream(self) -> None:
         if self._hello is None or not self._control.tones_agree:
             return
-        table = self.parameters
-        options = StreamOptions(
-            table.window_s, table.rate_hz or self._setup.flux_rate_hz, table.mains_hz
-        )
         try:
-            self._stream = FluxStream(self._hello, self._setup, self._calibration, options)
+            self._stream = FluxStream(self._hello, self._setup, self._calibration, self._options())
         except AnserError as error:
             self._refusal = str(error)
             raise
@@ -269,6 +262,11 @@ class Acquisition(AnserNode):
         self._backlog = Backlog(1 / self._stream.rate_hz)
         if self._start_sent_ns is not None:
             self._stream.clock.bound(0, self._start_sent_ns)
+
+    def _options(self) -> StreamOptions:
+        table = self.parameters
+        rate_hz = table.rate_hz or self._setup.flux_rate_hz
+        return StreamOptions(table.window_s, rate_hz, table.mains_hz)
 
     def _publish_setup(self, setup: Setup) -> None:
         text = dump_setup(setup)
@@ -307,10 +305,7 @@ class Acquisition(AnserNode):
     def on_parameters(self, old: Any, new: Any) -> None:
         """Demodulate the new way from the next block on; what cannot be done is refused."""
         if self._hello is not None and self._stream is not None:
-            options = StreamOptions(
-                new.window_s, new.rate_hz or self._setup.flux_rate_hz, new.mains_hz
-            )
-            FluxStream(self._hello, self._setup, self._calibration, options)
+            FluxStream(self._hello, self._setup, self._calibration, self._options())
         self._rebuild = True
 
     def close(self) -> None:
@@ -327,21 +322,22 @@ class Acquisition(AnserNode):
     def status(self) -> Status:
         """Return the state of the port and of the stream."""
         interval, self._interval = self._interval, Interval(time.monotonic())
+        self._last = interval
         elapsed = max(self._interval.begin_s - interval.begin_s, 1e-3)
         values: dict[str, object] = {
             'rate_hz': interval.frames / elapsed,
             'processing_ms_mean': 1e3 * interval.delay_sum_s / max(interval.frames, 1),
             'processing_ms_max': 1e3 * interval.delay_max_s,
         }
-        self._sensor_flags, self._staleness = interval.flags, interval.staleness
         port, stream, device = self._port, self._stream, self._device
         if port is not None:
             values |= {'device': port.device, 'port': port.state.value, **port.fault_counters()}
-        live = self._stream_counters(stream) if stream is not None else {}
+        totals = self._past.copy()
         if stream is not None:
+            totals.update(self._stream_counters(stream))
             values |= clock_values(stream)
         values['system_clock_set'] = self._wall_clock.sets
-        values |= {name: live.get(name, 0) + self._past[name] for name in {*live, *self._past}}
+        values |= totals
         if device is not None:
             values |= {
                 'device_state': device.state.name.lower(),
@@ -349,13 +345,11 @@ class Acquisition(AnserNode):
                 'device_dropped_blocks': device.dropped_blocks,
                 'device_temperature_deg_c': device.temperature_deg_c,
             }
-        duplicates = self._past['duplicate_blocks'] + live.get('duplicate_blocks', 0)
-        interval.duplicates, self._duplicates = duplicates - self._duplicates, duplicates
-        skipped = self._past['windows_skipped'] + live.get('windows_skipped', 0)
-        interval.skipped, self._skipped = skipped - self._skipped, skipped
+        rises = {name: count - self._totals.get(name, 0) for name, count in totals.items()}
+        self._totals = dict(totals)
         counters = {name: int(values.get(name, 0)) for name in FAULTS}  # type: ignore[call-overload]
         self._faults.note(counters, time.monotonic())
-        level, message = self._verdict(interval)
+        level, message = self._verdict(interval, rises)
         self._say(level, message)
         return Status('', level, message, values)
 
@@ -370,7 +364,7 @@ class Acquisition(AnserNode):
         else:  # a line of code has one severity
             self.get_logger().error(f'{device}: {message}')
 
-    def _verdict(self, interval: Interval) -> tuple[Level, str]:
+    def _verdict(self, interval: Interval, rises: dict[str, int]) -> tuple[Level, str]:
         port = self._port
         if self._refusal or self._control.refusal:
             return Level.ERROR, self._refusal or self._control.refusal
@@ -381,9 +375,9 @@ class Acquisition(AnserNode):
             words = [f'{port.state.value}{reason}', self._faults.words]
             return Level.ERROR, '; '.join(filter(None, words))
         frames = interval.frames
-        if interval.repeats == frames and max(frames, interval.duplicates) > 0:
+        if interval.repeats == frames and max(frames, rises.get('duplicate_blocks', 0)) > 0:
             return Level.ERROR, 'the control unit keeps sending the same samples'
-        slow = too_slow(interval.skipped, frames)
+        slow = too_slow(rises.get('windows_skipped', 0), frames)
         if slow:
             self.warn('seconds_too_slow', slow)
         own = device_words(self._device) if self._device is not None else ''
@@ -394,9 +388,7 @@ class Acquisition(AnserNode):
         if self._stream is not None:
             coils = self._setup.emitter.coils
             troubles += clock_troubles(self._stream)
-            troubles += signal_troubles(
-                coils, self._stream, self._frame, self._sensor_flags, self._staleness
-            )
+            troubles += signal_troubles(coils, self._stream, self._frame, interval)
         if troubles:
             return max(level for level, _ in troubles), '; '.join(words for _, words in troubles)
         if frames == 0:
@@ -410,7 +402,7 @@ class Acquisition(AnserNode):
             return []
         return [
             *emitter_statuses(self._setup.emitter.coils, stream, frame),
-            *sensor_statuses(stream, frame, self._sensor_flags, self._staleness),
+            *sensor_statuses(stream, frame, self._last),
         ]
 
 

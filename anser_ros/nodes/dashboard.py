@@ -2,13 +2,13 @@
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from std_msgs.msg import String
 
 from anser_ros.nodes.output_parts.chain_client import ChainClient
-from anser_ros.nodes.output_parts.live_view import LiveView
 from anser_ros.nodes.output_parts.polled import polling_node
 from anser_ros.nodes.output_parts.view_source import ViewSource
 from anser_ros.nodes.runtime import qos
@@ -60,10 +60,11 @@ class Dashboard(AnserNode):
 
         table = self.parameters
         self._streams = polling_node(self.get_name(), self.get_namespace())
-        self._client = ChainClient(self, self._view, self._mark)
-        self._source = ViewSource(
-            self._streams, table.optical, self._refuse, self._client.is_there
+        self._client = ChainClient(
+            self, lambda: self._source.view, lambda words: self._source.mark(words)
         )
+        refuse = partial(self.warn, 'messages_refused')
+        self._source = ViewSource(self._streams, table.optical, refuse, self._client.is_there)
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         folder = RecordingFolder(Path(table.directory))
         if words := folder.trouble():
@@ -79,15 +80,6 @@ class Dashboard(AnserNode):
 
     def _on_setup(self, message: String) -> None:
         self._source.setup_text = message.data
-
-    def _view(self) -> LiveView | None:
-        return self._source.view
-
-    def _mark(self, words: str) -> None:
-        self._source.mark(words)
-
-    def _refuse(self, words: str) -> None:
-        self.warn('messages_refused', words)
 
     def status(self) -> Status:
         """Return how many pages look on."""

@@ -17,9 +17,11 @@ from rich.table import Table
 from std_msgs.msg import String
 
 from anser_ros.errors import ParameterError
-from anser_ros.nodes.output_parts.causes import LastStatus, causes
+from anser_ros.nodes.output_parts.causes import causes
 from anser_ros.nodes.output_parts.traces import OpticalTrace, Row, Traces, latency_of, targets_of
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
+from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.runtime.process import main
@@ -117,37 +119,30 @@ class Monitor(AnserNode):
             self._subscribe(PoseStamped, topic, partial(self._on_optical, seen))
 
     def _subscribe(self, kind: type, topic: str, callback: Any) -> None:
-        # rclpy wants a function, not a partial
-        def received(message: Any) -> None:
-            callback(message)
-
-        self._pose_subscriptions.append(
-            self.create_subscription(kind, topic, received, qos.STREAM)
-        )
+        subscription = self.create_subscription(kind, topic, callback, qos.STREAM)
+        self._pose_subscriptions.append(subscription)
 
     def _on_pose(self, trace: Any, message: PoseWithCovarianceStamped) -> None:
         now_s = time.time()
         if self._first_s is None:
             self._first_s = time.monotonic()
-        pose, variance = message.pose.pose, message.pose.covariance
-        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        q = pose.orientation
+        variance, stamp_s = message.pose.covariance, seconds_of(message)
+        pose = pose_numbers(message.pose.pose)
         trace.stamp_s.append(stamp_s)
-        trace.position.append((pose.position.x, pose.position.y, pose.position.z))
-        trace.axis.append(_z_axis(q))
+        trace.position.append(pose[:3])
+        trace.axis.append(_z_axis(*pose[3:]))
         trace.sigma_m.append(float(np.sqrt(variance[0] + variance[7] + variance[14])))
         trace.latency_s.append(latency_of(now_s, stamp_s))
 
     def _on_optical(self, trace: OpticalTrace, message: PoseStamped) -> None:
-        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        p, q = message.pose.position, message.pose.orientation
-        trace.add(stamp_s, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+        pose = pose_numbers(message.pose)
+        trace.add(seconds_of(message), pose[:3], pose[3:])
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = {pair.key: pair.value for pair in status.values}
-            self._statuses[status.name] = LastStatus(status.level[0], status.message, values)
-            if status.name.endswith('cu_simulator') and 'metal_distance_m' in values:
+        statuses = statuses_in(message)
+        self._statuses |= statuses
+        for name, (_, _, values) in statuses.items():
+            if name.endswith('cu_simulator') and 'metal_distance_m' in values:
                 self._metal.append((time.time(), float(values['metal_distance_m'])))
 
     def _show(self) -> None:
@@ -320,13 +315,9 @@ def _check(path: Path) -> None:
         raise ParameterError(f'parameter output: {path}: {error.strerror}') from error
 
 
-def _z_axis(q: Any) -> tuple[float, ...]:
+def _z_axis(x: float, y: float, z: float, w: float) -> tuple[float, ...]:
     """Axis of a pose: +z, as docs/interfaces.md has it, for sensors as for bodies."""
-    return (
-        2 * (q.x * q.z + q.w * q.y),
-        2 * (q.y * q.z - q.w * q.x),
-        1 - 2 * (q.x * q.x + q.y * q.y),
-    )
+    return 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
 
 
 def _middle(values: list[float]) -> float:

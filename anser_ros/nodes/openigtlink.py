@@ -14,6 +14,7 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.output_parts.igtl_server import IgtlServer
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.runtime.process import main
@@ -130,14 +131,13 @@ class OpenIGTLink(AnserNode):
                 )
 
     def _on_pose(self, name: str, message: PoseStamped) -> None:
-        point, turn = message.pose.position, message.pose.orientation
-        position = (point.x, point.y, point.z)
-        quaternion = (turn.x, turn.y, turn.z, turn.w)
-        if not all(map(math.isfinite, position + quaternion)) or not any(quaternion):
+        numbers = pose_numbers(message.pose)
+        position, quaternion = numbers[:3], numbers[3:]
+        if not all(map(math.isfinite, numbers)) or not any(quaternion):
             self.warn('poses_refused', f'{name}: an invalid pose')
             return
         now_s = self._last_pose_s[name] = time.monotonic()
-        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        stamp_s = seconds_of(message)
         self._ahead_s = stamp_s - now_s
         self._set_state(name, OK)
         if self._n_clients:

@@ -22,6 +22,8 @@ from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
 from anser_ros.wire.records import FULL_SCALE_CODE, ChannelKind, Hello, SampleBlock
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class StreamOptions:
@@ -191,29 +193,22 @@ class FluxStream:
         return converted
 
 
-@dataclass(frozen=True)
-class _Geometry:
-    channel: NDArray[np.int64]
-    position: NDArray[np.float64]
-    axis: NDArray[np.float64]
-
-
-def _geometry(sensors: Sequence[SensorSpec]) -> _Geometry:
+def _geometry(sensors: Sequence[SensorSpec]) -> tuple[NDArray[np.int64], Array, Array]:
     """Channels, and positions and axes in fg: NaN for what moves."""
     fixed = np.array([s.body == FIELD_GENERATOR for s in sensors], bool)[:, None]
     position = np.array([s.position_m for s in sensors]).reshape(-1, 3)
     axis = np.array([s.axis for s in sensors]).reshape(-1, 3)
-    return _Geometry(
-        np.array([s.channel for s in sensors], np.int64),
-        np.where(fixed, position, np.nan),
-        np.where(fixed, axis, np.nan),
-    )
+    channel = np.array([s.channel for s in sensors], np.int64)
+    return channel, np.where(fixed, position, np.nan), np.where(fixed, axis, np.nan)
 
 
 def _points(
-    geometry: _Geometry, flux: NDArray[np.complex128], flags: NDArray[np.int64]
+    geometry: tuple[NDArray[np.int64], Array, Array],
+    flux: NDArray[np.complex128],
+    flags: NDArray[np.int64],
 ) -> FluxPoints:
-    return FluxPoints(geometry.channel, flags, flux, geometry.position, geometry.axis)
+    channel, position, axis = geometry
+    return FluxPoints(channel, flags, flux, position, axis)
 
 
 def _current_column(hello: Hello) -> int:

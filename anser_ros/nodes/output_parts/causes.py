@@ -4,7 +4,8 @@ A service answers with the same words, because both come from the node concerned
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+
+from anser_ros.nodes.runtime.diagnostics import LastStatus
 
 MOST_CAUSES = 4
 """Causes that are reported at once: what is behind all else is among the gravest."""
@@ -14,14 +15,6 @@ MOST_TEXT = 160
 """Characters of a cause: two lines of a terminal."""
 LEAST_LOSS = 0.05
 """Share of missing frames that is reported: a rate over a second is off by a few percent."""
-
-
-class LastStatus(NamedTuple):
-    """Holds the last status of a node or of a part of it: level, words, figures by name."""
-
-    level: int
-    message: str
-    values: Mapping[str, str]
 
 
 def causes(

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import AnserError
-from anser_ros.nodes.output_parts.live_view import LiveView, known
+from anser_ros.nodes.output_parts.live_view import LiveView
 
 TRIGGERS = ('recorder/start', 'recorder/stop', 'field_model/set_baseline')
 MODEL_FILE, BASELINE_FILE = 'model_file', 'baseline_file'
@@ -89,14 +89,7 @@ class ChainClient:
     def figures(self, since_s: float) -> dict[str, float | None]:
         """Return how well it goes, not before a time (of ``time.time``)."""
         view = self._view()
-        if view is None:
-            return {}
-        found = view.figures(since_s)
-        return {
-            'tracked_percent': known(100.0 * found.tracked),
-            'error_mm': known(1e3 * found.error_m),
-            'residual_pt': known(1e12 * found.residual_t),
-        }
+        return {} if view is None else view.figures(since_s)
 
 
 async def _text_parameter(getter: Any, name: str) -> str:

@@ -5,19 +5,19 @@ import struct
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.nodes.output_parts.causes import LastStatus, causes
+from anser_ros.nodes.output_parts.causes import causes
 from anser_ros.nodes.output_parts.traces import (
     LONGEST_OPTICAL_GAP_S,
     OpticalTrace,
     latency_of,
     targets_of,
 )
+from anser_ros.nodes.runtime.diagnostics import LastStatus
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
@@ -50,38 +50,23 @@ def read_pose(data: bytes) -> tuple[float, Array]:
     return sec + 1e-9 * nanosec, np.frombuffer(data, f'{order}f8', count, offset).astype(float)
 
 
-@dataclass(frozen=True)
-class Figures:
-    """States how well it goes, over all coils and a stretch of time; NaN where nothing is known.
-
-    ``tracked`` is the mean share of frames with a pose, ``error_m`` the root mean square distance
-    of these from the optical poses, ``residual_t`` that of all fluxes from the model, T.
-    """
-
-    tracked: float
-    error_m: float
-    residual_t: float
-    seconds: float
-
-
 class LiveView:
     """Holds arrays of all targets, by their numbers.
 
     ``statuses`` has what nodes reported last, by ``node`` or ``node: part``.
     """
 
-    def __init__(self, setup: Setup, namespace: str) -> None:
+    def __init__(
+        self, setup: Setup, namespace: str, statuses: dict[str, LastStatus] | None = None
+    ) -> None:
         self.setup, self.namespace = setup, namespace
+        self.statuses = {} if statuses is None else statuses
         self.targets = targets_of(setup)
         self.bodies = {target.body for target in self.targets}
-        self.statuses: dict[str, LastStatus] = {}
-        self._status_s: dict[str, float] = {}
         count = len(self.targets)
-        self._stamp_s = np.full(count, np.nan)
         self._received_s = np.full(count, -np.inf)
         self._pose = np.full((count, POSE), np.nan)
         self._covariance = np.full((count, 3, 3), np.nan)
-        self._number = {target.name: index for index, target in enumerate(self.targets)}
         self._optical = {body: OpticalTrace() for body in self.bodies}
         self._recent: list[tuple[int, float, Array]] = []
         self._came = np.zeros(count)
@@ -89,7 +74,8 @@ class LiveView:
         self._since_s = time.monotonic()
         self.rate_hz = np.zeros(count)
         self.latency_s = math.nan
-        self._error_m = np.full(count, np.nan)
+        # Distance to the optical pose at the last point, m; NaN where none is.
+        self.error_m = np.full(count, np.nan)
         self.points: deque[tuple[float, Array, Array, Array]] = deque(maxlen=HISTORY)
 
     # What comes in ------------------------------------------------------------------------
@@ -105,7 +91,7 @@ class LiveView:
         stamp_s, values = read_pose(newest)
         if not np.isfinite(values).all():
             raise ValueError('a pose is not finite')
-        self._stamp_s[number], self._pose[number] = stamp_s, values[:POSE]
+        self._pose[number] = values[:POSE]
         self._covariance[number] = values[POSE:].reshape(6, 6)[:3, :3]
         self._received_s[number] = time.monotonic()
         if sent_ns:
@@ -119,10 +105,6 @@ class LiveView:
             stamp_s, values = read_pose(data)
             trace.add(stamp_s, tuple(values[:3]), tuple(values[3:POSE]))
         trace.forget(OPTICAL_KEPT)
-
-    def take_status(self, name: str, status: LastStatus) -> None:
-        """Take the status of a node."""
-        self.statuses[name], self._status_s[name] = status, time.monotonic()
 
     # What is shown ------------------------------------------------------------------------
 
@@ -178,10 +160,6 @@ class LiveView:
         """Return the causes of what the statuses report."""
         return causes(self.statuses, self.namespace, self.setup.flux_rate_hz)
 
-    def silent_s(self, name: str) -> float:
-        """Return the time since something was said under a name, s."""
-        return time.monotonic() - self._status_s.get(name, -math.inf)
-
     def add_point(self) -> tuple[float, Array, Array, Array]:
         """Work out rates, and the next point of the curves: time, error, residual, tracked."""
         now_s = time.monotonic()
@@ -191,15 +169,10 @@ class LiveView:
         if self._latency_s:
             self.latency_s = float(np.median(self._latency_s))
             self._latency_s = []
-        self._error_m = self._errors()
-        point = time.time(), self._error_m, self.residual_t(), self.tracked()
+        self.error_m = self._errors()
+        point = time.time(), self.error_m, self.residual_t(), self.tracked()
         self.points.append(point)
         return point
-
-    @property
-    def error_m(self) -> Array:
-        """Return the distance to the optical pose at the last point, m; NaN where none is."""
-        return self._error_m
 
     def _errors(self) -> Array:
         """Root mean square distance of the last poses from the optical ones, m."""
@@ -223,20 +196,22 @@ class LiveView:
         return np.sqrt(np.divide(squares, counts, out=np.full_like(squares, np.nan),
                                  where=counts > 0))  # fmt: skip
 
-    def figures(self, since_s: float = -math.inf) -> Figures:
-        """Return how well it went lately, not before a time (of ``time.time``)."""
+    def figures(self, since_s: float = -math.inf) -> dict[str, float | None]:
+        """Return how well it went lately, not before a time (of ``time.time``), over all coils.
+
+        These are the mean share of frames with a pose, the root mean square distance of poses from
+        the optical ones, and that of all fluxes from the model.
+        """
         begin_s = max(since_s, time.time() - WINDOW_S)
-        points = [point for point in self.points if point[0] >= begin_s]
-        if not points:
-            return Figures(math.nan, math.nan, math.nan, 0.0)
+        points = [point[1:] for point in self.points if point[0] >= begin_s]
         coils = len(self.setup.tool_sensors)
-        error, residual, tracked = (
-            np.array(values)[:, :coils] for values in list(zip(*points, strict=True))[1:]
-        )
-        return Figures(
-            _middle(tracked, np.mean), _middle(error, _rms), _middle(residual, _rms),
-            points[-1][0] - points[0][0],
-        )  # fmt: skip
+        columns = zip(*points, strict=True) if points else ((),) * 3
+        error, residual, tracked = (np.array(values)[..., :coils] for values in columns)
+        return {
+            'tracked_percent': known(100.0 * _middle(tracked, np.mean)),
+            'error_mm': known(1e3 * _middle(error, _rms)),
+            'residual_pt': known(1e12 * _middle(residual, _rms)),
+        }
 
 
 def known(value: float, digits: int = 3) -> float | None:

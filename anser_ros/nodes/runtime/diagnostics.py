@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -57,6 +58,24 @@ def diagnostic_array(node: str, statuses: Iterable[Status], stamp: Time) -> Diag
         one.values = [KeyValue(key=key, value=text_of(v)) for key, v in status.values.items()]
         message.status.append(one)
     return message
+
+
+class LastStatus(NamedTuple):
+    """Holds what a node reported last of itself or of a part of it."""
+
+    level: int
+    message: str
+    values: Mapping[str, str]
+
+
+def statuses_in(message: DiagnosticArray) -> dict[str, LastStatus]:
+    """Return the statuses of a message by ``node`` or ``node: part``."""
+    return {
+        one.name: LastStatus(
+            one.level[0], one.message, {pair.key: pair.value for pair in one.values}
+        )
+        for one in message.status
+    }
 
 
 class Trouble:

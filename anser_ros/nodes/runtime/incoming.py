@@ -56,3 +56,9 @@ def pose_numbers(pose: Pose) -> tuple[float, float, float, float, float, float, 
     """Return the position, m, and the quaternion x, y, z, w of a pose."""
     p, q = pose.position, pose.orientation
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+def seconds_of(message: Any) -> float:
+    """Return the header stamp of a message, s."""
+    stamp = message.header.stamp
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
