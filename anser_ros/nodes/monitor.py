@@ -18,7 +18,14 @@ from std_msgs.msg import String
 
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.output_parts.causes import causes
-from anser_ros.nodes.output_parts.traces import OpticalTrace, Row, Traces, latency_of, targets_of
+from anser_ros.nodes.output_parts.traces import (
+    OpticalTrace,
+    Row,
+    Traces,
+    latency_of,
+    middle,
+    targets_of,
+)
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
 from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
@@ -190,14 +197,10 @@ class Monitor(AnserNode):
             title=self._title(), title_justify='left', caption=self._caption(),
             caption_justify='left', padding=(0, 0) if narrow else (0, 1), collapse_padding=True,
         )  # fmt: skip
-        table.add_column('sensor', no_wrap=True)
-        table.add_column('state', no_wrap=True)
-        table.add_column('x, y, z mm', justify='right', no_wrap=True)
-        for heading in ('sigma\nmm', 'error\nmm'):
-            table.add_column(heading, justify='right', no_wrap=True)
-        if second:
-            table.add_column(f'{second}\nerror', justify='right', no_wrap=True)
-        for heading in ('Hz', 'ms'):
+        for heading in ('sensor', 'state'):
+            table.add_column(heading, no_wrap=True)
+        others_error = [f'{second}\nerror'] if second else []
+        for heading in ('x, y, z mm', 'sigma\nmm', 'error\nmm', *others_error, 'Hz', 'ms'):
             table.add_column(heading, justify='right', no_wrap=True)
         others = {row.name: row for row in rows.get(second, [])} if second else {}
         for row in rows.get('', []):
@@ -226,10 +229,9 @@ class Monitor(AnserNode):
         return f'{ran_s:.0f} s' + (f' of {end_s:.0f} s' if end_s else '')
 
     def _caption(self) -> str:
-        words = ['ms: latency from the middle of the window']
+        caption = 'ms: latency from the middle of the window'
         if self._metal:
-            words.insert(0, f'metal {100 * self._metal[-1][1]:.0f} cm from the board')
-        caption = '; '.join(words)
+            caption = f'metal {100 * self._metal[-1][1]:.0f} cm from the board; {caption}'
         if self._first_s is not None:  # until then they are in the title
             caption += ''.join(f'\n{escape(text)}' for text in self._causes())
         if self.parameters.compare and self.parameters.compare_note:
@@ -238,20 +240,20 @@ class Monitor(AnserNode):
 
     def _line(self, rows: dict[str, list[Row]]) -> str:
         """One line with the medians over all sensors."""
-        if self._first_s is None:
-            return self._title()
         parts = [self._title()]
+        if self._first_s is None:
+            return parts[0]
         for chain, found in rows.items():
             good = sum(row.rate_hz > 0 for row in found)
-            error = _middle([row.error_m for row in found])
-            sigma = _middle([row.sigma_m for row in found])
+            error = middle([row.error_m for row in found])
+            sigma = middle([row.sigma_m for row in found])
             parts.append(
                 f'{chain or "live"}: {good}/{len(found)} tracked, '
                 f'error {_mm(error)} mm, sigma {_mm(sigma)} mm'
             )
         live = rows.get('', [])
-        parts.append(f'{_middle([row.rate_hz for row in live]):.0f} Hz')
-        parts.append(f'{_number(1e3 * _middle([row.latency_s for row in live]), 1)} ms')
+        parts.append(f'{middle([row.rate_hz for row in live]):.0f} Hz')
+        parts.append(f'{_number(1e3 * middle([row.latency_s for row in live]), 1)} ms')
         if self._metal:
             parts.append(f'metal {100 * self._metal[-1][1]:.0f} cm')
         why = self._causes()
@@ -318,11 +320,6 @@ def _check(path: Path) -> None:
 def _z_axis(x: float, y: float, z: float, w: float) -> tuple[float, ...]:
     """Axis of a pose: +z, as docs/interfaces.md has it, for sensors as for bodies."""
     return 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
-
-
-def _middle(values: list[float]) -> float:
-    finite = [value for value in values if np.isfinite(value)]
-    return float(np.median(finite)) if finite else float('nan')
 
 
 def _mm(value_m: float, digits: int = 2) -> str:

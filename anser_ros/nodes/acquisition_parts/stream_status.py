@@ -1,13 +1,13 @@
 """Reports the state of emitters and sensors: a line for each, with what is wrong in words."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame, Staleness
 from anser_ros.nodes.acquisition_parts.flux_stream import FluxStream
 from anser_ros.nodes.acquisition_parts.stream_interval import Interval
-from anser_ros.nodes.runtime.diagnostics import Level, Status
+from anser_ros.nodes.runtime.diagnostics import Level, Status, named
 from anser_ros.signals.clock import ClockState
 from anser_ros.wire.points import DROPPED, SATURATED, STALE
 from anser_ros.wire.setup import Coil
@@ -31,11 +31,11 @@ def signal_troubles(
     """
     found = []
     if stream.missing:
-        names = _named(sensor.name for sensor in stream.missing)
+        names = named((sensor.name for sensor in stream.missing), MOST_NAMES)
         found.append((Level.WARN, f'the control unit has no channel for {names}'))
     if frame is not None and not frame.window.driven.all():
         pairs = zip(coils, frame.window.driven, strict=True)
-        names = _named(coil.name for coil, driven in pairs if not driven)
+        names = named((coil.name for coil, driven in pairs if not driven), MOST_NAMES)
         found.append((Level.ERROR, f'no current in {names}'))
     if past.flags is None or len(past.flags) != len(stream.sensors):
         return found
@@ -44,7 +44,10 @@ def signal_troubles(
         for row in np.flatnonzero(past.flags & bit).tolist():
             why = _why_stale(past.staleness, row) if bit == STALE else ''
             bad.setdefault(why, []).append(stream.sensors[row].name)
-        found += [(level, f'{word}: {_named(n)} {why}'.strip()) for why, n in bad.items()]
+        found += [
+            (level, f'{word}: {named(names, MOST_NAMES)} {why}'.strip())
+            for why, names in bad.items()
+        ]
     return found
 
 
@@ -124,13 +127,6 @@ def sensor_statuses(stream: FluxStream, frame: FluxFrame, past: Interval) -> lis
         }
         statuses.append(Status(sensor.name, level, message, values))
     return statuses
-
-
-def _named(names: Iterable[str]) -> str:
-    """The first few names, and how many more there are."""
-    known = list(names)
-    more = f' and {len(known) - MOST_NAMES} more' if len(known) > MOST_NAMES else ''
-    return ', '.join(known[:MOST_NAMES]) + more
 
 
 def _rms(values: np.ndarray) -> float:

@@ -5,7 +5,7 @@ A service answers with the same words, because both come from the node concerned
 
 from collections.abc import Mapping
 
-from anser_ros.nodes.runtime.diagnostics import LastStatus
+from anser_ros.nodes.runtime.diagnostics import LastStatus, named
 
 MOST_CAUSES = 4
 """Causes that are reported at once: what is behind all else is among the gravest."""
@@ -37,7 +37,9 @@ def causes(
         elif short == 'tracker':
             silent.setdefault((-one.level, one.message), []).append(part)
     found.sort(key=lambda item: item[0])
-    reasons = [f'{words} ({_names(names)})' for (_, words), names in sorted(silent.items())]
+    reasons = [
+        f'{words} ({named(names, MOST_NAMES)})' for (_, words), names in sorted(silent.items())
+    ]
     texts = [words for _, words in found] + reasons
     return [_short(text) for text in texts[:MOST_CAUSES]]
 
@@ -50,11 +52,6 @@ def _loss(one: LastStatus, flux_rate_hz: float) -> str:
         return ''
     share = 1.0 - rate_hz / flux_rate_hz if flux_rate_hz > 0 else 0.0
     return f'; {share:.0%} of the frames are missing' if share > LEAST_LOSS else ''
-
-
-def _names(names: list[str]) -> str:
-    more = f' and {len(names) - MOST_NAMES} more' if len(names) > MOST_NAMES else ''
-    return ', '.join(names[:MOST_NAMES]) + more
 
 
 def _short(text: str) -> str:

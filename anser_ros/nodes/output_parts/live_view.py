@@ -15,6 +15,7 @@ from anser_ros.nodes.output_parts.traces import (
     LONGEST_OPTICAL_GAP_S,
     OpticalTrace,
     latency_of,
+    middle,
     targets_of,
 )
 from anser_ros.nodes.runtime.diagnostics import LastStatus
@@ -208,20 +209,15 @@ class LiveView:
         columns = zip(*points, strict=True) if points else ((),) * 3
         error, residual, tracked = (np.array(values)[..., :coils] for values in columns)
         return {
-            'tracked_percent': known(100.0 * _middle(tracked, np.mean)),
-            'error_mm': known(1e3 * _middle(error, _rms)),
-            'residual_pt': known(1e12 * _middle(residual, _rms)),
+            'tracked_percent': known(100.0 * middle(tracked, np.mean)),
+            'error_mm': known(1e3 * middle(error, _rms)),
+            'residual_pt': known(1e12 * middle(residual, _rms)),
         }
 
 
 def known(value: float, digits: int = 3) -> float | None:
     """Return a number as a page takes it: rounded, None where it is not known."""
     return round(float(value), digits) if math.isfinite(value) else None
-
-
-def _middle(values: Array, of: Any) -> float:
-    known = values[np.isfinite(values)]
-    return float(of(known)) if known.size else math.nan
 
 
 def _rms(values: Array) -> float:

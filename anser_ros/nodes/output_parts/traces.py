@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,13 @@ def latency_of(now_s: float, stamp_s: float) -> float:
     """Return how old a pose is as it comes, s; NaN where its stamp is not of now."""
     age_s = now_s - stamp_s
     return age_s if abs(age_s) < LIVE_WITHIN_S else float('nan')
+
+
+def middle(values: Sequence[float] | Array, of: Callable[[Array], Any] = np.median) -> float:
+    """Return the median of what is finite, or another figure of it; NaN where nothing is."""
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    return float(of(known)) if known.size else float('nan')
 
 
 @dataclass(frozen=True)
@@ -147,20 +155,15 @@ class Traces:
             if count and track is not None:
                 # the last poses may be newer than the last optical one
                 away = trace.errors(track, max(0, since - 5))[0]
-                known = away[np.isfinite(away)]
-                error = float(np.median(known)) if known.size else error
+                error = middle(away)
             rows.append(
                 Row(
                     name,
                     trace.position[-1] if count else (float('nan'),) * 3,
-                    _median(trace.sigma_m[since:]),
+                    middle(trace.sigma_m[since:]),
                     error,
                     count / elapsed_s,
-                    _median(trace.latency_s[since:]),
+                    middle(trace.latency_s[since:]),
                 )
             )
         return rows
-
-
-def _median(values: list[float]) -> float:
-    return float(np.median(values)) if values else float('nan')

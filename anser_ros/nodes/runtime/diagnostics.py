@@ -78,6 +78,13 @@ def statuses_in(message: DiagnosticArray) -> dict[str, LastStatus]:
     }
 
 
+def named(names: Iterable[str], most: int) -> str:
+    """Return the first few names, and how many more there are."""
+    known = list(names)
+    more = f' and {len(known) - most} more' if len(known) > most else ''
+    return ', '.join(known[:most]) + more
+
+
 class Trouble:
     """Remembers what went wrong last, and whether that is still news."""
 

@@ -103,14 +103,8 @@ def settings_of(table: TrackerParameters) -> TrackerSettings:
             if len(getattr(table, name)) != 3:
                 raise ParameterError(f'parameter {name}: three numbers needed')
         volume = TrackedVolume((low[0], low[1], low[2]), (high[0], high[1], high[2]))
-    return TrackerSettings(
-        adaptive=table.adaptive,
-        volume=volume,
-        grid_spacing_m=table.grid_spacing_m,
-        gate=table.gate,
-        max_sigma_m=table.max_sigma_m,
-        warm_age_s=table.warm_age_s,
-    )
+    names = ('adaptive', 'grid_spacing_m', 'gate', 'max_sigma_m', 'warm_age_s')
+    return TrackerSettings(volume=volume, **{name: getattr(table, name) for name in names})
 
 
 def tips_of_file(path: str) -> dict[str, TipSpec]:
