@@ -18,7 +18,7 @@ from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters
+from anser_ros.nodes.runtime.shared_names import STALE_AFTER_S
 from anser_ros.pose_states import OK, STALE
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
@@ -36,7 +36,7 @@ class OpenIGTLinkParameters:
     host: str = parameter('127.0.0.1', 'address to listen on; 0.0.0.0 lets other machines in')
     port: int = parameter(OPENIGTLINK, 'TCP port, 0 for a free one', minimum=0, maximum=65535)
     stale_after_s: float = parameter(
-        TrackerParameters.stale_after_s,
+        STALE_AFTER_S,
         'time without a pose after which a sensor is reported, s',
         minimum=0.02,
         live=True,

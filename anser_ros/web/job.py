@@ -18,8 +18,6 @@ KEPT_LINES = 20
 """Lines of what a command says that are kept, for the last ones say why it failed."""
 LONGEST_LINE = 65_536
 """Bytes of a line that are taken as one, which bounds the memory of a line without an end."""
-PATIENCE_S = 3.0
-"""Time for a command to end when it is told to, s; then it is killed."""
 
 
 class Job:
@@ -94,9 +92,9 @@ class Job:
         self._is_ended = self._is_ended or self.exit_code is None
         self.end()
 
-    def end(self, number: int = signal.SIGTERM) -> None:
+    def end(self) -> None:
         """Ask its processes to end."""
         process = self._process
         if process is not None and process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, number)
+                os.killpg(process.pid, signal.SIGTERM)

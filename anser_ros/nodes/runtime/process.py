@@ -19,10 +19,11 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, ParameterError
-from anser_ros.nodes.runtime import parameter_files, parameters
+from anser_ros.nodes.runtime import parameters
 from anser_ros.nodes.runtime.allocator import keep_in_one_piece
 from anser_ros.nodes.runtime.handover import Handover
 from anser_ros.nodes.runtime.node import AnserNode
+from anser_ros.nodes.runtime.parameter_files import complaints, names_for
 from anser_ros.one_line_parser import OneLineParser
 from anser_ros.wire.config_folder import config_path
 
@@ -102,15 +103,11 @@ def _parse(
 ) -> dict[str, Any]:
     module = classes[0].__module__ if len(classes) == 1 else '__main__'
     summary = (sys.modules[module].__doc__ or '').strip().split('\n')[0]
-    tables = [(node.NAME, parameters.describe(node.PARAMETERS)) for node in classes]
-    prefix = '' if len(classes) == 1 else 'NODE:'
-    if prefix:
-        table = '\n'.join(f'{node}:\n{table}' for node, table in tables)
-    else:
-        table = tables[0][1]
-    example = classes[0].EXAMPLE
-    if prefix:
-        example = example.replace('-p ', f'-p {classes[0].NAME}:')
+    tables = {node.NAME: parameters.describe(node.PARAMETERS) for node in classes}
+    prefix, example, (table, *_) = '', classes[0].EXAMPLE, tables.values()
+    if len(classes) > 1:
+        prefix, example = 'NODE:', example.replace('-p ', f'-p {classes[0].NAME}:')
+        table = '\n'.join(f'{node}:\n{text}' for node, text in tables.items())
     parser = OneLineParser(
         prog=f'anser {name}',
         description=summary,
@@ -283,10 +280,10 @@ def _complain(nodes: Sequence[AnserNode], arguments: Sequence[str]) -> None:
     know.
     """
     for node in nodes if len(nodes) > 1 else ():
-        for name in parameter_files.names_for(arguments, node.get_name()):
+        for name in names_for(arguments, node.get_name()):
             if not parameters.is_known(node.PARAMETERS, name):
                 raise ParameterError(f'{node.get_name()} has no parameter {name}')
-    refusals = [parameter_files.complaints(arguments, node.get_name()) for node in nodes]
+    refusals = [complaints(arguments, node.get_name()) for node in nodes]
     if all(refusals):
         for text in refusals[-1]:
             nodes[-1].get_logger().warning(text)

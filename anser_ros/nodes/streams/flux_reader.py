@@ -8,7 +8,7 @@ from sensor_msgs.msg import PointCloud2
 from anser_ros.errors import LayoutError
 from anser_ros.frames.intake import Count
 from anser_ros.nodes.runtime.handover import HandedFlux
-from anser_ros.nodes.streams.model_clouds import layout_of, width_of
+from anser_ros.nodes.streams.clouds import layout_of, width_of
 from anser_ros.stamps import SECOND_NS, stamp_of
 from anser_ros.wire.points import FluxPoints, decode_flux
 

@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 Model = TypeVar('Model')
 Frame = TypeVar('Frame')
 
-OTHER_CLOCK_NS = 1_000_000_000
+FAR_AHEAD_NS = 1_000_000_000
 """A model that far from a frame has its stamp from another clock (a recording's, the host's)."""
 MOST_LATE = 5
 """Frames in a row that waited in vain, after which none waits until an answer has come again."""
@@ -87,7 +87,7 @@ class AnsweredFrames(Generic[Model, Frame]):
         newest = None
         while self._models:
             model_ns = self._models[0][0]
-            if stamp_ns < model_ns <= stamp_ns + OTHER_CLOCK_NS and self._last_frame_ns:
+            if stamp_ns < model_ns <= stamp_ns + FAR_AHEAD_NS and self._last_frame_ns:
                 break
             newest = self._models.popleft()
         if newest is not None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.shared_names import STALE_AFTER_S
 from anser_ros.nodes.runtime.stated_parameters import stated
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.estimate import NO_GATE, TrackerSettings
@@ -78,7 +79,10 @@ class TrackerParameters:
         live=True,
     )
     stale_after_s: float = parameter(
-        0.3, 'time without fluxes after which a sensor is stale, s', minimum=0.02, live=True
+        STALE_AFTER_S,
+        'time without fluxes after which a sensor is stale, s',
+        minimum=0.02,
+        live=True,
     )
     model_wait_s: float = parameter(
         0.1,
