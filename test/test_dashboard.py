@@ -268,7 +268,7 @@ def test_the_loop_from_recording_to_undo(tmp_path, monkeypatch):
 
     monkeypatch.setattr(loop_module, 'Job', Instant)
     chain = FakeChain()
-    loop = CorrectionLoop(chain, RecordingFolder(tmp_path))
+    loop = CorrectionLoop(chain, chain, RecordingFolder(tmp_path))
 
     async def closed():
         await loop.diagnose()
@@ -368,7 +368,7 @@ def test_the_nodes_are_asked_for_services_and_models(ros, tmp_path):
     from anser_ros.sessions.model_file import save_model
 
     server, asker = FieldModelNode(), ros.create_node('asker', namespace='anser')
-    client = ChainClient(asker, lambda: None, print)
+    client = ChainClient(asker)
     executor = SingleThreadedExecutor()
     for node in (server, asker):
         executor.add_node(node)

@@ -60,16 +60,14 @@ class Dashboard(AnserNode):
 
         table = self.parameters
         self._streams = polling_node(self.get_name(), self.get_namespace())
-        self._client = ChainClient(
-            self, lambda: self._source.view, lambda words: self._source.mark(words)
-        )
+        self._client = ChainClient(self)
         refuse = partial(self.warn, 'messages_refused')
         self._source = ViewSource(self._streams, table.optical, refuse, self._client.is_there)
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         folder = RecordingFolder(Path(table.directory))
         if words := folder.trouble():
             self.get_logger().warning(f'directory {folder.path}: {words}: no result can be kept')
-        self._loop = CorrectionLoop(self._client, folder)
+        self._loop = CorrectionLoop(self._client, self._source, folder)
         self._pages = Pages(self._source, self._loop, self._guard)
         self._pages.register()
         token = token_for(table.host, table.token_file)

@@ -148,13 +148,12 @@ class OpenIGTLink(AnserNode):
             self._server.send(older, newer)
             self.count('transforms')
             self._tracked[name] = igtl.Tracked(device, position, quaternion)
-            self._send_tracking(now_s, stamp_s)
+            self._server.send_tracking(partial(self._tracking, stamp_s), now_s)
 
-    def _send_tracking(self, now_s: float, stamp_s: float) -> None:
-        """Send what is tracked just now to the clients that have asked for it."""
-        if self._server.is_tracking_due(now_s):
-            good = [one for name, one in self._tracked.items() if self._states[name] == OK]
-            self._server.send_tracking(igtl.tracking(stamp_s, good), now_s)
+    def _tracking(self, stamp_s: float) -> bytes:
+        """What is tracked just now, for the clients that have asked for it."""
+        good = [one for name, one in self._tracked.items() if self._states[name] == OK]
+        return igtl.tracking(stamp_s, good)
 
     def _now_s(self) -> float:
         """The time on the clock of the poses, those of a bag included."""

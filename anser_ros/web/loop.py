@@ -31,6 +31,11 @@ class Chain(Protocol):
     async def model_files(self) -> dict[str, str]: ...
     async def load_model(self, files: Mapping[str, str]) -> None: ...
     async def baseline_file(self) -> str: ...
+
+
+class LiveFigures(Protocol):
+    """States what the page knows of the present moment."""
+
     def figures(self, since_s: float) -> dict[str, float | None]: ...
     def mark(self, words: str) -> None: ...
 
@@ -86,8 +91,8 @@ class CorrectionLoop:
     on; ``model`` is the active model's file, as ``field_model`` has it.
     """
 
-    def __init__(self, chain: Chain, folder: RecordingFolder) -> None:
-        self._chain, self.folder = chain, folder
+    def __init__(self, chain: Chain, live: LiveFigures, folder: RecordingFolder) -> None:
+        self._chain, self._live, self.folder = chain, live, folder
         self.chosen, self.model = '', ''
         self.job: Job | None = None
         self.found: Found | None = None
@@ -159,10 +164,10 @@ class CorrectionLoop:
         if self.found is None:
             raise ParameterError('there is no model to load yet')
         before = await self._chain.model_files()
-        figures = self._chain.figures(0.0)
+        figures = self._live.figures(0.0)
         await self._exchange(before, dict.fromkeys(before, str(self.found.model)))
         self._loaded = [*self._loaded[-MOST_UNDONE + 1 :], Loaded(before, figures, time.time())]
-        self._chain.mark('model loaded')
+        self._live.mark('model loaded')
         return 'the new model is in force'
 
     @_step
@@ -172,7 +177,7 @@ class CorrectionLoop:
             raise ParameterError('no model was loaded from this page')
         await self._exchange(await self._chain.model_files(), self._loaded[-1].before)
         self._loaded.pop()
-        self._chain.mark('undone')
+        self._live.mark('undone')
         return 'the previous model is in force again'
 
     def refresh_names(self) -> None:
@@ -239,7 +244,7 @@ class CorrectionLoop:
         if not self._loaded:
             return []
         before = self._loaded[-1]
-        now = self._chain.figures(before.at_s + SETTLING_S)
+        now = self._live.figures(before.at_s + SETTLING_S)
         return [
             (label, _text(before.figures.get(key), digits), _text(now.get(key), digits))
             for label, key, digits in LIVE_ROWS

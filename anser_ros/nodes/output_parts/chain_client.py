@@ -1,7 +1,7 @@
 """Asks the running nodes on behalf of the page: services, and which model file they have."""
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -11,7 +11,6 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import AnserError
-from anser_ros.nodes.output_parts.live_view import LiveView
 
 TRIGGERS = ('recorder/start', 'recorder/stop', 'field_model/set_baseline')
 MODEL_FILE, BASELINE_FILE = 'model_file', 'baseline_file'
@@ -33,10 +32,7 @@ class ChainClient:
     The node's executor must be spinning in another thread than that of the page.
     """
 
-    def __init__(
-        self, node: Node, view: Callable[[], LiveView | None], mark: Callable[[str], None]
-    ) -> None:
-        self._view, self.mark = view, mark
+    def __init__(self, node: Node) -> None:
         self._triggers = {name: node.create_client(Trigger, name) for name in TRIGGERS}
         self._getters = {
             name: node.create_client(GetParameters, f'{name}/get_parameters') for name in HOLDERS
@@ -85,11 +81,6 @@ class ChainClient:
         """Return the recording without metal that ``field_model`` was started with."""
         getter = self._getters['field_model']
         return await _text_parameter(getter, BASELINE_FILE) if getter.service_is_ready() else ''
-
-    def figures(self, since_s: float) -> dict[str, float | None]:
-        """Return how well it goes, not before a time (of ``time.time``)."""
-        view = self._view()
-        return {} if view is None else view.figures(since_s)
 
 
 async def _text_parameter(getter: Any, name: str) -> str:

@@ -75,6 +75,10 @@ class ViewSource:
         """Mark this moment in the curves."""
         self._marks.append((time.time(), words))
 
+    def figures(self, since_s: float) -> dict[str, float | None]:
+        """Return how well it goes, not before a time (of ``time.time``)."""
+        return {} if self.view is None else self.view.figures(since_s)
+
     # What comes in ------------------------------------------------------------------------
 
     def look(self) -> None:
