@@ -1,7 +1,7 @@
 """Tracks the last frame once more just before the next one comes, for the sake of the caches.
 
-In the 15 ms between two frames other programs fill the processor's caches. After a rehearsal code,
-tables and model are there again, and the real frame takes half of the time.
+In the 15 ms between two frames other programs fill the processor's caches: a frame that takes
+0.5 ms one after the other takes 1.4 ms after such a pause, and 0.9 ms after a rehearsal.
 """
 
 from anser_ros.errors import AnserError
