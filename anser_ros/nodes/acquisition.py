@@ -32,7 +32,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.process import TURN_S, main
-from anser_ros.nodes.streams.backlog import Backlog, Deference
+from anser_ros.nodes.streams.backlog import Backlog
 from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.nodes.streams.overload import too_slow
 from anser_ros.wire.channel_calibration import parse_channels
@@ -99,7 +99,7 @@ class Acquisition(AnserNode):
         self._interval = self._last = Interval(time.monotonic())
         self._past: Counter[str] = Counter()
         self._totals: dict[str, int] = {}
-        self._backlog, self._deference = Backlog(), Deference()
+        self._backlog = Backlog()
         self._published_setup = ''
         self._said: Level | None = None
         self._accuracy = MeasuredAccuracy()
@@ -287,7 +287,7 @@ class Acquisition(AnserNode):
         # The model is refitted when the poses and all messages are on their way, and no further
         # frame waits.
         age_s = (time.monotonic_ns() - arrival_ns) / 1e9
-        if self.hands_over and self._deference.gives_way(age_s, stream.rate_hz):
+        if self.hands_over and self._backlog.gives_way(age_s):
             self.count('refits_left_out')
         else:
             self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)
