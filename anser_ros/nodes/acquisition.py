@@ -101,7 +101,7 @@ class Acquisition(AnserNode):
         self._totals: dict[str, int] = {}
         self._backlog = Backlog()
         self._published_setup = ''
-        self._said: Level | None = None
+        self._logged: Level | None = None
         self._accuracy = MeasuredAccuracy()
         self._wall_clock = WallClock()
         self._asked_ns = 0
@@ -350,14 +350,14 @@ class Acquisition(AnserNode):
         counters = {name: int(values.get(name, 0)) for name in FAULTS}  # type: ignore[call-overload]
         self._faults.note(counters, time.monotonic())
         level, message = self._verdict(interval, rises)
-        self._say(level, message)
+        self._log_change(level, message)
         return Status('', level, message, values)
 
-    def _say(self, level: Level, message: str) -> None:
+    def _log_change(self, level: Level, message: str) -> None:
         """Write on the console when an error begins, and when all is well (again)."""
-        if level is self._said or level not in (Level.OK, Level.ERROR):
+        if level is self._logged or level not in (Level.OK, Level.ERROR):
             return
-        self._said = level
+        self._logged = level
         device = self.parameters.device if self._port is None else self._port.device
         if level is Level.OK:
             self.get_logger().info(f'{device}: {message}')

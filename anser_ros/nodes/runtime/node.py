@@ -111,7 +111,7 @@ class AnserNode(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.EVENTS)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._speak = self._guard(self._in_turn(self.publish_diagnostics, LONGEST_TURN_S))
+        self._report = self._guard(self._in_turn(self.publish_diagnostics, LONGEST_TURN_S))
         timer = self._guard(self._diagnostics_due)
         super().create_timer(DIAGNOSTICS_PERIOD_S, timer, clock=self.steady_clock)
         if self.HAS_KERNELS:
@@ -198,14 +198,14 @@ class AnserNode(Node):
 
     def _diagnostics_due(self) -> None:
         """Publish them in the next pause between two frames, where there are such."""
-        if self._handover is None or not self._handover.defer(self._speak_if_free):
-            self._speak()
+        if self._handover is None or not self._handover.defer(self._report_if_free):
+            self._report()
 
-    def _speak_if_free(self) -> bool:
+    def _report_if_free(self) -> bool:
         is_free = bool(self._turn.acquire(blocking=False))
         if is_free:
             try:
-                self._speak()
+                self._report()
             finally:
                 self._turn.release()
         return is_free
