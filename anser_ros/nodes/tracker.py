@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -103,11 +104,11 @@ class TrackerNode(AnserNode):
         warm_up()
         setups = setup_source(self, self._on_setup)
         # The executor takes topics in this order, so a model finds its uncertainty there.
-        self.create_subscription(
-            PointCloud2, 'field_model_error', self._on_error, qos.MODEL_ERRORS
-        )
+        take_error = partial(self._take_model, self._intake.take_error)
+        self.create_subscription(PointCloud2, 'field_model_error', take_error, qos.MODEL_ERRORS)
+        take = partial(self._take_model, self._intake.take)
         models = OneSource(
-            self, PointCloud2, 'field_model', self._on_model, qos.MODELS, lasting=self._lasting
+            self, PointCloud2, 'field_model', take, qos.MODELS, lasting=self._lasting
         )
         self._fluxes = NewestSource(
             self, 'tool/flux', self._on_flux, self._on_doubted, works_later=True
@@ -171,12 +172,6 @@ class TrackerNode(AnserNode):
         if self._tracker is not None:
             same = replace(self._settings, volume=self._tracker.settings.volume)
             self._tracker = self._tracker.with_settings(settings_for(setup, same))
-
-    def _on_model(self, message: PointCloud2) -> None:
-        self._take_model(self._intake.take, message)
-
-    def _on_error(self, message: PointCloud2) -> None:
-        self._take_model(self._intake.take_error, message)
 
     def _take_model(
         self, take: Callable[[PointCloud2], GivenModel | None], message: PointCloud2

@@ -137,11 +137,6 @@ class LiveView:
         """Return the last status of a target from the tracker."""
         return self.statuses.get(f'{self.namespace}/tracker: {name}', LastStatus(1, 'waiting', {}))
 
-    def figure(self, node: str, key: str) -> float:
-        """Return a number that a node of the chain reported, NaN where it did not."""
-        status = self.statuses.get(f'{self.namespace}/{node}')
-        return _number(status, key)
-
     def residual_t(self) -> Array:
         """Return the residual of every target's fluxes, T."""
         return np.array([_number(self.last_status(t.name), 'residual_t') for t in self.targets])
@@ -161,7 +156,7 @@ class LiveView:
         """Return the causes of what the statuses report."""
         return causes(self.statuses, self.namespace, self.setup.flux_rate_hz)
 
-    def add_point(self) -> tuple[float, Array, Array, Array]:
+    def add_point(self) -> None:
         """Work out rates, and the next point of the curves: time, error, residual, tracked."""
         now_s = time.monotonic()
         elapsed_s = max(now_s - self._since_s, 1e-3)
@@ -171,9 +166,7 @@ class LiveView:
             self.latency_s = float(np.median(self._latency_s))
             self._latency_s = []
         self.error_m = self._errors()
-        point = time.time(), self.error_m, self.residual_t(), self.tracked()
-        self.points.append(point)
-        return point
+        self.points.append((time.time(), self.error_m, self.residual_t(), self.tracked()))
 
     def _errors(self) -> Array:
         """Root mean square distance of the last poses from the optical ones, m."""
