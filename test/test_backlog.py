@@ -2,7 +2,7 @@
 
 import pytest
 
-from anser_ros.nodes.streams.backlog import Backlog, Deference
+from anser_ros.nodes.streams.backlog import Backlog
 from anser_ros.nodes.streams.overload import too_slow
 
 
@@ -36,11 +36,11 @@ def test_a_burst_is_no_faster_than_its_stamps():
 
 
 def test_work_that_can_wait_leaves_out_at_most_two_frames_in_a_row():
-    one = Deference()
-    assert not one.gives_way(0.019, 50.0) and not one.gives_way(1.0, 0.0)
-    assert [one.gives_way(0.021, 50.0) for _ in range(7)] == [True, True, False] * 2 + [True]
-    assert not one.gives_way(0.01, 50.0), 'no frame waits'
-    assert one.gives_way(0.021, 50.0) and one.gives_way(0.021, 50.0)
+    one = Backlog(0.02)
+    assert not one.gives_way(0.019) and not Backlog().gives_way(1.0)
+    assert [one.gives_way(0.021) for _ in range(7)] == [True, True, False] * 2 + [True]
+    assert not one.gives_way(0.01), 'no frame waits'
+    assert one.gives_way(0.021) and one.gives_way(0.021)
 
 
 def test_a_known_spacing_needs_no_arrivals():

@@ -268,7 +268,7 @@ def test_the_loop_from_recording_to_undo(tmp_path, monkeypatch):
 
     monkeypatch.setattr(loop_module, 'Job', Instant)
     chain = FakeChain()
-    loop = CorrectionLoop(chain, RecordingFolder(tmp_path))
+    loop = CorrectionLoop(chain, chain, RecordingFolder(tmp_path))
 
     async def closed():
         await loop.diagnose()
@@ -345,7 +345,7 @@ def test_the_view_has_place_ellipsoid_error_and_residual(monkeypatch):
     view.take_optical('pen', [pose(t, (0.1, 0.0, 0.2)) for t in (1.0, 1.02, 1.04)])
     view.take_pose(2, [pose(1.01, (9.0, 9.0, 9.0), 1.0), pose(1.03, (0.1, OFF_M, 0.22), 1e-3)])
     told = LastStatus(0, 'ok', {'residual_t': '2e-10', 'rate_hz': '25', 'frame_rate_hz': '50'})
-    view.take_status('anser/tracker: pen/c2', told)
+    view.statuses['anser/tracker: pen/c2'] = told
     view.add_point()
     row = view.frame()[2]
     assert row[:7] == [0.1, OFF_M, 0.22, 0, 0, 0, 1]
@@ -355,9 +355,9 @@ def test_the_view_has_place_ellipsoid_error_and_residual(monkeypatch):
     assert view.error_m[2] == pytest.approx(OFF_M), 'of the pose shown, coil 2 is 20 mm up the pen'
     assert np.isnan(np.delete(view.error_m, 2)).all()
     figures = view.figures()
-    assert figures.tracked == 0.5
-    assert figures.error_m == pytest.approx(OFF_M)
-    assert figures.residual_t == 2e-10
+    assert figures['tracked_percent'] == 50.0
+    assert figures['error_mm'] == pytest.approx(1e3 * OFF_M)
+    assert figures['residual_pt'] == 200.0
     assert view.points[-1][2][2] == 2e-10
 
 
@@ -368,7 +368,7 @@ def test_the_nodes_are_asked_for_services_and_models(ros, tmp_path):
     from anser_ros.sessions.model_file import save_model
 
     server, asker = FieldModelNode(), ros.create_node('asker', namespace='anser')
-    client = ChainClient(asker, lambda: None, print)
+    client = ChainClient(asker)
     executor = SingleThreadedExecutor()
     for node in (server, asker):
         executor.add_node(node)

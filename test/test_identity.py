@@ -11,7 +11,7 @@ from anser_ros.field.model import EffectRecord, from_document, to_document
 from anser_ros.field.nominal import nominal_model
 from anser_ros.field.reference_readings import ReferenceReadings
 from anser_ros.fingerprint import fingerprint_of
-from anser_ros.nodes.tracker_parts.model_in_force import ModelInForce
+from anser_ros.nodes.tracker_parts.model_in_force import ActiveModel
 from anser_ros.nodes.tracker_parts.model_intake import GivenModel
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import code_of
@@ -99,7 +99,7 @@ def test_a_model_of_another_board_or_tool_is_refused_with_both_named():
 def test_dipoles_and_effects_have_to_be_of_one_model(own, served, effects, state):
     models = [certain_model(), replace(certain_model(), effects=(gain(0),))]
     file_model = None if own is None else models[own]
-    in_force = ModelInForce(SETUP, TrackedVolume((-0.2, -0.2, 0.05), (0.2, 0.2, 0.3)), file_model)
+    in_force = ActiveModel(SETUP, TrackedVolume((-0.2, -0.2, 0.05), (0.2, 0.2, 0.3)), file_model)
     told = '' if served is None else models[served].fingerprint
     error = ModelError(0.0, np.zeros((0, 1, 8), complex), fingerprint=told, effects=effects)
     given = GivenModel(
@@ -127,7 +127,7 @@ def test_an_uncertainty_that_names_no_model_is_read_as_before():
 @pytest.mark.parametrize(('allowed', 'state'), [(False, 'uncalibrated'), (True, '')])
 def test_the_drawing_gives_poses_only_where_it_may(allowed, state):
     model = certain_model()
-    in_force = ModelInForce(
+    in_force = ActiveModel(
         SETUP, TrackedVolume((-0.2, -0.2, 0.05), (0.2, 0.2, 0.3)), None, allowed
     )
     error = ModelError(0.0, np.zeros((0, 1, 8), complex), withheld=code_of('uncalibrated'))

@@ -10,7 +10,7 @@ from dataclasses import replace
 from tracking_world import certain_model, setup_of, triaxial_tool
 
 from anser_ros.nodes.streams.model_clouds import ModelWriter
-from anser_ros.nodes.tracker_parts.model_in_force import ModelInForce
+from anser_ros.nodes.tracker_parts.model_in_force import ActiveModel
 from anser_ros.nodes.tracker_parts.model_intake import ModelIntake
 from anser_ros.physics.volume import TrackedVolume
 
@@ -76,7 +76,7 @@ def test_a_shift_that_all_poses_share_is_known_from_the_file():
 def test_the_model_in_force_ages_by_the_clock_of_the_frames():
     model, maker, intake = certain_model(), ModelWriter(), ModelIntake()
     setup = setup_of(triaxial_tool())
-    force = ModelInForce(setup, TrackedVolume(), None)
+    force = ActiveModel(setup, TrackedVolume(), None)
     assert force.at(10**9).model is None and force.at(10**9).withheld is None
 
     def publish(stamp_ns, follows=True, withheld=0):
@@ -104,7 +104,7 @@ def test_the_model_in_force_ages_by_the_clock_of_the_frames():
 
 def test_the_model_for_the_next_frame_is_aged_before_it_comes():
     maker, intake, now = ModelWriter(), ModelIntake(), 10**12
-    force = ModelInForce(setup_of(triaxial_tool()), TrackedVolume(), None)
+    force = ActiveModel(setup_of(triaxial_tool()), TrackedVolume(), None)
     assert force.soon() is None
     for frame in range(2):
         model = replace(MODEL, moments=(1.0 + 0.01 * frame) * MODEL.moments)
@@ -120,7 +120,7 @@ def test_the_model_for_the_next_frame_is_aged_before_it_comes():
 def test_an_answer_to_an_old_frame_is_late_however_old_the_frame(late_s):
     """Beyond some age it was once taken for one by another clock, and trusted anew."""
     model, maker, intake = certain_model(), ModelWriter(), ModelIntake()
-    force = ModelInForce(setup_of(triaxial_tool()), TrackedVolume(), None)
+    force = ActiveModel(setup_of(triaxial_tool()), TrackedVolume(), None)
     now = 10**12
     force.at(now)
     stamp = now - late_s * 10**9

@@ -116,7 +116,8 @@ import sys
 import time
 from dataclasses import dataclass
 from std_srvs.srv import Trigger
-from anser_ros.nodes.runtime.node import AnserNode, main
+from anser_ros.nodes.runtime.node import AnserNode
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.parameter_files import complaints
 from anser_ros.nodes.runtime.parameters import parameter
 

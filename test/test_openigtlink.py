@@ -165,15 +165,14 @@ class TestServer:
                     client.sendall(byte)
                     time.sleep(0.02)
                 assert read(client, 20) == b'GET_CAPABILSTT_TDATA'
-                assert server.is_tracking_due(10.0)
                 server.send(b'old', b'new')
                 assert read(client, 3) == b'new', 'it has asked in version 2'
                 for now_s in (10.0, 10.01, 10.021, 10.022):
-                    server.send_tracking(b'tracked', now_s)
+                    server.send_tracking(lambda: b'tracked', now_s)
                 assert read(client, 14) == 2 * b'tracked'
                 client.sendall(asked[1])
                 assert read(client, 9) == b'STP_TDATA'
-                assert not server.is_tracking_due(20.0)
+                server.send_tracking(lambda: pytest.fail('nobody wants it'), 20.0)
         finally:
             server.close()
 

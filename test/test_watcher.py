@@ -250,20 +250,21 @@ def test_fluxes_of_another_frame_are_counted_and_not_looked_at(ros, moving):
 
     node = Watcher(parameter_overrides=[Parameter('model_file', value=str(MODEL))])
     try:
-        node._on_setup(String(data=moving.setup_text))
+        streams = node._streams
+        streams.on_setup(String(data=moving.setup_text))
         for frame_id in ('world', moving.setup.frame_id):
-            for stream, take in (
-                (moving.tool, node._on_tool),
-                (moving.reference, node._on_reference),
+            for stream, topic in (
+                (moving.tool, 'tool/flux'),
+                (moving.reference, 'reference/flux'),
             ):
-                cloud = FluxCloud(frame_id)
-                take(cloud.message(points(stream, 0), int(stream.stamp_ns[0])))
+                cloud = FluxCloud(frame_id).message(points(stream, 0), int(stream.stamp_ns[0]))
+                streams.on_fluxes(topic, cloud)
             if frame_id == 'world':
-                assert node._window.session() is None
+                assert streams.window.session() is None
                 assert node.counters['fluxes_other_frame_id'] == 2
                 assert "fluxes in the frame 'world'" in node._trouble
         assert node.counters['frames'] == node.counters['fluxes_refused'] == 2
-        assert node._window.session() is not None
+        assert streams.window.session() is not None
     finally:
         node.close()
         node.destroy_node()

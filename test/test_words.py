@@ -53,7 +53,9 @@ def fault_of(docstring, is_function=False):
 
 
 def is_accessor(node):
-    """Whether a definition only completes another one: an overload, a setter, an override."""
+    """Whether a definition only completes another one: an overload, a setter, a stub."""
+    if not isinstance(node, ast.ClassDef) and ast.unparse(node.body[0]) == '...':
+        return True  # what a protocol asks for is described where it is done
     names = {ast.unparse(d).split('.')[-1].split('(')[0] for d in node.decorator_list}
     return bool(names & {'overload', 'override', 'setter'})
 

@@ -10,14 +10,13 @@ import time
 from collections import Counter
 from typing import Any
 
-import numpy as np
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes.acquisition_parts.acquisition_parameters import AcquisitionParameters
 from anser_ros.nodes.acquisition_parts.fault_memory import FAULTS, RecentFaults, device_words
-from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame, Staleness
+from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame
 from anser_ros.nodes.acquisition_parts.flux_stream import FluxStream, StreamOptions
 from anser_ros.nodes.acquisition_parts.measured_accuracy import MeasuredAccuracy
 from anser_ros.nodes.acquisition_parts.stream_interval import Interval
@@ -31,9 +30,9 @@ from anser_ros.nodes.acquisition_parts.stream_status import (
 from anser_ros.nodes.acquisition_parts.wall_clock import WallClock
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.handover import HandedFlux
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
-from anser_ros.nodes.runtime.process import TURN_S
-from anser_ros.nodes.streams.backlog import Backlog, Deference
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
+from anser_ros.nodes.runtime.process import TURN_S, main
+from anser_ros.nodes.streams.backlog import Backlog
 from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.nodes.streams.overload import too_slow
 from anser_ros.wire.channel_calibration import parse_channels
@@ -97,18 +96,16 @@ class Acquisition(AnserNode):
         self._refusal = ''
         self._rebuild = self._woken_early = False
         self._frame: FluxFrame | None = None
-        self._interval = Interval(time.monotonic())
-        self._sensor_flags: np.ndarray | None = None
+        self._interval = self._last = Interval(time.monotonic())
         self._past: Counter[str] = Counter()
-        self._duplicates = self._skipped = 0
-        self._backlog, self._deference = Backlog(), Deference()
+        self._totals: dict[str, int] = {}
+        self._backlog = Backlog()
         self._published_setup = ''
-        self._said: Level | None = None
+        self._logged: Level | None = None
         self._accuracy = MeasuredAccuracy()
         self._wall_clock = WallClock()
         self._asked_ns = 0
         self._start_sent_ns: int | None = None
-        self._staleness: Staleness | None = None
         self._faults = RecentFaults()
         self._publish_setup(self._setup)
         self._port: ControlUnitPort | None = None
@@ -256,12 +253,8 @@ class Acquisition(AnserNode):
     def _make_stream(self) -> None:
         if self._hello is None or not self._control.tones_agree:
             return
-        table = self.parameters
-        options = StreamOptions(
-            table.window_s, table.rate_hz or self._setup.flux_rate_hz, table.mains_hz
-        )
         try:
-            self._stream = FluxStream(self._hello, self._setup, self._calibration, options)
+            self._stream = FluxStream(self._hello, self._setup, self._calibration, self._options())
         except AnserError as error:
             self._refusal = str(error)
             raise
@@ -269,6 +262,11 @@ class Acquisition(AnserNode):
         self._backlog = Backlog(1 / self._stream.rate_hz)
         if self._start_sent_ns is not None:
             self._stream.clock.bound(0, self._start_sent_ns)
+
+    def _options(self) -> StreamOptions:
+        table = self.parameters
+        rate_hz = table.rate_hz or self._setup.flux_rate_hz
+        return StreamOptions(table.window_s, rate_hz, table.mains_hz)
 
     def _publish_setup(self, setup: Setup) -> None:
         text = dump_setup(setup)
@@ -289,7 +287,7 @@ class Acquisition(AnserNode):
         # The model is refitted when the poses and all messages are on their way, and no further
         # frame waits.
         age_s = (time.monotonic_ns() - arrival_ns) / 1e9
-        if self.hands_over and self._deference.gives_way(age_s, stream.rate_hz):
+        if self.hands_over and self._backlog.gives_way(age_s):
             self.count('refits_left_out')
         else:
             self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)
@@ -307,10 +305,7 @@ class Acquisition(AnserNode):
     def on_parameters(self, old: Any, new: Any) -> None:
         """Demodulate the new way from the next block on; what cannot be done is refused."""
         if self._hello is not None and self._stream is not None:
-            options = StreamOptions(
-                new.window_s, new.rate_hz or self._setup.flux_rate_hz, new.mains_hz
-            )
-            FluxStream(self._hello, self._setup, self._calibration, options)
+            FluxStream(self._hello, self._setup, self._calibration, self._options())
         self._rebuild = True
 
     def close(self) -> None:
@@ -327,21 +322,22 @@ class Acquisition(AnserNode):
     def status(self) -> Status:
         """Return the state of the port and of the stream."""
         interval, self._interval = self._interval, Interval(time.monotonic())
+        self._last = interval
         elapsed = max(self._interval.begin_s - interval.begin_s, 1e-3)
         values: dict[str, object] = {
             'rate_hz': interval.frames / elapsed,
             'processing_ms_mean': 1e3 * interval.delay_sum_s / max(interval.frames, 1),
             'processing_ms_max': 1e3 * interval.delay_max_s,
         }
-        self._sensor_flags, self._staleness = interval.flags, interval.staleness
         port, stream, device = self._port, self._stream, self._device
         if port is not None:
             values |= {'device': port.device, 'port': port.state.value, **port.fault_counters()}
-        live = self._stream_counters(stream) if stream is not None else {}
+        totals = self._past.copy()
         if stream is not None:
+            totals.update(self._stream_counters(stream))
             values |= clock_values(stream)
         values['system_clock_set'] = self._wall_clock.sets
-        values |= {name: live.get(name, 0) + self._past[name] for name in {*live, *self._past}}
+        values |= totals
         if device is not None:
             values |= {
                 'device_state': device.state.name.lower(),
@@ -349,28 +345,26 @@ class Acquisition(AnserNode):
                 'device_dropped_blocks': device.dropped_blocks,
                 'device_temperature_deg_c': device.temperature_deg_c,
             }
-        duplicates = self._past['duplicate_blocks'] + live.get('duplicate_blocks', 0)
-        interval.duplicates, self._duplicates = duplicates - self._duplicates, duplicates
-        skipped = self._past['windows_skipped'] + live.get('windows_skipped', 0)
-        interval.skipped, self._skipped = skipped - self._skipped, skipped
+        rises = {name: count - self._totals.get(name, 0) for name, count in totals.items()}
+        self._totals = dict(totals)
         counters = {name: int(values.get(name, 0)) for name in FAULTS}  # type: ignore[call-overload]
         self._faults.note(counters, time.monotonic())
-        level, message = self._verdict(interval)
-        self._say(level, message)
+        level, message = self._verdict(interval, rises)
+        self._log_change(level, message)
         return Status('', level, message, values)
 
-    def _say(self, level: Level, message: str) -> None:
+    def _log_change(self, level: Level, message: str) -> None:
         """Write on the console when an error begins, and when all is well (again)."""
-        if level is self._said or level not in (Level.OK, Level.ERROR):
+        if level is self._logged or level not in (Level.OK, Level.ERROR):
             return
-        self._said = level
+        self._logged = level
         device = self.parameters.device if self._port is None else self._port.device
         if level is Level.OK:
             self.get_logger().info(f'{device}: {message}')
         else:  # a line of code has one severity
             self.get_logger().error(f'{device}: {message}')
 
-    def _verdict(self, interval: Interval) -> tuple[Level, str]:
+    def _verdict(self, interval: Interval, rises: dict[str, int]) -> tuple[Level, str]:
         port = self._port
         if self._refusal or self._control.refusal:
             return Level.ERROR, self._refusal or self._control.refusal
@@ -381,9 +375,9 @@ class Acquisition(AnserNode):
             words = [f'{port.state.value}{reason}', self._faults.words]
             return Level.ERROR, '; '.join(filter(None, words))
         frames = interval.frames
-        if interval.repeats == frames and max(frames, interval.duplicates) > 0:
+        if interval.repeats == frames and max(frames, rises.get('duplicate_blocks', 0)) > 0:
             return Level.ERROR, 'the control unit keeps sending the same samples'
-        slow = too_slow(interval.skipped, frames)
+        slow = too_slow(rises.get('windows_skipped', 0), frames)
         if slow:
             self.warn('seconds_too_slow', slow)
         own = device_words(self._device) if self._device is not None else ''
@@ -394,9 +388,7 @@ class Acquisition(AnserNode):
         if self._stream is not None:
             coils = self._setup.emitter.coils
             troubles += clock_troubles(self._stream)
-            troubles += signal_troubles(
-                coils, self._stream, self._frame, self._sensor_flags, self._staleness
-            )
+            troubles += signal_troubles(coils, self._stream, self._frame, interval)
         if troubles:
             return max(level for level, _ in troubles), '; '.join(words for _, words in troubles)
         if frames == 0:
@@ -410,7 +402,7 @@ class Acquisition(AnserNode):
             return []
         return [
             *emitter_statuses(self._setup.emitter.coils, stream, frame),
-            *sensor_statuses(stream, frame, self._sensor_flags, self._staleness),
+            *sensor_statuses(stream, frame, self._last),
         ]
 
 

@@ -12,8 +12,10 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.incoming import pose_numbers
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import tracked_parameter
 from anser_ros.poses.corrector import OK, OUTSIDE, PoseCorrector
 from anser_ros.stamps import set_stamp, stamp_of
@@ -74,14 +76,8 @@ class Corrector(AnserNode):
         return statuses
 
     def _on_pose(self, sensor: str, message: PoseStamped) -> None:
-        place, turn = message.pose.position, message.pose.orientation
-        stamp = stamp_of(message)
-        pose = self._corrector.correct(
-            sensor,
-            stamp,
-            np.array([place.x, place.y, place.z]),
-            np.array([turn.x, turn.y, turn.z, turn.w]),
-        )
+        given = np.array(pose_numbers(message.pose))
+        pose = self._corrector.correct(sensor, stamp_of(message), given[:3], given[3:])
         sigma = float(np.sqrt(np.trace(pose.covariance[:3, :3])))
         self._states[sensor][pose.state] += 1
         self._latest[sensor] = time.monotonic(), pose.state, sigma

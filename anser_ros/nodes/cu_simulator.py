@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import BLOCK_SAMPLES, ControlUnit, Piece

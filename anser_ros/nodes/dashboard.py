@@ -2,18 +2,19 @@
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from std_msgs.msg import String
 
 from anser_ros.nodes.output_parts.chain_client import ChainClient
-from anser_ros.nodes.output_parts.live_view import LiveView
 from anser_ros.nodes.output_parts.polled import polling_node
 from anser_ros.nodes.output_parts.view_source import ViewSource
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.wire.tcp_ports import LIVE_VIEW
 
@@ -59,15 +60,14 @@ class Dashboard(AnserNode):
 
         table = self.parameters
         self._streams = polling_node(self.get_name(), self.get_namespace())
-        self._client = ChainClient(self, self._view, self._mark)
-        self._source = ViewSource(
-            self._streams, table.optical, self._refuse, self._client.is_there
-        )
+        self._client = ChainClient(self)
+        refuse = partial(self.warn, 'messages_refused')
+        self._source = ViewSource(self._streams, table.optical, refuse, self._client.is_there)
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         folder = RecordingFolder(Path(table.directory))
         if words := folder.trouble():
             self.get_logger().warning(f'directory {folder.path}: {words}: no result can be kept')
-        self._loop = CorrectionLoop(self._client, folder)
+        self._loop = CorrectionLoop(self._client, self._source, folder)
         self._pages = Pages(self._source, self._loop, self._guard)
         self._pages.register()
         token = token_for(table.host, table.token_file)
@@ -78,15 +78,6 @@ class Dashboard(AnserNode):
 
     def _on_setup(self, message: String) -> None:
         self._source.setup_text = message.data
-
-    def _view(self) -> LiveView | None:
-        return self._source.view
-
-    def _mark(self, words: str) -> None:
-        self._source.mark(words)
-
-    def _refuse(self, words: str) -> None:
-        self.warn('messages_refused', words)
 
     def status(self) -> Status:
         """Return how many pages look on."""

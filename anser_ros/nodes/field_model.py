@@ -28,7 +28,8 @@ from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
 from anser_ros.nodes.field_model_parts.refit_in_force import RefitInForce
 from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
 from anser_ros.nodes.runtime.diagnostics import Trouble
-from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.stated_parameters import stated_by
 from anser_ros.nodes.streams.flux_reader import read_frame
 from anser_ros.nodes.streams.newest_frame import NewestSource

@@ -17,11 +17,21 @@ from rich.table import Table
 from std_msgs.msg import String
 
 from anser_ros.errors import ParameterError
-from anser_ros.nodes.output_parts.causes import LastStatus, causes
-from anser_ros.nodes.output_parts.traces import OpticalTrace, Row, Traces, latency_of, targets_of
+from anser_ros.nodes.output_parts.causes import causes
+from anser_ros.nodes.output_parts.traces import (
+    OpticalTrace,
+    Row,
+    Traces,
+    latency_of,
+    middle,
+    targets_of,
+)
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
+from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
@@ -116,37 +126,30 @@ class Monitor(AnserNode):
             self._subscribe(PoseStamped, topic, partial(self._on_optical, seen))
 
     def _subscribe(self, kind: type, topic: str, callback: Any) -> None:
-        # rclpy wants a function, not a partial
-        def received(message: Any) -> None:
-            callback(message)
-
-        self._pose_subscriptions.append(
-            self.create_subscription(kind, topic, received, qos.STREAM)
-        )
+        subscription = self.create_subscription(kind, topic, callback, qos.STREAM)
+        self._pose_subscriptions.append(subscription)
 
     def _on_pose(self, trace: Any, message: PoseWithCovarianceStamped) -> None:
         now_s = time.time()
         if self._first_s is None:
             self._first_s = time.monotonic()
-        pose, variance = message.pose.pose, message.pose.covariance
-        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        q = pose.orientation
+        variance, stamp_s = message.pose.covariance, seconds_of(message)
+        pose = pose_numbers(message.pose.pose)
         trace.stamp_s.append(stamp_s)
-        trace.position.append((pose.position.x, pose.position.y, pose.position.z))
-        trace.axis.append(_z_axis(q))
+        trace.position.append(pose[:3])
+        trace.axis.append(_z_axis(*pose[3:]))
         trace.sigma_m.append(float(np.sqrt(variance[0] + variance[7] + variance[14])))
         trace.latency_s.append(latency_of(now_s, stamp_s))
 
     def _on_optical(self, trace: OpticalTrace, message: PoseStamped) -> None:
-        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        p, q = message.pose.position, message.pose.orientation
-        trace.add(stamp_s, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+        pose = pose_numbers(message.pose)
+        trace.add(seconds_of(message), pose[:3], pose[3:])
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = {pair.key: pair.value for pair in status.values}
-            self._statuses[status.name] = LastStatus(status.level[0], status.message, values)
-            if status.name.endswith('cu_simulator') and 'metal_distance_m' in values:
+        statuses = statuses_in(message)
+        self._statuses |= statuses
+        for name, (_, _, values) in statuses.items():
+            if name.endswith('cu_simulator') and 'metal_distance_m' in values:
                 self._metal.append((time.time(), float(values['metal_distance_m'])))
 
     def _show(self) -> None:
@@ -194,14 +197,10 @@ class Monitor(AnserNode):
             title=self._title(), title_justify='left', caption=self._caption(),
             caption_justify='left', padding=(0, 0) if narrow else (0, 1), collapse_padding=True,
         )  # fmt: skip
-        table.add_column('sensor', no_wrap=True)
-        table.add_column('state', no_wrap=True)
-        table.add_column('x, y, z mm', justify='right', no_wrap=True)
-        for heading in ('sigma\nmm', 'error\nmm'):
-            table.add_column(heading, justify='right', no_wrap=True)
-        if second:
-            table.add_column(f'{second}\nerror', justify='right', no_wrap=True)
-        for heading in ('Hz', 'ms'):
+        for heading in ('sensor', 'state'):
+            table.add_column(heading, no_wrap=True)
+        others_error = [f'{second}\nerror'] if second else []
+        for heading in ('x, y, z mm', 'sigma\nmm', 'error\nmm', *others_error, 'Hz', 'ms'):
             table.add_column(heading, justify='right', no_wrap=True)
         others = {row.name: row for row in rows.get(second, [])} if second else {}
         for row in rows.get('', []):
@@ -230,10 +229,9 @@ class Monitor(AnserNode):
         return f'{ran_s:.0f} s' + (f' of {end_s:.0f} s' if end_s else '')
 
     def _caption(self) -> str:
-        words = ['ms: latency from the middle of the window']
+        caption = 'ms: latency from the middle of the window'
         if self._metal:
-            words.insert(0, f'metal {100 * self._metal[-1][1]:.0f} cm from the board')
-        caption = '; '.join(words)
+            caption = f'metal {100 * self._metal[-1][1]:.0f} cm from the board; {caption}'
         if self._first_s is not None:  # until then they are in the title
             caption += ''.join(f'\n{escape(text)}' for text in self._causes())
         if self.parameters.compare and self.parameters.compare_note:
@@ -242,20 +240,20 @@ class Monitor(AnserNode):
 
     def _line(self, rows: dict[str, list[Row]]) -> str:
         """One line with the medians over all sensors."""
-        if self._first_s is None:
-            return self._title()
         parts = [self._title()]
+        if self._first_s is None:
+            return parts[0]
         for chain, found in rows.items():
             good = sum(row.rate_hz > 0 for row in found)
-            error = _middle([row.error_m for row in found])
-            sigma = _middle([row.sigma_m for row in found])
+            error = middle([row.error_m for row in found])
+            sigma = middle([row.sigma_m for row in found])
             parts.append(
                 f'{chain or "live"}: {good}/{len(found)} tracked, '
                 f'error {_mm(error)} mm, sigma {_mm(sigma)} mm'
             )
         live = rows.get('', [])
-        parts.append(f'{_middle([row.rate_hz for row in live]):.0f} Hz')
-        parts.append(f'{_number(1e3 * _middle([row.latency_s for row in live]), 1)} ms')
+        parts.append(f'{middle([row.rate_hz for row in live]):.0f} Hz')
+        parts.append(f'{_number(1e3 * middle([row.latency_s for row in live]), 1)} ms')
         if self._metal:
             parts.append(f'metal {100 * self._metal[-1][1]:.0f} cm')
         why = self._causes()
@@ -319,18 +317,9 @@ def _check(path: Path) -> None:
         raise ParameterError(f'parameter output: {path}: {error.strerror}') from error
 
 
-def _z_axis(q: Any) -> tuple[float, ...]:
+def _z_axis(x: float, y: float, z: float, w: float) -> tuple[float, ...]:
     """Axis of a pose: +z, as docs/interfaces.md has it, for sensors as for bodies."""
-    return (
-        2 * (q.x * q.z + q.w * q.y),
-        2 * (q.y * q.z - q.w * q.x),
-        1 - 2 * (q.x * q.x + q.y * q.y),
-    )
-
-
-def _middle(values: list[float]) -> float:
-    finite = [value for value in values if np.isfinite(value)]
-    return float(np.median(finite)) if finite else float('nan')
+    return 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
 
 
 def _mm(value_m: float, digits: int = 2) -> str:

@@ -14,9 +14,11 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.output_parts.igtl_server import IgtlServer
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
-from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters
+from anser_ros.nodes.runtime.process import main
+from anser_ros.nodes.runtime.shared_names import STALE_AFTER_S
 from anser_ros.pose_states import OK, STALE
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
@@ -34,7 +36,7 @@ class OpenIGTLinkParameters:
     host: str = parameter('127.0.0.1', 'address to listen on; 0.0.0.0 lets other machines in')
     port: int = parameter(OPENIGTLINK, 'TCP port, 0 for a free one', minimum=0, maximum=65535)
     stale_after_s: float = parameter(
-        TrackerParameters.stale_after_s,
+        STALE_AFTER_S,
         'time without a pose after which a sensor is reported, s',
         minimum=0.02,
         live=True,
@@ -129,14 +131,13 @@ class OpenIGTLink(AnserNode):
                 )
 
     def _on_pose(self, name: str, message: PoseStamped) -> None:
-        point, turn = message.pose.position, message.pose.orientation
-        position = (point.x, point.y, point.z)
-        quaternion = (turn.x, turn.y, turn.z, turn.w)
-        if not all(map(math.isfinite, position + quaternion)) or not any(quaternion):
+        numbers = pose_numbers(message.pose)
+        position, quaternion = numbers[:3], numbers[3:]
+        if not all(map(math.isfinite, numbers)) or not any(quaternion):
             self.warn('poses_refused', f'{name}: an invalid pose')
             return
         now_s = self._last_pose_s[name] = time.monotonic()
-        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        stamp_s = seconds_of(message)
         self._ahead_s = stamp_s - now_s
         self._set_state(name, OK)
         if self._n_clients:
@@ -147,13 +148,12 @@ class OpenIGTLink(AnserNode):
             self._server.send(older, newer)
             self.count('transforms')
             self._tracked[name] = igtl.Tracked(device, position, quaternion)
-            self._send_tracking(now_s, stamp_s)
+            self._server.send_tracking(partial(self._tracking, stamp_s), now_s)
 
-    def _send_tracking(self, now_s: float, stamp_s: float) -> None:
-        """Send what is tracked just now to the clients that have asked for it."""
-        if self._server.is_tracking_due(now_s):
-            good = [one for name, one in self._tracked.items() if self._states[name] == OK]
-            self._server.send_tracking(igtl.tracking(stamp_s, good), now_s)
+    def _tracking(self, stamp_s: float) -> bytes:
+        """What is tracked just now, for the clients that have asked for it."""
+        good = [one for name, one in self._tracked.items() if self._states[name] == OK]
+        return igtl.tracking(stamp_s, good)
 
     def _now_s(self) -> float:
         """The time on the clock of the poses, those of a bag included."""
@@ -220,10 +220,7 @@ def check_templates(table: OpenIGTLinkParameters) -> None:
 def devices_of(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
     """Return the device of each body, of its tip and, where they are wanted, of each coil.
 
-    Raises
-    ------
-    ParameterError
-        As `anser_ros.wire.igtl.device_names`.
+    Raises `ParameterError` as `anser_ros.wire.igtl.device_names`.
     """
     named = {
         sensor.name: table.coil_name.format(

@@ -15,8 +15,9 @@ from std_srvs.srv import Trigger
 from anser_ros.errors import AnserError
 from anser_ros.nodes.bag_parts.definitions import definition, message_class, type_hash
 from anser_ros.nodes.bag_parts.recording_log import TopicLog, report
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import optical_parameter, tracked_parameter
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag_metadata import qos_profile, write_metadata
@@ -100,10 +101,7 @@ class Recorder(AnserNode):
     def start(self) -> Path:
         """Begin a bag and return its folder.
 
-        Raises
-        ------
-        BagError
-            The bag cannot be made.
+        Raises `BagError`: the bag cannot be made.
         """
         folder = self._new_folder()
         self._error = ''

@@ -19,8 +19,9 @@ from anser_ros.errors import AnserError, BagError, ParameterError
 from anser_ros.nodes.bag_parts.consumers import Consumers
 from anser_ros.nodes.bag_parts.definitions import message_class
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.nodes.streams.readiness import Readiness
 from anser_ros.stamps import set_stamp
@@ -62,28 +63,10 @@ class ReplayParameters:
 class Replay(AnserNode):
     """Plays one bag in a thread of its own; the executor stays free for parameters and replies.
 
-    Parameters
-    ----------
-    bag : str
-        The ``.mcap`` file or the folder that holds one.
-    rate : float
-        Speed relative to the recording; 0 for as fast as the listeners take it.
-    loop : bool
-        Whether to begin again at the end.
-    all_topics : bool
-        Whether topics that running nodes publish themselves (poses, model, diagnostics) are
-        played too.
-    wait : float
-        Longest time to wait until all who take the fluxes, or poses made of them, are ready, s.
-    **options : object
-        As `AnserNode` takes them.
-
-    Raises
-    ------
-    ParameterError
-        The rate or the wait is negative.
-    BagError
-        There is no such bag, or nothing of it can be read.
+    A rate of 0 is as fast as the listeners take it. With ``all_topics``, topics that running nodes
+    publish themselves (poses, model, diagnostics) are played too. Raises `ParameterError`: the
+    rate or the wait is negative, and `BagError`: there is no such bag, or nothing of it can be
+    read.
     """
 
     NAME = 'replay'
@@ -317,14 +300,9 @@ class Replay(AnserNode):
 def name_played(topic: str, home: str, optical: str) -> str:
     """Return the name that a bag's topic is played under.
 
-    Parameters
-    ----------
-    topic : str
-        Name in the bag.
-    home : str
-        Namespace that the bag's nodes had, with a slash at its end; it gives way to the player's.
-    optical : str
-        Namespace of the optical poses here; in a bag they may be in one of their own.
+    ``home`` is the namespace, with a slash at its end, that the bag's nodes had; it gives way to
+    the player's. ``optical`` is that of the optical poses here; in a bag they may be in one of
+    their own.
     """
     _, is_optical, rest = topic.partition(OPTICAL)
     if is_optical:

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,16 +21,16 @@ from anser_ros.integrity.ageing import FrameModel
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.handover import HandedFlux
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.stated_parameters import stated_by
-from anser_ros.nodes.streams.backlog import Backlog
 from anser_ros.nodes.streams.flux_reader import read_frame
-from anser_ros.nodes.streams.newest_frame import newest_of
+from anser_ros.nodes.streams.newest_frame import NewestSource
 from anser_ros.nodes.streams.one_source import OneSource, sender_words, setup_source
-from anser_ros.nodes.streams.overload import Load
+from anser_ros.nodes.streams.overload import too_slow
 from anser_ros.nodes.streams.readiness import digest_of
 from anser_ros.nodes.tracker_parts.answered_frames import AnsweredFrames
-from anser_ros.nodes.tracker_parts.model_in_force import ModelInForce
+from anser_ros.nodes.tracker_parts.model_in_force import ActiveModel
 from anser_ros.nodes.tracker_parts.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.tracker_parts.pose_output import (
     PoseTopic,
@@ -88,32 +89,30 @@ class TrackerNode(AnserNode):
         self._rehearsal: Rehearsal | None = None
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
-        self._in_force: ModelInForce | None = None
+        self._active: ActiveModel | None = None
         self._given: GivenModel | None = None
         self._frames = AnsweredFrames[GivenModel, tuple[int, FluxPoints]](
-            self._put_in_force, self._track
+            self._activate, self._track
         )
         self._withheld: Withheld | None = None
         self._trouble = Trouble()
         self._solve_s = 0.0
-        self._backlog = Backlog()
         self._diagnosed_s = 0.0
-        self._load = Load()
+        self._counted = 0, 0
         self._model_age_ns = 0
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
         setups = setup_source(self, self._on_setup)
         # The executor takes topics in this order, so a model finds its uncertainty there.
-        self.create_subscription(
-            PointCloud2, 'field_model_error', self._on_error, qos.MODEL_ERRORS
-        )
+        take_error = partial(self._take_model, self._intake.take_error)
+        self.create_subscription(PointCloud2, 'field_model_error', take_error, qos.MODEL_ERRORS)
+        take = partial(self._take_model, self._intake.take)
         models = OneSource(
-            self, PointCloud2, 'field_model', self._on_model, qos.MODELS, lasting=self._lasting
+            self, PointCloud2, 'field_model', take, qos.MODELS, lasting=self._lasting
         )
-        self._fluxes = OneSource(
-            self, PointCloud2, 'tool/flux', self._on_flux, qos.STREAM, self._on_doubted,
-            informed=True,
-        )  # fmt: skip
+        self._fluxes = NewestSource(
+            self, 'tool/flux', self._on_flux, self._on_doubted, works_later=True
+        )
         self._sources = [setups, models, self._fluxes]
         self.prepare(self._rehearse)
         self._wait = self.create_timer(WAIT_PERIOD_S, self._on_wait, clock=self.steady_clock)
@@ -140,7 +139,7 @@ class TrackerNode(AnserNode):
             return
         self._setup_text, self._setup, self._tracker = message.data, setup, tracker
         self._rehearsal = Rehearsal(sensors, settings) if self.hands_over else None
-        self._in_force = ModelInForce(
+        self._active = ActiveModel(
             setup, settings.box, self._file_model, self.parameters.allow_uncalibrated
         )
         for topic in self._topics.values():
@@ -174,12 +173,6 @@ class TrackerNode(AnserNode):
             same = replace(self._settings, volume=self._tracker.settings.volume)
             self._tracker = self._tracker.with_settings(settings_for(setup, same))
 
-    def _on_model(self, message: PointCloud2) -> None:
-        self._take_model(self._intake.take, message)
-
-    def _on_error(self, message: PointCloud2) -> None:
-        self._take_model(self._intake.take_error, message)
-
     def _take_model(
         self, take: Callable[[PointCloud2], GivenModel | None], message: PointCloud2
     ) -> None:
@@ -192,27 +185,27 @@ class TrackerNode(AnserNode):
             self._frames.follows = given.follows
             self._frames.add_model(given.stamp_ns, given, time.monotonic())
 
-    def _put_in_force(self, given: GivenModel) -> None:
+    def _activate(self, given: GivenModel) -> None:
         """Track with another model from now on."""
         self._given = given
         self._use_model()
 
     def _use_model(self) -> None:
-        """Give the tracker the model in force, once the setup is known too."""
-        given, in_force = self._given, self._in_force
-        if in_force is None:
+        """Give the tracker the active model, once the setup is known too."""
+        given, active = self._given, self._active
+        if active is None:
             return
         try:
-            field = in_force.field if given is None else in_force.field_of(given)
+            field = active.field if given is None else active.field_of(given)
             if field is not None:
-                new = field is not in_force.field or given is None
+                new = field is not active.field or given is None
                 ages = given is not None and given.follows and self.hands_over
                 if not ages:
                     self._track_with(field, given)
                 if given is not None:
-                    in_force.put(given, field)
+                    active.put(given, field)
                 if ages:  # frames that are handed over are younger than their model
-                    self._track_with(in_force.soon() or field, given)
+                    self._track_with(active.soon() or field, given)
                 self.count('models', new)
         except AnserError as error:
             self._refuse('models_refused', error)
@@ -227,21 +220,15 @@ class TrackerNode(AnserNode):
         else:
             self._tracker = self._tracker.with_model(field, name)
 
-    def _on_flux(self, message: PointCloud2 | HandedFlux, info: dict[str, int]) -> None:
-        """Take a frame; one that is late beyond hope gives way to the newest.
+    def _on_flux(self, message: PointCloud2 | HandedFlux) -> None:
+        """Track a frame when its model is there, or after so long.
 
         One that was handed over doesn't wait: its model is made once its poses have gone out.
         """
-        if isinstance(message, HandedFlux):
-            self._take_frame(self._read(message), 0.0)
-            return
-        newest = newest_of(message, info, self._backlog, self._fluxes, self.count)
-        if newest is not None:
-            self._take_frame(self._read(newest), self.parameters.model_wait_s)
-
-    def _take_frame(self, frame: tuple[int, FluxPoints] | None, wait_s: float) -> None:
-        """Track a frame when its model is there, or after so long."""
+        frame = self._read(message)
         if frame is not None:
+            is_handed = isinstance(message, HandedFlux)
+            wait_s = 0.0 if is_handed else self.parameters.model_wait_s
             self._frames.add_frame(frame[0], frame, time.monotonic(), wait_s)
             if self._frames.waiting:
                 self._wait.reset()
@@ -275,8 +262,8 @@ class TrackerNode(AnserNode):
             return None
 
     def _track(self, frame: tuple[int, FluxPoints]) -> None:
-        """Track a frame with the model in force, and publish what is good."""
-        if self._tracker is None or self._in_force is None:
+        """Track a frame with the active model, and publish what is good."""
+        if self._tracker is None or self._active is None:
             return
         begin_s = time.perf_counter()
         stamp_ns, points = frame
@@ -285,7 +272,7 @@ class TrackerNode(AnserNode):
         if conflict:  # the frame may be another sender's: its stamp does not tell the model's age
             standing = FrameModel(None, Withheld(TWO_SOURCES, conflict))
         else:
-            standing = self._in_force.at(stamp_ns)
+            standing = self._active.at(stamp_ns)
         self._withheld = standing.withheld
         if self._given is not None and self._given.follows:
             self._model_age_ns = max(self._model_age_ns, stamp_ns - self._given.stamp_ns)
@@ -318,7 +305,7 @@ class TrackerNode(AnserNode):
         if self._rehearsal is not None:
             has_poses = standing.withheld is None
             self._rehearsal.note(stamp_ns, points, self._solve_s, has_poses=has_poses)
-        self._backlog.worked(self._solve_s)
+        self._fluxes.backlog.worked(self._solve_s)
         if changed and time.monotonic() - self._diagnosed_s > EARLIEST_DIAGNOSTICS_S:
             self.publish_diagnostics()
 
@@ -327,7 +314,7 @@ class TrackerNode(AnserNode):
         if self._tracker is not None and self._rehearsal is not None:
             self._rehearsal.play(self._tracker)
 
-    # What is told -------------------------------------------------------------------------
+    # What is reported ---------------------------------------------------------------------
 
     def _refuse(self, counter: str, error: AnserError) -> None:
         self._trouble.say(str(error), time.monotonic())
@@ -350,13 +337,15 @@ class TrackerNode(AnserNode):
         if setup is not None:
             box = settings_for(setup, self._settings).box
             allowed = self.parameters.allow_uncalibrated
-            self._in_force = ModelInForce(setup, box, file_model, allowed)
+            self._active = ActiveModel(setup, box, file_model, allowed)
             self._use_model()
 
     def status(self) -> Status:
         """Return what the tracker lacks, if anything, and its counters."""
         self._diagnosed_s = time.monotonic()
-        slow = self._load.words(self.counters['frames_skipped'], self.counters['frames'])
+        before = self._counted
+        self._counted = skipped, frames = self.counters['frames_skipped'], self.counters['frames']
+        slow = too_slow(skipped - before[0], frames - before[1])
         if slow:
             self.warn('seconds_too_slow', slow)
         tracker, newest = self._tracker, self._intake.newest

@@ -6,7 +6,8 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Protocol
 
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
@@ -15,13 +16,14 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.incoming import pose_numbers
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.nodes.runtime.stated_parameters import stated, stated_by
 from anser_ros.nodes.streams.flux_reader import read_frame
 from anser_ros.nodes.streams.one_source import OneSource, sender_words, setup_source
-from anser_ros.nodes.watcher_parts.pose_streams import PoseStreams, pose_values, pose_words
 from anser_ros.nodes.watcher_parts.sighting_words import (
     figures_of,
     plain_text,
@@ -30,16 +32,13 @@ from anser_ros.nodes.watcher_parts.sighting_words import (
     words_of,
 )
 from anser_ros.pose_states import TWO_SOURCES
-from anser_ros.poses.live_look import PoseSighting, PoseWatch
-from anser_ros.poses.live_window import PoseWindow
-from anser_ros.poses.sequence import PoseSession
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.session import Session, empty_session, load_session
+from anser_ros.sessions.session import empty_session, load_session
 from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 from anser_ros.sessions.watch import Sighting, Watch
-from anser_ros.stamps import SECOND_NS
+from anser_ros.stamps import stamp_of
 from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import parse_setup
 
@@ -95,13 +94,131 @@ class WatcherParameters:
     reference_gain: float = stated('reference_gain')
 
 
-@dataclass(frozen=True)
-class Task:
-    """States what one look is at, and with whom."""
+class Streams(Protocol):
+    """States what a watcher looks at: streams into a window, and who looks at the window.
 
-    watch: Watch | PoseWatch
-    session: Session | PoseSession
-    first_ns: int
+    `FluxStreams` are those of this package's own fluxes; others come by `streams_of`.
+    """
+
+    WHAT: str
+    """What comes, in a word."""
+    sources: list[OneSource]
+    received_s: float
+    """When the last of it came, by the monotonic clock."""
+    window: Any
+    """Has ``span_s`` and ``restarts``; None before anything can be taken."""
+    watch: Any
+    """Has ``searches``; another one where all begins again."""
+
+    def quiet_topics(self) -> tuple[str, ...]: ...
+    def look(self) -> Callable[[], Any] | None:
+        """Return what looks at the window as it is now; None where that has too little."""
+
+    def words(self, seen: Any) -> str: ...
+    def values(self, seen: Any) -> dict[str, object]: ...
+    def on_parameters(self, old: WatcherParameters, new: WatcherParameters) -> None: ...
+
+
+class FluxStreams:
+    """Takes the fluxes of a setup's sensors and the optical poses of its bodies."""
+
+    WHAT = 'fluxes'
+
+    def __init__(self, node: 'Watcher', table: WatcherParameters) -> None:
+        self._node, self._stated = node, stated_by(table)
+        if table.model_file != NOMINAL:
+            load_model(table.model_file)  # refused now, not when fluxes come
+        self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
+        self._setup_text = self._offered = ''
+        self.window: SlidingWindow | None = None
+        self.watch: Watch | None = None
+        self.received_s = 0.0
+        self._pose_subscriptions: dict[str, Any] = {}
+        self.sources = [setup_source(node, self.on_setup)] + [
+            OneSource(node, PointCloud2, topic, partial(self.on_fluxes, topic), qos.STREAM)
+            for topic in ('tool/flux', 'reference/flux')
+        ]
+
+    def on_setup(self, message: String) -> None:
+        """Take a setup document."""
+        if message.data == self._setup_text:
+            return
+        self._offered = message.data
+        try:
+            self._begin(message.data)
+        except AnserError as error:
+            self._node.refuse('setups_refused', error)
+
+    def on_parameters(self, old: WatcherParameters, new: WatcherParameters) -> None:
+        """Start again with another model."""
+        if old.model_file != new.model_file and self._offered:
+            self._begin(self._offered)
+
+    def _begin(self, text: str) -> None:
+        """Watch what a setup's fluxes say, from an empty window on.
+
+        Raises `AnserError` when the text is not a setup, or model or baseline do not fit it.
+        """
+        setup, table = parse_setup(text).with_stated(self._stated), self._node.parameters
+        # An empty window has a session's setup already, and a model must fit that.
+        empty = empty_session(setup, LIVE)
+        prepared = prepare(empty, model_for(table.model_file, empty), self._baseline_bag)
+        self._setup_text = text
+        self.window = SlidingWindow(setup, table.window_s, table.frames)
+        self.watch = Watch(prepared)
+        self._node.forget()
+        for body in setup.bodies:
+            if body not in self._pose_subscriptions:
+                topic, take = optical_topic(body, table.optical), partial(self._on_optical, body)
+                self._pose_subscriptions[body] = self._node.create_subscription(
+                    PoseStamped, topic, take, qos.STREAM
+                )
+
+    def _on_optical(self, body: str, message: PoseStamped) -> None:
+        if self.window is not None:
+            self.window.take_pose(body, stamp_of(message), pose_numbers(message.pose))
+
+    def on_fluxes(self, topic: str, message: PointCloud2) -> None:
+        """Take a frame of one of the two topics."""
+        window = self.window
+        if window is None:
+            return
+        take = window.take_tool if topic == 'tool/flux' else window.take_reference
+        try:
+            take(*read_frame(message, window.setup.frame_id, self._node.count))
+        except AnserError as error:
+            self._node.refuse('fluxes_refused', error)
+            return
+        self.received_s = time.monotonic()
+        self._node.count('frames')
+
+    def quiet_topics(self) -> tuple[str, ...]:
+        """Return none: silence is that of all fluxes."""
+        return ()
+
+    def look(self) -> Callable[[], Sighting] | None:
+        """Return what looks at the window as it is now; None where that has too little."""
+        session = None if self.window is None else self.window.session()
+        if session is None or self.watch is None or self.window is None:
+            return None
+        return partial(self.watch.look, session, self.window.first_ns)
+
+    def words(self, seen: Sighting) -> str:
+        """Return what was seen as one line."""
+        return words_of(seen)
+
+    def values(self, seen: Sighting) -> dict[str, object]:
+        """Return the figures of what was seen, by name."""
+        return values_of(seen)
+
+
+def streams_of(node: 'Watcher', table: WatcherParameters) -> Streams:
+    """Return what the parameters name: poses of another tracker, else this package's fluxes."""
+    if not table.tracked_poses:
+        return FluxStreams(node, table)
+    from anser_ros.nodes.watcher_parts.pose_streams import PoseStreams
+
+    return PoseStreams(node, table)
 
 
 class Watcher(AnserNode):
@@ -119,189 +236,101 @@ class Watcher(AnserNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        table = self.parameters
-        self._stated = stated_by(table)
-        if not table.tracked_poses and table.model_file != NOMINAL:
-            load_model(table.model_file)  # refused now, not when fluxes come
-        self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
-        self._setup_text = self._offered = ''
-        self._window: SlidingWindow | PoseWindow | None = None
-        self._watch: Watch | PoseWatch | None = None
-        self._sighting: Sighting | PoseSighting | None = None
+        self._seen: Any = None
         self._trouble = ''
         self._known: dict[str, EffectRecord] = {}
-        self._pose_subscriptions: dict[str, Any] = {}
-        self._received_s = 0.0
-        self._next_s = 0.0
-        self._look_s = 0.0
+        self._next_s = self._look_s = 0.0
         self._busy = False
-        self._tasks: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
-        self._poses: PoseStreams | None = None
-        if table.tracked_poses:
-            self._poses = PoseStreams(
-                self, table.tracked_poses, table.reference_pose, table.window_s
-            )
-            self._window, self._watch = self._poses.window, PoseWatch()
-            self._sources = self._poses.sources
-        else:
-            self._sources = [
-                setup_source(self, self._on_setup),
-                OneSource(self, PointCloud2, 'tool/flux', self._on_tool, qos.STREAM),
-                OneSource(self, PointCloud2, 'reference/flux', self._on_reference, qos.STREAM),
-            ]  # fmt: skip
+        # What looks, and by whose watch; None at the end.
+        self._tasks: queue.SimpleQueue[tuple[Any, Callable[[], Any]] | None] = queue.SimpleQueue()
+        self._streams = streams_of(self, self.parameters)
         self.create_timer(POLL_S, self._begin_look, clock=self.steady_clock)
         work = self._guard(self._take_look)
         self._thread = threading.Thread(target=self._work, args=(work,), daemon=True)
         self._thread.start()
 
-    # What is subscribed to ----------------------------------------------------------------
+    def refuse(self, counter: str, error: AnserError) -> None:
+        """Count and report what can't be used."""
+        self._trouble = str(error)
+        self.warn(counter, str(error))
 
-    def _on_setup(self, message: String) -> None:
-        if message.data == self._setup_text:
-            return
-        self._offered = message.data
-        try:
-            self._begin(message.data)
-        except AnserError as error:
-            self._refuse('setups_refused', error)
+    def forget(self) -> None:
+        """Forget what was found: something else is watched from now on."""
+        self._trouble, self._seen, self._known = '', None, {}
 
     def on_parameters(self, old: WatcherParameters, new: WatcherParameters) -> None:
         """Start again with another model."""
-        if old.model_file != new.model_file and self._offered:
-            self._begin(self._offered)
-
-    def _begin(self, text: str) -> None:
-        """Watch what a setup's fluxes say, from an empty window on.
-
-        Raises
-        ------
-        AnserError
-            When the text is not a setup, or model or baseline do not fit it.
-        """
-        setup = parse_setup(text).with_stated(self._stated)
-        # An empty window has a session's setup already, and a model must fit that.
-        empty = empty_session(setup, LIVE)
-        model = model_for(self.parameters.model_file, empty)
-        prepared = prepare(empty, model, self._baseline_bag)
-        self._setup_text, self._trouble = text, ''
-        self._window = SlidingWindow(setup, self.parameters.window_s, self.parameters.frames)
-        self._watch = Watch(prepared)
-        self._sighting, self._known = None, {}
-        for body in setup.bodies:
-            if body not in self._pose_subscriptions:
-                self._pose_subscriptions[body] = self.create_subscription(
-                    PoseStamped,
-                    optical_topic(body, self.parameters.optical),
-                    self._taker(body),
-                    qos.STREAM,
-                )
-
-    def _taker(self, body: str) -> Callable[[PoseStamped], None]:
-        def take(message: PoseStamped) -> None:
-            if isinstance(self._window, SlidingWindow):
-                p, q = message.pose.position, message.pose.orientation
-                stamp = message.header.stamp
-                pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-                self._window.take_pose(body, stamp.sec * SECOND_NS + stamp.nanosec, pose)
-
-        return take
-
-    def _on_tool(self, message: PointCloud2) -> None:
-        if isinstance(self._window, SlidingWindow):
-            self._take(message, self._window, self._window.take_tool)
-
-    def _on_reference(self, message: PointCloud2) -> None:
-        if isinstance(self._window, SlidingWindow):
-            self._take(message, self._window, self._window.take_reference)
-
-    def _take(
-        self, message: PointCloud2, window: SlidingWindow, take: Callable[..., None]
-    ) -> None:
-        try:
-            take(*read_frame(message, window.setup.frame_id, self.count))
-        except AnserError as error:
-            self._refuse('fluxes_refused', error)
-            return
-        self._received_s = time.monotonic()
-        self.count('frames')
-
-    def _refuse(self, counter: str, error: AnserError) -> None:
-        self._trouble = str(error)
-        self.warn(counter, str(error))
+        self._streams.on_parameters(old, new)
 
     # Looking ------------------------------------------------------------------------------
 
     def _begin_look(self) -> None:
         """Hand the window to the thread when it is due and the thread is free."""
-        now_s, window, watch = time.monotonic(), self._window, self._watch
-        if self._busy or window is None or watch is None or now_s < self._next_s:
+        now_s, streams = time.monotonic(), self._streams
+        if self._busy or streams.watch is None or now_s < self._next_s:
             return
-        if window.span_s < FILLED * self.parameters.window_s or self._is_silent(now_s):
+        if streams.window.span_s < FILLED * self.parameters.window_s or self._is_silent(now_s):
             return
-        session = window.session() if self._poses is None else self._poses.session()
-        if session is not None:
+        look = streams.look()
+        if look is not None:
             self._busy = True
             self._next_s = now_s + self.parameters.period_s
-            self._tasks.put(Task(watch, session, window.first_ns))
+            self._tasks.put((streams.watch, look))
 
-    def _work(self, take_look: Callable[[Task], None]) -> None:
+    def _work(self, take_look: Callable[[Any, Callable[[], Any]], None]) -> None:
         while (task := self._tasks.get()) is not None:
             began_s = time.thread_time()
-            take_look(task)
+            take_look(*task)
             self._look_s = time.thread_time() - began_s
             rest_s = self._look_s * (1.0 / self.parameters.cpu_share - 1.0)
             self._next_s = max(self._next_s, time.monotonic() + rest_s)
             self._busy = False
 
-    def _take_look(self, task: Task) -> None:
+    def _take_look(self, watch: Any, look: Callable[[], Any]) -> None:
         self.count('looks')
         try:
-            sighting = _look(task)
+            seen = look()
         except AnserError as error:
-            self._refuse('looks_refused', error)
-            self._sighting = None
+            self.refuse('looks_refused', error)
+            self._seen = None
             return
-        if task.watch is self._watch:
-            self._trouble = ''
-            self._sighting = sighting
-            self._known |= {title_of(record): record for record in sighting.findings}
+        if watch is self._streams.watch:
+            self._trouble, self._seen = '', seen
+            self._known |= {title_of(record): record for record in seen.findings}
 
     def close(self) -> None:
         """End the thread after the look that it is at."""
         self._tasks.put(None)
 
-    # What is told -------------------------------------------------------------------------
+    # What is reported ---------------------------------------------------------------------
 
     def _is_silent(self, now_s: float) -> bool:
-        received_s = self._received_s if self._poses is None else self._poses.received_s
-        return now_s - received_s > SILENCE_S
+        return now_s - self._streams.received_s > SILENCE_S
 
     def status(self) -> Status:
         """Return what is there, in one line, with its figures."""
-        window, seen = self._window, self._sighting
+        streams, seen = self._streams, self._seen
         values: dict[str, object] = {'look_cpu_s': self._look_s, 'last_refusal': self._trouble}
-        conflict = sender_words(self._sources)
+        conflict = sender_words(streams.sources)
         if conflict:
             return Status('', Level.ERROR, f'{TWO_SOURCES}: {conflict}', values)
-        if window is None or self._watch is None:
+        if streams.window is None or streams.watch is None:
             return Status('', Level.WARN, self._trouble or 'no setup yet', values)
-        values |= {'searches': self._watch.searches, 'restarts': window.restarts}
+        values |= {'searches': streams.watch.searches, 'restarts': streams.window.restarts}
         if self._is_silent(time.monotonic()):
-            what = 'fluxes' if self._poses is None else 'poses'
-            return Status('', Level.WARN, f'no {what}', values)
-        quiet = () if self._poses is None else self._poses.quiet_topics()
+            return Status('', Level.WARN, f'no {streams.WHAT}', values)
+        quiet = streams.quiet_topics()
         if quiet:
-            return Status('', Level.WARN, f'no poses on {", ".join(quiet)}', values)
+            return Status('', Level.WARN, f'no {streams.WHAT} on {", ".join(quiet)}', values)
         if seen is None:
-            state = self._trouble or f'collecting data, {window.span_s:.0f} s so far'
-            return Status('', Level.OK, state, values)
-        values |= pose_values(seen) if isinstance(seen, PoseSighting) else values_of(seen)
-        words = pose_words(seen) if isinstance(seen, PoseSighting) else words_of(seen)
-        return Status('', Level.OK if seen.is_clear else Level.WARN, words, values)
+            state = f'collecting data, {streams.window.span_s:.0f} s so far'
+            return Status('', Level.OK, self._trouble or state, values)
+        level = Level.OK if seen.is_clear else Level.WARN
+        return Status('', level, streams.words(seen), values | streams.values(seen))
 
     def part_statuses(self) -> list[Status]:
         """Return a line for everything that was found since the setup came."""
-        seen = self._sighting
+        seen = self._seen
         there = {} if seen is None else {title_of(record): record for record in seen.findings}
         statuses = []
         for title, record in self._known.items():
@@ -316,15 +345,6 @@ class Watcher(AnserNode):
             else:
                 statuses.append(Status(title, Level.OK, 'gone'))
         return statuses
-
-
-def _look(task: Task) -> Sighting | PoseSighting:
-    """Look at a window as its kind of watch does."""
-    if isinstance(task.watch, PoseWatch):
-        assert isinstance(task.session, PoseSession)
-        return task.watch.look(task.session)
-    assert isinstance(task.session, Session)
-    return task.watch.look(task.session, task.first_ns)
 
 
 if __name__ == '__main__':

@@ -22,10 +22,7 @@ MOST = 100
 class RecordingFolder:
     """Finds recordings and results by their names; no name leads out of the folder.
 
-    Parameters
-    ----------
-    path : Path
-        Need not be there yet.
+    The folder need not be there yet.
     """
 
     def __init__(self, path: Path) -> None:
@@ -51,10 +48,7 @@ class RecordingFolder:
     def recording(self, name: str) -> Path:
         """Return the path of a bag.
 
-        Raises
-        ------
-        BagError
-            When the folder has no bag of that name.
+        Raises `BagError` when the folder has no bag of that name.
         """
         path = self.path / name
         if Path(name).name != name or not _is_bag(path):

@@ -30,18 +30,9 @@ def is_local(host: str) -> bool:
 class Guard:
     """Stands before another ASGI application, and refuses who may not come in.
 
-    Parameters
-    ----------
-    inner : ASGI application
-    token : str
-        What has to be known; empty where only this machine can reach the address. Then names of
-        other machines in a request are refused: a page from elsewhere, open in the same browser,
-        could reach it by a name of its own that leads here.
-
-    Attributes
-    ----------
-    pages : int
-        Connections that are open.
+    Without a token, only this machine can reach the address. Then names of other machines in a
+    request are refused: a page from elsewhere, open in the same browser, could reach it by a name
+    of its own that leads here. ``pages`` counts open connections.
     """
 
     def __init__(self, inner: Application, token: str) -> None:

@@ -18,29 +18,13 @@ KEPT_LINES = 20
 """Lines of what a command says that are kept, for the last ones say why it failed."""
 LONGEST_LINE = 65_536
 """Bytes of a line that are taken as one, which bounds the memory of a line without an end."""
-PATIENCE_S = 3.0
-"""Time for a command to end when it is told to, s; then it is killed."""
 
 
 class Job:
     """Runs a command once.
 
-    Parameters
-    ----------
-    kind : str
-        The command's name, such as ``diagnose``.
-    arguments : sequence of str
-    folder : Path
-        Gets its results, and what it prints as ``output.txt``.
-
-    Attributes
-    ----------
-    exit_code : int or None
-        None while it runs.
-    share : float
-        How much is done, 0 to 1; NaN where it does not say.
-    stage : str
-        What it does, in its own words.
+    What it prints goes to ``output.txt`` in the folder of its results. ``exit_code`` is None while
+    it runs; ``share`` is how much is done, 0 to 1, and NaN where it does not say.
     """
 
     def __init__(self, kind: str, arguments: Sequence[str], folder: Path) -> None:
@@ -108,9 +92,9 @@ class Job:
         self._is_ended = self._is_ended or self.exit_code is None
         self.end()
 
-    def end(self, number: int = signal.SIGTERM) -> None:
+    def end(self) -> None:
         """Ask its processes to end."""
         process = self._process
         if process is not None and process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, number)
+                os.killpg(process.pid, signal.SIGTERM)

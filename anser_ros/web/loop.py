@@ -1,9 +1,10 @@
 """Lets a person close the loop on the page: record, diagnose, load the better model, or undo."""
 
 import asyncio
+import functools
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,42 +25,26 @@ MOST_UNDONE = 20
 
 
 class Chain(Protocol):
-    """States what the page can ask of the running nodes."""
+    """States what the page can ask of the running nodes; they refuse by `AnserError`."""
 
-    async def trigger(self, service: str) -> str:
-        """Call a service and return its answer; AnserError where it refuses."""
+    async def trigger(self, service: str) -> str: ...
+    async def model_files(self) -> dict[str, str]: ...
+    async def load_model(self, files: Mapping[str, str]) -> None: ...
+    async def baseline_file(self) -> str: ...
 
-    async def model_files(self) -> dict[str, str]:
-        """Return the model file of each node that has one, ``field_model`` first."""
 
-    async def load_model(self, files: Mapping[str, str]) -> None:
-        """Give nodes other model files; AnserError where one refuses."""
+class LiveFigures(Protocol):
+    """States what the page knows of the present moment."""
 
-    async def baseline_file(self) -> str:
-        """Return the recording without metal that the nodes were started with; empty for none."""
-
-    def figures(self, since_s: float) -> dict[str, float | None]:
-        """Return ``tracked``, ``error_mm`` and ``residual_pt`` of the last seconds."""
-
-    def mark(self, words: str) -> None:
-        """Mark this moment in the curves."""
+    def figures(self, since_s: float) -> dict[str, float | None]: ...
+    def mark(self, words: str) -> None: ...
 
 
 @dataclass(frozen=True)
 class Found:
     """Holds what a command has found.
 
-    Attributes
-    ----------
-    kind : `CALIBRATE` or `DIAGNOSE`
-    recording : str
-        Name of the bag.
-    folder : Path
-        Its results.
-    words : str
-        The finding in a short paragraph.
-    rows : tuple of (label, before, after)
-        Figures on data held out, as text.
+    ``rows`` have a label and, as text, a figure before and after, on data held out.
     """
 
     kind: str
@@ -83,34 +68,38 @@ class Loaded:
     at_s: float
 
 
+def _step(
+    step: Callable[['CorrectionLoop'], Awaitable[str]],
+) -> Callable[['CorrectionLoop'], Awaitable[None]]:
+    """Make a method one step, which says in words how it went: one at a time, whoever clicks."""
+
+    @functools.wraps(step)
+    async def stepped(loop: 'CorrectionLoop') -> None:
+        async with loop.busy:
+            try:
+                loop.message, loop.is_trouble = await step(loop), False
+            except AnserError as error:
+                loop.message, loop.is_trouble = ' '.join(str(error).split()), True
+
+    return stepped
+
+
 class CorrectionLoop:
     """Holds the loop's state, one for all pages; every step says in words how it went.
 
-    Attributes
-    ----------
-    chosen : str
-        The recording that commands work on.
-    job : Job or None
-        The command that runs, or ran last.
-    found : Found or None
-        What the last one that succeeded has found.
-    names : tuple of str
-        The recordings that there are, the newest first.
-    message, is_trouble : str, bool
-        How the last step went, and whether badly.
-    model : str
-        The file of the model in force, as ``field_model`` has it.
+    ``names`` are the recordings, the newest first, and ``chosen`` is the one that commands work
+    on; ``model`` is the active model's file, as ``field_model`` has it.
     """
 
-    def __init__(self, chain: Chain, folder: RecordingFolder) -> None:
-        self._chain, self.folder = chain, folder
+    def __init__(self, chain: Chain, live: LiveFigures, folder: RecordingFolder) -> None:
+        self._chain, self._live, self.folder = chain, live, folder
         self.chosen, self.model = '', ''
         self.job: Job | None = None
         self.found: Found | None = None
         self.message, self.is_trouble = '', False
         self.names: tuple[str, ...] = ()
         self._loaded: list[Loaded] = []
-        self._busy = asyncio.Lock()
+        self.busy = asyncio.Lock()
 
     # What can be done ---------------------------------------------------------------------
 
@@ -121,7 +110,7 @@ class CorrectionLoop:
 
     @property
     def can_load(self) -> bool:
-        """Return whether there is a model to load that is not in force."""
+        """Return whether there is a model to load that is not active."""
         return self.found is not None and str(self.found.model) != self.model
 
     @property
@@ -131,38 +120,65 @@ class CorrectionLoop:
 
     @property
     def model_name(self) -> str:
-        """Return the model in force: its place in the recordings' folder, else its whole path."""
+        """Return the active model: its place in the recordings' folder, else its whole path."""
         path = Path(self.model)
         inside = path.is_relative_to(self.folder.path)
         return str(path.relative_to(self.folder.path)) if inside else self.model
 
-    async def record(self) -> None:
+    @_step
+    async def record(self) -> str:
         """Begin to record another bag."""
-        await self._step(self._record())
+        return f'recording to {Path(await self._chain.trigger("recorder/start")).name}'
 
-    async def stop(self) -> None:
+    @_step
+    async def stop(self) -> str:
         """End the bag and choose it."""
-        await self._step(self._stop())
+        message = await self._chain.trigger('recorder/stop')
+        self.refresh_names()
+        if not self.names:
+            raise ParameterError(
+                f'{message}; but {self.folder.path} holds no recording: give the live view and '
+                'the recorder the same directory'
+            )
+        self.chosen = self.names[0]
+        return message
 
-    async def set_baseline(self) -> None:
+    @_step
+    async def set_baseline(self) -> str:
         """Take what the references read now for what they read without metal."""
-        await self._step(self._set_baseline())
+        return await self._chain.trigger('field_model/set_baseline')
 
-    async def calibrate(self) -> None:
+    @_step
+    async def calibrate(self) -> str:
         """Fit a model to the chosen recording."""
-        await self._step(self._start(CALIBRATE))
+        return await self._start(CALIBRATE)
 
-    async def diagnose(self) -> None:
-        """Find what the model in force lacks on the chosen recording."""
-        await self._step(self._start(DIAGNOSE))
+    @_step
+    async def diagnose(self) -> str:
+        """Find what the active model lacks on the chosen recording."""
+        return await self._start(DIAGNOSE)
 
-    async def load(self) -> None:
-        """Put the model that was found in force."""
-        await self._step(self._load())
+    @_step
+    async def load(self) -> str:
+        """Activate the model that was found."""
+        if self.found is None:
+            raise ParameterError('there is no model to load yet')
+        before = await self._chain.model_files()
+        figures = self._live.figures(0.0)
+        await self._exchange(before, dict.fromkeys(before, str(self.found.model)))
+        self._loaded = [*self._loaded[-MOST_UNDONE + 1 :], Loaded(before, figures, time.time())]
+        self._live.mark('model loaded')
+        return 'the new model is in force'
 
-    async def undo(self) -> None:
-        """Put the model in force that was there before."""
-        await self._step(self._undo())
+    @_step
+    async def undo(self) -> str:
+        """Activate the model that was there before."""
+        if not self._loaded:
+            raise ParameterError('no model was loaded from this page')
+        await self._exchange(await self._chain.model_files(), self._loaded[-1].before)
+        self._loaded.pop()
+        self._live.mark('undone')
+        return 'the previous model is in force again'
 
     def refresh_names(self) -> None:
         """See which recordings there are."""
@@ -176,34 +192,10 @@ class CorrectionLoop:
             self.job.cancel()
 
     async def look(self) -> None:
-        """Ask which model is in force."""
+        """Ask which model is active."""
         self.model = (await self._chain.model_files()).get('field_model', '')
 
     # How it is done -----------------------------------------------------------------------
-
-    async def _step(self, step: Any) -> None:
-        async with self._busy:  # one after the other, whoever clicks
-            try:
-                self.message, self.is_trouble = await step, False
-            except AnserError as error:
-                self.message, self.is_trouble = ' '.join(str(error).split()), True
-
-    async def _record(self) -> str:
-        return f'recording to {Path(await self._chain.trigger("recorder/start")).name}'
-
-    async def _stop(self) -> str:
-        message = await self._chain.trigger('recorder/stop')
-        self.refresh_names()
-        if not self.names:
-            raise ParameterError(
-                f'{message}; but {self.folder.path} holds no recording: give the live view and '
-                'the recorder the same directory'
-            )
-        self.chosen = self.names[0]
-        return message
-
-    async def _set_baseline(self) -> str:
-        return await self._chain.trigger('field_model/set_baseline')
 
     async def _start(self, kind: str) -> str:
         if self.is_running:
@@ -235,25 +227,6 @@ class CorrectionLoop:
         self.found = Found(job.kind, name, job.folder, words, rows)
         self.message, self.is_trouble = f'{job.kind} {name}: done in {job.seconds:.0f} s', False
 
-    async def _load(self) -> str:
-        if self.found is None:
-            raise ParameterError('there is no model to load yet')
-        before = await self._chain.model_files()
-        figures = self._chain.figures(0.0)
-        await self._exchange(before, dict.fromkeys(before, str(self.found.model)))
-        self._loaded = [*self._loaded[-MOST_UNDONE + 1 :], Loaded(before, figures, time.time())]
-        self._chain.mark('model loaded')
-        return 'the new model is in force'
-
-    async def _undo(self) -> str:
-        if not self._loaded:
-            raise ParameterError('no model was loaded from this page')
-        last = self._loaded[-1]
-        await self._exchange(await self._chain.model_files(), last.before)
-        self._loaded.pop()
-        self._chain.mark('undone')
-        return 'the previous model is in force again'
-
     async def _exchange(self, present: Mapping[str, str], wanted: Mapping[str, str]) -> None:
         """Give the nodes other models; where one refuses, all keep what they had."""
         try:
@@ -267,15 +240,15 @@ class CorrectionLoop:
     # What is shown ------------------------------------------------------------------------
 
     def comparison(self) -> list[tuple[str, str, str]]:
-        """Return rows of label, before and after: live, where a model was loaded, and held out."""
-        rows = []
-        if self._loaded:
-            last = self._loaded[-1]
-            now = self._chain.figures(last.at_s + SETTLING_S)
-            for label, key, digits in LIVE_ROWS:
-                before, after = last.figures.get(key), now.get(key)
-                rows.append((label, _text(before, digits), _text(after, digits)))
-        return rows
+        """Return rows of label, before and after, live, where a model was loaded."""
+        if not self._loaded:
+            return []
+        before = self._loaded[-1]
+        now = self._live.figures(before.at_s + SETTLING_S)
+        return [
+            (label, _text(before.figures.get(key), digits), _text(now.get(key), digits))
+            for label, key, digits in LIVE_ROWS
+        ]
 
 
 LIVE_ROWS = (
@@ -287,40 +260,31 @@ LIVE_ROWS = (
 _NOUN = {CALIBRATE: 'calibration', DIAGNOSE: 'diagnosis'}
 
 
-def _text(value: float | None, digits: int) -> str:
-    return '–' if value is None else f'{value:.{digits}f}'
-
-
-def _scaled(value: float | None, scale: float) -> float | None:
-    return None if value is None else scale * value
+def _text(value: float | None, digits: int, scale: float = 1.0) -> str:
+    return '–' if value is None else f'{scale * value:.{digits}f}'
 
 
 def _read_diagnosis(document: dict[str, Any]) -> tuple[str, tuple[tuple[str, str, str], ...]]:
-    held = document['held_out']
-    rows = []
+    held, rows = document['held_out'], []
     for label, key, unit, scale, digits in (
         ('residual, pT', 'flux_rms', 't', 1e12, 0),
         ('position error, mm', 'position_rmse', 'm', 1e3, 2),
         ('orientation error, deg', 'orientation_rmse', 'rad', DEGREES, 2),
     ):
-        pair = [
-            _text(_scaled(held[f'{key}_{when}_{unit}'], scale), digits)
-            for when in ('before', 'after')
-        ]
-        rows.append((label, pair[0], pair[1]))
+        before, after = held[f'{key}_before_{unit}'], held[f'{key}_after_{unit}']
+        rows.append((label, _text(before, digits, scale), _text(after, digits, scale)))
     return verdict(document), tuple(rows)
 
 
 def _read_calibration(document: dict[str, Any]) -> tuple[str, tuple[tuple[str, str, str], ...]]:
-    before = _scaled(document.get('nominal_flux_rmse_t'), 1e12)
-    after = _scaled(document['heldout_flux_rmse_t'], 1e12)
+    before = _text(document.get('nominal_flux_rmse_t'), 0, 1e12)
+    after = _text(document['heldout_flux_rmse_t'], 0, 1e12)
     words = (
         f'A model of {document["n_dipoles"]} dipoles from {document["n_measurements"]} readings '
-        f'per emitter; on held-out data its residual is {_text(after, 0)} pT, '
+        f'per emitter; on held-out data its residual is {after} pT, '
         f'{document["heldout_n_rmse_percent"]:.3f} % of the range.'
     )
-    rows = (('residual, pT (before: nominal model)', _text(before, 0), _text(after, 0)),)
-    return words, rows
+    return words, (('residual, pT (before: nominal model)', before, after),)
 
 
 _READ = {CALIBRATE: _read_calibration, DIAGNOSE: _read_diagnosis}

@@ -28,38 +28,19 @@ _LIBRARIES = (ui.scene, ui.echart)
 
 
 class ShownGraph(Protocol):
-    """States what the page shows; numbers that are not known are None."""
+    """States what the page shows, as `ViewSource` does; numbers that are not known are None."""
 
     @property
-    def version(self) -> int:
-        """Return a number that changes where there is another world to show."""
-
-    def look(self) -> None:
-        """Take in what has come."""
-
-    def add_point(self) -> None:
-        """Take the next point of the curves."""
-
-    def world(self) -> dict[str, Any] | None:
-        """Return what stands still, targets, and curves so far; None before there is a setup."""
-
-    def frame(self) -> list[Any]:
-        """Return the targets' places, as `LiveView.frame` does."""
-
-    def table(self) -> list[list[Any]]:
-        """Return level, state, reason, sigma, error, residual and rate of every target."""
-
-    def metal(self) -> list[list[float]]:
-        """Return balls where metal seems to be: x, y, z and radius, m."""
-
-    def point(self) -> list[Any]:
-        """Return the newest point of the curves: time, errors, residuals."""
-
-    def marks(self) -> list[list[Any]]:
-        """Return moments in the curves: time and words."""
-
-    def status(self) -> dict[str, Any]:
-        """Return what header and lists say."""
+    def version(self) -> int: ...
+    def look(self) -> None: ...
+    def add_point(self) -> None: ...
+    def world(self) -> dict[str, Any] | None: ...
+    def frame(self) -> list[Any]: ...
+    def table(self) -> list[list[Any]]: ...
+    def metal(self) -> list[list[float]]: ...
+    def point(self) -> list[Any]: ...
+    def marks(self) -> list[list[Any]]: ...
+    def status(self) -> dict[str, Any]: ...
 
 
 class Instrument(Element, component='instrument.js'):
@@ -290,12 +271,7 @@ def _table(title: str, rows: Any) -> str:
 class Pages:
     """Holds all open pages, and what drives them.
 
-    Parameters
-    ----------
-    source : ShownGraph
-    loop : CorrectionLoop
-    guarded : callable
-        Makes of a function one that outlives its errors, and tells of them.
+    ``guarded`` makes of a function one that outlives its errors, and reports them.
     """
 
     def __init__(
@@ -334,7 +310,7 @@ class Pages:
             await asyncio.sleep(due_s - clock.time())
 
     async def _watch(self) -> None:
-        """See now and then which recordings there are, and which model is in force.
+        """See now and then which recordings there are, and which model is active.
 
         Others may record and change models too.
         """

@@ -35,10 +35,7 @@ SANDBOX = "sandbox; default-src 'none'; img-src data:; style-src 'unsafe-inline'
 def token_for(host: str, token_file: str) -> str:
     """Return the token that pages need: none on this machine alone, else the file's or a new one.
 
-    Raises
-    ------
-    ParameterError
-        When the file holds none, or a short one.
+    Raises `ParameterError` when the file holds none, or a short one.
     """
     if not token_file:
         return '' if is_local(host) else secrets.token_urlsafe(LEAST_TOKEN)
@@ -54,18 +51,8 @@ def token_for(host: str, token_file: str) -> str:
 class PageServer:
     """Serves the pages that are registered with NiceGUI, and the results of the folder.
 
-    Parameters
-    ----------
-    host, port
-        Address to listen on; port 0 for any that is free.
-    token : str
-        What a browser has to know; empty for nothing.
-    folder : RecordingFolder
-
-    Raises
-    ------
-    ParameterError
-        When the address can't be used.
+    Port 0 stands for any that is free, an empty token for none. Raises `ParameterError` when the
+    address can't be used.
     """
 
     def __init__(self, host: str, port: int, token: str, folder: RecordingFolder) -> None:

@@ -74,15 +74,7 @@ class WaitingFrames:
 
     On a punctual line no frame waits. A frame that nothing confirms for `PATIENCE_NS` is withheld.
 
-    Parameters
-    ----------
-    clock : SampleClock
-        The clock that the stamps come from.
-
-    Attributes
-    ----------
-    withheld : int
-        Frames that were withheld.
+    ``withheld`` counts these.
     """
 
     def __init__(self, clock: SampleClock) -> None:

@@ -22,6 +22,8 @@ from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
 from anser_ros.wire.records import FULL_SCALE_CODE, ChannelKind, Hello, SampleBlock
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class StreamOptions:
@@ -36,12 +38,8 @@ class FluxStream:
     """Turns samples into fluxes; it is made again for every hello that differs from the one
     before.
 
-    Parameters
-    ----------
-    hello : what the control unit says that it sends
-    setup : which sensors are wanted
-    calibration : response of the channels
-    options : window and rate
+    Raises `SetupError` when the control unit has none of the channels, or other emitters than the
+    setup, and `ParameterError` when the window cannot be demodulated.
 
     Attributes
     ----------
@@ -50,13 +48,6 @@ class FluxStream:
     rate_hz : windows a second, a whole number of samples apart
     clock, ticks : host time of the samples, and what the device's own clock says beside them
     waiting : frames whose stamps are not confirmed yet
-
-    Raises
-    ------
-    SetupError
-        When the control unit has none of the channels, or other emitters than the setup.
-    ParameterError
-        When the window cannot be demodulated.
     """
 
     def __init__(
@@ -202,29 +193,22 @@ class FluxStream:
         return converted
 
 
-@dataclass(frozen=True)
-class _Geometry:
-    channel: NDArray[np.int64]
-    position: NDArray[np.float64]
-    axis: NDArray[np.float64]
-
-
-def _geometry(sensors: Sequence[SensorSpec]) -> _Geometry:
+def _geometry(sensors: Sequence[SensorSpec]) -> tuple[NDArray[np.int64], Array, Array]:
     """Channels, and positions and axes in fg: NaN for what moves."""
     fixed = np.array([s.body == FIELD_GENERATOR for s in sensors], bool)[:, None]
     position = np.array([s.position_m for s in sensors]).reshape(-1, 3)
     axis = np.array([s.axis for s in sensors]).reshape(-1, 3)
-    return _Geometry(
-        np.array([s.channel for s in sensors], np.int64),
-        np.where(fixed, position, np.nan),
-        np.where(fixed, axis, np.nan),
-    )
+    channel = np.array([s.channel for s in sensors], np.int64)
+    return channel, np.where(fixed, position, np.nan), np.where(fixed, axis, np.nan)
 
 
 def _points(
-    geometry: _Geometry, flux: NDArray[np.complex128], flags: NDArray[np.int64]
+    geometry: tuple[NDArray[np.int64], Array, Array],
+    flux: NDArray[np.complex128],
+    flags: NDArray[np.int64],
 ) -> FluxPoints:
-    return FluxPoints(geometry.channel, flags, flux, geometry.position, geometry.axis)
+    channel, position, axis = geometry
+    return FluxPoints(channel, flags, flux, position, axis)
 
 
 def _current_column(hello: Hello) -> int:

@@ -18,8 +18,6 @@ class Interval:
     flags: np.ndarray | None = None
     staleness: Staleness | None = None
     repeats: int = 0
-    duplicates: int = 0
-    skipped: int = 0
 
     def add(self, frame: FluxFrame, delay_s: float) -> None:
         """Note a published frame."""

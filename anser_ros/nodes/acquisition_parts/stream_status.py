@@ -1,12 +1,13 @@
 """Reports the state of emitters and sensors: a line for each, with what is wrong in words."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame, Staleness
 from anser_ros.nodes.acquisition_parts.flux_stream import FluxStream
-from anser_ros.nodes.runtime.diagnostics import Level, Status
+from anser_ros.nodes.acquisition_parts.stream_interval import Interval
+from anser_ros.nodes.runtime.diagnostics import Level, Status, named
 from anser_ros.signals.clock import ClockState
 from anser_ros.wire.points import DROPPED, SATURATED, STALE
 from anser_ros.wire.setup import Coil
@@ -22,53 +23,32 @@ STATES = (
 
 
 def signal_troubles(
-    coils: Sequence[Coil],
-    stream: FluxStream,
-    frame: FluxFrame | None,
-    flags: np.ndarray | None,
-    staleness: Staleness | None = None,
+    coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame | None, past: Interval
 ) -> list[tuple[Level, str]]:
     """Return what is wrong with the signals, by the names of emitters and sensors.
 
-    Parameters
-    ----------
-    coils : sequence of Coil
-        The emitters, in the order of the setup document.
-    stream : FluxStream
-        Of the connection.
-    frame : FluxFrame or None
-        The newest one.
-    flags : ndarray, shape (S,), or None
-        Flag bits that the sensors had since the last look. Lost samples are not told here: the
-        counters of the line say where they were lost.
-    staleness : Staleness, optional
-        Why they were stale.
+    Lost samples are not reported here: the counters of the line say where they were lost.
     """
     found = []
     if stream.missing:
-        names = _named(sensor.name for sensor in stream.missing)
+        names = named((sensor.name for sensor in stream.missing), MOST_NAMES)
         found.append((Level.WARN, f'the control unit has no channel for {names}'))
     if frame is not None and not frame.window.driven.all():
         pairs = zip(coils, frame.window.driven, strict=True)
-        names = _named(coil.name for coil, driven in pairs if not driven)
+        names = named((coil.name for coil, driven in pairs if not driven), MOST_NAMES)
         found.append((Level.ERROR, f'no current in {names}'))
-    if flags is None or len(flags) != len(stream.sensors):
+    if past.flags is None or len(past.flags) != len(stream.sensors):
         return found
     for bit, level, word, _ in STATES[:2]:
-        bad = [s.name for s, flag in zip(stream.sensors, flags, strict=True) if flag & bit]
-        if bad and bit == STALE and staleness is not None:
-            found += _stuck(stream, flags, staleness)
-        elif bad:
-            found.append((level, f'{word}: {_named(bad)}'))
+        bad: dict[str, list[str]] = {}  # those of one reason together
+        for row in np.flatnonzero(past.flags & bit).tolist():
+            why = _why_stale(past.staleness, row) if bit == STALE else ''
+            bad.setdefault(why, []).append(stream.sensors[row].name)
+        found += [
+            (level, f'{word}: {named(names, MOST_NAMES)} {why}'.strip())
+            for why, names in bad.items()
+        ]
     return found
-
-
-def _stuck(stream: FluxStream, flags: np.ndarray, staleness: Staleness) -> list[tuple[Level, str]]:
-    """Name the stuck sensors, those of one reason together."""
-    names: dict[str, list[str]] = {}
-    for row in np.flatnonzero(flags & STALE).tolist():
-        names.setdefault(_why_stale(staleness, row), []).append(stream.sensors[row].name)
-    return [(Level.ERROR, f'stuck: {_named(bad)} {why}'.strip()) for why, bad in names.items()]
 
 
 def _why_stale(staleness: Staleness | None, row: int) -> str:
@@ -128,19 +108,18 @@ def emitter_statuses(coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame
     return statuses
 
 
-def sensor_statuses(
-    stream: FluxStream,
-    frame: FluxFrame,
-    flags: np.ndarray | None,
-    staleness: Staleness | None = None,
-) -> list[Status]:
+def sensor_statuses(stream: FluxStream, frame: FluxFrame, past: Interval) -> list[Status]:
     """Return state and noise of each sensor, by the flags since the last look."""
-    seen = frame.flags if flags is None or len(flags) != len(frame.flags) else flags
+    seen = past.flags
+    flags = frame.flags if seen is None or len(seen) != len(frame.flags) else seen
     statuses = []
     for row, sensor in enumerate(stream.sensors):
-        level, message = _sensor_state(
-            int(seen[row]), _why_stale(staleness or frame.staleness, row)
-        )
+        level, message = Level.OK, 'ok'
+        for bit, bad, word, usual in STATES:
+            if flags[row] & bit:
+                why = _why_stale(past.staleness or frame.staleness, row) if bit == STALE else ''
+                level, message = bad, ': '.join(filter(None, [word, why or usual]))
+                break
         values = {
             'channel': sensor.channel,
             'flux_rms_t': _rms(frame.window.flux[row]),
@@ -148,21 +127,6 @@ def sensor_statuses(
         }
         statuses.append(Status(sensor.name, level, message, values))
     return statuses
-
-
-def _sensor_state(flags: int, why_stale: str) -> tuple[Level, str]:
-    for bit, level, word, usual in STATES:
-        if flags & bit:
-            why = (why_stale if bit == STALE else '') or usual
-            return level, f'{word}: {why}' if why else word
-    return Level.OK, 'ok'
-
-
-def _named(names: Iterable[str]) -> str:
-    """The first few names, and how many more there are."""
-    known = list(names)
-    more = f' and {len(known) - MOST_NAMES} more' if len(known) > MOST_NAMES else ''
-    return ', '.join(known[:MOST_NAMES]) + more
 
 
 def _rms(values: np.ndarray) -> float:

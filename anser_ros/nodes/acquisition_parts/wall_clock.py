@@ -16,15 +16,7 @@ clock that is being slewed moves by 0.5 ms a second."""
 class WallClock:
     """Converts monotonic times to the system's time, which may be set while we run.
 
-    Parameters
-    ----------
-    wall_ns, monotonic_ns : callable
-        The two clocks, ns.
-
-    Attributes
-    ----------
-    sets : int
-        How often the system's clock was set.
+    ``sets`` counts how often that happened.
     """
 
     def __init__(

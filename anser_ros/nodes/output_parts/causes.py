@@ -4,7 +4,8 @@ A service answers with the same words, because both come from the node concerned
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+
+from anser_ros.nodes.runtime.diagnostics import LastStatus, named
 
 MOST_CAUSES = 4
 """Causes that are reported at once: what is behind all else is among the gravest."""
@@ -13,15 +14,7 @@ MOST_NAMES = 3
 MOST_TEXT = 160
 """Characters of a cause: two lines of a terminal."""
 LEAST_LOSS = 0.05
-"""Share of frames missing that is told: a rate counted over a second is off by a few percent."""
-
-
-class LastStatus(NamedTuple):
-    """Holds the last status of a node or of a part of it: level, words, figures by name."""
-
-    level: int
-    message: str
-    values: Mapping[str, str]
+"""Share of missing frames that is reported: a rate over a second is off by a few percent."""
 
 
 def causes(
@@ -29,14 +22,8 @@ def causes(
 ) -> list[str]:
     """Name what is wrong: nodes that complain, then sensors without pose, by their reasons.
 
-    Parameters
-    ----------
-    statuses : mapping
-        What was said last, by ``node`` or ``node: part``.
-    namespace : str
-        Of the nodes that are asked, without slashes around it.
-    flux_rate_hz : float
-        Frames a second that there should be; 0 where that is not known.
+    ``statuses`` has what was reported last, by ``node`` or ``node: part``; the namespace is
+    without slashes around it, and the rate of frames is 0 where it is not known.
     """
     found: list[tuple[int, str]] = []
     silent: dict[tuple[int, str], list[str]] = {}
@@ -50,7 +37,9 @@ def causes(
         elif short == 'tracker':
             silent.setdefault((-one.level, one.message), []).append(part)
     found.sort(key=lambda item: item[0])
-    reasons = [f'{words} ({_names(names)})' for (_, words), names in sorted(silent.items())]
+    reasons = [
+        f'{words} ({named(names, MOST_NAMES)})' for (_, words), names in sorted(silent.items())
+    ]
     texts = [words for _, words in found] + reasons
     return [_short(text) for text in texts[:MOST_CAUSES]]
 
@@ -63,11 +52,6 @@ def _loss(one: LastStatus, flux_rate_hz: float) -> str:
         return ''
     share = 1.0 - rate_hz / flux_rate_hz if flux_rate_hz > 0 else 0.0
     return f'; {share:.0%} of the frames are missing' if share > LEAST_LOSS else ''
-
-
-def _names(names: list[str]) -> str:
-    more = f' and {len(names) - MOST_NAMES} more' if len(names) > MOST_NAMES else ''
-    return ', '.join(names[:MOST_NAMES]) + more
 
 
 def _short(text: str) -> str:

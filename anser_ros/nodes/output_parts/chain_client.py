@@ -1,7 +1,7 @@
 """Asks the running nodes on behalf of the page: services, and which model file they have."""
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -11,7 +11,6 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import AnserError
-from anser_ros.nodes.output_parts.live_view import LiveView, known
 
 TRIGGERS = ('recorder/start', 'recorder/stop', 'field_model/set_baseline')
 MODEL_FILE, BASELINE_FILE = 'model_file', 'baseline_file'
@@ -30,20 +29,10 @@ class ChainError(AnserError):
 class ChainClient:
     """Reaches the nodes of a namespace, as `anser_ros.web.loop.Chain` has them.
 
-    Parameters
-    ----------
-    node : Node
-        Asks; its executor must be spinning in another thread than that of the page.
-    view : callable
-        Returns what is shown now, None before there is a setup.
-    mark : callable
-        Marks this moment, with a word, in the curves.
+    The node's executor must be spinning in another thread than that of the page.
     """
 
-    def __init__(
-        self, node: Node, view: Callable[[], LiveView | None], mark: Callable[[str], None]
-    ) -> None:
-        self._view, self.mark = view, mark
+    def __init__(self, node: Node) -> None:
         self._triggers = {name: node.create_client(Trigger, name) for name in TRIGGERS}
         self._getters = {
             name: node.create_client(GetParameters, f'{name}/get_parameters') for name in HOLDERS
@@ -59,10 +48,7 @@ class ChainClient:
     async def trigger(self, service: str) -> str:
         """Call a service without arguments and return its answer.
 
-        Raises
-        ------
-        ChainError
-            When no node offers it, answers in time, or when it refuses.
+        Raises `ChainError` when no node offers it, answers in time, or when it refuses.
         """
         answer = await _ask(self._triggers[service], Trigger.Request(), ANSWER_S)
         if not answer.success:
@@ -80,10 +66,7 @@ class ChainClient:
     async def load_model(self, files: Mapping[str, str]) -> None:
         """Give nodes other model files.
 
-        Raises
-        ------
-        ChainError
-            When one refuses; those before it have theirs already.
+        Raises `ChainError` when one refuses; those before it have theirs already.
         """
         for name, path in files.items():
             value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=path)
@@ -98,18 +81,6 @@ class ChainClient:
         """Return the recording without metal that ``field_model`` was started with."""
         getter = self._getters['field_model']
         return await _text_parameter(getter, BASELINE_FILE) if getter.service_is_ready() else ''
-
-    def figures(self, since_s: float) -> dict[str, float | None]:
-        """Return how well it goes, not before a time (of ``time.time``)."""
-        view = self._view()
-        if view is None:
-            return {}
-        found = view.figures(since_s)
-        return {
-            'tracked_percent': known(100.0 * found.tracked),
-            'error_mm': known(1e3 * found.error_m),
-            'residual_pt': known(1e12 * found.residual_t),
-        }
 
 
 async def _text_parameter(getter: Any, name: str) -> str:

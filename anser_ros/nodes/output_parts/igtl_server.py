@@ -102,9 +102,8 @@ class _Client:
         return self._tracking_s is not None and now_s >= self._due_s
 
     def put_tracking(self, data: bytes, now_s: float) -> None:
-        if self._tracking_s is not None and now_s >= self._due_s:
-            self._due_s = now_s + self._tracking_s
-            self.put(data)
+        self._due_s = now_s + (self._tracking_s or 0.0)
+        self.put(data)
 
     def end(self) -> None:
         with self._filled:
@@ -154,24 +153,9 @@ def _set_options(connection: socket.socket) -> None:
 class IgtlServer:
     """Listens on one address and sends to all who connect.
 
-    Parameters
-    ----------
-    host : str
-        Address to listen on.
-    port : int
-        TCP port; 0 for a free one.
-    answer : callable
-        Gives the reply to a request by its header; called by the threads of clients.
-
-    Attributes
-    ----------
-    refused : int
-        Connections closed because there were `MOST_CLIENTS` already.
-
-    Raises
-    ------
-    PortError
-        The address can't be listened on.
+    ``answer`` is called by the threads of clients; ``refused`` counts connections that were closed
+    because there were `MOST_CLIENTS` already. Port 0 stands for a free one. Raises `PortError`:
+    the address can't be listened on.
     """
 
     def __init__(self, host: str, port: int, answer: Answer) -> None:
@@ -211,15 +195,12 @@ class IgtlServer:
             for client in self._clients:
                 client.put(newer if newer and client.version > 1 else data)
 
-    def is_tracking_due(self, now_s: float) -> bool:
-        """Return whether a client wants TDATA by now, a monotonic time."""
+    def send_tracking(self, tracking: Callable[[], bytes], now_s: float) -> None:
+        """Queue a TDATA for the clients that want one by now; none is made for nobody."""
         with self._lock:
-            return any(client.is_due(now_s) for client in self._clients)
-
-    def send_tracking(self, data: bytes, now_s: float) -> None:
-        """Queue a TDATA for the clients that want one by now."""
-        with self._lock:
-            for client in self._clients:
+            due = [client for client in self._clients if client.is_due(now_s)]
+            data = tracking() if due else b''
+            for client in due:
                 client.put_tracking(data, now_s)
 
     def close(self) -> None:

@@ -5,19 +5,20 @@ import struct
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.nodes.output_parts.causes import LastStatus, causes
+from anser_ros.nodes.output_parts.causes import causes
 from anser_ros.nodes.output_parts.traces import (
     LONGEST_OPTICAL_GAP_S,
     OpticalTrace,
     latency_of,
+    middle,
     targets_of,
 )
+from anser_ros.nodes.runtime.diagnostics import LastStatus
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
@@ -38,10 +39,7 @@ POSE, COVARIANCE = 7, 36
 def read_pose(data: bytes) -> tuple[float, Array]:
     """Return stamp (s) and the numbers (7 or 43) of a serialised pose, with covariance or without.
 
-    Raises
-    ------
-    ValueError, struct.error
-        When the bytes are no such message.
+    Raises `ValueError`, `struct.error` when the bytes are no such message.
     """
     order = '<' if data[1] & 1 else '>'
     sec, nanosec, length = struct.unpack_from(f'{order}iII', data, 4)
@@ -53,53 +51,23 @@ def read_pose(data: bytes) -> tuple[float, Array]:
     return sec + 1e-9 * nanosec, np.frombuffer(data, f'{order}f8', count, offset).astype(float)
 
 
-@dataclass(frozen=True)
-class Figures:
-    """States how well it goes, over all coils and a stretch of time; NaN where nothing is known.
-
-    Attributes
-    ----------
-    tracked : mean share of frames with a pose
-    error_m : root mean square distance to the optical pose, of those with a pose
-    residual_t : root mean square residual of the fluxes, T, whether with a pose or without
-    seconds : the stretch
-    """
-
-    tracked: float
-    error_m: float
-    residual_t: float
-    seconds: float
-
-
 class LiveView:
     """Holds arrays of all targets, by their numbers.
 
-    Parameters
-    ----------
-    setup : Setup
-    namespace : str
-        Of the chain, without slashes around it.
-
-    Attributes
-    ----------
-    targets : list of Target
-        Tool coils first, then the bodies with several.
-    statuses : dict
-        What nodes said last, by ``node`` or ``node: part``.
+    ``statuses`` has what nodes reported last, by ``node`` or ``node: part``.
     """
 
-    def __init__(self, setup: Setup, namespace: str) -> None:
+    def __init__(
+        self, setup: Setup, namespace: str, statuses: dict[str, LastStatus] | None = None
+    ) -> None:
         self.setup, self.namespace = setup, namespace
+        self.statuses = {} if statuses is None else statuses
         self.targets = targets_of(setup)
         self.bodies = {target.body for target in self.targets}
-        self.statuses: dict[str, LastStatus] = {}
-        self._status_s: dict[str, float] = {}
         count = len(self.targets)
-        self._stamp_s = np.full(count, np.nan)
         self._received_s = np.full(count, -np.inf)
         self._pose = np.full((count, POSE), np.nan)
         self._covariance = np.full((count, 3, 3), np.nan)
-        self._number = {target.name: index for index, target in enumerate(self.targets)}
         self._optical = {body: OpticalTrace() for body in self.bodies}
         self._recent: list[tuple[int, float, Array]] = []
         self._came = np.zeros(count)
@@ -107,7 +75,8 @@ class LiveView:
         self._since_s = time.monotonic()
         self.rate_hz = np.zeros(count)
         self.latency_s = math.nan
-        self._error_m = np.full(count, np.nan)
+        # Distance to the optical pose at the last point, m; NaN where none is.
+        self.error_m = np.full(count, np.nan)
         self.points: deque[tuple[float, Array, Array, Array]] = deque(maxlen=HISTORY)
 
     # What comes in ------------------------------------------------------------------------
@@ -123,7 +92,7 @@ class LiveView:
         stamp_s, values = read_pose(newest)
         if not np.isfinite(values).all():
             raise ValueError('a pose is not finite')
-        self._stamp_s[number], self._pose[number] = stamp_s, values[:POSE]
+        self._pose[number] = values[:POSE]
         self._covariance[number] = values[POSE:].reshape(6, 6)[:3, :3]
         self._received_s[number] = time.monotonic()
         if sent_ns:
@@ -137,10 +106,6 @@ class LiveView:
             stamp_s, values = read_pose(data)
             trace.add(stamp_s, tuple(values[:3]), tuple(values[3:POSE]))
         trace.forget(OPTICAL_KEPT)
-
-    def take_status(self, name: str, status: LastStatus) -> None:
-        """Take the status of a node."""
-        self.statuses[name], self._status_s[name] = status, time.monotonic()
 
     # What is shown ------------------------------------------------------------------------
 
@@ -172,11 +137,6 @@ class LiveView:
         """Return the last status of a target from the tracker."""
         return self.statuses.get(f'{self.namespace}/tracker: {name}', LastStatus(1, 'waiting', {}))
 
-    def figure(self, node: str, key: str) -> float:
-        """Return a number that a node of the chain told, NaN where it did not."""
-        status = self.statuses.get(f'{self.namespace}/{node}')
-        return _number(status, key)
-
     def residual_t(self) -> Array:
         """Return the residual of every target's fluxes, T."""
         return np.array([_number(self.last_status(t.name), 'residual_t') for t in self.targets])
@@ -196,11 +156,7 @@ class LiveView:
         """Return the causes of what the statuses report."""
         return causes(self.statuses, self.namespace, self.setup.flux_rate_hz)
 
-    def silent_s(self, name: str) -> float:
-        """Return the time since something was said under a name, s."""
-        return time.monotonic() - self._status_s.get(name, -math.inf)
-
-    def add_point(self) -> tuple[float, Array, Array, Array]:
+    def add_point(self) -> None:
         """Work out rates, and the next point of the curves: time, error, residual, tracked."""
         now_s = time.monotonic()
         elapsed_s = max(now_s - self._since_s, 1e-3)
@@ -209,15 +165,8 @@ class LiveView:
         if self._latency_s:
             self.latency_s = float(np.median(self._latency_s))
             self._latency_s = []
-        self._error_m = self._errors()
-        point = time.time(), self._error_m, self.residual_t(), self.tracked()
-        self.points.append(point)
-        return point
-
-    @property
-    def error_m(self) -> Array:
-        """Return the distance to the optical pose at the last point, m; NaN where none is."""
-        return self._error_m
+        self.error_m = self._errors()
+        self.points.append((time.time(), self.error_m, self.residual_t(), self.tracked()))
 
     def _errors(self) -> Array:
         """Root mean square distance of the last poses from the optical ones, m."""
@@ -241,30 +190,27 @@ class LiveView:
         return np.sqrt(np.divide(squares, counts, out=np.full_like(squares, np.nan),
                                  where=counts > 0))  # fmt: skip
 
-    def figures(self, since_s: float = -math.inf) -> Figures:
-        """Return how well it went lately, not before a time (of ``time.time``)."""
+    def figures(self, since_s: float = -math.inf) -> dict[str, float | None]:
+        """Return how well it went lately, not before a time (of ``time.time``), over all coils.
+
+        These are the mean share of frames with a pose, the root mean square distance of poses from
+        the optical ones, and that of all fluxes from the model.
+        """
         begin_s = max(since_s, time.time() - WINDOW_S)
-        points = [point for point in self.points if point[0] >= begin_s]
-        if not points:
-            return Figures(math.nan, math.nan, math.nan, 0.0)
+        points = [point[1:] for point in self.points if point[0] >= begin_s]
         coils = len(self.setup.tool_sensors)
-        error, residual, tracked = (
-            np.array(values)[:, :coils] for values in list(zip(*points, strict=True))[1:]
-        )
-        return Figures(
-            _middle(tracked, np.mean), _middle(error, _rms), _middle(residual, _rms),
-            points[-1][0] - points[0][0],
-        )  # fmt: skip
+        columns = zip(*points, strict=True) if points else ((),) * 3
+        error, residual, tracked = (np.array(values)[..., :coils] for values in columns)
+        return {
+            'tracked_percent': known(100.0 * middle(tracked, np.mean)),
+            'error_mm': known(1e3 * middle(error, _rms)),
+            'residual_pt': known(1e12 * middle(residual, _rms)),
+        }
 
 
 def known(value: float, digits: int = 3) -> float | None:
     """Return a number as a page takes it: rounded, None where it is not known."""
     return round(float(value), digits) if math.isfinite(value) else None
-
-
-def _middle(values: Array, of: Any) -> float:
-    known = values[np.isfinite(values)]
-    return float(of(known)) if known.size else math.nan
 
 
 def _rms(values: Array) -> float:

@@ -12,6 +12,7 @@ from rclpy.qos import QoSProfile
 
 from anser_ros.errors import LayoutError
 from anser_ros.nodes.runtime import incoming
+from anser_ros.nodes.streams.newest_frame import take_waiting
 
 STREAMS = '_streams'
 """What the name of the node that is polled has behind that of its process."""
@@ -28,12 +29,7 @@ def polling_node(name: str, namespace: str) -> Node:
 class Polled:
     """Subscribes to a topic whose messages are taken when asked for.
 
-    Parameters
-    ----------
-    node : Node
-        That of `polling_node`.
-    message_type, topic, profile
-        As of ``create_subscription``; the profile's depth is how many messages are kept.
+    The profile's depth is how many messages are kept. The node is that of `polling_node`.
     """
 
     def __init__(self, node: Node, message_type: type, topic: str, profile: QoSProfile) -> None:
@@ -44,15 +40,10 @@ class Polled:
 
     def take(self) -> list[tuple[bytes, dict[str, int]]]:
         """Return what has come since the last time, serialised, the oldest first."""
-        taken = []
-        handle = self._subscription.handle
-        with handle:
-            while (item := handle.take_message(self._type, True)) is not None:
-                taken.append(item)
-        return taken
+        return take_waiting(self._subscription)
 
     def messages(self, refused: Callable[[str], None]) -> list[Any]:
-        """Return what has come as messages; of what is too large ``refused`` is told."""
+        """Return what has come as messages; ``refused`` gets what is wrong with the others."""
         found = []
         for data, _ in self.take():
             try:

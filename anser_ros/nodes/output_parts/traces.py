@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +25,19 @@ def latency_of(now_s: float, stamp_s: float) -> float:
     return age_s if abs(age_s) < LIVE_WITHIN_S else float('nan')
 
 
+def middle(values: Sequence[float] | Array, of: Callable[[Array], Any] = np.median) -> float:
+    """Return the median of what is finite, or another figure of it; NaN where nothing is."""
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    return float(of(known)) if known.size else float('nan')
+
+
 @dataclass(frozen=True)
 class Target:
     """Names a sensor or a body that is tracked.
 
-    Attributes
-    ----------
-    name, body : its own name and that of the body that it sits on
-    position_m, axis : in the body's frame; a body's own axis is its z
+    ``position_m`` and ``axis`` are in the frame of the body that it sits on; a body's own axis is
+    z.
     """
 
     name: str
@@ -87,11 +93,7 @@ class OpticalTrace:
 class PoseTrace:
     """Keeps poses of one target by one tracker.
 
-    Attributes
-    ----------
-    target : what is tracked
-    stamp_s, sigma_m, latency_s : a value per pose; latency from the middle of the window
-    position, axis : three values per pose
+    Every list has an item per pose; latency is counted from the middle of the window.
     """
 
     target: Target
@@ -120,12 +122,8 @@ class PoseTrace:
 class Row:
     """Holds the newest of one target, for a table.
 
-    Attributes
-    ----------
-    name : of the target
-    position_m : NaN when nothing came lately
-    error_m, latency_s, sigma_m : medians of the poses of the interval, NaN without any
-    rate_hz : poses a second of the interval
+    Error, latency and sigma are medians over the interval, NaN without a pose in it, and so is the
+    place.
     """
 
     name: str
@@ -157,20 +155,15 @@ class Traces:
             if count and track is not None:
                 # the last poses may be newer than the last optical one
                 away = trace.errors(track, max(0, since - 5))[0]
-                known = away[np.isfinite(away)]
-                error = float(np.median(known)) if known.size else error
+                error = middle(away)
             rows.append(
                 Row(
                     name,
                     trace.position[-1] if count else (float('nan'),) * 3,
-                    _median(trace.sigma_m[since:]),
+                    middle(trace.sigma_m[since:]),
                     error,
                     count / elapsed_s,
-                    _median(trace.latency_s[since:]),
+                    middle(trace.latency_s[since:]),
                 )
             )
         return rows
-
-
-def _median(values: list[float]) -> float:
-    return float(np.median(values)) if values else float('nan')

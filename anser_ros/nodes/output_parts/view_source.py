@@ -16,11 +16,11 @@ from rclpy.serialization import deserialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
 from anser_ros.errors import AnserError
-from anser_ros.nodes.output_parts.causes import LastStatus
 from anser_ros.nodes.output_parts.live_view import LiveView, known
 from anser_ros.nodes.output_parts.polled import STREAMS, Polled
 from anser_ros.nodes.output_parts.processor import Processor
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
 from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import parse_setup, topic_of
 
@@ -43,25 +43,8 @@ COIL_M = 0.07
 class ViewSource:
     """Shows the graph to the page, as `anser_ros.web.page.ShownGraph` has it.
 
-    Parameters
-    ----------
-    node : Node
-        That of `polling_node`.
-    optical : str
-        Namespace of the optical poses.
-    refused : callable
-        Called for what can't be read.
-    is_there : callable
-        Whether somebody offers a service.
-
-    Attributes
-    ----------
-    setup_text : str
-        The setup document that came last; another thread may put it there.
-    view : LiveView or None
-        What is shown of it.
-    version : int
-        Changes with the view.
+    ``refused`` is called for what can't be read. ``setup_text`` is the setup document that came
+    last, which another thread may put there; ``version`` changes with the view.
     """
 
     def __init__(
@@ -83,6 +66,7 @@ class ViewSource:
         self._poses: list[Polled] = []
         self._optical: dict[str, Polled] = {}
         self._statuses: dict[str, LastStatus] = {}
+        self._status_s: dict[str, float] = {}
         self._balls: list[list[float]] = []
         self._marks: deque[tuple[float, str]] = deque(maxlen=MOST_MARKS)
         self._processor = Processor()
@@ -90,6 +74,10 @@ class ViewSource:
     def mark(self, words: str) -> None:
         """Mark this moment in the curves."""
         self._marks.append((time.time(), words))
+
+    def figures(self, since_s: float) -> dict[str, float | None]:
+        """Return how well it goes, not before a time (of ``time.time``)."""
+        return {} if self.view is None else self.view.figures(since_s)
 
     # What comes in ------------------------------------------------------------------------
 
@@ -125,9 +113,7 @@ class ViewSource:
             return
         for polled in (*self._poses, *self._optical.values()):
             polled.close()
-        view = LiveView(setup, self.namespace)
-        for name, status in self._statuses.items():
-            view.take_status(name, status)
+        view = LiveView(setup, self.namespace, self._statuses)
         self._poses = [
             Polled(self._node, PoseWithCovarianceStamped,
                    f'{topic_of(target.name)}/pose_with_covariance', NEWEST)
@@ -140,17 +126,13 @@ class ViewSource:
         self.view, self.version = view, self.version + 1
 
     def _take_statuses(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            is_ours = status.name.startswith(f'{self.namespace}/')
-            if not is_ours or (
-                status.name not in self._statuses and len(self._statuses) >= MOST_STATUSES
-            ):
-                continue
-            values = {pair.key: pair.value for pair in status.values}
-            latest = LastStatus(status.level[0], status.message, values)
-            self._statuses[status.name] = latest
-            if self.view is not None:
-                self.view.take_status(status.name, latest)
+        for name, latest in statuses_in(message).items():
+            is_known = name in self._statuses or len(self._statuses) < MOST_STATUSES
+            if name.startswith(f'{self.namespace}/') and is_known:
+                self._statuses[name], self._status_s[name] = latest, time.monotonic()
+
+    def _is_silent(self, name: str) -> bool:
+        return time.monotonic() - self._status_s[name] > SILENT_S
 
     def add_point(self) -> None:
         """Take the next point of the curves, and see where the metal is."""
@@ -243,29 +225,29 @@ class ViewSource:
             'rate': f'{sorted(rates)[len(rates) // 2]:.0f}' if len(rates) else '0',
             'latency': '–' if math.isnan(view.latency_s) else f'{1e3 * view.latency_s:.1f} ms',
             'why': view.reasons(),
-            'nodes': self._nodes(view),
-            'findings': self._findings(view),
+            'nodes': self._nodes(),
+            'findings': self._findings(),
             'recording': _recording(recorder) if recorder and is_recording else '',
         }
 
-    def _nodes(self, view: LiveView) -> list[tuple[str, int, str]]:
+    def _nodes(self) -> list[tuple[str, int, str]]:
         found = []
         for name, status in self._statuses.items():
             home, _, short = name.rpartition('/')
             if home == self.namespace and ':' not in name and name not in self._own:
-                if view.silent_s(name) > SILENT_S:
+                if self._is_silent(name):
                     status = LastStatus(3, 'silent', {})
                 found.append((short, status.level, status.message))
         return sorted(found)
 
-    def _findings(self, view: LiveView) -> list[tuple[int, str]]:
+    def _findings(self) -> list[tuple[int, str]]:
         name = f'{self.namespace}/watcher'
-        if name not in self._statuses or view.silent_s(name) > SILENT_S:
+        if name not in self._statuses or self._is_silent(name):
             return [(1, 'no watcher runs')]
         parts = [
             (status.level, f'{part.partition(": ")[2]}: {status.message}')
             for part, status in self._statuses.items()
-            if part.startswith(f'{name}: ') and view.silent_s(part) <= SILENT_S
+            if part.startswith(f'{name}: ') and not self._is_silent(part)
         ]
         own = self._statuses[name]
         return [(own.level, own.message), *parts]

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -27,15 +28,8 @@ class Level(IntEnum):
 class Status:
     """Holds one line of ``/diagnostics``.
 
-    Attributes
-    ----------
-    name : str
-        What it is about, such as ``tool_a/0/x``; empty for the node itself.
-    level : Level
-    message : str
-        The state or the reason, one line.
-    values : mapping
-        Figures by name; the unit stands in the name.
+    ``name`` is what it is about, such as ``tool_a/0/x``, and empty for the node itself; in
+    ``values`` the unit stands in the name.
     """
 
     name: str
@@ -66,14 +60,33 @@ def diagnostic_array(node: str, statuses: Iterable[Status], stamp: Time) -> Diag
     return message
 
 
-class Trouble:
-    """Remembers what went wrong last, and whether that is still news.
+class LastStatus(NamedTuple):
+    """Holds what a node reported last of itself or of a part of it."""
 
-    Parameters
-    ----------
-    held_s : float
-        How long it is news.
-    """
+    level: int
+    message: str
+    values: Mapping[str, str]
+
+
+def statuses_in(message: DiagnosticArray) -> dict[str, LastStatus]:
+    """Return the statuses of a message by ``node`` or ``node: part``."""
+    return {
+        one.name: LastStatus(
+            one.level[0], one.message, {pair.key: pair.value for pair in one.values}
+        )
+        for one in message.status
+    }
+
+
+def named(names: Iterable[str], most: int) -> str:
+    """Return the first few names, and how many more there are."""
+    known = list(names)
+    more = f' and {len(known) - most} more' if len(known) > most else ''
+    return ', '.join(known[:most]) + more
+
+
+class Trouble:
+    """Remembers what went wrong last, and whether that is still news."""
 
     def __init__(self, held_s: float = TROUBLE_HELD_S) -> None:
         self._held_s = held_s
@@ -94,13 +107,7 @@ class Trouble:
 
 
 class Throttle:
-    """Lets the first warning of a kind through whole, and the rest at most once a period.
-
-    Parameters
-    ----------
-    period_s : float
-        Least time between two warnings of one kind.
-    """
+    """Lets the first warning of a kind through whole, and the rest at most once a period."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
@@ -110,14 +117,7 @@ class Throttle:
     def admit(self, kind: str, text: str, now_s: float) -> str | None:
         """Return the text to log now, or None when this one is held back.
 
-        Parameters
-        ----------
-        kind : str
-            Warnings of one kind are throttled together.
-        text : str
-            The whole warning.
-        now_s : float
-            Monotonic time.
+        Warnings of one kind are throttled together; times are monotonic.
         """
         last_s = self._last_s.get(kind)
         if last_s is not None and now_s - last_s < self._period_s:

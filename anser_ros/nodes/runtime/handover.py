@@ -47,10 +47,7 @@ class DirectSubscription:
 class NewestWorker:
     """Processes the newest object handed over in a thread, so that the sender need not wait.
 
-    Parameters
-    ----------
-    skipped : callable
-        Called for each object that a newer one of its topic has replaced.
+    ``skipped`` is called for each object that a newer one of its topic has replaced.
     """
 
     def __init__(self, skipped: Callable[[], object]) -> None:

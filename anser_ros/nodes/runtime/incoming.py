@@ -8,6 +8,7 @@ what arrives is taken as bytes, and their number, and the sizes that they state,
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Pose
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
@@ -36,10 +37,7 @@ def is_bounded(message_type: type) -> bool:
 def opened(data: bytes, message_type: type) -> Any:
     """Return the message that serialised bytes hold.
 
-    Raises
-    ------
-    LayoutError
-        When there are more bytes, points or fields than a sensible message has.
+    Raises `LayoutError` when there are more bytes, points or fields than a sensible message has.
     """
     most = MOST_BYTES[message_type]
     if len(data) > most:
@@ -52,3 +50,15 @@ def opened(data: bytes, message_type: type) -> Any:
                 f'the most is {MOST_POINTS} with {MOST_FIELDS}'
             )
     return deserialize_message(data, message_type)
+
+
+def pose_numbers(pose: Pose) -> tuple[float, float, float, float, float, float, float]:
+    """Return the position, m, and the quaternion x, y, z, w of a pose."""
+    p, q = pose.position, pose.orientation
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+def seconds_of(message: Any) -> float:
+    """Return the header stamp of a message, s."""
+    stamp = message.header.stamp
+    return float(stamp.sec + 1e-9 * stamp.nanosec)

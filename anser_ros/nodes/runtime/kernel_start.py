@@ -19,16 +19,9 @@ def wait_for_kernels(say: Callable[[str], None]) -> str:
 
     Of nodes that start together one process compiles, and the others wait for it.
 
-    Parameters
-    ----------
-    say : callable
-        Gets a line at once and every second, none where all kernels are there.
-
-    Returns
-    -------
-    str
-        Why it failed, empty when all is there. The node may go on all the same: it then compiles
-        what it needs when it needs it.
+    ``say`` gets a line at once and every second, none where all kernels are there. What is
+    returned is why it failed, empty when all is there: the node may go on all the same, and then
+    compiles what it needs when it needs it.
     """
     cache = KernelCache(folder_of(fill_frame))
     if cache.is_full:

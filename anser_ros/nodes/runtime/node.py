@@ -39,7 +39,6 @@ from anser_ros.errors import AnserError
 from anser_ros.nodes.runtime import incoming, parameters, qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status, Throttle, diagnostic_array
 from anser_ros.nodes.runtime.handover import DirectSubscription, Handover, NewestWorker
-from anser_ros.nodes.runtime.process import main
 
 Callback = Callable[..., Any]
 
@@ -64,23 +63,17 @@ class NoParameters:
 class AnserNode(Node):
     """Gives all nodes their parameters, diagnostics and guarded callbacks.
 
+    ``beside`` are the other nodes of the process: values that are given to all of them may be
+    meant for one.
+
     Attributes
     ----------
     parameters : instance of ``PARAMETERS``
-        The values in force, frozen; a change that is allowed swaps the whole instance.
+        The present values, frozen; a change that is allowed swaps the whole instance.
     counters : collections.Counter
         Events by name; all of them are shown in ``/diagnostics``.
     exit_code : int or None
         What the process ends with once :meth:`stop` was called.
-
-    Parameters
-    ----------
-    handover : Handover, optional
-        What nodes of the same process give each other directly.
-    beside : sequence of type, optional
-        The other nodes of the process: values that are given to all of them may be meant for one.
-    **options : object
-        As `rclpy.node.Node` takes them.
     """
 
     NAME: ClassVar[str]
@@ -118,7 +111,7 @@ class AnserNode(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.EVENTS)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._speak = self._guard(self._in_turn(self.publish_diagnostics, LONGEST_TURN_S))
+        self._report = self._guard(self._in_turn(self.publish_diagnostics, LONGEST_TURN_S))
         timer = self._guard(self._diagnostics_due)
         super().create_timer(DIAGNOSTICS_PERIOD_S, timer, clock=self.steady_clock)
         if self.HAS_KERNELS:
@@ -205,14 +198,14 @@ class AnserNode(Node):
 
     def _diagnostics_due(self) -> None:
         """Publish them in the next pause between two frames, where there are such."""
-        if self._handover is None or not self._handover.defer(self._speak_if_free):
-            self._speak()
+        if self._handover is None or not self._handover.defer(self._report_if_free):
+            self._report()
 
-    def _speak_if_free(self) -> bool:
+    def _report_if_free(self) -> bool:
         is_free = bool(self._turn.acquire(blocking=False))
         if is_free:
             try:
-                self._speak()
+                self._report()
             finally:
                 self._turn.release()
         return is_free
@@ -407,4 +400,4 @@ def _failed(response: Any, reason: str) -> Any:
     return response
 
 
-__all__ = ['AnserNode', 'Level', 'Status', 'main']
+__all__ = ['AnserNode', 'Level', 'Status']

@@ -37,13 +37,6 @@ def complaints(arguments: Sequence[str], node: str) -> list[str]:
 
     rclpy ignores such a file silently, and the node runs with its defaults. A file that is not a
     parameter file is left to rclpy, which refuses it.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        The process's arguments.
-    node : str
-        The node's name.
     """
     found = []
     for value, document in _documents(arguments):
@@ -68,13 +61,8 @@ def names_for(arguments: Sequence[str], node: str) -> Iterator[str]:
 def checked(name: str, nodes: Collection[str]) -> str:
     """Return the path of a parameter file for several nodes: a path, or a file of `config/`.
 
-    Raises
-    ------
-    SetupError
-        There is no such file.
-    ParameterError
-        It is no YAML, holds no section, or one whose node is not among ``nodes``: all would start
-        with their defaults then.
+    Raises `SetupError`: there is no such file, and `ParameterError`: it is no YAML, holds no
+    section, or one whose node is not among ``nodes``: all would start with their defaults then.
     """
     path = str(config_path(name))
     try:

@@ -11,7 +11,7 @@ The node declares it, ``--help`` prints it, and an instance of it is what the no
 import dataclasses
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from anser_ros.errors import ParameterError
@@ -90,10 +90,8 @@ def types(table: type) -> dict[str, Any]:
 def build(table: type, values: Mapping[str, Any]) -> Any:
     """Return a table's instance from values of the ROS graph, a file or a command line.
 
-    Raises
-    ------
-    ParameterError
-        A name that the table does not have, a value of the wrong type, or one out of its range.
+    Raises `ParameterError`: a name that the table does not have, a value of the wrong type, or one
+    out of its range.
     """
     known = types(table)
     unknown = sorted(set(values) - set(known))
@@ -101,29 +99,23 @@ def build(table: type, values: Mapping[str, Any]) -> Any:
         raise ParameterError(
             f'no parameter {", ".join(unknown)}; there are: {", ".join(known) or "none"}'
         )
-    checked = {name: check(name, known[name], rules(table)[name], values[name]) for name in values}
+    checked = {
+        name: _check(name, known[name], rules(table)[name], values[name]) for name in values
+    }
     return table(**checked)
 
 
-def check(name: str, kind: Any, rule: Rule, value: Any) -> Any:
-    """Return one value in the type of its field.
+def _check(name: str, kind: Any, rule: Rule, value: Any) -> Any:
+    """One value in the type of its field.
 
     A whole number will do for a float: a YAML file that says ``rate_hz: 25`` is right.
-
-    Raises
-    ------
-    ParameterError
-        The value has another type, or breaks the parameter's rule.
     """
-    if kind in LIST_ITEMS:
-        if isinstance(value, str | bytes) and len(value):
-            raise ParameterError(f'parameter {name}: {value!r} is not a list')
-        try:
-            items = list(value)
-        except TypeError:
-            raise ParameterError(f'parameter {name}: {value!r} is not a list') from None
-        return tuple(_check_scalar(name, LIST_ITEMS[kind], rule, item) for item in items)
-    return _check_scalar(name, kind, rule, value)
+    if kind not in LIST_ITEMS:
+        return _check_scalar(name, kind, rule, value)
+    is_text = isinstance(value, str | bytes) and len(value) > 0
+    if is_text or not isinstance(value, Iterable):
+        raise ParameterError(f'parameter {name}: {value!r} is not a list')
+    return tuple(_check_scalar(name, LIST_ITEMS[kind], rule, item) for item in value)
 
 
 def _check_scalar(name: str, kind: type[Any], rule: Rule, value: Any) -> Any:

@@ -10,7 +10,7 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
@@ -19,14 +19,13 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, ParameterError
-from anser_ros.nodes.runtime import parameter_files, parameters
+from anser_ros.nodes.runtime import parameters
 from anser_ros.nodes.runtime.allocator import keep_in_one_piece
 from anser_ros.nodes.runtime.handover import Handover
+from anser_ros.nodes.runtime.node import AnserNode
+from anser_ros.nodes.runtime.parameter_files import complaints, names_for
 from anser_ros.one_line_parser import OneLineParser
 from anser_ros.wire.config_folder import config_path
-
-if TYPE_CHECKING:
-    from anser_ros.nodes.runtime.node import AnserNode
 
 # How long a signal may go unnoticed by an idle node.
 SPIN_SLICE_S = 0.1
@@ -47,25 +46,15 @@ RENAMING = ('__node:=', '__name:=')
 
 
 def main(
-    node_class: 'type[AnserNode] | Sequence[type[AnserNode]]',
+    node_class: type[AnserNode] | Sequence[type[AnserNode]],
     argv: Sequence[str] | None = None,
     name: str = '',
 ) -> int:
     """Run nodes until one of them ends, or until SIGINT or SIGTERM.
 
-    Parameters
-    ----------
-    node_class : type, or sequence of types
-        The node; or several that hand their frames over to each other, in the order of the chain.
-    argv : sequence of str, optional
-        The command line; that of the process by default.
-    name : str, optional
-        How the process is called, where it is not called like its node.
-
-    Returns
-    -------
-    int
-        0 ended as asked; 2 a wrong argument or parameter, reported in one line; 1 a defect.
+    Several classes, in the order of the chain, hand their frames over to each other; the process
+    then needs a name of its own. The exit code is 0 where it ended as asked, 2 for a wrong
+    argument or parameter, reported in one line, and 1 for a defect.
     """
     arguments = list(sys.argv if argv is None else argv)
     classes = tuple(node_class) if isinstance(node_class, Sequence) else (node_class,)
@@ -110,19 +99,15 @@ def _without_ros(arguments: Sequence[str]) -> list[str]:
 
 
 def _parse(
-    name: str, classes: 'Sequence[type[AnserNode]]', arguments: Sequence[str]
+    name: str, classes: Sequence[type[AnserNode]], arguments: Sequence[str]
 ) -> dict[str, Any]:
     module = classes[0].__module__ if len(classes) == 1 else '__main__'
     summary = (sys.modules[module].__doc__ or '').strip().split('\n')[0]
-    tables = [(node.NAME, parameters.describe(node.PARAMETERS)) for node in classes]
-    prefix = '' if len(classes) == 1 else 'NODE:'
-    if prefix:
-        table = '\n'.join(f'{node}:\n{table}' for node, table in tables)
-    else:
-        table = tables[0][1]
-    example = classes[0].EXAMPLE
-    if prefix:
-        example = example.replace('-p ', f'-p {classes[0].NAME}:')
+    tables = {node.NAME: parameters.describe(node.PARAMETERS) for node in classes}
+    prefix, example, (table, *_) = '', classes[0].EXAMPLE, tables.values()
+    if len(classes) > 1:
+        prefix, example = 'NODE:', example.replace('-p ', f'-p {classes[0].NAME}:')
+        table = '\n'.join(f'{node}:\n{text}' for node, text in tables.items())
     parser = OneLineParser(
         prog=f'anser {name}',
         description=summary,
@@ -136,7 +121,7 @@ def _parse(
 
 
 def _meant_for(
-    classes: 'Sequence[type[AnserNode]]', arguments: Sequence[str]
+    classes: Sequence[type[AnserNode]], arguments: Sequence[str]
 ) -> tuple[list[str], dict[str, list[str]]]:
     """Split off the parameters of one node among several, ``-p NODE:NAME:=VALUE``.
 
@@ -156,7 +141,7 @@ def _meant_for(
     return common, meant
 
 
-def _check_known(classes: 'Sequence[type[AnserNode]]', node: str, name: str) -> None:
+def _check_known(classes: Sequence[type[AnserNode]], node: str, name: str) -> None:
     """Refuse a value for one node among several that another one of them knows, or none."""
     owners = [c.NAME for c in classes if parameters.is_known(c.PARAMETERS, name)]
     if node not in owners:
@@ -227,7 +212,7 @@ class _Signals:
 
 
 def make_executor() -> Executor:
-    """Return the executor of a node: one thread, told of events where rclpy can do that.
+    """Return the executor of a node: one thread, called for events where rclpy can do that.
 
     With a dozen topics the waiting of the older one, which looks through all entities for every
     message, costs several times what is done with the message. Jazzy has both since rclpy 7.1.4.
@@ -240,7 +225,7 @@ def make_executor() -> Executor:
 
 
 def _run(
-    classes: 'Sequence[type[AnserNode]]',
+    classes: Sequence[type[AnserNode]],
     own: dict[str, Any],
     arguments: Sequence[str],
     meant: dict[str, list[str]],
@@ -288,19 +273,17 @@ def _run(
     return code
 
 
-def _complain(nodes: 'Sequence[AnserNode]', arguments: Sequence[str]) -> None:
+def _complain(nodes: Sequence[AnserNode], arguments: Sequence[str]) -> None:
     """Warn of parameter files that say nothing to any of the nodes.
 
-    Raises
-    ------
-    ParameterError
-        When the section of one node among several has a value that it does not know.
+    Raises `ParameterError` when the section of one node among several has a value that it does not
+    know.
     """
     for node in nodes if len(nodes) > 1 else ():
-        for name in parameter_files.names_for(arguments, node.get_name()):
+        for name in names_for(arguments, node.get_name()):
             if not parameters.is_known(node.PARAMETERS, name):
                 raise ParameterError(f'{node.get_name()} has no parameter {name}')
-    refusals = [parameter_files.complaints(arguments, node.get_name()) for node in nodes]
+    refusals = [complaints(arguments, node.get_name()) for node in nodes]
     if all(refusals):
         for text in refusals[-1]:
             nodes[-1].get_logger().warning(text)

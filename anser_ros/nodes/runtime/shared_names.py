@@ -9,6 +9,9 @@ from typing import Any
 from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.wire.pose_topics import OPTICAL, TRACKED
 
+STALE_AFTER_S = 0.3
+"""Time without fluxes, or poses, s, after which a sensor is stale, unless parameters differ."""
+
 
 def optical_parameter() -> Any:
     """Return the parameter of a node that has to do with optical poses."""

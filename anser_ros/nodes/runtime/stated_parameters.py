@@ -22,10 +22,7 @@ def stated(name: str) -> Any:
 def stated_by(table: Any) -> dict[str, float]:
     """Return the values that a node's parameters state, without those that are 0.
 
-    Raises
-    ------
-    ParameterError
-        When a value is out of its range.
+    Raises `ParameterError` when a value is out of its range.
     """
     names = [field.name for field in dataclasses.fields(table) if field.name in VALUES]
     values = {name: getattr(table, name) for name in names if getattr(table, name) != 0}

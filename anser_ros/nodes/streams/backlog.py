@@ -21,40 +21,21 @@ MEMORY = 25
 """Messages that typical figures are taken of, so that a few slow ones say nothing."""
 FEWEST_MESSAGES = 10
 """Messages that must have been worked on before a backlog is judged: the first ones are slow."""
-
 MOST_LEFT_OUT = 2
 """Frames in a row that are left out by what gives way to newer ones. Fewer, and poses of a
 computer that is a tenth too slow fall behind; more, and the model is older than metal in a hand
 allows."""
 
 
-class Deference:
-    """Decides which frames are left out by work that can wait, while newer frames wait already."""
-
-    def __init__(self) -> None:
-        self._left_out = 0
-
-    def gives_way(self, age_s: float, rate_hz: float) -> bool:
-        """Return whether to leave a frame out that is so old, s, of so many a second."""
-        is_behind = age_s * rate_hz > 1.0 and self._left_out < MOST_LEFT_OUT
-        self._left_out = self._left_out + 1 if is_behind else 0
-        return is_behind
-
-
 class Backlog:
-    """Estimates the typical spacing of messages, and the time that each takes.
-
-    Parameters
-    ----------
-    spacing_s : float, optional
-        The spacing, s, where it is known.
-    """
+    """Estimates the typical spacing of messages, and the time that each takes."""
 
     def __init__(self, spacing_s: float | None = None) -> None:
         known = () if spacing_s is None else (spacing_s,)
         self._spacing_s: deque[float] = deque(known, maxlen=MEMORY)
         self._work_s: deque[float] = deque(maxlen=MEMORY)
         self._last = (0, 0)
+        self._left_out = 0
 
     def arrived(self, received_ns: int, stamp_ns: int) -> None:
         """Note when the middleware received the message that is worked on next, and its stamp.
@@ -78,3 +59,10 @@ class Backlog:
             return False
         share = work_s / max(spacing_s, 1e-9)
         return share >= 1.0 or age_s * share / (1.0 - share) > CATCH_UP_S
+
+    def gives_way(self, age_s: float) -> bool:
+        """Return whether to leave out, of a frame so old, work that can wait for newer ones."""
+        behind = bool(self._spacing_s) and age_s > median(self._spacing_s)
+        is_left_out = behind and self._left_out < MOST_LEFT_OUT
+        self._left_out = self._left_out + 1 if is_left_out else 0
+        return is_left_out

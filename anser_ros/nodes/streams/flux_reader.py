@@ -8,30 +8,9 @@ from sensor_msgs.msg import PointCloud2
 from anser_ros.errors import LayoutError
 from anser_ros.frames.intake import Count
 from anser_ros.nodes.runtime.handover import HandedFlux
-from anser_ros.nodes.streams.model_clouds import layout_of, width_of
+from anser_ros.nodes.streams.clouds import layout_of, width_of
 from anser_ros.stamps import SECOND_NS, stamp_of
 from anser_ros.wire.points import FluxPoints, decode_flux
-
-
-def read_flux(message: PointCloud2) -> tuple[int, FluxPoints]:
-    """Return the stamp (ns) and points of a flux message.
-
-    Raises
-    ------
-    LayoutError
-        When the stamp is zero or none, or the cloud is no flux cloud.
-    """
-    if message.header.stamp.nanosec >= SECOND_NS:
-        raise LayoutError(
-            f'the stamp has {message.header.stamp.nanosec} nanoseconds, a second or more'
-        )
-    stamp_ns = stamp_of(message)
-    if stamp_ns <= 0:
-        raise LayoutError('the flux message has no stamp')
-    width = width_of(message)
-    return stamp_ns, decode_flux(
-        layout_of(message), message.point_step, width, message.data, bool(message.is_bigendian)
-    )
 
 
 def read_frame(
@@ -39,19 +18,8 @@ def read_frame(
 ) -> tuple[int, FluxPoints]:
     """Read a flux message that must be in a frame; its peculiarities are counted.
 
-    Parameters
-    ----------
-    message : PointCloud2, or HandedFlux where it has been handed over within the process
-    frame_id : str
-        The setup's frame.
-    count : callable
-        Gets a counter's name, and by how much it rises: ``fluxes_big_endian``,
-        ``fluxes_other_frame_id``, ``fluxes_without_stamp``.
-
-    Raises
-    ------
-    LayoutError
-        When it is in another frame, has no stamp, or is no flux cloud.
+    The counters are ``fluxes_big_endian``, ``fluxes_other_frame_id``, ``fluxes_without_stamp``.
+    Raises `LayoutError` when it is in another frame, has no stamp, or is no flux cloud.
     """
     given_id = message.frame_id if isinstance(message, HandedFlux) else message.header.frame_id
     if given_id != frame_id:
@@ -61,6 +29,14 @@ def read_frame(
         return message.stamp_ns, message.points
     if message.is_bigendian:
         count('fluxes_big_endian', 1)
-    if stamp_of(message) <= 0 or message.header.stamp.nanosec >= SECOND_NS:
+    stamp_ns, nanosec = stamp_of(message), message.header.stamp.nanosec
+    if stamp_ns <= 0 or nanosec >= SECOND_NS:
         count('fluxes_without_stamp', 1)
-    return read_flux(message)
+    if nanosec >= SECOND_NS:
+        raise LayoutError(f'the stamp has {nanosec} nanoseconds, a second or more')
+    if stamp_ns <= 0:
+        raise LayoutError('the flux message has no stamp')
+    width = width_of(message)
+    return stamp_ns, decode_flux(
+        layout_of(message), message.point_step, width, message.data, bool(message.is_bigendian)
+    )

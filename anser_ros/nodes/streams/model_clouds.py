@@ -1,56 +1,19 @@
 """Turns field models into messages, and back: the dipoles, and beside them their uncertainty."""
 
-import array
-from collections.abc import Sequence
-
 import numpy as np
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import PointCloud2
 
 from anser_ros.effects.correction import needs_correction
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
+from anser_ros.nodes.streams.clouds import CloudMaker, layout_of, width_of
 from anser_ros.stamps import set_stamp
 from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
 from anser_ros.wire.points import (
     DipolePoints,
-    PointFieldTuple,
     decode_field_model,
     encode_field_model,
 )
-
-
-class CloudMaker:
-    """Makes point clouds; the fields of each layout are built once."""
-
-    def __init__(self) -> None:
-        self._fields: dict[tuple[PointFieldTuple, ...], list[PointField]] = {}
-
-    def message(
-        self,
-        packed: tuple[Sequence[PointFieldTuple], int, bytes],
-        frame_id: str,
-        stamp_ns: int,
-    ) -> PointCloud2:
-        """Return the message of packed points (fields, point_step, bytes)."""
-        fields, step, data = packed
-        key = tuple(fields)
-        if key not in self._fields:
-            self._fields[key] = [
-                PointField(name=name, offset=offset, datatype=datatype, count=count)
-                for name, offset, datatype, count in fields
-            ]
-        message = PointCloud2()
-        message.header.frame_id = frame_id
-        set_stamp(message.header.stamp, stamp_ns)
-        message.height, message.width = 1, len(data) // step
-        message.fields = self._fields[key]
-        message.point_step, message.row_step = step, len(data)
-        # An array is handed over in microseconds; bytes are checked one by one.
-        buffer = array.array('B')
-        buffer.frombytes(data)
-        message.data = buffer
-        message.is_dense = True
-        return message
 
 
 class ModelWriter:
@@ -106,31 +69,11 @@ class ModelWriter:
         return self._maker.message(encode_model_error(error), frame_id, stamp_ns)
 
 
-def layout_of(message: PointCloud2) -> list[PointFieldTuple]:
-    """Return the fields of a cloud as plain tuples."""
-    return [(f.name, f.offset, f.datatype, f.count) for f in message.fields]
-
-
-def width_of(message: PointCloud2) -> int:
-    """Return the number of points of a cloud that has one row.
-
-    Raises
-    ------
-    LayoutError
-        When the cloud has more rows.
-    """
-    if message.height != 1:
-        raise LayoutError(f'the cloud must have height 1, got {message.height}')
-    return int(message.width)
-
-
 def read_dipoles(message: PointCloud2) -> DipolePoints:
     """Read a ``field_model`` message.
 
-    Raises
-    ------
-    LayoutError
-        When it is not a field model, has no dipole, or a direction is no unit vector.
+    Raises `LayoutError` when it is not a field model, has no dipole, or a direction is no unit
+    vector.
     """
     points = decode_field_model(
         layout_of(message), message.point_step, width_of(message), message.data,

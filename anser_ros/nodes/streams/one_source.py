@@ -3,17 +3,15 @@
 import time
 from collections.abc import Callable, Hashable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
 from anser_ros.integrity.senders import Senders
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.streams.measured_keys import without_measured
-
-if TYPE_CHECKING:
-    from anser_ros.nodes.runtime.node import AnserNode
 
 LOOK_S = 0.1
 """How often the graph is asked at most, s, while messages go on as before: it takes 15 us.
@@ -32,30 +30,16 @@ NUMBER = 'publication_sequence_number'
 class OneSource:
     """Subscribes to a topic; what comes while it has several senders is not passed on.
 
-    Parameters
-    ----------
-    node : AnserNode
-    message_type, topic, callback, profile
-        As of ``create_subscription``; the callback takes the message alone, or its information
-        too where ``informed``.
-    doubted : callable, optional
-        Takes messages that are not believed.
-    lasting : callable, optional
-        Returns what a message says if that holds until its sender says otherwise, else None.
-    is_constant : bool
-        Whether what lasts never changes, so that who says otherwise is another sender.
-    informed : bool
-        Whether callbacks take the message's information too.
-
-    Attributes
-    ----------
-    subscription : Subscription
-        The present one: that of a latched topic is made again once it has a single sender again.
+    The callback takes the message alone, or its information too where ``informed``; ``doubted``
+    takes messages that are not believed. ``lasting`` returns what a message says if that holds
+    until its sender says otherwise, else None; if that ``is_constant``, who says otherwise is
+    another sender. The ``subscription`` to a latched topic is made again once it has a single
+    sender again.
     """
 
     def __init__(
         self,
-        node: 'AnserNode',
+        node: AnserNode,
         message_type: type,
         topic: str,
         callback: Callable[..., None],
@@ -137,7 +121,7 @@ class OneSource:
         return self._publishers
 
 
-def setup_source(node: 'AnserNode', callback: Callable[[Any], None]) -> OneSource:
+def setup_source(node: AnserNode, callback: Callable[[Any], None]) -> OneSource:
     """Subscribe to the setup document, which is one sender's for good but for what it measures."""
     return OneSource(
         node, String, 'setup', callback, qos.LATCHED,

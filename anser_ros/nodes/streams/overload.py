@@ -15,21 +15,3 @@ def too_slow(skipped: int, worked: int) -> str:
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     percent = f'{share:.0f} %' if share >= 1 else 'less than 1 %'
     return f'computer too slow: {percent} of windows skipped, load {load:.1f} on {cores} cores'
-
-
-class Load:
-    """Finds words for what was skipped since one asked last, from the counters of a node."""
-
-    def __init__(self) -> None:
-        self._counted = 0, 0
-
-    def words(self, skipped: int, worked: int) -> str:
-        """Return what `too_slow` says of the frames since the last call.
-
-        Parameters
-        ----------
-        skipped, worked : int
-            Frames that gave way, and that were worked on, since the start.
-        """
-        before, self._counted = self._counted, (skipped, worked)
-        return too_slow(skipped - before[0], worked - before[1])

@@ -9,13 +9,14 @@ setup, its model, and everybody connected who wants its poses (``ready_for``), h
 
 import hashlib
 import time
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 
 from anser_ros.errors import SetupError
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.diagnostics import statuses_in
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.setup_tips import tip_name
@@ -38,30 +39,11 @@ def digest_of(setup_text: str) -> str:
     return hashlib.blake2b(setup_text.encode(), digest_size=4).hexdigest()
 
 
-@dataclass
-class _Report:
-    """What a node said last about itself, and when."""
-
-    at_s: float
-    values: dict[str, str] = field(default_factory=dict)
-
-
 class Readiness:
     """Watches the graph and ``/diagnostics`` from a node whose executor spins elsewhere.
 
-    Parameters
-    ----------
-    node : AnserNode
-    fluxes : list of Publisher
-        What is going to be published.
-    setup_text : str
-        The setup that has been published; empty where there is none.
-
-    Attributes
-    ----------
-    is_starting : bool
-        Whether :meth:`missing` found a node that has not said a word yet: it may be compiling its
-        kernels for the first time.
+    ``is_starting`` says whether `missing` found a node that has not reported anything yet: it may
+    be compiling its kernels for the first time.
     """
 
     def __init__(self, node: AnserNode, fluxes: list[Any], setup_text: str) -> None:
@@ -79,7 +61,8 @@ class Readiness:
             ]
         except SetupError:
             pass  # who listens may make more of it
-        self._reports: dict[str, _Report] = {}
+        # When a node reported last, by the monotonic clock, and its figures.
+        self._reports: dict[str, tuple[float, Mapping[str, str]]] = {}
         self._seen: object = None
         self._since_s = time.monotonic()
         self.is_starting = False
@@ -156,21 +139,22 @@ class Readiness:
     def _pose_listeners(self) -> int:
         """How many subscriptions the tracker reaches; it may not know all who are known here."""
         report = self._reports.get(f'{self._namespace}/{TRACKER}'.strip('/'))
-        return 0 if report is None else int(report.values.get('pose_listeners') or 0)
+        return 0 if report is None else int(report[1].get('pose_listeners') or 0)
 
     def _is_ready(self, name: str, listeners: dict[str, tuple[str, ...]]) -> bool:
         report = self._reports.get(name.strip('/'))
         # It must have looked at the graph as it is now.
-        if report is None or report.at_s < self._since_s:
+        if report is None or report[0] < self._since_s:
             return False
+        values = report[1]
         is_listening = any(name in names for names in listeners.values())
         if name.endswith(FIELD_MODEL):
-            return is_listening and bool(report.values.get('stamp_ns'))
-        if report.values.get('ready_for') != self._digest or not is_listening:
+            return is_listening and bool(values.get('stamp_ns'))
+        if values.get('ready_for') != self._digest or not is_listening:
             return False
         server = self._reports.get(name.strip('/').removesuffix(TRACKER) + FIELD_MODEL)
-        served = '' if server is None else server.values.get('stamp_ns', '')
-        return not served or report.values.get('model_stamp_ns') == served
+        served = '' if server is None else server[1].get('stamp_ns', '')
+        return not served or values.get('model_stamp_ns') == served
 
     @property
     def poses(self) -> list[str]:
@@ -179,6 +163,5 @@ class Readiness:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         now_s = time.monotonic()
-        for status in message.status:
-            values = {item.key: item.value for item in status.values}
-            self._reports[status.name] = _Report(now_s, values)
+        for name, status in statuses_in(message).items():
+            self._reports[name] = now_s, status.values

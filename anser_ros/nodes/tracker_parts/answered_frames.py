@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 Model = TypeVar('Model')
 Frame = TypeVar('Frame')
 
-OTHER_CLOCK_NS = 1_000_000_000
+FAR_AHEAD_NS = 1_000_000_000
 """A model that far from a frame has its stamp from another clock (a recording's, the host's)."""
 MOST_LATE = 5
 """Frames in a row that waited in vain, after which none waits until an answer has come again."""
@@ -28,19 +28,8 @@ frame is tracked at once. At 50 frames a second that is four seconds, beyond any
 class AnsweredFrames(Generic[Model, Frame]):
     """Keeps frames and models in the order in which they are to be used.
 
-    Parameters
-    ----------
-    use : callable
-        Puts a model in force.
-    track : callable
-        Works on a frame with the model in force.
-
-    Attributes
-    ----------
-    follows : bool
-        Whether the server answers frames; what it says itself.
-    late : int
-        Frames that waited in vain.
+    ``use`` activates a model, ``track`` works on a frame with the active one. ``follows`` is
+    whether the server answers frames, by its own word; ``late`` counts frames that waited in vain.
     """
 
     def __init__(self, use: Callable[[Model], None], track: Callable[[Frame], None]) -> None:
@@ -48,7 +37,7 @@ class AnsweredFrames(Generic[Model, Frame]):
         self._models: deque[tuple[int, Model]] = deque(maxlen=MOST_WAITING)
         self._frames: deque[tuple[int, Frame, float]] = deque()
         self._last_frame_ns = 0
-        self._in_force_ns = 0
+        self._active_ns = 0
         self._in_vain = 0
         self.follows = False
         self.late = 0
@@ -94,17 +83,17 @@ class AnsweredFrames(Generic[Model, Frame]):
         self._use_models(self._last_frame_ns)
 
     def _use_models(self, stamp_ns: int) -> None:
-        """Put in force the newest model that is meant for a frame; later ones stay."""
+        """Activate the newest model that is meant for a frame; later ones stay."""
         newest = None
         while self._models:
             model_ns = self._models[0][0]
-            if stamp_ns < model_ns <= stamp_ns + OTHER_CLOCK_NS and self._last_frame_ns:
+            if stamp_ns < model_ns <= stamp_ns + FAR_AHEAD_NS and self._last_frame_ns:
                 break
             newest = self._models.popleft()
         if newest is not None:
-            self._in_force_ns = newest[0]
+            self._active_ns = newest[0]
             self._use(newest[1])
 
     def _is_answered(self, stamp_ns: int) -> bool:
-        """Whether the model of a frame is in force, or a later one says that it has none."""
-        return self._in_force_ns == stamp_ns or bool(self._models)
+        """Whether the model of a frame is active, or a later one says that it has none."""
+        return self._active_ns == stamp_ns or bool(self._models)

@@ -16,25 +16,11 @@ OTHER_CLOCK_NS = 5_000_000_000
 where a recording is played. Its age counts from when it came."""
 
 
-class ModelInForce:
+class ActiveModel:
     """Holds the published model, as the fluxes of each moment may be tracked with it.
 
-    Parameters
-    ----------
-    setup : Setup
-    volume : TrackedVolume
-        Where tools are tracked.
-    file_model : FieldModel or None
-        The tracker's own, whose effects apply, and its field while none is published.
-    uncalibrated : bool
-        Whether the nominal model will do.
-
-    Attributes
-    ----------
-    given : GivenModel or None
-        The published one.
-    field : FieldModel or None
-        It, or the file's while none is published.
+    ``file_model`` is the tracker's own, whose effects apply; ``given`` is the published model, and
+    ``field`` its field, or the file's while none is published.
     """
 
     def __init__(
@@ -55,10 +41,7 @@ class ModelInForce:
     def field_of(self, given: GivenModel) -> FieldModel:
         """Return a published model for the setup, with the effects of the tracker's own.
 
-        Raises
-        ------
-        LayoutError
-            When it has other emitters than the setup.
+        Raises `LayoutError` when it has other emitters than the setup.
         """
         if self.field is not None and given.is_same_as(self.given):
             return self.field

@@ -45,10 +45,7 @@ class GivenModel:
     def field_model(self, setup: Setup, file_model: FieldModel | None) -> FieldModel:
         """Return the model for a setup, with the effects of the model file.
 
-        Raises
-        ------
-        LayoutError
-            When it has other emitters than the setup.
+        Raises `LayoutError` when it has other emitters than the setup.
         """
         points, count = self.points, len(setup.emitter_names)
         if points.moments.shape[1] != count:
@@ -72,10 +69,6 @@ class ModelIntake:
     """Reads models; what is the same as before is not read again.
 
     So models that share their dipoles or their uncertainty share all that is derived from them.
-
-    Attributes
-    ----------
-    newest : GivenModel or None
     """
 
     def __init__(self) -> None:
@@ -92,10 +85,7 @@ class ModelIntake:
     def take(self, message: PointCloud2) -> GivenModel:
         """Read a ``field_model`` message.
 
-        Raises
-        ------
-        LayoutError
-            When it is not a field model, or has no stamp.
+        Raises `LayoutError` when it is not a field model, or has no stamp.
         """
         stamp_ns, newest = stamp_of(message), self.newest
         if stamp_ns <= 0:
@@ -108,10 +98,7 @@ class ModelIntake:
     def take_error(self, message: PointCloud2) -> GivenModel | None:
         """Keep an uncertainty; return the newest model with it where it is of that model.
 
-        Raises
-        ------
-        LayoutError
-            When it does not belong to that model.
+        Raises `LayoutError` when it does not belong to that model.
         """
         self._early.append(message)
         newest = self.newest

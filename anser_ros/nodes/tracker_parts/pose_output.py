@@ -46,12 +46,7 @@ class PackedMessage:
     Bytes are published in half the time of a message, whose fields are taken from Python objects
     one by one.
 
-    Parameters
-    ----------
-    message : PoseStamped or PoseWithCovarianceStamped
-        With all that stays; the stamp and the numbers are written over.
-    count : int
-        Numbers at its end, in double precision.
+    The stamp and the ``count`` numbers at its end, in double precision, are written over.
     """
 
     def __init__(self, message: Any, count: int) -> None:
@@ -108,8 +103,14 @@ class PoseTopic:
 
     def publish(self, estimate: PoseEstimate) -> None:
         """Publish an estimate that is good, and nothing else: other topics wait for it."""
-        if estimate.state == OK:
-            self._publish(estimate)
+        if estimate.state != OK:
+            return
+        if estimate.rotation is None:
+            x, y, z, w = quaternion_of_axis(estimate.axis)
+        else:
+            x, y, z, w = quaternion_of_rotation(estimate.rotation)
+        self._values = *estimate.position.tolist(), x, y, z, w
+        self._pose.publish(self._plain.packed(estimate.stamp_ns, *self._values))
 
     def note(self, estimate: PoseEstimate, now_ns: int) -> bool:
         """Count an estimate of a time, ns; return whether the state is another than before."""
@@ -123,14 +124,6 @@ class PoseTopic:
             if is_live(estimate.stamp_ns, now_ns) and estimate.stamp_ns <= now_ns:
                 self.tally.latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
         return changed
-
-    def _publish(self, estimate: PoseEstimate) -> None:
-        if estimate.rotation is None:
-            x, y, z, w = quaternion_of_axis(estimate.axis)
-        else:
-            x, y, z, w = quaternion_of_rotation(estimate.rotation)
-        self._values = *estimate.position.tolist(), x, y, z, w
-        self._pose.publish(self._plain.packed(estimate.stamp_ns, *self._values))
 
     def publish_covariance(self) -> None:
         """Publish the good pose just noted once more, with its covariance.

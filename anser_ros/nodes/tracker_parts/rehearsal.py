@@ -1,7 +1,7 @@
 """Tracks the last frame once more just before the next one comes, for the sake of the caches.
 
-In the 15 ms between two frames other programs fill the processor's caches. After a rehearsal code,
-tables and model are there again, and the real frame takes half of the time.
+In the 15 ms between two frames other programs fill the processor's caches: a frame that takes
+0.5 ms one after the other takes 1.4 ms after such a pause, and 0.9 ms after a rehearsal.
 """
 
 from anser_ros.errors import AnserError
@@ -17,13 +17,7 @@ frame comes."""
 
 
 class Rehearsal:
-    """Has a tracker of its own, whose poses nobody gets.
-
-    Parameters
-    ----------
-    sensors : SensorTable
-    settings : TrackerSettings
-    """
+    """Has a tracker of its own, whose poses nobody gets."""
 
     def __init__(self, sensors: SensorTable, settings: TrackerSettings) -> None:
         self._past = Tracker(None, sensors, settings)

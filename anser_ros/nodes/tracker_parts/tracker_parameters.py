@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.shared_names import STALE_AFTER_S
 from anser_ros.nodes.runtime.stated_parameters import stated
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.estimate import NO_GATE, TrackerSettings
@@ -78,7 +79,10 @@ class TrackerParameters:
         live=True,
     )
     stale_after_s: float = parameter(
-        0.3, 'time without fluxes after which a sensor is stale, s', minimum=0.02, live=True
+        STALE_AFTER_S,
+        'time without fluxes after which a sensor is stale, s',
+        minimum=0.02,
+        live=True,
     )
     model_wait_s: float = parameter(
         0.1,
@@ -93,12 +97,8 @@ class TrackerParameters:
 def settings_of(table: TrackerParameters) -> TrackerSettings:
     """Return settings of the core.
 
-    Raises
-    ------
-    ParameterError
-        When a corner of the volume is not three numbers, or only one of the two is given.
-    TrackingError
-        When the corners make no box.
+    Raises `ParameterError` when a corner of the volume is not three numbers, or only one of the
+    two is given, and `TrackingError` when the corners make no box.
     """
     low, high = table.volume_low_m, table.volume_high_m
     volume = None
@@ -107,25 +107,14 @@ def settings_of(table: TrackerParameters) -> TrackerSettings:
             if len(getattr(table, name)) != 3:
                 raise ParameterError(f'parameter {name}: three numbers needed')
         volume = TrackedVolume((low[0], low[1], low[2]), (high[0], high[1], high[2]))
-    return TrackerSettings(
-        adaptive=table.adaptive,
-        volume=volume,
-        grid_spacing_m=table.grid_spacing_m,
-        gate=table.gate,
-        max_sigma_m=table.max_sigma_m,
-        warm_age_s=table.warm_age_s,
-    )
+    names = ('adaptive', 'grid_spacing_m', 'gate', 'max_sigma_m', 'warm_age_s')
+    return TrackerSettings(volume=volume, **{name: getattr(table, name) for name in names})
 
 
 def tips_of_file(path: str) -> dict[str, TipSpec]:
     """Return tips of a file by body; none where no file is named.
 
-    Raises
-    ------
-    ParameterError
-        When it can't be read.
-    SetupError
-        When it has no tips.
+    Raises `ParameterError` when it can't be read, and `SetupError` when it has no tips.
     """
     try:
         return read_tips(read_text(path)) if path else {}

@@ -1,24 +1,24 @@
 """Takes topics of poses for a watcher, and reports what it found in them."""
 
 import time
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.incoming import pose_numbers
+from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.streams.one_source import OneSource
 from anser_ros.nodes.watcher_parts.sighting_words import findings_words, titles_of
-from anser_ros.poses.live_look import PoseSighting
+from anser_ros.poses.live_look import PoseSighting, PoseWatch
 from anser_ros.poses.live_window import PoseWindow
-from anser_ros.poses.sequence import REFERENCE, PoseSession
+from anser_ros.poses.sequence import REFERENCE
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.pose_topics import ENDING, TRACKED
-
-if TYPE_CHECKING:
-    from anser_ros.nodes.runtime.node import AnserNode
 
 QUIET_S = 2.0
 """Time without a pose on a topic, s, after which it counts as silent."""
@@ -30,24 +30,16 @@ def sensor_of(topic: str) -> str:
 
 
 class PoseStreams:
-    """Subscribes to topics of tracked poses and of a reference, into one window.
+    """Subscribes to topics of tracked poses and of a reference, as `watcher.Streams` has it.
 
-    Attributes
-    ----------
-    window : PoseWindow
-    sources : list of OneSource
-    received_s : float
-        When the last tracked pose came, by the monotonic clock.
-
-    Raises
-    ------
-    ParameterError
-        When two topics give sensors of the same name, or the reference is tracked as well.
+    Raises `ParameterError` when two topics give sensors of the same name, or the reference is
+    tracked as well.
     """
 
-    def __init__(
-        self, node: 'AnserNode', tracked: Sequence[str], reference: str, window_s: float
-    ) -> None:
+    WHAT = 'poses'
+
+    def __init__(self, node: AnserNode, table: Any) -> None:
+        tracked, reference = table.tracked_poses, table.reference_pose
         names = {topic: sensor_of(topic) for topic in tracked}
         if len({*names.values(), REFERENCE}) < len(tracked) + 1 or reference in names:
             raise ParameterError(
@@ -58,56 +50,54 @@ class PoseStreams:
             raise ParameterError('reference_pose: a single sensor needs a reference')
         self._topics = {**names, **({reference: REFERENCE} if reference else {})}
         self._received: dict[str, float] = dict.fromkeys(self._topics, 0.0)
-        self.window = PoseWindow(list(names.values()), window_s)
+        self.window, self.watch = PoseWindow(list(names.values()), table.window_s), PoseWatch()
         self.received_s = 0.0
         self._node = node
         self.sources = [
-            OneSource(node, PoseStamped, topic, self._taker(topic, name), qos.STREAM)
+            OneSource(node, PoseStamped, topic, partial(self._on_pose, topic, name), qos.STREAM)
             for topic, name in self._topics.items()
         ]
 
-    def _taker(self, topic: str, name: str) -> Callable[[PoseStamped], None]:
-        def take(message: PoseStamped) -> None:
-            p, q = message.pose.position, message.pose.orientation
-            pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-            self.window.take(name, stamp_of(message), pose)
-            self._received[topic] = time.monotonic()
-            if name != REFERENCE:
-                self.received_s = self._received[topic]
-            self._node.count('poses')
-
-        return take
+    def _on_pose(self, topic: str, name: str, message: PoseStamped) -> None:
+        self.window.take(name, stamp_of(message), pose_numbers(message.pose))
+        self._received[topic] = time.monotonic()
+        if name != REFERENCE:
+            self.received_s = self._received[topic]
+        self._node.count('poses')
 
     def quiet_topics(self) -> tuple[str, ...]:
         """Return topics on which nothing comes now."""
         now_s = time.monotonic()
         return tuple(topic for topic, at in self._received.items() if now_s - at > QUIET_S)
 
-    def session(self) -> PoseSession | None:
-        """Return what is in the window, of the topics on which something comes."""
-        return self.window.session(without=[self._topics[t] for t in self.quiet_topics()])
+    def look(self) -> Callable[[], PoseSighting] | None:
+        """Return what looks at the window now, at those topics on which something comes."""
+        session = self.window.session(without=[self._topics[t] for t in self.quiet_topics()])
+        return None if session is None else partial(self.watch.look, session)
 
+    def on_parameters(self, old: Any, new: Any) -> None:
+        """Go on: no live parameter is about poses."""
 
-def pose_words(seen: PoseSighting) -> str:
-    """Return what was seen of poses as one line for an operator."""
-    size = '' if np.isnan(seen.after_m) else f'error {1e3 * seen.after_m:.2f} mm'
-    if seen.findings:
-        with_them = f'{size} with it corrected' if size else ''
-        return '; '.join(filter(None, [findings_words(seen.findings), with_them, seen.remark]))
-    if seen.remark:
-        return '; '.join(filter(None, [seen.remark, size]))
-    return f'nothing found; {size}'
+    def words(self, seen: PoseSighting) -> str:
+        """Return what was seen as one line for an operator."""
+        size = '' if np.isnan(seen.after_m) else f'error {1e3 * seen.after_m:.2f} mm'
+        if seen.findings:
+            with_them = f'{size} with it corrected' if size else ''
+            parts = [findings_words(seen.findings), with_them, seen.remark]
+            return '; '.join(filter(None, parts))
+        if seen.remark:
+            return '; '.join(filter(None, [seen.remark, size]))
+        return f'nothing found; {size}'
 
-
-def pose_values(seen: PoseSighting) -> dict[str, object]:
-    """Return the figures of what was seen of poses, by name."""
-    return {
-        'poses_compared': seen.poses,
-        'position_rmse_before_m': seen.before_m,
-        'position_rmse_after_m': seen.after_m,
-        'position_floor_m': seen.jitter_m,
-        'misfit_of_known_frames_m': seen.misfit_m,
-        'unexplained': seen.unexplained,
-        'findings': titles_of(seen.findings),
-        'depends_on': ', '.join(seen.depends_on),
-    }
+    def values(self, seen: PoseSighting) -> dict[str, object]:
+        """Return the figures of what was seen, by name."""
+        return {
+            'poses_compared': seen.poses,
+            'position_rmse_before_m': seen.before_m,
+            'position_rmse_after_m': seen.after_m,
+            'position_floor_m': seen.jitter_m,
+            'misfit_of_known_frames_m': seen.misfit_m,
+            'unexplained': seen.unexplained,
+            'findings': titles_of(seen.findings),
+            'depends_on': ', '.join(seen.depends_on),
+        }

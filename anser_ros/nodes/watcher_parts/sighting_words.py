@@ -1,19 +1,20 @@
 """Puts a sighting into words, for an operator who reads /diagnostics."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.watch import Sighting
+if TYPE_CHECKING:  # words must not load the kernels
+    from anser_ros.field.model import EffectRecord
+    from anser_ros.sessions.watch import Sighting
 
 SITES = ('channel', 'channels', 'coil', 'coils', 'body', 'sensor', 'stream')
-MOST_TEXT = 60
+MOST_FIGURE_TEXT = 60
 """Characters of a figure beyond which it is left to the values: a line is read at a glance."""
 
 
-def words_of(seen: Sighting) -> str:
+def words_of(seen: 'Sighting') -> str:
     """Return what was seen as one line for an operator."""
     size = f'residual {1e12 * seen.flux_rms_t:.0f} pT, {seen.excess**0.5:.1f} x the expected one'
     if seen.findings:
@@ -26,7 +27,7 @@ def words_of(seen: Sighting) -> str:
     return f'{size}; {cause}{depends}'
 
 
-def values_of(seen: Sighting) -> dict[str, object]:
+def values_of(seen: 'Sighting') -> dict[str, object]:
     """Return the figures of what was seen, by name."""
     return {
         'compared_with': seen.truth,
@@ -39,17 +40,17 @@ def values_of(seen: Sighting) -> dict[str, object]:
     }
 
 
-def findings_words(findings: Sequence[EffectRecord]) -> str:
+def findings_words(findings: Sequence['EffectRecord']) -> str:
     """Return every effect with its site and its parameters, for a line."""
     return '; '.join(f'{title_of(record)}: {figures_of(record)}' for record in findings)
 
 
-def titles_of(findings: Sequence[EffectRecord]) -> str:
+def titles_of(findings: Sequence['EffectRecord']) -> str:
     """Return the names and sites of effects, separated by commas."""
     return ', '.join(title_of(record) for record in findings)
 
 
-def title_of(record: EffectRecord) -> str:
+def title_of(record: 'EffectRecord') -> str:
     """Return the name of an effect and where it sits."""
     sites = [
         f'{key} {plain_text(record.parameters[key])}' for key in SITES if key in record.parameters
@@ -57,12 +58,12 @@ def title_of(record: EffectRecord) -> str:
     return f'{record.name} ({", ".join(sites)})' if sites else record.name
 
 
-def figures_of(record: EffectRecord) -> str:
+def figures_of(record: 'EffectRecord') -> str:
     """Return the parameters that are short enough for a line."""
     parts = [
         f'{key} {text}'
         for key, value in record.parameters.items()
-        if key not in SITES and len(text := plain_text(value)) <= MOST_TEXT
+        if key not in SITES and len(text := plain_text(value)) <= MOST_FIGURE_TEXT
     ]
     return ', '.join(parts) or 'found'
 
