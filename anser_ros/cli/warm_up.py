@@ -19,8 +19,7 @@ from numba.core.dispatcher import Dispatcher
 from anser_ros.cli.progress import LINE_INTERVAL_S
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.frames.intake import fill_frame
-from anser_ros.kernel_cache import KernelCache, folder_of
+from anser_ros.kernel_cache import KernelCache
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import parse_setup
@@ -48,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     stream = sys.stderr if args.json else sys.stdout
     compile_kernels(lambda text: print(text, file=stream, flush=True))
     if args.json:
-        count = KernelCache(folder_of(fill_frame)).total
+        count = KernelCache().total
         print(json.dumps({'schema': SCHEMA, 'kernels': count}))
     else:
         print('all kernels are compiled')
@@ -72,7 +71,7 @@ def compile_kernels(
     ParameterError
         When a process fails, with its last line.
     """
-    cache = KernelCache(folder_of(fill_frame))
+    cache = KernelCache()
     if cache.is_full:
         return
     with cache.locked():
@@ -141,7 +140,7 @@ def kernels() -> dict[str, Dispatcher]:
 
 def main(part: str) -> int:
     """Call the kernels of one part the way that nodes and commands do."""
-    cache = KernelCache(folder_of(fill_frame))
+    cache = KernelCache()
     numba.core.event.register('numba:compile', _Listener(cache))
     for step in PARTS[part]:
         step()
