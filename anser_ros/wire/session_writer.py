@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.wire import cdr
 from anser_ros.wire.bag_metadata import qos_profile
-from anser_ros.wire.bag_writer import BagWriter, Closing
+from anser_ros.wire.bag_writer import BagWriter
 from anser_ros.wire.points import STALE, FluxPoints, PointFieldTuple, encode_flux
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec
 
@@ -16,7 +16,7 @@ FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
 """Topics of a session's fluxes, and whether their sensors are fixed to the field generator."""
 
 
-class SessionWriter(Closing):
+class SessionWriter(BagWriter):
     """Writes a session without ROS: setup, fluxes and poses, log time = stamp.
 
     Parameters
@@ -33,14 +33,14 @@ class SessionWriter(Closing):
     """
 
     def __init__(self, path: str | Path, frame_id: str = 'fg') -> None:
-        self._bag = BagWriter(path)
+        super().__init__(path)
         self._frame_id = frame_id
         self._channels: dict[str, int] = {}
 
     def write_setup(self, text: str, stamp_ns: int) -> None:
         """Write the setup document."""
         channel = self._channel('/anser/setup', 'std_msgs/msg/String', latched=True)
-        self._bag.write(channel, stamp_ns, cdr.string_bytes(text))
+        self.write(channel, stamp_ns, cdr.string_bytes(text))
 
     def write_readings(
         self, sensors: Sequence[SensorSpec], stamp_ns: int, flux: NDArray[np.complex128]
@@ -76,7 +76,7 @@ class SessionWriter(Closing):
         channel = self._channel(topic, 'sensor_msgs/msg/PointCloud2')
         frame = self._frame_id
         message = cdr.cloud_bytes(stamp_ns, frame, fields, point_step, width, data)
-        self._bag.write(channel, stamp_ns, message)
+        self.write(channel, stamp_ns, message)
 
     def write_pose(
         self,
@@ -88,21 +88,13 @@ class SessionWriter(Closing):
         """Write one pose: position in m, unit quaternion."""
         channel = self._channel(topic, 'geometry_msgs/msg/PoseStamped')
         message = cdr.pose_bytes(stamp_ns, self._frame_id, position, quaternion_xyzw)
-        self._bag.write(channel, stamp_ns, message)
-
-    def close(self) -> None:
-        """Write the index and close the file."""
-        self._bag.close()
-
-    def remove(self) -> None:
-        """Remove the closed file."""
-        self._bag.remove()
+        self.write(channel, stamp_ns, message)
 
     def _channel(self, topic: str, type_name: str, latched: bool = False) -> int:
         if topic not in self._channels:
             qos = [qos_profile(latched=latched, depth=1 if latched else 100)]
             definition = cdr.DEFINITIONS[type_name]
-            self._channels[topic] = self._bag.add_topic(topic, type_name, definition, qos)
+            self._channels[topic] = self.add_topic(topic, type_name, definition, qos)
         return self._channels[topic]
 
 
