@@ -60,12 +60,8 @@ FRAMES_IN = 'frames_'
 class Withheld(NamedTuple):
     """Names one reason for which all poses of a frame are withheld.
 
-    Attributes
-    ----------
-    state : str
-        One of `OF_MODEL`, or `TWO_SOURCES`.
-    reason : str
-        The text for `/diagnostics`, with figures.
+    The state is one of `OF_MODEL`, or `TWO_SOURCES`; the reason is for `/diagnostics`, with
+    figures.
     """
 
     state: str

@@ -22,15 +22,7 @@ POSE_COLUMNS = ('stamp_ns', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
 
 @dataclass(frozen=True)
 class ExportedBag:
-    """States what came of an export.
-
-    Attributes
-    ----------
-    rows : dict of str to int
-        Written rows by the file's name.
-    lost : str
-        What of the bag could not be read, in words.
-    """
+    """Holds how many rows each file got, by its name, and in words what could not be read."""
 
     rows: dict[str, int]
     lost: str

@@ -20,16 +20,9 @@ SETUP_TYPE = 'std_msgs/msg/String'
 
 @dataclass(frozen=True)
 class ImportedBag:
-    """States what came of an import.
+    """Holds how many messages each topic got, and how many were left out, by topic and type.
 
-    Attributes
-    ----------
-    messages : dict of str to int
-        Written messages by their topic's new name.
-    left_out : dict of str to int
-        Messages whose type has no known definition, by topic and type.
-    lost : str
-        What could not be read, in words.
+    What is left out has no known definition; ``lost`` says in words what could not be read.
     """
 
     messages: dict[str, int]
@@ -62,16 +55,8 @@ def import_bag(
 ) -> ImportedBag:
     """Write the messages of any ROS 2 bag as one MCAP file that every command reads.
 
-    Parameters
-    ----------
-    path : path
-        As `anser_ros.wire.foreign_bag.read_foreign`.
-    out : Path
-        The file to write; it must not exist yet.
-    remaps : mapping, optional
-        New names of topics.
-    setup_text : str, optional
-        Setup document that is written at the start, in place of any in the bag.
+    ``remaps`` are new names of topics; a setup document's text is written at the start, in place
+    of any in the bag.
 
     Raises
     ------

@@ -39,12 +39,8 @@ FEWEST_BLOCKS = 5
 
 @dataclass(frozen=True)
 class Difference:
-    """Holds the interval of a difference, second less first, and which side of zero it is on.
-
-    Attributes
-    ----------
-    low, high : float
-        NaN where the stretches are too few.
+    """Holds the interval of a difference, second less first; NaN where the stretches are too
+    few.
     """
 
     low: float
@@ -58,16 +54,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class Compared(Difference):
-    """Compares the errors of one coil or body, or of all coils, in the frames that both have.
+    """Compares ``n`` pairs of errors, m or rad, of one coil or body, or of all coils.
 
-    Attributes
-    ----------
-    n : int
-        Pairs of errors.
-    only_a, only_b : int
-        Frames that only one of them has a pose for.
-    rmse_a, rmse_b : float
-        Root mean square of the errors, m or rad.
+    ``only_a`` and ``only_b`` are frames that only one of the two has a pose for.
     """
 
     n: int
@@ -86,15 +75,7 @@ class Compared(Difference):
 
 @dataclass(frozen=True)
 class ComparedShares(Difference):
-    """Compares the shares of frames with a pose, of one coil or body, in the frames both know.
-
-    Attributes
-    ----------
-    n : int
-        Frames.
-    share_a, share_b : float
-        Shares of them with a pose, 0 to 1.
-    """
+    """Compares the shares, 0 to 1, of ``n`` frames with a pose, of one coil or body."""
 
     n: int
     share_a: float

@@ -14,13 +14,7 @@ from anser_ros.wire.setup import Setup
 
 @dataclass(frozen=True)
 class Drawing:
-    """Holds what a setup's geometry gives; all of it is None for no known kind of board.
-
-    Attributes
-    ----------
-    board : Board or None
-        The emitters' coils.
-    """
+    """Holds what a setup's geometry gives; all of it is None for no known kind of board."""
 
     board: Board | None
 

@@ -90,13 +90,7 @@ def diagnose_few_poses(
 ) -> FewPosesDiagnosis:
     """Find what is wrong with the sensors of a session that `calibration.is_estimated_jointly`.
 
-    Parameters
-    ----------
-    session : Session
-    model : FieldModel
-        Of the session's emitters; the effects that it has are corrected first.
-    progress : callable, optional
-        Called with words on what goes on.
+    The effects that the model has are corrected first.
 
     Raises
     ------

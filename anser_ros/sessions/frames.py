@@ -38,17 +38,7 @@ class FrameReadings:
 
 @dataclass(frozen=True)
 class SessionFrame:
-    """Holds all that was measured under one stamp.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp of the flux messages.
-    tools : FrameReadings or None
-        Of all tool sensors; None where only the references were read.
-    reference : FrameReadings or None
-        Of the reference sensors; None where only tools were read.
-    """
+    """Holds all that tools or references, or both, measured under one stamp."""
 
     stamp_ns: int
     tools: FrameReadings | None

@@ -45,16 +45,8 @@ class PoseSeries:
 def sensor_series(
     name: str, estimates: Sequence[PoseEstimate], centres: Array, axes: Array
 ) -> PoseSeries:
-    """Compare a sensor's poses with where it truly was.
-
-    Parameters
-    ----------
-    name : str
-        Of the sensor.
-    estimates : sequence of PoseEstimate, length F
-        One a frame.
-    centres, axes : ndarray, shape (F, 3)
-        True centres (m) and unit axes, frame fg; NaN where they are not known.
+    """Compare a sensor's F poses with where it truly was, frame fg; NaN where that is not
+    known.
     """
     distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
     for i, estimate in enumerate(estimates):
@@ -67,19 +59,7 @@ def sensor_series(
 def body_series(
     name: str, estimates: Sequence[PoseEstimate], position: Array, rotation: Array
 ) -> PoseSeries:
-    """Compare a body's poses with the true ones.
-
-    Parameters
-    ----------
-    name : str
-        Of the body.
-    estimates : sequence of PoseEstimate, length F
-        One a frame.
-    position : ndarray, shape (F, 3)
-        True positions, m, frame fg; NaN where they are not known.
-    rotation : ndarray, shape (F, 3, 3)
-        True rotation matrices from the body's frame to fg.
-    """
+    """Compare a body's F poses with the true ones, frame fg; NaN where they are not known."""
     distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
     for i, estimate in enumerate(estimates):
         if estimate.state == OK and estimate.rotation is not None:

@@ -89,15 +89,7 @@ def prepare(
 ) -> PreparedSession:
     """Check a model against a session, and work out what follows from the two.
 
-    Parameters
-    ----------
-    session : Session
-        What was recorded.
-    model : FieldModel
-        Calibrated or nominal.
-    baseline : Session, optional
-        Distortion-free recording of the same board; its readings are not used where the session
-        has no reference fluxes.
+    A baseline's readings are not used where the session has no reference fluxes.
 
     Raises
     ------

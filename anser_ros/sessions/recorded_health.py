@@ -48,14 +48,8 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
 def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
     """Return the share of poses in state ok among all that a tracker judged; 0 if it judged none.
 
-    Frames that it never saw, because the machine was too slow for them, do not count.
-
-    Parameters
-    ----------
-    words : mapping
-        Of `last_words`.
-    tracker : str
-        The node, whose statuses of sensors and bodies are named ``NODE: SENSOR``.
+    Frames that it never saw, because the machine was too slow for them, do not count. The statuses
+    of its sensors and bodies, of `last_words`, are named ``NODE: SENSOR``.
     """
     ok = judged = 0
     for name, values in words.items():
@@ -67,19 +61,9 @@ def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
 
 
 def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
-    """Return when each part of a node first warned.
+    """Return when each part of a node first warned: log time, ns, by the part's name.
 
-    Parameters
-    ----------
-    path : path
-        The recording.
-    part_of : str
-        The node, whose statuses are named ``NODE: PART``.
-
-    Returns
-    -------
-    dict of str to int
-        Log time of the first warning, ns, by the part's name.
+    The statuses of a node's parts are named ``NODE: PART``.
 
     Raises
     ------

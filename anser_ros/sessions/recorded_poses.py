@@ -22,14 +22,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LiveErrors:
-    """Holds errors of the poses of one sensor or body.
+    """Holds errors (n,) of the poses of one sensor or body against the optical ones, m and rad.
 
-    Attributes
-    ----------
-    position : ndarray, shape (n,)
-        Distance from the optical pose, m, where there is one.
-    orientation : ndarray, shape (n,)
-        Angle, rad: of a coil between the axes, of a body the whole turn.
+    The angle is of a coil between the axes, of a body the whole turn.
     """
 
     position: Array
@@ -59,15 +54,10 @@ def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict
 
 
 def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErrors]:
-    """Return errors of everything that the tracker of a namespace published, by sensor and body.
+    """Return errors of all that the tracker of a namespace published, by sensor and body.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        The recording, with optical poses, and the tracker's model, whose corrections of the
-        clock, the optical frame and the sensors are made.
-    namespace : str
-        Of the tracker, such as ``/anser``.
+    The recording has optical poses, and is prepared with the tracker's model, whose corrections of
+    the clock, the optical frame and the sensors are made.
 
     Raises
     ------

@@ -67,14 +67,7 @@ def without_resting_metal(
 ) -> Scan | None:
     """Return a scan without metal that rested during it; None where there is none to take off.
 
-    Parameters
-    ----------
-    sessions : sequence of Session
-        That were calibrated.
-    calibration : Calibration
-        With the metal in its field.
-    progress : callable, optional
-        Called with the name of the stage.
+    The calibration has the metal in its field.
     """
     scan = calibration.scan
     if scan.survey is None:

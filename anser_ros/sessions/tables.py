@@ -22,11 +22,7 @@ ENDINGS = ('.csv', '.npy', '.npz', '.mat')
 class NumberTable:
     """Holds the arrays of one file by name; the first index of each counts rows.
 
-    Attributes
-    ----------
-    path : Path
-    arrays : mapping of str to ndarray, shapes (N, ...)
-        Of a CSV file one for each column, of a ``.npy`` file one called ``data``.
+    A CSV file has one for each column, a ``.npy`` file one called ``data``.
     """
 
     path: Path

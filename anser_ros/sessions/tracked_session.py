@@ -55,20 +55,9 @@ def track(
 ) -> TrackedSession:
     """Track every tool sensor and body of a session at every frame.
 
-    The optical pose is never used: neither as a start value nor to refuse a pose.
-
-    Parameters
-    ----------
-    prepared : PreparedSession
-        The session and its model.
-    settings : TrackerSettings, optional
-        The noise is that of the session's setup.
-    follower : ModelFollower, optional
-        Refits the model on the way.
-    in_phase : bool
-        Whether only the fluxes' in-phase parts are used, for an `in_phase_model`.
-    progress : callable, optional
-        Called with the finished share, 0 to 1.
+    The optical pose is never used: neither as a start value nor to refuse a pose. The noise is
+    that of the session's setup. With ``in_phase``, for an `in_phase_model`, only the fluxes'
+    in-phase parts are used.
 
     Raises
     ------

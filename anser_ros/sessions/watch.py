@@ -93,16 +93,9 @@ class Sighting:
 class Watch:
     """Looks at one window after the other, and remembers what it found.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        Any session of the setup, an empty one too, with the model whose effects are corrected
-        already; without a baseline the references are not used.
-
-    Attributes
-    ----------
-    searches : int
-        How often something new was searched for.
+    It is made of any session of the setup, an empty one too, with the model whose effects are
+    corrected already; without a baseline the references are not used. ``searches`` counts how
+    often something new was searched for.
     """
 
     def __init__(self, prepared: PreparedSession) -> None:
@@ -112,14 +105,7 @@ class Watch:
         self.searches = 0
 
     def look(self, session: Session, first_ns: int) -> Sighting:
-        """Look at a window.
-
-        Parameters
-        ----------
-        session : Session
-            The last seconds.
-        first_ns : int
-            Stamp that the time of the model's own effects counts from.
+        """Look at the last seconds; the time of the model's own effects counts from a stamp.
 
         Raises
         ------

@@ -162,13 +162,9 @@ def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[Ra
 
 
 def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[RawMessage]:
-    """Yield the messages of a bag by ascending log time.
+    """Yield the messages of a bag, or of its folder, by ascending log time.
 
-    Parameters
-    ----------
-    path : path of the ``.mcap`` file or of the bag's folder
-    salvage : Salvage
-        Filled with what could not be read.
+    What could not be read is filled into ``salvage``.
 
     Raises
     ------

@@ -59,16 +59,7 @@ class BagRecord:
 def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bool = True) -> None:
     """Write ``metadata.yaml`` of the folder that holds one MCAP file, in place of an older one.
 
-    Parameters
-    ----------
-    path : Path
-        The MCAP file.
-    record : BagRecord
-        What it holds.
-    ros_distro : str
-        Name of the ROS distribution.
-    is_closed : bool
-        False while the bag is still being written.
+    The bag may still be written: then it is not ``is_closed``.
     """
     times = {
         'duration': {'nanoseconds': record.last_ns - record.first_ns},

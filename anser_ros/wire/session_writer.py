@@ -17,14 +17,7 @@ FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
 
 
 class SessionWriter(BagWriter):
-    """Writes a session without ROS: setup, fluxes and poses, log time = stamp.
-
-    Parameters
-    ----------
-    path : str or Path
-        The ``.mcap`` file; it must not exist yet.
-    frame_id : str
-        Frame of the fluxes and poses.
+    """Writes a session without ROS: setup, fluxes and poses of one frame, log time = stamp.
 
     Raises
     ------
@@ -45,16 +38,11 @@ class SessionWriter(BagWriter):
     def write_readings(
         self, sensors: Sequence[SensorSpec], stamp_ns: int, flux: NDArray[np.complex128]
     ) -> None:
-        """Write one window: a message of the tools' sensors and one of the references, if any.
+        """Write one window, by its middle: a message of tools' sensors and one of references, if
+        any.
 
-        Parameters
-        ----------
-        sensors : sequence of SensorSpec
-            The S sensors that the window is of.
-        stamp_ns : int
-            Its middle.
-        flux : ndarray, shape (S, K), complex
-            T; NaN where there is no reading, and for emitters without current.
+        Fluxes are (S, K), T, of the S sensors that are given: NaN where there is no reading, and
+        for emitters without current.
         """
         for topic, fixed in FLUX_TOPICS.items():
             rows = [i for i, s in enumerate(sensors) if (s.body == FIELD_GENERATOR) == fixed]

@@ -301,15 +301,6 @@ def parse_setup(text: str) -> Setup:
     stated has its default. ``fingerprint`` is for other readers and is computed again. Any other
     key is kept in ``extra``; one that looks like a misspelling is refused.
 
-    Parameters
-    ----------
-    text : str
-        YAML, schema ``anser_setup/1``.
-
-    Returns
-    -------
-    Setup
-
     Raises
     ------
     SetupError
