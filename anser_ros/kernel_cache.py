@@ -27,6 +27,7 @@ from numba.core.registry import cpu_target
 from anser_ros.errors import ParameterError
 
 PACKAGE = Path(__file__).parent
+_CONFIG: Any = numba.config
 DECORATOR = b'\n@kernel'
 """What stands before every kernel."""
 MOST_STATES = 4
@@ -42,7 +43,7 @@ def kernel(function: Any = None, **options: Any) -> Any:
         return functools.partial(kernel, **options)
     folder, code = kept_folder(), function.__code__
     path = Path(code.co_filename)
-    if folder is not None and path.is_relative_to(PACKAGE) and not numba.config.DISABLE_JIT:
+    if folder is not None and path.is_relative_to(PACKAGE) and not _CONFIG.DISABLE_JIT:
         copy = folder / path.relative_to(PACKAGE)
         function.__code__ = code.replace(co_filename=str(copy))
     return numba.njit(function, cache=True, error_model='numpy', **options)
@@ -51,7 +52,7 @@ def kernel(function: Any = None, **options: Any) -> Any:
 @functools.cache
 def kept_folder() -> Path | None:
     """Return the folder of the kernels as their sources are now; None where it cannot be made."""
-    home = Path(numba.config.CACHE_DIR or os.environ.get('XDG_CACHE_HOME') or '~/.cache')
+    home = Path(_CONFIG.CACHE_DIR or os.environ.get('XDG_CACHE_HOME') or '~/.cache')
     folder = home.expanduser() / 'anser_ros' / 'kernels' / _state()[0]
     return folder if folder.is_dir() or _copy_sources(folder) else None
 

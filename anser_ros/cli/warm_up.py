@@ -177,7 +177,7 @@ def _refit() -> None:
     """Make a refit of the demo's board; its tables, most of the work, are kept for the demo."""
     from anser_ros.refit.live_refit import LiveRefit
     from anser_ros.refit.tables import build_tables
-    from anser_ros.sessions.drawing import Drawing
+    from anser_ros.sessions.drawing import NominalBoard
     from anser_ros.sessions.kept_tables import KeptTables, kept_folder
     from anser_ros.sessions.session import sensor_table
     from anser_ros.sessions.volume import stated_volume
@@ -195,7 +195,7 @@ def _refit() -> None:
     )
     model, folder = _demo_model(), kept_folder()
     tables = build_tables(
-        model, references, setup.refit, Drawing.of(setup).field, stated_volume(setup)
+        model, references, setup.refit, NominalBoard.of(setup).field, stated_volume(setup)
     )
     refit = LiveRefit(model, references, clean, setup.refit, tables=tables)
     if folder is not None:

@@ -122,15 +122,10 @@ def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
     ParameterError
         When the folder has none, or the table is not one of ours.
     """
-    found: dict[str, dict[Key, float]] = {'position': {}, 'orientation': {}}
-
-    def take(row: dict[str, str]) -> None:
-        key = int(row['stamp_ns']), row['name']
-        for kind, unit in (('position', 'm'), ('orientation', 'rad')):
-            found[kind][key] = float(row[f'{kind}_error_{unit}'])
-
-    _each_row(folder, ERRORS_FILE, ERROR_COLUMNS, take)
-    return found
+    return {
+        kind: _read(folder, ERRORS_FILE, ERROR_COLUMNS, lambda row, k=key: float(row[k]))
+        for kind, key in zip(('position', 'orientation'), ERROR_COLUMNS[2:], strict=True)
+    }
 
 
 def read_states(folder: Path) -> dict[Key, float]:
@@ -141,22 +136,17 @@ def read_states(folder: Path) -> dict[Key, float]:
     ParameterError
         When the folder lacks a table, or one is not ours.
     """
+    tables = ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS))
     found: dict[Key, float] = {}
-
-    def take_as(column: str) -> Callable[[dict[str, str]], None]:
-        def take(row: dict[str, str]) -> None:
-            found[int(row['stamp_ns']), row[column]] = float(row['status'] == OK)
-
-        return take
-
-    _each_row(folder, POSES_FILE, POSE_COLUMNS, take_as('sensor'))
-    _each_row(folder, BODIES_FILE, BODY_COLUMNS, take_as('body'))
+    for name, columns in tables:
+        found |= _read(folder, name, columns, lambda row: float(row['status'] == OK))
     return found
 
 
-def _each_row(
-    folder: Path, name: str, columns: tuple[str, ...], take: Callable[[dict[str, str]], None]
-) -> None:
+def _read(
+    folder: Path, name: str, columns: tuple[str, ...], value: Callable[[dict[str, str]], float]
+) -> dict[Key, float]:
+    """A value of each row of a table, by stamp and by the name in its second column."""
     path = folder / name
     if not path.is_file():
         raise ParameterError(f'{folder}: no {name}; is it a folder of anser evaluate?')
@@ -164,8 +154,7 @@ def _each_row(
     try:
         if tuple(names) != columns:
             raise ValueError(f'columns must be {", ".join(columns)}')
-        for row in rows:
-            take(row)
+        return {(int(row['stamp_ns']), row[columns[1]]): value(row) for row in rows}
     except (ValueError, TypeError) as error:
         raise ParameterError(f'{path}: {error}') from error
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.units import FLUX_UNITS, LENGTH_UNITS, unit_words
 from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.setup import Setup
@@ -108,7 +108,7 @@ OTHER_READINGS = (
 """What people write instead; the first that fits is named."""
 
 
-def check_conventions(path: str, setup: Setup, drawing: Drawing, tool: Measurements) -> None:
+def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Measurements) -> None:
     """Check units and order of a tool's poses, and the unit of its fluxes, against each other.
 
     Raises
@@ -117,18 +117,18 @@ def check_conventions(path: str, setup: Setup, drawing: Drawing, tool: Measureme
         When the poses contradict the fluxes as they stand and fit them when read in another way,
         or the fluxes are larger than the board can make by the factor of a unit.
     """
-    if drawing.field is None:
+    if nominal.field is None:
         return
     rows, columns = _chosen(tool)
     flux = tool.flux[rows, columns]
     if len(rows) >= FEWEST_READINGS:
-        share, gain = _fit(drawing, tool, rows, columns, flux, AS_WRITTEN)
+        share, gain = _fit(nominal, tool, rows, columns, flux, AS_WRITTEN)
         if share < POOR:
-            _check_readings(path, drawing, tool, rows, columns, flux, share)
+            _check_readings(path, nominal, tool, rows, columns, flux, share)
         elif share > GOOD:
             _check_flux(path, tool, float(np.median(np.linalg.norm(flux, axis=1))), gain)
             return
-    _check_size(path, setup, drawing, tool)
+    _check_size(path, setup, nominal, tool)
 
 
 def _chosen(tool: Measurements) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -146,7 +146,7 @@ def _chosen(tool: Measurements) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _fit(
-    drawing: Drawing,
+    nominal: NominalBoard,
     tool: Measurements,
     rows: NDArray[np.int64],
     columns: NDArray[np.int64],
@@ -163,8 +163,8 @@ def _fit(
     )
     rotation = (turn.inv() if reading.is_inverse else turn).as_matrix()
     centres, axes = tool.sensors.placed(*reading.placed(tool.position[frames], rotation))
-    assert drawing.field is not None
-    field = drawing.field(centres[where, columns])
+    assert nominal.field is not None
+    field = nominal.field(centres[where, columns])
     predicted = np.einsum('pki,pi->pk', field, axes[where, columns])
     size = np.einsum('pk,pk->p', predicted, predicted)
     ratio = np.einsum('pk,pk->p', predicted, flux) / np.maximum(size, 1e-300)
@@ -177,7 +177,7 @@ def _fit(
 
 def _check_readings(
     path: str,
-    drawing: Drawing,
+    nominal: NominalBoard,
     tool: Measurements,
     rows: NDArray[np.int64],
     columns: NDArray[np.int64],
@@ -186,7 +186,7 @@ def _check_readings(
 ) -> None:
     """Raise where one other way to read the poses explains the fluxes."""
     for reading in OTHER_READINGS:
-        better, _ = _fit(drawing, tool, rows, columns, flux, reading)
+        better, _ = _fit(nominal, tool, rows, columns, flux, reading)
         if better > GOOD:
             span = float(np.linalg.norm(np.ptp(tool.position[rows], axis=0)))
             raise PlausibilityError(
@@ -208,13 +208,13 @@ def _check_flux(
         )
 
 
-def _check_size(path: str, setup: Setup, drawing: Drawing, tool: Measurements) -> None:
+def _check_size(path: str, setup: Setup, nominal: NominalBoard, tool: Measurements) -> None:
     """Raise where fluxes are larger than the drawn board makes anywhere in the tracked volume."""
     whole = np.isfinite(tool.flux).all(axis=2) & (tool.flags == 0)
-    if not whole.any() or drawing.field is None:
+    if not whole.any() or nominal.field is None:
         return
     median = float(np.median(np.linalg.norm(tool.flux[whole], axis=1)))
-    there = np.linalg.norm(drawing.field(tracked_volume(setup).samples(4, 3)), axis=(1, 2))
+    there = np.linalg.norm(nominal.field(tracked_volume(setup).samples(4, 3)), axis=(1, 2))
     if median > TOO_LARGE * float(there.max()):
         usual = float(np.median(there))
         _check_flux(path, tool, median, median / usual, 'in the tracked volume')

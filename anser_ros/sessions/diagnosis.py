@@ -110,7 +110,7 @@ def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Prob
         session.reference,
         None if clean is None else clean.flux,
         corrected.model,
-        corrected.drawing.model,
+        corrected.nominal.model,
         spread or spread_of(corrected),
     )
 
@@ -172,8 +172,9 @@ def _errors(
     usual = TrackerSettings()
     settings = replace(usual, gate=usual.gate * max(1.0, ROOM * misfit))
     evaluation = compare(prepared, track(prepared, settings, follower))
-    # Where the field is the same all around its axis, no coil has a pose, but the source has.
-    series = (evaluation.sources or evaluation.sensors).values()
+    # Where no coil has a pose (a field that is the same all around an axis), the source has.
+    further = [one for group in evaluation.further.values() for one in group.values()]
+    series = further or list(evaluation.sensors.values())
     # The first frame of a held-out part is there for its stamp alone.
     return TrackingErrors(
         _rms([one.position_error[1:] for one in series]),

@@ -1,30 +1,46 @@
-"""Takes the emitters of a setup as it draws them: their field, and the nominal model of it."""
+"""Makes the nominal board of a setup: the emitters as it draws them, their field and model."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from anser_ros.errors import AnserError, SetupError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
-from anser_ros.physics.board import Board
+from anser_ros.physics.board import Board, build_board
 from anser_ros.refit.excitation import FieldFunction
-from anser_ros.sessions.starting_model import board_of
 from anser_ros.wire.setup import Setup
 
 
+def board_of(setup: Setup) -> Board:
+    """Return the emitter's geometry; raises `SetupError` when its kind is unknown or a key is
+    missing.
+    """
+    emitter = setup.emitter
+    return build_board(
+        emitter.kind,
+        emitter.geometry,
+        setup.emitter_names,
+        np.array([coil.centre_m for coil in emitter.coils]),
+        np.array([coil.rotation_deg for coil in emitter.coils]),
+        setup.frequencies_hz,
+    )
+
+
 @dataclass(frozen=True)
-class Drawing:
+class NominalBoard:
     """Holds what a setup's geometry gives; all of it is None for no known kind of board."""
 
     board: Board | None
 
     @staticmethod
-    def of(setup: Setup) -> 'Drawing':
-        """Return the drawing of a setup's emitters."""
+    def of(setup: Setup) -> 'NominalBoard':
+        """Return the nominal board of a setup."""
         try:
-            return Drawing(board_of(setup))
+            return NominalBoard(board_of(setup))
         except SetupError:
-            return Drawing(None)
+            return NominalBoard(None)
 
     @property
     def field(self) -> FieldFunction | None:

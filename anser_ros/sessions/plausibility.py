@@ -13,7 +13,7 @@ from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.sessions.conventions import check_conventions
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.units import LENGTH_UNITS, unit_words
 from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.pose_topics import optical_stem
@@ -53,13 +53,13 @@ def plausible_tools(
     PlausibilityError
         With the evidence, in one line.
     """
-    drawing, kept, words = Drawing.of(setup), [], []
+    nominal, kept, words = NominalBoard.of(setup), [], []
     for tool in tools:
         words += _check_refused(path, tool, refused)
         _check_clocks(path, tool)
         thawed, remarks = _thawed(path, tool)
         words += remarks
-        check_conventions(path, setup, drawing, thawed)
+        check_conventions(path, setup, nominal, thawed)
         _check_distance(path, setup, thawed)
         kept.append(thawed)
     return tuple(kept), '; '.join(words)

@@ -42,29 +42,31 @@ class PoseSeries:
         return np.array([estimate.state == OK for estimate in self.estimates], dtype=bool)
 
 
-def sensor_series(
-    name: str, estimates: Sequence[PoseEstimate], centres: Array, axes: Array
+def pose_series(
+    name: str, estimates: Sequence[PoseEstimate], position: Array, orientation: Array
 ) -> PoseSeries:
-    """Compare a sensor's F poses with where it truly was, frame fg; NaN where that is not
-    known.
+    """Compare the F poses of a sensor or body with where it truly was, frame fg.
+
+    Parameters
+    ----------
+    name : str
+    estimates : sequence of PoseEstimate, length F
+    position : ndarray, shape (F, 3)
+        m; NaN where it is not known.
+    orientation : ndarray, shape (F, 3) or (F, 3, 3)
+        Unit axes of a coil, or rotations of a body from its own frame.
     """
+    of_body = orientation.ndim == 3
     distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
     for i, estimate in enumerate(estimates):
-        if estimate.state == OK:
-            distance[i] = np.linalg.norm(estimate.position - centres[i])
-            angle[i] = axis_angles(estimate.axis, axes[i])
-    return PoseSeries(name, tuple(estimates), distance, angle)
-
-
-def body_series(
-    name: str, estimates: Sequence[PoseEstimate], position: Array, rotation: Array
-) -> PoseSeries:
-    """Compare a body's F poses with the true ones, frame fg; NaN where they are not known."""
-    distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
-    for i, estimate in enumerate(estimates):
-        if estimate.state == OK and estimate.rotation is not None:
-            distance[i] = np.linalg.norm(estimate.position - position[i])
-            angle[i] = rotation_angles(estimate.rotation.T @ rotation[i])
+        if estimate.state != OK or (of_body and estimate.rotation is None):
+            continue
+        distance[i] = np.linalg.norm(estimate.position - position[i])
+        if of_body:
+            assert estimate.rotation is not None
+            angle[i] = rotation_angles(estimate.rotation.T @ orientation[i])
+        else:
+            angle[i] = axis_angles(estimate.axis, orientation[i])
     return PoseSeries(name, tuple(estimates), distance, angle)
 
 

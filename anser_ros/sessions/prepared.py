@@ -15,7 +15,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.baseline import Baseline, baseline_of
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.recorded_drift import is_recorded
 from anser_ros.sessions.session import Session, measured_noise
 from anser_ros.sessions.starting_model import check_fits
@@ -32,7 +32,7 @@ class PreparedSession:
         What was recorded.
     model : FieldModel
         Of the session's emitters.
-    drawing : Drawing
+    nominal : NominalBoard
         The emitters as the setup draws them.
     noise_t : float
         Noise of the fluxes' components as the acquisition measured it, T; 0 where it did not, and
@@ -49,7 +49,7 @@ class PreparedSession:
 
     session: Session
     model: FieldModel
-    drawing: Drawing
+    nominal: NominalBoard
     noise_t: float
     volume: TrackedVolume
     baseline: Baseline | None
@@ -108,7 +108,7 @@ def prepare(
     return PreparedSession(
         session,
         model,
-        Drawing.of(session.setup),
+        NominalBoard.of(session.setup),
         measured_noise(session.setup),
         tracked_volume(session.setup),
         clean,

@@ -23,7 +23,7 @@ from anser_ros.effects.prediction import tool_view
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.session import Session
 
 Array = NDArray[np.float64]
@@ -195,7 +195,7 @@ def _problem(
     try:
         return build_problem(
             tools, _between(reference, begin, end), baseline, calibration.model,
-            Drawing.of(setup).model, Spread(noise, accuracy),
+            NominalBoard.of(setup).model, Spread(noise, accuracy),
         )  # fmt: skip
     except DiagnosisError:
         return None  # too few frames with a pose

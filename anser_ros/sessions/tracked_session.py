@@ -15,6 +15,9 @@ from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
 
 Progress = Callable[[float], None]
+SOURCES = 'sources'
+"""Kind of tracked things: the source as a body sees it, place and axis in the body's frame, where
+the field is the same all around an axis."""
 
 
 @dataclass(frozen=True)
@@ -29,15 +32,14 @@ class TrackedSession:
         Mean wall time that a frame took, the refit included.
     refit : RefitSummary or None
         What the refit did; None where the model did not follow the references.
-    sources : dict of str to tuple of PoseEstimate
-        Of every body by its name, where the field is the same all around an axis: place and axis
-        of the source in the body's frame.
+    further : dict of str to dict of str to tuple of PoseEstimate
+        What else was tracked, by kind and name: `SOURCES`.
     """
 
     estimates: dict[str, tuple[PoseEstimate, ...]]
     seconds_per_frame: float
     refit: RefitSummary | None = None
-    sources: dict[str, tuple[PoseEstimate, ...]] = field(default_factory=dict)
+    further: dict[str, dict[str, tuple[PoseEstimate, ...]]] = field(default_factory=dict)
 
 
 def in_phase_model(model: FieldModel) -> FieldModel:
@@ -96,8 +98,8 @@ def track(
     seconds = (time.perf_counter() - start) / max(len(frames), 1)
     by_name = {name: tuple(given) for name, given in estimates.items()}
     summary = None if follower is None else follower.summary
-    seen_from = {name: tuple(given) for name, given in sources.items()}
-    return TrackedSession(by_name, seconds, summary, seen_from)
+    seen = {name: tuple(given) for name, given in sources.items()}
+    return TrackedSession(by_name, seconds, summary, {SOURCES: seen} if seen else {})
 
 
 def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: bool) -> Tracker:

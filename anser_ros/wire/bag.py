@@ -177,28 +177,21 @@ def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[Ra
             words = 'not an MCAP file' if os.path.getsize(name) else 'the file is empty'
             raise BagError(f'{name}: {words}{_import_words(name)}')
         stream.seek(0)
-        count = 0
-        messages = _indexed(stream)
-        if messages is not None:
-            try:
-                for message in messages:
-                    count += 1
-                    yield message
+        last, messages = -1, _indexed(stream)
+        try:
+            for message in messages or ():
+                yield message
+                last = message.log_time_ns
+            if messages is not None:
                 return
-            except _BROKEN as error:
-                salvage.lost = f'{type(error).__name__}: {error}'
-                last = message.log_time_ns if count else -1
-                stream.seek(0)
-                rest = _streamed(stream, salvage, os.path.getsize(name))
-                rest = [message for message in rest if message.log_time_ns > last]
-                yield from rest
-                return
+        except _BROKEN as error:
+            salvage.lost = f'{type(error).__name__}: {error}'
         stream.seek(0)
-        for message in _streamed(stream, salvage, os.path.getsize(name)):
-            count += 1
-            yield message
-        if count == 0:
+        rest = _streamed(stream, salvage, os.path.getsize(name))
+        rest = [message for message in rest if message.log_time_ns > last]
+        if not rest and last < 0:
             raise BagError(f'{name}: no message can be read ({salvage.lost or "empty bag"})')
+        yield from rest
 
 
 class MessageDecoder:

@@ -10,7 +10,7 @@ from anser_ros.wire import cdr
 from anser_ros.wire.bag_metadata import qos_profile
 from anser_ros.wire.bag_writer import BagWriter
 from anser_ros.wire.points import STALE, FluxPoints, PointFieldTuple, encode_flux
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec
 
 FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
 """Topics of a session's fluxes, and whether their sensors are fixed to the field generator."""
@@ -47,7 +47,7 @@ class SessionWriter(BagWriter):
         for topic, fixed in FLUX_TOPICS.items():
             rows = [i for i, s in enumerate(sensors) if (s.body == FIELD_GENERATOR) == fixed]
             if rows:
-                points = _points([sensors[i] for i in rows], flux[rows], fixed)
+                points = _points([sensors[i] for i in rows], flux[rows])
                 fields, step, data = encode_flux(points)
                 self.write_flux(topic, stamp_ns, fields, step, len(rows), data)
 
@@ -86,20 +86,11 @@ class SessionWriter(BagWriter):
         return self._channels[topic]
 
 
-def _points(
-    sensors: Sequence[SensorSpec], flux: NDArray[np.complex128], fixed: bool
-) -> FluxPoints:
-    """One window's cloud; a sensor lacks its reading where it has none of an emitter in force.
+def _points(sensors: Sequence[SensorSpec], flux: NDArray[np.complex128]) -> FluxPoints:
+    """One window's cloud; a sensor lacks its reading where it has none of a driven emitter.
 
     The place of a sensor that moves is not known to its fluxes.
     """
-    known = np.isfinite(flux)
+    known, rows = np.isfinite(flux), SensorRows.of(sensors, fixed_only=True)
     lacks = (known != known.any(axis=0)).any(axis=1) | ~known.any()
-    nothing = np.full((len(sensors), 3), np.nan)
-    return FluxPoints(
-        channel=np.array([sensor.channel for sensor in sensors]),
-        flags=np.where(lacks, STALE, 0),
-        flux=flux,
-        position=np.array([sensor.position_m for sensor in sensors]) if fixed else nothing,
-        axis=np.array([sensor.axis for sensor in sensors]) if fixed else nothing,
-    )
+    return FluxPoints(rows.channel, np.where(lacks, STALE, 0), flux, rows.position, rows.axis)

@@ -5,12 +5,14 @@ positions and axes are given in the frame of the sensor's body; the body ``fg`` 
 generator itself.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.fingerprint import Identity, fingerprint_of
@@ -79,6 +81,31 @@ class SensorSpec:
     axis: Vector
     length_m: float
     windings: tuple[Winding, ...] = ()
+
+
+class SensorRows(NamedTuple):
+    """Holds what S sensors are as arrays, in the frames of their bodies.
+
+    Attributes
+    ----------
+    channel : ndarray of int, shape (S,)
+    position, axis : ndarray, shape (S, 3)
+        m and unit vector.
+    """
+
+    channel: NDArray[np.int64]
+    position: NDArray[np.float64]
+    axis: NDArray[np.float64]
+
+    @staticmethod
+    def of(sensors: Sequence[SensorSpec], fixed_only: bool = False) -> 'SensorRows':
+        """Return sensors in their order; with ``fixed_only`` places of what moves are NaN."""
+        position = np.array([s.position_m for s in sensors], np.float64).reshape(-1, 3)
+        axis = np.array([s.axis for s in sensors], np.float64).reshape(-1, 3)
+        if fixed_only:
+            moves = np.array([s.body != FIELD_GENERATOR for s in sensors], bool)
+            position[moves] = axis[moves] = np.nan
+        return SensorRows(np.array([s.channel for s in sensors], np.int64), position, axis)
 
 
 @dataclass(frozen=True)
