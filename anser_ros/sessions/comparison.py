@@ -39,9 +39,7 @@ FEWEST_BLOCKS = 5
 
 @dataclass(frozen=True)
 class Difference:
-    """Holds the interval of a difference, second less first; NaN where the stretches are too
-    few.
-    """
+    """Holds the interval of a difference, second less first; NaN where stretches are too few."""
 
     low: float
     high: float

@@ -42,22 +42,11 @@ board that is not as drawn stay far below."""
 
 @dataclass(frozen=True)
 class Reading:
-    """Describes one way to read the numbers of a pose.
+    """Describes one way to read the numbers of a pose, and says in words what they then are.
 
-    Attributes
-    ----------
-    words : str
-        What the numbers then are.
-    order : tuple of int
-        Where x, y, z and w stand.
-    is_inverse : bool
-        Whether the rotation is from fg to the body.
-    scale : float
-        m in a unit of length.
-    axes : tuple of int
-        Which of the numbers, counted from one, are x, y and z; negative where they are reversed.
-    is_frame : bool
-        Whether rotations have these axes too, and not positions alone.
+    ``order`` is where x, y, z and w stand, ``scale`` m in a unit of length, and ``axes`` which of
+    the numbers, counted from one, are x, y and z: negative where they are reversed. A rotation
+    that is inverse is from fg to the body; in another frame rotations have these axes too.
     """
 
     words: str

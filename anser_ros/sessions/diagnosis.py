@@ -123,7 +123,7 @@ def spread_of(prepared: PreparedSession) -> Spread:
 
 
 def held_out_part(session: Session, problem: Problem) -> Session:
-    """Return the frames of a problem's blocks that took no part, and the first, which sets the
+    """Return the frames of the blocks that took no part, and the first one, which sets the
     clock.
     """
     held = {

@@ -32,19 +32,11 @@ from anser_ros.tracking.source_track import seen_from
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Holds tracked poses and their errors.
+    """Holds tracked poses and their errors, by the names of sensors, and of bodies in six degrees.
 
-    Attributes
-    ----------
-    sensors, bodies : dict of str to PoseSeries
-        Poses and errors of every tool sensor, and of every body whose six degrees of freedom were
-        tracked, by name.
-    seconds_per_frame : float
-        Mean wall time that a frame took.
-    refit : RefitSummary or None
-        What the refit did; None where the model did not follow the references.
-    further : dict of str to dict of str to PoseSeries
-        What else was tracked (`FURTHER`), by kind and name.
+    The seconds are the mean wall time of a frame; ``refit`` is what the refit did, None where the
+    model did not follow the references, and ``further`` what else was tracked (`FURTHER`), by kind
+    and name.
     """
 
     sensors: dict[str, PoseSeries]
@@ -73,28 +65,11 @@ def track_session(
 ) -> Evaluation:
     """Track every tool sensor and body of a session at every frame, and compare with the optics.
 
-    Parameters
-    ----------
-    session : Session
-        What was recorded.
-    model : FieldModel
-        Of the session's emitters.
-    settings : TrackerSettings, optional
-        What the tracker may assume.
-    baseline : Session, optional
-        Distortion-free recording of the same board, whose reference readings are the clean ones.
-    refit : bool
-        Whether the model follows the session's reference sensors, as the node does live.
-    in_phase : bool
-        Whether only in-phase fluxes and moments are used (the article's way).
-    progress : callable, optional
-        Called with the finished share, 0 to 1.
-    patches : dict of str to str, optional
-        Bodies that carry further reference coils, each with the topic of its poses in the bag.
-    witnesses : bool
-        Whether the refit also uses what the coils of rigid tools contradict.
-    known_metal : KnownMetal, optional
-        Metal that the model follows by the tools alone, instead of a refit.
+    A baseline is a distortion-free recording of the same board. With ``refit`` the model follows
+    the references as it does live, with further ones on patches (bodies with the topic of their
+    poses in the bag), and with witnesses also what the coils of rigid tools contradict; known
+    metal is followed by the tools alone, instead. In phase, only these fluxes and moments are used
+    (the article's way). Progress gets the finished share, 0 to 1.
 
     Raises
     ------

@@ -42,16 +42,9 @@ CHANCE = 1e-3
 class FewPosesDiagnosis:
     """Holds what is wrong with the sensors of a session of few poses.
 
-    Attributes
-    ----------
-    before, after : Calibration
-        With sensors as the given model has them, and with what was found.
-    effects : tuple of EffectRecord
-        What was found, with its evidence.
-    without_t : tuple of float
-        Held-out residual, T, with all effects but each of these.
-    model : FieldModel
-        The field as it was estimated, and the effects that were known and found.
+    Before is with sensors as the given model has them, after with the effects that were found, of
+    which each has the held-out residual without it, T. The model is the field as it was estimated,
+    and the effects that were known and found.
     """
 
     before: Calibration

@@ -15,17 +15,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class FrameReadings:
-    """Holds what S sensors read in one frame.
-
-    Attributes
-    ----------
-    channels : ndarray of int, shape (S,)
-        Channel of each sensor.
-    flux : ndarray, shape (S, K), complex
-        T.
-    flags : ndarray of int, shape (S,)
-        Flag bits of the flux messages.
-    """
+    """Holds what S sensors read in one frame: channels, fluxes (S, K), T, and flag bits."""
 
     channels: NDArray[np.int64]
     flux: ComplexArray

@@ -16,19 +16,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PoseSeries:
-    """Holds every estimate of one sensor or body, with its error where the truth is known.
+    """Holds every estimate of one sensor or body, one a frame, with its error if the truth is
+    known.
 
-    Attributes
-    ----------
-    name : str
-        Of the sensor or body.
-    estimates : tuple of PoseEstimate, length F
-        One a frame.
-    position_error : ndarray, shape (F,)
-        Distance from the optical pose, m; NaN where there is no pose or no optical one.
-    orientation_error : ndarray, shape (F,)
-        Angle to the optical pose, rad: of a sensor between the axes, of a body the whole turn;
-        NaN as above.
+    Errors (F,) are the distance from the optical pose, m, and the angle to it, rad: of a sensor
+    between the axes, of a body the whole turn. They are NaN without a pose or an optical one.
     """
 
     name: str
@@ -45,16 +37,10 @@ class PoseSeries:
 def pose_series(
     name: str, estimates: Sequence[PoseEstimate], position: Array, orientation: Array
 ) -> PoseSeries:
-    """Compare the F poses of a sensor or body with where it truly was, frame fg.
+    """Compare the F poses of a sensor or body with where it truly was, m, frame fg; NaN if
+    unknown.
 
-    Parameters
-    ----------
-    name : str
-    estimates : sequence of PoseEstimate, length F
-    position : ndarray, shape (F, 3)
-        m; NaN where it is not known.
-    orientation : ndarray, shape (F, 3) or (F, 3, 3)
-        Unit axes of a coil, or rotations of a body from its own frame.
+    Orientations are unit axes (F, 3) of a coil, or rotations (F, 3, 3) of a body from its frame.
     """
     of_body = orientation.ndim == 3
     distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)

@@ -26,25 +26,10 @@ from anser_ros.sessions.volume import tracked_volume
 class PreparedSession:
     """Holds a session and a model that fits it, with what follows from the two.
 
-    Attributes
-    ----------
-    session : Session
-        What was recorded.
-    model : FieldModel
-        Of the session's emitters.
-    nominal : NominalBoard
-        The emitters as the setup draws them.
-    noise_t : float
-        Noise of the fluxes' components as the acquisition measured it, T; 0 where it did not, and
-        where the setup's accuracy states the noise, which goes before.
-    volume : TrackedVolume
-        The box in which poses are accepted.
-    baseline : Baseline or None
-        Clean readings of the session's reference sensors.
-    correction : Correction
-        Undoes the effects that the model knows.
-    recorded_drift : bool
-        Whether the model's drifts took their course on this very session.
+    ``noise_t`` is the noise of the fluxes' components as the acquisition measured it; 0 where it
+    did not, and where the setup states it. Poses are accepted in the volume. The baseline is of
+    the reference sensors, the correction undoes the effects that the model knows, and
+    ``recorded_drift`` says whether the model's drifts took their course on this very session.
     """
 
     session: Session

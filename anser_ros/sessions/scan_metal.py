@@ -43,16 +43,10 @@ UNCERTAINTY_FRAMES = 60
 
 @dataclass(frozen=True)
 class RestingMetal:
-    """Holds what metal at rest did to the fluxes of a session's tools.
+    """Holds what metal at rest did to the fluxes of a session's tools, (F, S, K) each, T.
 
-    Attributes
-    ----------
-    flux : tuple of ndarray, one per tool, shape (F, S, K), complex
-        In the frames that a scan holds, T.
-    sigma_t : float
-        Its standard deviation, root mean square of a phasor component, T.
-    record : EffectRecord
-        Where it rested, and where it came.
+    Sigma is that of a phasor component, root mean square; the record says where it rested and
+    came.
     """
 
     flux: tuple[NDArray[np.complex128], ...]

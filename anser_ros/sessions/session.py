@@ -27,22 +27,10 @@ hand at 0.1 m/s would be a centimetre off. Smaller, a slow recorder could not sa
 
 @dataclass(frozen=True)
 class Session:
-    """Holds one recording as measurements of every body.
+    """Holds one recording as measurements of every body that moves, in the order of the setup.
 
-    Attributes
-    ----------
-    path : str
-        Of the bag.
-    setup : Setup
-        The setup document that the bag holds.
-    start_ns : int
-        The stamp at time 0 of all measurements.
-    tools : tuple of Measurements
-        One a body that moves, in the order of the setup.
-    reference : Measurements or None
-        Of the reference sensors, where their fluxes were recorded.
-    lost : str
-        What could not be read, in words; empty when nothing is missing.
+    Time 0 of all is at ``start_ns``. The references are there where their fluxes were recorded;
+    ``lost`` says in words what could not be read.
     """
 
     path: str

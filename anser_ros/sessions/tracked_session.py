@@ -22,18 +22,10 @@ the field is the same all around an axis."""
 
 @dataclass(frozen=True)
 class TrackedSession:
-    """Holds what tracking a session gave.
+    """Holds the estimates of every sensor and body by its name, one per frame by its stamp.
 
-    Attributes
-    ----------
-    estimates : dict of str to tuple of PoseEstimate
-        Of every sensor and body by its name, one per frame, in the order of the stamps.
-    seconds_per_frame : float
-        Mean wall time that a frame took, the refit included.
-    refit : RefitSummary or None
-        What the refit did; None where the model did not follow the references.
-    further : dict of str to dict of str to tuple of PoseEstimate
-        What else was tracked, by kind and name: `SOURCES`.
+    The seconds are the mean wall time that a frame took, the refit included; ``further`` is what
+    else was tracked, by kind and name: `SOURCES`.
     """
 
     estimates: dict[str, tuple[PoseEstimate, ...]]

@@ -47,30 +47,12 @@ tool that stays closer shows that something is wrong, but not what."""
 
 @dataclass(frozen=True)
 class Sighting:
-    """Holds what a look found.
+    """Holds what a look found by comparing the fluxes with ``truth``.
 
-    Attributes
-    ----------
-    truth : str
-        What the fluxes were compared with.
-    frames : int
-        Tool frames that were compared.
-    findings : tuple of EffectRecord
-        What the model lacks; empty when all is well, or when no effect explains it.
-    excess : float
-        Mean square of the residuals in units of what is expected: 1 when all is well.
-    excess_left : float
-        The same with the findings in force.
-    flux_rms_t : float
-        Residual of the tools' fluxes, T a phasor component.
-    depends_on : tuple of str
-        What the unexplained part depends on.
-    remark : str
-        Why nothing is named although something is there.
-    terms : tuple of Term
-        The findings in force.
-    model : FieldModel or None
-        With the findings; None where there are none.
+    The excess is the mean square of the residuals of the tools' frames in units of what is
+    expected: 1 when all is well; ``excess_left`` is with the findings, empty also when no effect
+    explains it, as ``remark`` says. The residual is in T a phasor component; terms and model are
+    the findings', and ``depends_on`` is what the unexplained part depends on.
     """
 
     truth: str

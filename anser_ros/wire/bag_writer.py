@@ -61,15 +61,10 @@ class _Segments:
 class BagWriter:
     """Writes messages into one MCAP file, which is closed at the end of a ``with`` block.
 
-    A block that fails leaves no file, as half of one would be taken for a whole session. Until the
-    end the index of all chunks is in memory, 40 MB for an hour of forty topics.
-
-    Parameters
-    ----------
-    path : str or Path
-        The ``.mcap`` file; it must not exist yet, its folder is made.
-    raw : unbuffered binary stream, optional
-        Written to instead of a file at ``path``.
+    The file must not exist yet; its folder is made. An unbuffered binary stream may be given to be
+    written to instead. A block that fails leaves no file, as half of one would be taken for a
+    whole session. Until the end the index of all chunks is in memory, 40 MB for an hour of forty
+    topics.
 
     Raises
     ------
@@ -130,20 +125,11 @@ class BagWriter:
         qos: Sequence[Mapping[str, Any]] = (),
         type_hash: str = '',
     ) -> int:
-        """Announce a topic and return its channel.
+        """Announce a topic by its absolute name and return its channel.
 
-        Parameters
-        ----------
-        name : str
-            Absolute topic name.
-        type_name : str
-            Such as ``sensor_msgs/msg/PointCloud2``.
-        definition : str
-            The text of its definition, followed by those of all types that it contains.
-        qos : sequence of mapping
-            What its publishers offer (:func:`qos_profile`).
-        type_hash : str
-            REP 2011's hash, empty when it is not known.
+        The definition of its type is followed by those of all types in it; ``qos`` is what its
+        publishers offer (:func:`qos_profile`), and the hash, of REP 2011, empty when it is not
+        known.
         """
         if type_name not in self._schemas:
             self._schemas[type_name] = self._writer.register_schema(

@@ -48,12 +48,8 @@ class _Parts:
 def read_foreign(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[ForeignMessage]:
     """Yield the messages of a bag, one file after the other, each by its times of recording.
 
-    Parameters
-    ----------
-    path : path
-        A ``.db3`` or ``.mcap`` file, also with ``.zstd`` behind it, or a bag's folder.
-    salvage : Salvage
-        Filled with what could not be read.
+    The path is of a ``.db3`` or ``.mcap`` file, also with ``.zstd`` behind it, or of a bag's
+    folder. What could not be read is filled into ``salvage``.
 
     Raises
     ------

@@ -10,16 +10,10 @@ from anser_ros.wire.setup import Setup
 
 @dataclass(frozen=True)
 class RecordedFluxes:
-    """Holds the fluxes of one topic.
+    """Holds the fluxes (F, S, K) of one topic, T, with flags (F, S), by ascending header stamps
+    (F,).
 
-    Attributes
-    ----------
-    stamp_ns : ndarray, shape (F,)
-        Header stamps, ascending.
-    channel : ndarray, shape (S,)
-    flags : ndarray, shape (F, S)
-    flux : ndarray, shape (F, S, K), complex
-        T; NaN (with the flag `STALE`) where a frame lacks the channel.
+    They are NaN, with the flag `STALE`, where a frame lacks a channel, of which there are S.
     """
 
     stamp_ns: NDArray[np.int64]

@@ -38,8 +38,7 @@ class SessionWriter(BagWriter):
     def write_readings(
         self, sensors: Sequence[SensorSpec], stamp_ns: int, flux: NDArray[np.complex128]
     ) -> None:
-        """Write one window, by its middle: a message of tools' sensors and one of references, if
-        any.
+        """Write one window, stamped with its middle: a message of tools, and one of references.
 
         Fluxes are (S, K), T, of the S sensors that are given: NaN where there is no reading, and
         for emitters without current.

@@ -84,13 +84,8 @@ class SensorSpec:
 
 
 class SensorRows(NamedTuple):
-    """Holds what S sensors are as arrays, in the frames of their bodies.
-
-    Attributes
-    ----------
-    channel : ndarray of int, shape (S,)
-    position, axis : ndarray, shape (S, 3)
-        m and unit vector.
+    """Holds channels (S,), positions, m, and unit axes (S, 3) of sensors, in their bodies'
+    frames.
     """
 
     channel: NDArray[np.int64]
