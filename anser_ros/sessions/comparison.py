@@ -7,7 +7,9 @@ Frames close in time share the causes of their errors, so whole stretches of tim
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,10 +122,9 @@ def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
     ParameterError
         When the folder has none, or the table is not one of ours.
     """
-    return {
-        kind: _read(folder, ERRORS_FILE, ERROR_COLUMNS, lambda row, k=key: float(row[k]))
-        for kind, key in zip(('position', 'orientation'), ERROR_COLUMNS[2:], strict=True)
-    }
+    _, _, *kinds = ERROR_COLUMNS
+    errors = [_read(folder, ERRORS_FILE, ERROR_COLUMNS, itemgetter(kind)) for kind in kinds]
+    return {'position': errors[0], 'orientation': errors[1]}
 
 
 def read_states(folder: Path) -> dict[Key, float]:
@@ -137,12 +138,12 @@ def read_states(folder: Path) -> dict[Key, float]:
     tables = ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS))
     found: dict[Key, float] = {}
     for name, columns in tables:
-        found |= _read(folder, name, columns, lambda row: float(row['status'] == OK))
+        found |= _read(folder, name, columns, lambda row: row['status'] == OK)
     return found
 
 
 def _read(
-    folder: Path, name: str, columns: tuple[str, ...], value: Callable[[dict[str, str]], float]
+    folder: Path, name: str, columns: tuple[str, ...], value: Callable[[dict[str, str]], Any]
 ) -> dict[Key, float]:
     """A value of each row of a table, by stamp and by the name in its second column."""
     path = folder / name
@@ -152,7 +153,7 @@ def _read(
     try:
         if tuple(names) != columns:
             raise ValueError(f'columns must be {", ".join(columns)}')
-        return {(int(row['stamp_ns']), row[columns[1]]): value(row) for row in rows}
+        return {(int(row['stamp_ns']), row[columns[1]]): float(value(row)) for row in rows}
     except (ValueError, TypeError) as error:
         raise ParameterError(f'{path}: {error}') from error
 

@@ -123,9 +123,7 @@ def spread_of(prepared: PreparedSession) -> Spread:
 
 
 def held_out_part(session: Session, problem: Problem) -> Session:
-    """Return the frames of the blocks that took no part, and the first one, which sets the
-    clock.
-    """
+    """Return the frames of the blocks that took no part, and the first, which sets the clock."""
     held = {
         tool.body: tool.time[np.isin(blocks, test_blocks())]
         for tool, blocks in zip(problem.tools, problem.blocks, strict=True)

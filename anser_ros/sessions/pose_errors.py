@@ -16,12 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PoseSeries:
-    """Holds every estimate of one sensor or body, one a frame, with its error if the truth is
-    known.
-
-    Errors (F,) are the distance from the optical pose, m, and the angle to it, rad: of a sensor
-    between the axes, of a body the whole turn. They are NaN without a pose or an optical one.
-    """
+    """Holds the estimates of one sensor or body, one a frame, and their errors where known."""
 
     name: str
     estimates: tuple[PoseEstimate, ...]
@@ -37,11 +32,7 @@ class PoseSeries:
 def pose_series(
     name: str, estimates: Sequence[PoseEstimate], position: Array, orientation: Array
 ) -> PoseSeries:
-    """Compare the F poses of a sensor or body with where it truly was, m, frame fg; NaN if
-    unknown.
-
-    Orientations are unit axes (F, 3) of a coil, or rotations (F, 3, 3) of a body from its frame.
-    """
+    """Compare F poses of a sensor or body with where it truly was, m, frame fg; NaN if unknown."""
     of_body = orientation.ndim == 3
     distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
     for i, estimate in enumerate(estimates):

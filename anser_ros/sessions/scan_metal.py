@@ -106,7 +106,7 @@ def without_resting_metal(
 def _completed(
     record: EffectRecord, metal: RestingMetal, ends: tuple[float, float]
 ) -> EffectRecord:
-    """The telling of a span in which this metal moved, with where it rested."""
+    """The record of a span in which this metal moved, with where it rested."""
     parameters = record.parameters
     if not ends[0] <= parameters['t_start_s'] <= ends[1]:
         return record

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +73,7 @@ def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
 
 def _measured(setup: Setup, name: str) -> float:
     """What the acquisition wrote into the setup; NaN if nothing, and if a value was stated."""
-    value = setup.extra.get(name)
+    value: Any = setup.extra.get(name)
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return float(value) if is_number and name not in setup.stated else np.nan
 

@@ -90,8 +90,8 @@ def track(
     seconds = (time.perf_counter() - start) / max(len(frames), 1)
     by_name = {name: tuple(given) for name, given in estimates.items()}
     summary = None if follower is None else follower.summary
-    seen = {name: tuple(given) for name, given in sources.items()}
-    return TrackedSession(by_name, seconds, summary, {SOURCES: seen} if seen else {})
+    further = {SOURCES: {name: tuple(given) for name, given in sources.items()}}
+    return TrackedSession(by_name, seconds, summary, further if sources else {})
 
 
 def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: bool) -> Tracker:

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import Enum
 
 import serial
@@ -184,8 +184,7 @@ class ControlUnitPort:
 
     def fault_counters(self) -> dict[str, int]:
         """Return all counters by name, the frame reader's included."""
-        ours = {field.name: getattr(self.counters, field.name) for field in fields(self.counters)}
-        return ours | self._reader.fault_counters()
+        return vars(self.counters) | self._reader.fault_counters()
 
     @property
     def last_refusal(self) -> str:

@@ -10,11 +10,7 @@ from anser_ros.wire.setup import Setup
 
 @dataclass(frozen=True)
 class RecordedFluxes:
-    """Holds the fluxes (F, S, K) of one topic, T, with flags (F, S), by ascending header stamps
-    (F,).
-
-    They are NaN, with the flag `STALE`, where a frame lacks a channel, of which there are S.
-    """
+    """Holds the fluxes (F, S, K) of one topic, T, with flags (F, S), by ascending stamps (F,)."""
 
     stamp_ns: NDArray[np.int64]
     channel: NDArray[np.int64]

@@ -84,9 +84,7 @@ class SensorSpec:
 
 
 class SensorRows(NamedTuple):
-    """Holds channels (S,), positions, m, and unit axes (S, 3) of sensors, in their bodies'
-    frames.
-    """
+    """Holds channels (S,), positions, m, and unit axes (S, 3), in the frames of bodies."""
 
     channel: NDArray[np.int64]
     position: NDArray[np.float64]
@@ -374,27 +372,11 @@ def parse_setup(text: str) -> Setup:
 
 def dump_setup(setup: Setup) -> str:
     """Write a setup as the YAML document that `parse_setup` reads back unchanged."""
-    coils = [
-        {
-            'name': coil.name,
-            'centre_m': list(coil.centre_m),
-            'rotation_deg': coil.rotation_deg,
-            'frequency_hz': coil.frequency_hz,
-        }
-        for coil in setup.emitter.coils
-    ]
-    sensors = [
-        {
-            'channel': s.channel,
-            'name': s.name,
-            'body': s.body,
-            'position_m': list(s.position_m),
-            'axis': list(s.axis),
-            'length_m': s.length_m,
-            **({'windings': [list(w) for w in s.windings]} if s.windings else {}),
-        }
-        for s in setup.sensors
-    ]
+    emitter = setup.emitter
+    sensors = [asdict(sensor) for sensor in setup.sensors]
+    for sensor in sensors:
+        if not sensor['windings']:
+            del sensor['windings']
     corners = zip(('low_m', 'high_m'), setup.volume or (), strict=False)
     volume = {key: list(corner) for key, corner in corners}
     document = {
@@ -403,7 +385,11 @@ def dump_setup(setup: Setup) -> str:
         'frame_id': setup.frame_id,
         'flux_rate_hz': setup.flux_rate_hz,
         'flux_unit': 'T',
-        'emitter': {'kind': setup.emitter.kind, **setup.emitter.geometry, 'coils': coils},
+        'emitter': {
+            'kind': emitter.kind,
+            **emitter.geometry,
+            'coils': list(map(asdict, emitter.coils)),
+        },
         'sensors': sensors,
         **({'volume': volume} if volume else {}),
         **({'tips': dump_tips(setup.tips)} if setup.tips else {}),
