@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,15 @@ class Difference:
     low: float
     high: float
 
+    MORE_IS_BETTER: ClassVar = False
+
+    @property
+    def verdict(self) -> str:
+        """Return which is better: ``a``, ``b``, or ``neither``, where the interval has room for
+        both.
+        """
+        return {0: 'neither', 1 if self.MORE_IS_BETTER else -1: 'b'}.get(self.sign, 'a')
+
     @property
     def sign(self) -> int:
         """Return the sign of the difference where the whole interval has one, else 0."""
@@ -65,26 +74,16 @@ class Compared(Difference):
     rmse_a: float
     rmse_b: float
 
-    @property
-    def verdict(self) -> str:
-        """Return which errs less: ``a``, ``b``, or ``neither``, where the interval has room for
-        both.
-        """
-        return {1: 'a', 0: 'neither', -1: 'b'}[self.sign]
-
 
 @dataclass(frozen=True)
 class ComparedShares(Difference):
     """Compares the shares, 0 to 1, of ``n`` frames with a pose, of one coil or body."""
 
+    MORE_IS_BETTER = True
+
     n: int
     share_a: float
     share_b: float
-
-    @property
-    def verdict(self) -> str:
-        """Return which has poses more often: ``a``, ``b``, or ``neither``."""
-        return {1: 'b', 0: 'neither', -1: 'a'}[self.sign]
 
 
 def check_same_recording(first: Path, second: Path) -> None:

@@ -1,7 +1,7 @@
 """Reads what the nodes reported about themselves in ``/diagnostics`` during a recording."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -33,16 +33,22 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
 
     A bag without diagnostics, or one that cannot be read yet, gives an empty mapping.
     """
-    found: dict[str, Mapping[str, str]] = {}
-    decoder = MessageDecoder()
     try:
-        for raw in iter_messages(path, Salvage()):
-            if raw.topic == TOPIC:
-                for status in decoder.decode(raw).status:
-                    found[status.name] = {item.key: item.value for item in status.values}
+        return {
+            status.name: {item.key: item.value for item in status.values}
+            for _, status in _statuses(path)
+        }
     except BagError:
         return {}
-    return found
+
+
+def _statuses(path: str | os.PathLike[str]) -> Iterator[tuple[int, Any]]:
+    """Every status of a recording with its log time, ns."""
+    decoder = MessageDecoder()
+    for raw in iter_messages(path, Salvage()):
+        if raw.topic == TOPIC:
+            for status in decoder.decode(raw).status:
+                yield raw.log_time_ns, status
 
 
 def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
@@ -71,13 +77,10 @@ def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]
         When the recording cannot be read.
     """
     found: dict[str, int] = {}
-    decoder = MessageDecoder()
-    for raw in iter_messages(path, Salvage()):
-        if raw.topic == TOPIC:
-            for status in decoder.decode(raw).status:
-                node, _, name = status.name.partition(': ')
-                if node == part_of and name and _level(status) == WARN:
-                    found.setdefault(name, raw.log_time_ns)
+    for log_time_ns, status in _statuses(path):
+        node, _, name = status.name.partition(': ')
+        if node == part_of and name and _level(status) == WARN:
+            found.setdefault(name, log_time_ns)
     return found
 
 

@@ -14,6 +14,7 @@ from anser_ros.physics.angles import axis_angles, rotation_angles
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.session import Session
 from anser_ros.stamps import NANO, stamp_of
+from anser_ros.wire.quaternion import pose_numbers
 from anser_ros.wire.recorded import PoseStream
 from anser_ros.wire.setup import topic_of
 
@@ -42,9 +43,8 @@ def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict
     for raw in iter_messages(path, Salvage()):
         if raw.topic in rows and raw.type_name == POSE_TYPE:
             message = decoder.decode(raw)
-            place, turn = message.pose.position, message.pose.orientation
             stamps[raw.topic].append(stamp_of(message))
-            rows[raw.topic].append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+            rows[raw.topic].append(pose_numbers(message.pose))
     found = {}
     for topic, values in rows.items():
         table = np.array(values, dtype=np.float64).reshape(-1, 7)

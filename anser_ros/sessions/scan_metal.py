@@ -24,7 +24,7 @@ from anser_ros.errors import DiagnosisError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.drawing import NominalBoard
-from anser_ros.sessions.session import Session
+from anser_ros.sessions.session import Session, shifted
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -205,7 +205,4 @@ def _near(learnt: cKDTree, tool: Measurements) -> Measurements:
 def _between(measurements: Measurements, begin: float, end: float) -> Measurements:
     """The frames between two times, the first of which becomes zero."""
     inside = (measurements.time >= begin) & (measurements.time <= end)
-    part, track = measurements.frames(inside), measurements.track
-    if track is not None:
-        track = replace(track, time=track.time - begin)
-    return replace(part, time=part.time - begin, track=track)
+    return shifted(measurements.frames(inside), -begin)

@@ -140,6 +140,14 @@ def _measurements(
     )
 
 
+def shifted(measurements: Measurements, seconds: float) -> Measurements:
+    """Return measurements on a time axis that begins so much earlier."""
+    track = measurements.track
+    if track is not None:
+        track = replace(track, time=track.time + seconds)
+    return replace(measurements, time=measurements.time + seconds, track=track)
+
+
 def session_of(bag: Bag) -> Session:
     """Turn a bag into arrays.
 

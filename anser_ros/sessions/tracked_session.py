@@ -12,7 +12,8 @@ from anser_ros.sessions.frames import frames_of
 from anser_ros.sessions.known_metal import KnownMetalModels
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.tracker_settings import settings_for
-from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
+from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
+from anser_ros.tracking.tracker import Tracker
 
 Progress = Callable[[float], None]
 SOURCES = 'sources'

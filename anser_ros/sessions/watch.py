@@ -21,7 +21,7 @@ from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.pose_states import OK
 from anser_ros.sessions.diagnosis import problem_of, spread_of
 from anser_ros.sessions.prepared import PreparedSession, correct
-from anser_ros.sessions.session import Session
+from anser_ros.sessions.session import Session, shifted
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import NO_GATE, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
@@ -167,16 +167,9 @@ def _moved(session: Session, seconds: float) -> Session:
     reference = session.reference
     return replace(
         session,
-        tools=tuple(_shifted(tool, seconds) for tool in session.tools),
-        reference=None if reference is None else _shifted(reference, seconds),
+        tools=tuple(shifted(tool, seconds) for tool in session.tools),
+        reference=None if reference is None else shifted(reference, seconds),
     )
-
-
-def _shifted(measurements: Measurements, seconds: float) -> Measurements:
-    track = measurements.track
-    if track is not None:
-        track = replace(track, time=track.time + seconds)
-    return replace(measurements, time=measurements.time + seconds, track=track)
 
 
 def _posed_by_itself(tool: Measurements, model: FieldModel) -> Measurements:

@@ -25,7 +25,7 @@ from anser_ros.errors import BagError, LayoutError, SetupError
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
 from anser_ros.wire.pose_topics import optical_stem
-from anser_ros.wire.quaternion import unit_quaternions
+from anser_ros.wire.quaternion import pose_numbers, unit_quaternions
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
 
@@ -194,31 +194,20 @@ def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[Ra
         yield from rest
 
 
-class MessageDecoder:
+class MessageDecoder(DecoderFactory):  # type: ignore[misc]
     """Turns raw messages into objects with the message's attributes, without ROS."""
-
-    def __init__(self) -> None:
-        self._factory = DecoderFactory()
-        self._decoders: dict[int, Any] = {}
 
     def decode(self, message: RawMessage) -> Any:
         """Decode one message; raises `BagError` when its bytes don't fit its schema."""
-        decoder = self._decoders.get(message.schema.id)
         try:
-            if decoder is None:
-                decoder = self._factory.decoder_for(
-                    message.channel.message_encoding, message.schema
-                )
-                self._decoders[message.schema.id] = decoder
-            if decoder is None:
-                raise BagError(f'{message.topic}: no decoder for {message.type_name}')
-            return decoder(message.data)
-        except BagError:
-            raise
+            decoder = self.decoder_for(message.channel.message_encoding, message.schema)
+            if decoder is not None:
+                return decoder(message.data)
         except Exception as error:  # the decoder's errors have no root of their own
             raise BagError(
                 f'{message.topic}: {message.type_name} does not decode: {error}'
             ) from error
+        raise BagError(f'{message.topic}: no decoder for {message.type_name}')
 
 
 class _Collector:
@@ -260,8 +249,8 @@ class _Collector:
 
     def _add_pose(self, raw: RawMessage) -> None:
         message = self.decoder.decode(raw)
-        p, q = message.pose.position, message.pose.orientation
-        values = (p.x, p.y, p.z, *unit_quaternions((q.x, q.y, q.z, q.w)).tolist())
+        numbers = pose_numbers(message.pose)
+        values = (*numbers[:3], *unit_quaternions(numbers[3:]).tolist())
         if not np.isfinite(values).all():
             raise LayoutError('a pose with values not finite or a quaternion not of unit length')
         body = optical_stem(raw.topic)

@@ -12,6 +12,7 @@ from anser_ros.wire.bag_writer import BagWriter
 from anser_ros.wire.points import STALE, FluxPoints, PointFieldTuple, encode_flux
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec
 
+SETUP_TOPIC, SETUP_TYPE = '/anser/setup', 'std_msgs/msg/String'
 FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
 """Topics of a session's fluxes, and whether their sensors are fixed to the field generator."""
 
@@ -32,7 +33,7 @@ class SessionWriter(BagWriter):
 
     def write_setup(self, text: str, stamp_ns: int) -> None:
         """Write the setup document."""
-        channel = self._channel('/anser/setup', 'std_msgs/msg/String', latched=True)
+        channel = self.channel(SETUP_TOPIC, SETUP_TYPE)
         self.write(channel, stamp_ns, cdr.string_bytes(text))
 
     def write_readings(
@@ -60,7 +61,7 @@ class SessionWriter(BagWriter):
         data: bytes,
     ) -> None:
         """Write one window's cloud, as `anser_ros.wire.points.encode_flux` packs it."""
-        channel = self._channel(topic, 'sensor_msgs/msg/PointCloud2')
+        channel = self.channel(topic, 'sensor_msgs/msg/PointCloud2')
         frame = self._frame_id
         message = cdr.cloud_bytes(stamp_ns, frame, fields, point_step, width, data)
         self.write(channel, stamp_ns, message)
@@ -73,15 +74,20 @@ class SessionWriter(BagWriter):
         quaternion_xyzw: Sequence[float],
     ) -> None:
         """Write one pose: position in m, unit quaternion."""
-        channel = self._channel(topic, 'geometry_msgs/msg/PoseStamped')
+        channel = self.channel(topic, 'geometry_msgs/msg/PoseStamped')
         message = cdr.pose_bytes(stamp_ns, self._frame_id, position, quaternion_xyzw)
         self.write(channel, stamp_ns, message)
 
-    def _channel(self, topic: str, type_name: str, latched: bool = False) -> int:
+    def channel(self, topic: str, type_name: str, definition: str = '') -> int:
+        """Return the channel of a topic, announced when it is first asked for; a setup is latched.
+
+        The types of a session need no definition.
+        """
         if topic not in self._channels:
+            latched = topic.endswith('/setup')
             qos = [qos_profile(latched=latched, depth=1 if latched else 100)]
-            definition = cdr.DEFINITIONS[type_name]
-            self._channels[topic] = self.add_topic(topic, type_name, definition, qos)
+            text = cdr.DEFINITIONS.get(type_name, definition)
+            self._channels[topic] = self.add_topic(topic, type_name, text, qos)
         return self._channels[topic]
 
 
