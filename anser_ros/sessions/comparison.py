@@ -50,9 +50,7 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """Return which is better: ``a``, ``b``, or ``neither``, where the interval has room for
-        both.
-        """
+        """Return which is better, ``a`` or ``b``; ``neither`` where both may be."""
         return {0: 'neither', 1 if self.MORE_IS_BETTER else -1: 'b'}.get(self.sign, 'a')
 
     @property

@@ -35,8 +35,10 @@ def document_of(
     effects: list[dict[str, Any]],
     unexplained: tuple[float, list[str]],
 ) -> dict[str, Any]:
-    """Return the document of held-out errors before and after (fluxes also of noise alone), of
-    effects, and of what is unexplained: its share, and what that depends on.
+    """Return the document of errors before and after, of effects, and of what is unexplained.
+
+    Of fluxes there is the error of noise alone too; the last are the share that is unexplained,
+    and what that depends on.
     """
     return {
         'schema': SCHEMA,

@@ -14,9 +14,7 @@ from anser_ros.wire.setup import Setup
 
 
 def board_of(setup: Setup) -> Board:
-    """Return the emitter's geometry; raises `SetupError` when its kind is unknown or a key is
-    missing.
-    """
+    """Return the emitters' geometry; `SetupError` when its kind is unknown or a key is missing."""
     emitter = setup.emitter
     return build_board(
         emitter.kind,
@@ -44,9 +42,7 @@ class NominalBoard:
 
     @property
     def field(self) -> FieldFunction | None:
-        """Return the field at the nominal currents: points (P, 3) in m, frame fg, to (P, K, 3) in
-        T.
-        """
+        """Return the field at nominal currents: points (P, 3), m, frame fg, to (P, K, 3), T."""
         return None if self.board is None else self.board.field
 
     @cached_property

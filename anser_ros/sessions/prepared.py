@@ -47,9 +47,7 @@ class PreparedSession:
         return self.session.sensors
 
     def with_session(self, session: Session) -> 'PreparedSession':
-        """Return the same for a part of the session, or for another recording of the same
-        setup.
-        """
+        """Return the same for a part of the session, or another recording of its setup."""
         return replace(self, session=session, recorded_drift=is_recorded(self.model, session))
 
     def with_model(self, model: FieldModel) -> 'PreparedSession':

@@ -93,8 +93,7 @@ def tracking_noise(setup: Setup) -> float:
 
 
 def stamp_sigma(setup: Setup) -> float:
-    """Return the error of the fluxes' stamps, s: what is stated, else what the acquisition
-    measured.
+    """Return the error of the fluxes' stamps, s: what is stated, or else was measured.
 
     If the setup has neither, it is the default of `anser_ros.settings.Accuracy`.
     """

@@ -111,7 +111,7 @@ def _numbers(cells: list[str]) -> NDArray[Any]:
     try:
         return np.array([float(cell) if cell else np.nan for cell in cells])
     except ValueError:
-        return np.array(cells)  # words; who asks for numbers of them is told
+        return np.array(cells)  # words; who asks for numbers of them gets an error
 
 
 def _mat(path: Path) -> dict[str, NDArray[Any]]:

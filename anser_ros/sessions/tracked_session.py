@@ -96,8 +96,7 @@ def track(
 
 
 def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: bool) -> Tracker:
-    """A tracker told of the session's noise, and of a drift's course where nothing else
-    determines it."""
+    """A tracker that knows the session's noise, and a drift's course if nothing else does."""
     return Tracker(
         prepared.model,
         prepared.sensors,

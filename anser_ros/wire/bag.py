@@ -312,7 +312,7 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
         collector.add(raw)
     if not collector.setups:
         raise BagError(f'{os.fspath(path)}: the bag has no setup; anser import --setup adds one')
-    text = collector.setups[-1]  # acquisition tells rate and noise once its stream is there
+    text = collector.setups[-1]  # acquisition adds rate and noise once its stream is there
     try:
         setup = parse_setup(text)
     except SetupError as error:

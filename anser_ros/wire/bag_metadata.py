@@ -90,8 +90,7 @@ def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bo
 
 
 def bag_summary(folder: Path) -> dict[str, Any]:
-    """Return what a bag's ``metadata.yaml`` tells: ``duration_s``, ``messages``, ``closed``; {}
-    without.
+    """Return ``duration_s``, ``messages`` and ``closed`` of a bag's ``metadata.yaml``; {} if none.
 
     A bag that was not closed may hold more than that; its readers do not use this file.
     """

@@ -83,7 +83,7 @@ def _parts(path: Path) -> tuple[list[Path], bool]:
         raise BagError(f'{described}: compressed by {form}, of which only zstd is read')
     files = []
     for name in names:
-        file = path / Path(name).name  # older versions of rosbag2 tell the folder too
+        file = path / Path(name).name  # older versions of rosbag2 write the folder too
         packed = file.with_name(file.name + ZSTD)
         files.append(packed if packed.is_file() and not file.is_file() else file)
         if not files[-1].is_file():
