@@ -46,7 +46,10 @@ def kernel(function: Any = None, **options: Any) -> Any:
     if folder is not None and path.is_relative_to(PACKAGE) and not _CONFIG.DISABLE_JIT:
         copy = folder / path.relative_to(PACKAGE)
         function.__code__ = code.replace(co_filename=str(copy))
-    return numba.njit(function, cache=True, error_model='numpy', **options)
+    try:
+        return numba.njit(function, cache=True, error_model='numpy', **options)
+    except RuntimeError:  # no folder can be written, which `KernelCache.locked` reports
+        return numba.njit(function, error_model='numpy', **options)
 
 
 @functools.cache

@@ -192,12 +192,20 @@ def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
         raise ParameterError(
             f'there is no value {", ".join(unknown)} to state; there are: {", ".join(VALUES)}'
         )
-    given = {s: {n: stated[n] for n in names if n in stated} for s, names in SECTIONS.items()}
+    given = sections_of(stated)
     return RefitSettings(
         **given['refit'],
         accuracy=Accuracy(**given['accuracy']),
         tools=ToolSettings(**given['tools']),
     )
+
+
+def sections_of(stated: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return stated values by section of the setup document, and by name."""
+    return {
+        section: {name: stated[name] for name in names if name in stated}
+        for section, names in SECTIONS.items()
+    }
 
 
 def parse_entries(entries: list[str]) -> dict[str, float]:

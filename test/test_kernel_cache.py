@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 
+import numba
 import pytest
 
 from anser_ros import kernel_cache
@@ -56,6 +57,18 @@ def test_a_cache_that_cannot_be_written_is_said(tmp_path):
         KernelCache(tmp_path / 'file').locked(),
     ):
         pass
+
+
+def test_without_any_folder_kernels_are_compiled_and_not_kept(monkeypatch):
+    njit = numba.njit
+
+    def without_folder(function, *, cache=False, **options):
+        if cache:
+            raise RuntimeError('no locator available')
+        return njit(function, **options)
+
+    monkeypatch.setattr(numba, 'njit', without_folder)
+    assert kernel_cache.kernel(lambda x: x + 1)(1) == 2
 
 
 def test_only_one_compiles_at_a_time(tmp_path):

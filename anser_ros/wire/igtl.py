@@ -94,8 +94,7 @@ def resolution_s(header: Header, body: bytes) -> float:
 
 
 def device_names(named: Mapping[str, str]) -> dict[str, str]:
-    """Return the device of each name; one that is longer than the protocol has loses its
-    beginning.
+    """Return the device of each name; one too long for the protocol loses its beginning.
 
     Raises
     ------

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.fingerprint import Identity, fingerprint_of
-from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
+from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, sections_of, settings_from
 from anser_ros.wire.setup_tips import TipSpec, dump_tips, parse_tips, refuse_unknown_bodies
 from anser_ros.wire.setup_values import (
     Vector,
@@ -303,15 +303,6 @@ def _parse_stated(root: dict[str, Any]) -> dict[str, float]:
     return stated
 
 
-def _stated_sections(stated: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """The sections that `_parse_stated` reads back; none that would be empty."""
-    sections = {
-        section: {name: stated[name] for name in names if name in stated}
-        for section, names in SECTIONS.items()
-    }
-    return {section: values for section, values in sections.items() if values}
-
-
 def parse_setup(text: str) -> Setup:
     """Read and check a setup document.
 
@@ -393,7 +384,7 @@ def dump_setup(setup: Setup) -> str:
         'sensors': sensors,
         **({'volume': volume} if volume else {}),
         **({'tips': dump_tips(setup.tips)} if setup.tips else {}),
-        **_stated_sections(setup.stated),
+        **{name: values for name, values in sections_of(setup.stated).items() if values},
         **setup.extra,
     }
     return str(yaml.dump(document, Dumper=DUMPER, sort_keys=False))
