@@ -17,14 +17,9 @@ nobody can set or measure a length or a moment so well."""
 
 @dataclass(frozen=True)
 class Identity:
-    """States what a setup is of.
+    """Holds fingerprints of a setup: of its emitters, and of the sensors on each body by name.
 
-    Attributes
-    ----------
-    board : str
-        Fingerprint of the emitters: kind, geometry, coils, tones.
-    bodies : mapping of str to str
-        Fingerprint of the sensors on each body by its name, the references' under ``fg``.
+    The references are those on the body ``fg``.
     """
 
     board: str
@@ -32,17 +27,9 @@ class Identity:
 
 
 def fingerprint_of(content: Any) -> str:
-    """Return the fingerprint of a content.
+    """Return the fingerprint of plain data and arrays, `DIGITS` hexadecimal digits.
 
-    Parameters
-    ----------
-    content : mapping, list, tuple, ndarray, str, number, bool or None
-        Keys' order and the kind of a number do not matter; an array is its shape and values.
-
-    Returns
-    -------
-    str
-        `DIGITS` hexadecimal digits.
+    Keys' order and the kind of a number do not matter; an array is its shape and values.
     """
     digest = hashlib.sha256()
     _add(digest, content)

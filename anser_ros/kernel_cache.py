@@ -1,15 +1,22 @@
-"""Knows whether the compiled kernels are on disk, and who compiles them: shared by all processes.
+"""Compiles kernels once for all copies of the package, and knows whether they are on disk.
 
-Numba keeps what it has compiled beside the source files, or in the user's cache. With an empty
-cache every process compiles all that it needs, processes that start together each the same. So one
-of them compiles everything under a lock, reports its progress, and leaves a mark when all kernels
-are there.
+Numba keeps what it has compiled beside the source file. So that a clone, an installation and the
+copy that ``colcon build`` makes of it share it, `kernel` has numba believe that the source files
+are copies of them, in a folder of the user's cache whose name is a digest of their contents.
+
+With an empty cache every process compiles all that it needs, processes that start together each
+the same. So one of them compiles everything under a lock, reports its progress, and leaves a mark
+when all kernels are there.
 """
 
 import contextlib
 import fcntl
+import functools
 import hashlib
+import os
 import platform
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,9 +24,72 @@ from typing import Any
 import numba
 from numba.core.registry import cpu_target
 
+from anser_ros.errors import ParameterError
+
 PACKAGE = Path(__file__).parent
-DECORATOR = '@numba.njit'
+_CONFIG: Any = numba.config
+DECORATOR = b'\n@kernel'
 """What stands before every kernel."""
+MOST_STATES = 4
+"""States of the sources whose kernels are kept, the last compiled: each has about 10 MB."""
+
+
+def kernel(function: Any = None, **options: Any) -> Any:
+    """Compile a function by numba, with a quotient by zero as numpy has it, and keep the result.
+
+    Further options, with which the decorator is called, are those of ``numba.njit``.
+    """
+    if function is None:
+        return functools.partial(kernel, **options)
+    folder, code = kept_folder(), function.__code__
+    path = Path(code.co_filename)
+    if folder is not None and path.is_relative_to(PACKAGE) and not _CONFIG.DISABLE_JIT:
+        copy = folder / path.relative_to(PACKAGE)
+        function.__code__ = code.replace(co_filename=str(copy))
+    try:
+        return numba.njit(function, cache=True, error_model='numpy', **options)
+    except RuntimeError:  # no folder can be written, which `KernelCache.locked` reports
+        return numba.njit(function, error_model='numpy', **options)
+
+
+@functools.cache
+def kept_folder() -> Path | None:
+    """Return the folder of the kernels as their sources are now; None where it cannot be made."""
+    home = Path(_CONFIG.CACHE_DIR or os.environ.get('XDG_CACHE_HOME') or '~/.cache')
+    folder = home.expanduser() / 'anser_ros' / 'kernels' / _state()[0]
+    return folder if folder.is_dir() or _copy_sources(folder) else None
+
+
+def _copy_sources(folder: Path) -> bool:
+    """Copy the kernels' sources at one stroke; another process may do so at the same time."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, ignore_cleanup_errors=True) as name:
+            draft = Path(name, folder.name)
+            for path in _sources():
+                copy = draft / path.relative_to(PACKAGE)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, copy)
+            draft.rename(folder)
+    except OSError:
+        return folder.is_dir()
+    return True
+
+
+def _sources() -> dict[Path, bytes]:
+    """The text of every source file with kernels."""
+    texts = {path: path.read_bytes() for path in sorted(PACKAGE.rglob('*.py'))}
+    return {path: text for path, text in texts.items() if DECORATOR in text}
+
+
+@functools.cache
+def _state() -> tuple[str, int]:
+    """A digest of the sources and of what compiles them, and the number of kernels."""
+    digest, total = hashlib.sha256(f'{numba.__version__} {platform.python_version()}'.encode()), 0
+    for path, text in _sources().items():
+        digest.update(str(path.relative_to(PACKAGE)).encode() + text)
+        total += text.count(DECORATOR)
+    return digest.hexdigest()[:16], total
 
 
 class KernelCache:
@@ -27,8 +97,8 @@ class KernelCache:
 
     Parameters
     ----------
-    folder : Path
-        Where the mark is kept: a folder in which numba keeps compiled kernels, see `folder_of`.
+    folder : Path, optional
+        Where these are kept; by default beside the kernels.
 
     Attributes
     ----------
@@ -36,20 +106,14 @@ class KernelCache:
         How many kernels the package has.
     """
 
-    def __init__(self, folder: Path) -> None:
-        processor = cpu_target.target_context.codegen().magic_tuple()
-        state = [numba.__version__, platform.python_version(), str(processor)]
-        self.total = 0
-        for path in sorted(PACKAGE.rglob('*.py')):
-            count = path.read_text(encoding='utf-8').count(f'\n{DECORATOR}')
-            if count:
-                self.total += count
-                stat = path.stat()  # what numba itself knows a changed source by
-                state.append(f'{path} {stat.st_mtime_ns} {stat.st_size}')
-        key = hashlib.sha256('\n'.join(state).encode()).hexdigest()[:16]
-        self._mark = folder / f'kernels_{key}.ready'
-        self._progress = folder / f'kernels_{key}.progress'
-        self._lock = folder / 'kernels.lock'
+    def __init__(self, folder: Path | None = None) -> None:
+        self._folder = folder or kept_folder() or PACKAGE / '__pycache__'
+        key, self.total = _state()
+        processor = str(cpu_target.target_context.codegen().magic_tuple())
+        name = f'{key}_{hashlib.sha256(processor.encode()).hexdigest()[:8]}'
+        self._mark = self._folder / f'{name}.ready'
+        self._progress = self._folder / f'{name}.progress'
+        self._lock = self._folder / 'kernels.lock'
 
     @property
     def is_full(self) -> bool:
@@ -66,9 +130,22 @@ class KernelCache:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Be the only process that compiles; wait for another one that does."""
-        self._lock.parent.mkdir(parents=True, exist_ok=True)
-        with self._lock.open('w') as lock:
+        """Be the only process that compiles; wait for another one that does.
+
+        Raises
+        ------
+        ParameterError
+            When nothing can be written into the cache.
+        """
+        try:
+            self._lock.parent.mkdir(parents=True, exist_ok=True)
+            lock = self._lock.open('w')
+        except OSError as error:
+            raise ParameterError(
+                f'compiled kernels cannot be kept, every start compiles them again: '
+                f'{self._folder}: {error.strerror}'
+            ) from error
+        with lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield
 
@@ -82,11 +159,11 @@ class KernelCache:
             file.write(f'{name}\n')
 
     def finish(self) -> None:
-        """Note that all kernels are there."""
+        """Note that all kernels are there, and remove those of sources that are long gone."""
         self._mark.touch()
         self._progress.unlink(missing_ok=True)
-
-
-def folder_of(kernel: Any) -> Path:
-    """Return the folder in which numba keeps a kernel that it has compiled."""
-    return Path(kernel.stats.cache_path)
+        kept = kept_folder()
+        if self._folder == kept:
+            last = sorted(kept.parent.iterdir(), key=lambda f: f.stat().st_mtime, reverse=True)
+            for folder in last[MOST_STATES:]:
+                shutil.rmtree(folder, ignore_errors=True)

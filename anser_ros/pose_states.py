@@ -1,8 +1,8 @@
 """Names every state of a pose: why a frame has one, or why it is withheld.
 
-This is the only list of states. A room that withholds poses takes the name from here and says the
-reason in its own words: `frames` for readings, `tracking` for solves, `integrity` for poses that
-contradict other readings, and the server of the field model for all poses together.
+This is the only list of states. A package that withholds poses takes the name from here and says
+the reason in its own words: `frames` for readings, `tracking` for solves, `integrity` for poses
+that contradict other readings, and the server of the field model for all poses together.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ REFERENCES_LOST = 'references_lost'
 REFERENCES_DOUBTFUL = 'references_doubtful'
 """The references contradict each other, and it cannot be determined which of them are right."""
 OTHER_MODEL = 'other_model'
-"""The model in force was made for another board, or is not the one whose effects are undone."""
+"""The active model was made for another board, or is not the one whose effects are undone."""
 UNCALIBRATED = 'uncalibrated'
 """The model is the nominal one, and its use has not been allowed."""
 TWO_SOURCES = 'two_sources'
@@ -60,12 +60,8 @@ FRAMES_IN = 'frames_'
 class Withheld(NamedTuple):
     """Names one reason for which all poses of a frame are withheld.
 
-    Attributes
-    ----------
-    state : str
-        One of `OF_MODEL`, or `TWO_SOURCES`.
-    reason : str
-        The text for `/diagnostics`, with figures.
+    The state is one of `OF_MODEL`, or `TWO_SOURCES`; the reason is for `/diagnostics`, with
+    figures.
     """
 
     state: str

@@ -22,25 +22,32 @@ def _value(default: float, meaning: str, low: float, high: float) -> Any:
     return field(default=default, metadata={'meaning': meaning, 'low': low, 'high': high})
 
 
-def _check(settings: object) -> None:
+@dataclass(frozen=True)
+class _Stated:
+    """Refuses a value that is no number or out of its range."""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            if item.metadata:
+                _check(item, getattr(self, item.name))
+
+
+def _check(item: Any, value: object) -> None:
     """Raise `ParameterError` when a value is no number or out of its range."""
-    for item in fields(settings):  # type: ignore[arg-type]
-        if not item.metadata:
-            continue
-        value, whole = getattr(settings, item.name), item.type is int
-        kinds = int if whole else (int, float)
-        if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
-            what = 'a whole number' if whole else 'a number'
-            hint = ' (YAML takes 6e-11 for text, and 6.0e-11 for a number)'
-            hint = hint if isinstance(value, str) else ''
-            raise ParameterError(f'{item.name} must be {what}, got {value!r}{hint}')
-        low, high = item.metadata['low'], item.metadata['high']
-        if not low <= value <= high:
-            raise ParameterError(f'{item.name} must be in [{low:g}, {high:g}], got {value:g}')
+    whole = item.type is int
+    kinds = int if whole else (int, float)
+    if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
+        what = 'a whole number' if whole else 'a number'
+        hint = ' (YAML takes 6e-11 for text, and 6.0e-11 for a number)'
+        hint = hint if isinstance(value, str) else ''
+        raise ParameterError(f'{item.name} must be {what}, got {value!r}{hint}')
+    low, high = item.metadata['low'], item.metadata['high']
+    if not low <= value <= high:
+        raise ParameterError(f'{item.name} must be in [{low:g}, {high:g}], got {value:g}')
 
 
 @dataclass(frozen=True)
-class Accuracy:
+class Accuracy(_Stated):
     """States how accurate an installation's instruments are: one standard deviation of each error.
 
     The defaults are those of the Anser sessions that this package was developed on: their noise
@@ -52,30 +59,12 @@ class Accuracy:
     ------
     ParameterError
         When a value is no number or out of its range.
-
-    Attributes
-    ----------
-    flux_noise_t : float
-        Noise of a phasor component of one flux reading, T. Where it is measured (the refit, the
-        tracker's adaptive scale, the calibration) the estimate starts here.
-    optical_position_m, optical_rotation_rad : float
-        Jitter of an optical pose along and about each axis, m and rad, as it stands after
-        interpolation to the fluxes' stamps.
-    reference_position_m, reference_axis_rad : float
-        Error of a reference sensor's surveyed place along each axis, m, and of its direction
-        along both tangents, rad.
-    reference_gain : float
-        Relative error of a reference sensor's gain.
-    patch_position_m, patch_rotation_rad : float
-        Error of the tracked pose of a patch of reference coils along and about each axis, m and
-        rad; its coils' gains have ``reference_gain``.
-    stamp_sigma_s : float
-        Error of a flux stamp against the moment that it names, s: a tool at a speed v is where
-        its pose says to v times this. The default is that of a line which delivers in frames of
-        1 ms, as USB does: a delay spread evenly over a frame.
     """
 
+    # Where the noise is measured (the refit, the tracker's adaptive scale, the calibration), the
+    # estimate starts here.
     flux_noise_t: float = _value(60e-12, 'noise of a phasor component, T', 1e-15, 1e-3)
+    # Of optical poses after interpolation to the fluxes' stamps.
     optical_position_m: float = _value(
         0.07e-3, 'jitter of an optical position along each axis, m', 0.0, 0.1
     )
@@ -88,6 +77,7 @@ class Accuracy:
     reference_axis_rad: float = _value(
         math.radians(0.3), "error of a reference sensor's surveyed axis, rad a tangent", 0.0, 1.0
     )
+    # Of the coils of patches too.
     reference_gain: float = _value(0.004, "relative error of a reference sensor's gain", 0.0, 1.0)
     patch_position_m: float = _value(
         0.15e-3, "error of a patch's tracked position along each axis, m", 0.0, 0.1
@@ -95,43 +85,28 @@ class Accuracy:
     patch_rotation_rad: float = _value(
         2e-3, "error of a patch's tracked orientation about each axis, rad", 0.0, 1.0
     )
-
+    # A tool at a speed v is where its pose says to v times this. The default is that of a line
+    # which delivers in frames of 1 ms, as USB does: a delay spread evenly over a frame.
     stamp_sigma_s: float = _value(0.3e-3, 'error of a flux stamp, s', 0.0, 0.1)
-
-    def __post_init__(self) -> None:
-        _check(self)
 
     @property
     def pose_jitter(self) -> NDArray[np.float64]:
-        """Return the jitter of an optical pose along (m) and about (rad) the three axes, shape
-        (6,).
-        """
+        """Return the jitter of an optical pose along (m) and about (rad) the axes, shape (6,)."""
         return np.repeat([self.optical_position_m, self.optical_rotation_rad], 3)
 
 
 @dataclass(frozen=True)
-class ToolSettings:
+class ToolSettings(_Stated):
     """States how well tools are known, and how fast they may be.
 
     Raises
     ------
     ParameterError
         When a value is no number or out of its range.
-
-    Attributes
-    ----------
-    tool_coil_position_m, tool_coil_axis_rad : float
-        Error of a tool coil's place along each axis, m, and of its direction along both tangents,
-        rad: one standard deviation. Too small, and faultless coils contradict their body; too
-        large, and a coil may be wrong by some times this before its body notices.
-    tool_coil_gain : float
-        Relative error of a tool coil's gain, one standard deviation.
-    max_speed_m_s, max_acceleration_m_s2 : float
-        Poses that would take more are not published until the frames after them confirm them. The
-        defaults are a hand's: it reaches over a table at 1 to 1.5 m/s, and jerks at 3 g. Too
-        small, and fast movements lose frames; too large, and wrong poses look like movements.
     """
 
+    # Too small, and faultless coils contradict their body; too large, and a coil may be wrong by
+    # some times this before its body notices.
     tool_coil_position_m: float = _value(
         0.12e-3, "error of a tool coil's place along each axis, m", 0.0, 0.1
     )
@@ -139,82 +114,57 @@ class ToolSettings:
         math.radians(0.5), "error of a tool coil's axis, rad a tangent", 0.0, 1.0
     )
     tool_coil_gain: float = _value(0.002, "relative error of a tool coil's gain", 0.0, 1.0)
+    # Poses that would take more are not published until the frames after them confirm them. The
+    # defaults are a hand's: it reaches over a table at 1 to 1.5 m/s, and jerks at 3 g. Too small,
+    # and fast movements lose frames; too large, and wrong poses look like movements.
     max_speed_m_s: float = _value(2.0, 'largest speed of a tool, m/s', 1e-3, 1e4)
     max_acceleration_m_s2: float = _value(40.0, 'largest acceleration of a tool, m/s^2', 1e-3, 1e6)
 
-    def __post_init__(self) -> None:
-        _check(self)
-
 
 @dataclass(frozen=True)
-class RefitSettings:
+class RefitSettings(_Stated):
     """States how the live refit follows; nothing here belongs to a particular board or metal.
 
     Raises
     ------
     ParameterError
         When a value is no number or out of its range.
-
-    Attributes
-    ----------
-    emitter_drift : float
-        Standard deviation of an emitter's strength relative to its measured current, which has a
-        gain error of its own. A larger one lets a change of one emitter explain more of what
-        metal does.
-    min_references : int
-        Usable reference sensors below which a model that follows them is not updated: its poses
-        are withheld after `references_age_s`. Eight emitters give eight complex readings per
-        sensor; with fewer than four sensors the place of metal is open.
-    average_frames : int
-        Most frames that readings are averaged over while they do not change. More make the refit
-        quieter at rest; movement ends the average at once.
-    persistence : float
-        Probability that the hypothesis of one frame still holds in the next: the closer to 1, the
-        longer a fresh hypothesis waits for its evidence.
-    hold_frames : int
-        Frames that a sensor which was left out must agree for before it is used again; 25 are
-        half a second at 50 Hz.
-    references_age_s : float
-        How long, s, poses are given while the references are silent. A C-arm that comes at 10 cm/s
-        is 5 cm nearer after half a second, and metal that comes again has not come far. Shorter,
-        and a hiccup of the line costs poses; longer, and poses are given without evidence.
-    error_modes : int
-        Rank of the uncertainty that is handed on with the model. Fewer are cheaper to send and to
-        use; what they leave out is added as noise.
-    seed : int
-        Of the random draws that the uncertainty is made from.
-    accuracy : Accuracy
-        Of the references and their readings.
-    tools : ToolSettings
-        Of the tools, which the refit itself has no use for: two settings that differ in it only
-        are the same.
     """
 
+    # The current has a gain error of its own. A larger deviation lets a change of one emitter
+    # explain more of what metal does.
     emitter_drift: float = _value(
         0.003, "deviation of an emitter's strength relative to its measured current", 0.0, 1.0
     )
+    # Eight emitters give eight complex readings per sensor; with fewer than four sensors the
+    # place of metal is open.
     min_references: int = _value(
         4, 'usable reference sensors below which poses are withheld', 1, 10_000
     )
+    # More make the refit quieter at rest; movement ends the average at once.
     average_frames: int = _value(
         5, 'most frames that unchanging readings are averaged over', 1, 10_000
     )
+    # The closer to 1, the longer a fresh hypothesis waits for its evidence.
     persistence: float = _value(
         0.98, 'probability that a hypothesis still holds in the next frame', 0.01, 0.9999
     )
+    # 25 are half a second at 50 Hz.
     hold_frames: int = _value(
         25, 'frames of agreement after which a sensor left out is used again', 1, 1_000_000
     )
+    # A C-arm that comes at 10 cm/s is 5 cm nearer after half a second, and metal that comes again
+    # has not come far. Shorter, and a hiccup of the line costs poses; longer, and poses are given
+    # without evidence.
     references_age_s: float = _value(
         0.5, 'longest time for which poses are given without references, s', 0.02, 60.0
     )
+    # Fewer are cheaper to send and to use; what they leave out is added as noise.
     error_modes: int = _value(12, "rank of the model's uncertainty", 1, 96)
     seed: int = _value(1, 'seed of the draws that the uncertainty is made from', 1, 2**31)
     accuracy: Accuracy = field(default_factory=Accuracy)
+    # The refit itself has no use for tools: settings that differ in them only are the same.
     tools: ToolSettings = field(default_factory=ToolSettings, compare=False)
-
-    def __post_init__(self) -> None:
-        _check(self)
 
 
 SECTIONS = {
@@ -228,12 +178,9 @@ VALUES = {name: item for section in SECTIONS.values() for name, item in section.
 
 
 def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
-    """Return the settings with some values stated, and the default of every other.
+    """Return the settings with some values stated by their names, and the default of every other.
 
-    Parameters
-    ----------
-    stated : mapping of str to number
-        By the names in `VALUES`. A whole number will do for a float.
+    A whole number will do for a float.
 
     Raises
     ------
@@ -245,10 +192,20 @@ def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
         raise ParameterError(
             f'there is no value {", ".join(unknown)} to state; there are: {", ".join(VALUES)}'
         )
-    accuracy = {name: stated[name] for name in SECTIONS['accuracy'] if name in stated}
-    refit = {name: stated[name] for name in SECTIONS['refit'] if name in stated}
-    tools = {name: stated[name] for name in SECTIONS['tools'] if name in stated}
-    return RefitSettings(**refit, accuracy=Accuracy(**accuracy), tools=ToolSettings(**tools))
+    given = sections_of(stated)
+    return RefitSettings(
+        **given['refit'],
+        accuracy=Accuracy(**given['accuracy']),
+        tools=ToolSettings(**given['tools']),
+    )
+
+
+def sections_of(stated: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return stated values by section of the setup document, and by name."""
+    return {
+        section: {name: stated[name] for name in names if name in stated}
+        for section, names in SECTIONS.items()
+    }
 
 
 def parse_entries(entries: list[str]) -> dict[str, float]:
@@ -265,12 +222,9 @@ def parse_entries(entries: list[str]) -> dict[str, float]:
         if name in stated:
             raise ParameterError(f'{name} is stated twice')
         try:
-            stated[name] = int(text) if _is_whole(name) else float(text)
+            whole = name in VALUES and VALUES[name].type is int
+            stated[name] = int(text) if whole else float(text)
         except ValueError:
             raise ParameterError(f'{entry!r} must be NAME=VALUE with a number') from None
     settings_from(stated)
     return stated
-
-
-def _is_whole(name: str) -> bool:
-    return name in VALUES and VALUES[name].type is int

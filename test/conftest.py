@@ -29,8 +29,9 @@ os.environ.setdefault('ROS_LOG_DIR', tempfile.mkdtemp(prefix='anser_ros_log_'))
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 os.environ.setdefault('NUMBA_NUM_THREADS', '1')
 if 'PYTEST_XDIST_WORKER' not in os.environ:
-    # What nodes keep for those after them is of this run; matplotlib's fonts are the user's.
+    # What nodes keep for those after them is of this run; fonts and kernels are the user's.
     os.environ.setdefault('MPLCONFIGDIR', str(Path('~/.cache/matplotlib').expanduser()))
+    os.environ.setdefault('NUMBA_CACHE_DIR', str(Path('~/.cache/numba').expanduser()))
     os.environ['XDG_CACHE_HOME'] = tempfile.mkdtemp(prefix='anser_ros_cache_')
 if 'AMENT_PREFIX_PATH' not in os.environ and importlib.util.find_spec('ros_wheels_bootstrapper'):
     os.environ['AMENT_PREFIX_PATH'] = sys.prefix

@@ -17,7 +17,7 @@ from anser_ros.cli.main import main
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.calibration import calibrate_sessions, generator_of
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
@@ -209,7 +209,7 @@ def test_a_model_worse_than_the_nominal_one_is_only_written_when_forced(factory,
     tool = factory.tools[0]
     rng = np.random.default_rng(0)
     # Points that say almost nothing of the places between them, and a drawing that is exact.
-    nominal = Drawing.of(factory.setup).model
+    nominal = NominalBoard.of(factory.setup).model
     points, axes = tool.placed()
     flux = nominal.flux(points, axes, tool.sensors.length)
     flux = flux + 3e-9 * rng.normal(size=flux.shape)
@@ -290,7 +290,7 @@ def test_options_raise_typed_errors():
 def test_a_board_of_unknown_kind_still_calibrates(factory):
     emitter = replace(factory.setup.emitter, kind='something_else', geometry={})
     session = replace(factory, setup=replace(factory.setup, emitter=emitter))
-    assert Drawing.of(session.setup).model is None
+    assert NominalBoard.of(session.setup).model is None
     assert generator_of(session.setup).side_m == pytest.approx(0.0969, abs=2e-3)
     options = Options(layout=Layout('layer', 10, 1.25, 0.0))
     found = calibrate_sessions([session], options)

@@ -19,12 +19,8 @@ from anser_ros.sessions.comparison import (
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import PoseSeries
 from anser_ros.sessions.pose_table import (
-    BODIES_FILE,
     ERRORS_FILE,
-    POSES_FILE,
-    write_body_poses,
-    write_errors,
-    write_poses,
+    write_tables,
 )
 
 STEP_NS = 40_000_000
@@ -80,9 +76,7 @@ def test_a_side_without_a_pose_is_told_and_not_refused(tmp_path, capsys):
         (tmp_path / name).mkdir()
         folders.append(str(tmp_path / name))
         evaluation = evaluation_of(some, state)
-        write_errors(tmp_path / name / ERRORS_FILE, evaluation)
-        write_poses(tmp_path / name / POSES_FILE, evaluation)
-        write_body_poses(tmp_path / name / BODIES_FILE, evaluation)
+        write_tables(tmp_path / name, evaluation)
     found = compare_errors(some, {}, np.random.default_rng(1))['a']
     assert (found.n, found.only_a, found.only_b) == (0, FRAMES, 0)
     assert found.verdict == 'neither'
@@ -129,9 +123,7 @@ def test_the_command(tmp_path, capsys):
     for name, scale in (('one', 2.0), ('two', 1.0)):
         (tmp_path / name).mkdir()
         evaluation = evaluation_of(errors(scale))
-        write_errors(tmp_path / name / ERRORS_FILE, evaluation)
-        write_poses(tmp_path / name / POSES_FILE, evaluation)
-        write_body_poses(tmp_path / name / BODIES_FILE, evaluation)
+        write_tables(tmp_path / name, evaluation)
     read = read_errors(tmp_path / 'one')
     assert len(read['position']) == FRAMES - 1
     key = next(iter(read['position']))

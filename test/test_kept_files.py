@@ -16,7 +16,7 @@ from anser_ros.nodes.field_model_parts.kept_baseline import BASELINE_S, KeptBase
 from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
 from anser_ros.sessions import kept_tables
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.kept_tables import MOST_TABLES, KeptTables, ReadAhead
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import sensor_table
@@ -40,7 +40,11 @@ def test_tables_are_read_as_they_were_written(tmp_path):
     kept = KeptTables(tmp_path, setup, world.model, world.references)
     assert kept.read() is None
     made = tables.build_tables(
-        world.model, world.references, setup.refit, Drawing.of(setup).field, stated_volume(setup)
+        world.model,
+        world.references,
+        setup.refit,
+        NominalBoard.of(setup).field,
+        stated_volume(setup),
     )
     kept.write(made)
     read = KeptTables(tmp_path, setup, world.model, world.references).read()

@@ -7,13 +7,13 @@ import shutil
 import subprocess
 import sys
 
+import numba
 import pytest
 
 from anser_ros import kernel_cache
 from anser_ros.cli import warm_up
 from anser_ros.errors import ParameterError
-from anser_ros.frames.intake import fill_frame
-from anser_ros.kernel_cache import PACKAGE, KernelCache, folder_of
+from anser_ros.kernel_cache import PACKAGE, KernelCache
 
 
 def test_it_is_full_when_all_has_been_compiled(tmp_path):
@@ -28,18 +28,47 @@ def test_it_is_full_when_all_has_been_compiled(tmp_path):
     assert KernelCache(tmp_path).is_full
 
 
-def test_a_changed_source_empties_it(tmp_path, monkeypatch):
-    """As for numba, it is the time of a file that tells; the package's own are in use."""
-    package = tmp_path / 'package'
-    package.mkdir()
-    source = shutil.copy2(PACKAGE / 'frames' / 'intake.py', package)
-    monkeypatch.setattr(kernel_cache, 'PACKAGE', package)
-    KernelCache(tmp_path).finish()
-    before = os.stat(source)
-    os.utime(source, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
-    assert not KernelCache(tmp_path).is_full
-    os.utime(source, ns=(before.st_atime_ns, before.st_mtime_ns))
-    assert KernelCache(tmp_path).is_full
+@pytest.mark.processes
+def test_copies_of_the_package_share_kernels_by_content(tmp_path):
+    """A second copy loads what the first one compiled; with another source it does not."""
+    code = (
+        'import numpy as np; from anser_ros.physics.tangent import fill_tangent as f\n'
+        'f(np.array([0.0, 0.0, 1.0]), np.zeros((2, 3)))\n'
+        'print(sum(f.stats.cache_hits.values()), sum(f.stats.cache_misses.values()))'
+    )
+    found = []
+    for name in ('clone', 'built', 'changed'):
+        package = tmp_path / name / 'anser_ros'
+        shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns('__pycache__'))
+        if name == 'changed':
+            with (package / 'frames' / 'intake.py').open('a') as source:
+                source.write('# other\n')
+        env = {**os.environ, 'PYTHONPATH': str(package.parent), 'XDG_CACHE_HOME': str(tmp_path)}
+        env.pop('NUMBA_CACHE_DIR', None)
+        command = [sys.executable, '-P', '-c', code]
+        found.append(subprocess.check_output(command, env=env, text=True))
+    assert found == ['0 1\n', '1 0\n', '0 1\n']
+
+
+def test_a_cache_that_cannot_be_written_is_said(tmp_path):
+    (tmp_path / 'file').touch()
+    with (
+        pytest.raises(ParameterError, match='cannot be kept, every start compiles them again'),
+        KernelCache(tmp_path / 'file').locked(),
+    ):
+        pass
+
+
+def test_without_any_folder_kernels_are_compiled_and_not_kept(monkeypatch):
+    njit = numba.njit
+
+    def without_folder(function, *, cache=False, **options):
+        if cache:
+            raise RuntimeError('no locator available')
+        return njit(function, **options)
+
+    monkeypatch.setattr(numba, 'njit', without_folder)
+    assert kernel_cache.kernel(lambda x: x + 1)(1) == 2
 
 
 def test_only_one_compiles_at_a_time(tmp_path):
@@ -61,7 +90,7 @@ def test_every_kernel_of_the_package_is_counted():
     from anser_ros.tracking import tracker  # noqa: F401
 
     assert scattering
-    cache = KernelCache(folder_of(fill_frame))
+    cache = KernelCache()
     own = [name for name in warm_up.kernels() if '<locals>' not in name]
     assert len(own) <= cache.total <= len(own) + 5
 
@@ -69,7 +98,7 @@ def test_every_kernel_of_the_package_is_counted():
 @pytest.mark.processes
 def test_a_kernel_that_does_not_compile_is_said(tmp_path, monkeypatch):
     said = []
-    monkeypatch.setattr(warm_up, 'folder_of', lambda _: tmp_path)
+    monkeypatch.setattr(kernel_cache, 'kept_folder', lambda: tmp_path)
 
     @contextlib.contextmanager
     def failing():
@@ -84,6 +113,6 @@ def test_a_kernel_that_does_not_compile_is_said(tmp_path, monkeypatch):
 
 
 def test_nothing_is_said_where_all_is_there(tmp_path, monkeypatch):
-    monkeypatch.setattr(warm_up, 'folder_of', lambda _: tmp_path)
+    monkeypatch.setattr(kernel_cache, 'kept_folder', lambda: tmp_path)
     KernelCache(tmp_path).finish()
     warm_up.compile_kernels(pytest.fail)

@@ -14,7 +14,7 @@ from anser_ros.cli.main import main
 from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.sessions.diagnosis import diagnose_session
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.plausibility import check_points, plausible_tools
 from anser_ros.sessions.session import load_session
@@ -77,7 +77,7 @@ def test_positions_far_away_need_no_drawing(moving):
     (tool,) = moving.tools
     emitter = replace(moving.setup.emitter, kind='somebody_elses')
     undrawn = replace(moving, setup=replace(moving.setup, emitter=emitter))
-    assert Drawing.of(undrawn.setup).field is None
+    assert NominalBoard.of(undrawn.setup).field is None
     assert checked(undrawn, tool)[1] == ''
     far = with_track(tool, position=1e3 * tool.track.position)
     says(undrawn, far, 'span', 'millimetres?')

@@ -24,13 +24,13 @@ from anser_ros.sessions.diagnosis import (
     track_held_out,
 )
 from anser_ros.sessions.diagnosis_document import to_document as diagnosis_document
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.evaluation import compare
 from anser_ros.sessions.evaluation_document import to_document as evaluation_document
 from anser_ros.sessions.follower import ModelFollower
 from anser_ros.sessions.frames import frames_of
 from anser_ros.sessions.model_file import load_model, save_model
-from anser_ros.sessions.pose_table import POSE_COLUMNS, write_poses
+from anser_ros.sessions.pose_table import POSE_COLUMNS, write_tables
 from anser_ros.sessions.prepared import correct, prepare
 from anser_ros.sessions.recorded_drift import FOUND_ON, date_drifts
 from anser_ros.sessions.session import empty_session, load_session
@@ -89,7 +89,7 @@ class TestPrepare:
         assert prepared.baseline.path == factory.path
         assert prepared.baseline.flux.shape == (len(moving.reference.sensors), 8)
         assert np.isfinite(prepared.baseline.flux).all()
-        assert prepared.drawing.board.names == model.emitters
+        assert prepared.nominal.board.names == model.emitters
         assert not prepared.correction.terms and not prepared.recorded_drift
         with pytest.raises(FrozenInstanceError):
             prepared.model = model
@@ -110,10 +110,10 @@ class TestPrepare:
 
     def test_the_nominal_model_is_made_once(self, moving, model):
         prepared = prepare(moving, model)
-        drawn = prepared.drawing.model
+        drawn = prepared.nominal.model
         assert drawn.emitters == model.emitters
-        assert prepared.with_session(beginning(moving, 2)).drawing.model is drawn
-        assert Drawing(None).model is None and Drawing(None).field is None
+        assert prepared.with_session(beginning(moving, 2)).nominal.model is drawn
+        assert NominalBoard(None).model is None and NominalBoard(None).field is None
 
     def test_a_drift_holds_on_the_session_that_it_is_dated_by(self, moving, model):
         drift = EffectRecord('coil_drift', {'coil': 1, 'amount': 0.01, 'tau_s': 5.0})
@@ -158,7 +158,7 @@ class TestTrack:
         assert (
             json.loads(json.dumps(evaluation_document(evaluation)))['bodies']['tool_a']['n'] == 5
         )
-        write_poses(tmp_path / 'poses.csv', evaluation)
+        write_tables(tmp_path, evaluation)
         rows = list(csv.DictReader((tmp_path / 'poses.csv').read_text().splitlines()))
         assert tuple(rows[0]) == POSE_COLUMNS and len(rows) == 9 * 5
 

@@ -11,7 +11,7 @@ from anser_ros.errors import SetupError
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import default_clouds
 from anser_ros.refit.excitation import region_of
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.volume import stated_volume, tracked_volume
 from anser_ros.wire.setup import dump_setup, parse_setup, topic_of
 
@@ -151,7 +151,7 @@ def test_a_stated_volume_is_read_and_written():
 def test_without_a_stated_volume_it_follows_from_the_board():
     """Tracker, refit and views have the same box, to the digit."""
     setup = parse_setup(DEMO.read_text())
-    region = region_of(Drawing.of(setup).field)
+    region = region_of(NominalBoard.of(setup).field)
     assert tracked_volume(setup) == TrackedVolume() == region.volume
     box = ((-0.1, -0.12, 0.06), (0.1, 0.1, 0.3))
     stated = replace(setup, volume=box)

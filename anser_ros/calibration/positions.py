@@ -10,7 +10,6 @@ number of emitters nor on that of readings.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +17,7 @@ from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import ComplexArray, as_complex, as_real
 from anser_ros.calibration.readings import BLOCK_ROWS, frame_blocks, weighted_readings
 from anser_ros.field.measurements import Measurements
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.dipole import GAUSS_OFFSET, fill_field_and_gradient, flux_basis
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ CONVERGED = 1e-3
 """Relative fall of the sum of squares below which another step is not worth its time."""
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel(nogil=True)
 def _fill_slopes(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
     basis = np.empty((9, positions.shape[0]))
     point = np.empty(3)

@@ -148,10 +148,9 @@ def kernels() -> list[Observation]:
     # Late, as numba may be what is missing.
     if not find_spec('numba'):
         return []
-    from anser_ros.frames.intake import fill_frame
-    from anser_ros.kernel_cache import KernelCache, folder_of
+    from anser_ros.kernel_cache import KernelCache
 
-    cache = KernelCache(folder_of(fill_frame))
+    cache = KernelCache()
     if cache.is_full:
         return [Observation('kernels', GOOD, f'all {cache.total} are compiled')]
     words = 'not all compiled: the first start compiles the rest, which takes up to a minute'

@@ -18,7 +18,7 @@ from anser_ros.errors import FitError, ParameterError, PlausibilityError
 from anser_ros.poses.point_model import to_point_model
 from anser_ros.sessions.plausibility import check_points
 from anser_ros.wire.fiducials import read_fiducials
-from anser_ros.wire.text_files import read_rows
+from anser_ros.wire.text_files import numbers_of, read_rows
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         error_map = learn_error_map(tracked, true, registers=args.register)
     if args.apply is not None:
         poses, names = _read(args.apply)
-        places = _columns(poses, TRACKED, args.apply)
+        places = _numbers(args.apply, poses, TRACKED)
         corrected = error_map.apply(places) if error_map.is_confirmed else places
     text = json.dumps(to_document(error_map), indent=1)
     (args.out / 'error_map.json').write_text(text + '\n', encoding='utf-8')
@@ -119,9 +119,9 @@ def _points(args: argparse.Namespace) -> tuple[Array, Array]:
         if args.points.suffix == MARKUPS:
             raise ParameterError(f'{args.points} has tracked positions only; --true is needed')
         rows, _ = _read(args.points)
-        return _columns(rows, TRACKED, args.points), _columns(rows, TRUE, args.points)
+        return _numbers(args.points, rows, TRACKED), _numbers(args.points, rows, TRUE)
     tracked, true = (
-        read_fiducials(path) if path.suffix == MARKUPS else _columns(_read(path)[0], TRACKED, path)
+        read_fiducials(path) if path.suffix == MARKUPS else _numbers(path, _read(path)[0], TRACKED)
         for path in (args.points, args.true)
     )
     if len(tracked) != len(true):
@@ -166,14 +166,8 @@ def _read(path: Path) -> tuple[list[dict[str, str]], list[str]]:
     return rows, names
 
 
-def _columns(rows: list[dict[str, str]], names: tuple[str, ...], path: Path) -> Array:
-    """Return columns as numbers, with NaN for an empty cell."""
-    try:
-        return np.array([[float(row[name] or 'nan') for name in names] for row in rows])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ParameterError(
-            f'{path}: needs the columns {", ".join(names)} with numbers: {error}'
-        ) from error
+def _numbers(path: Path, rows: list[dict[str, str]], names: tuple[str, ...]) -> Array:
+    return numbers_of(path, rows, names, with_gaps=True)
 
 
 def _write(path: Path, rows: list[dict[str, str]], names: list[str], places: Array) -> None:

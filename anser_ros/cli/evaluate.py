@@ -22,21 +22,10 @@ from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import recording_of, to_document
 from anser_ros.sessions.known_metal_file import load_known_metal
 from anser_ros.sessions.patches import parse_patches
-from anser_ros.sessions.pose_table import (
-    BODIES_FILE,
-    ERRORS_FILE,
-    POSES_FILE,
-    SOURCES_FILE,
-    write_body_poses,
-    write_errors,
-    write_poses,
-    write_sources,
-)
+from anser_ros.sessions.pose_table import write_tables
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
-
-FILES = ('evaluation.json', POSES_FILE, BODIES_FILE, ERRORS_FILE)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -173,13 +162,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     document = {**to_document(evaluation), 'recording': recording_of(session)}
     text = json.dumps(document, indent=1)
     (args.out / 'evaluation.json').write_text(text + '\n', encoding='utf-8')
-    write_poses(args.out / POSES_FILE, evaluation)
-    write_body_poses(args.out / BODIES_FILE, evaluation)
-    write_errors(args.out / ERRORS_FILE, evaluation)
-    written = [args.out / name for name in FILES]
-    if evaluation.sources:
-        written.append(args.out / SOURCES_FILE)
-        write_sources(written[-1], evaluation)
+    written = [args.out / 'evaluation.json', *write_tables(args.out, evaluation)]
     written += write_figures(
         evaluation, document, args.out, session=args.session, model=args.model,
         jitter_m=session.setup.accuracy.optical_position_m,

@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_of('importing') as tell:
         tell(f'reading {args.source}')
         if is_document:
-            counts = import_tables(args.source, args.out).messages
+            counts = import_tables(args.source, args.out)
         else:
             setup = None if args.setup is None else read_text(args.setup)
             bag = import_bag(args.source, args.out, parse_remaps(args.remap), setup)

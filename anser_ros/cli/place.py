@@ -23,13 +23,13 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Region
 from anser_ros.refit.design import Design, StatedMetal, choose, family, random_designs
 from anser_ros.refit.excitation import Excitation, region_of
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.units import LENGTH_UNITS, unit_words
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
-from anser_ros.wire.text_files import read_rows
+from anser_ros.wire.text_files import numbers_of, read_rows
 
 Array = NDArray[np.float64]
 
@@ -153,7 +153,7 @@ def propose(
     SetupError
         When the board can't be drawn from the setup.
     """
-    field = Drawing.of(setup).field
+    field = NominalBoard.of(setup).field
     if field is None:
         raise SetupError(
             f'places need a board with drawn coils, not one of the kind {setup.emitter.kind!r}'
@@ -249,28 +249,16 @@ def _read(path: Path) -> SensorTable:
     _, rows = read_rows(path)
     if not rows:
         raise ParameterError(f'{path}: no rows')
-    places = _numbers(path, rows, ('x_m', 'y_m', 'z_m'))
+    places = numbers_of(path, rows, ('x_m', 'y_m', 'z_m'))
     if 'ax' not in rows[0]:
         return _every_axis(places)
-    axes = _numbers(path, rows, ('ax', 'ay', 'az'))
+    axes = numbers_of(path, rows, ('ax', 'ay', 'az'))
     if not (np.linalg.norm(axes, axis=1) > 0.0).all():
         raise ParameterError(f'{path}: an axis has zero length')
     length: float | Array = LENGTH_M
     if 'length_m' in rows[0]:
-        length = _numbers(path, rows, ('length_m',))[:, 0]
+        length = numbers_of(path, rows, ('length_m',))[:, 0]
     return _coils(places, axes, length)
-
-
-def _numbers(path: Path, rows: list[dict[str, str]], names: tuple[str, ...]) -> Array:
-    try:
-        values = np.array([[float(row[name]) for name in names] for row in rows])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ParameterError(
-            f'{path}: needs the columns {", ".join(names)} with numbers: {error}'
-        ) from error
-    if not np.isfinite(values).all():
-        raise ParameterError(f'{path}: the columns {", ".join(names)} must be finite')
-    return values
 
 
 def to_document(proposal: Proposal, origin: str) -> dict[str, Any]:

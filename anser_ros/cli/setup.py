@@ -28,7 +28,7 @@ from anser_ros.cli.setup_parts import (
 from anser_ros.cli.setup_questions import ask_all
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import ParameterError
-from anser_ros.sessions.starting_model import board_of
+from anser_ros.sessions.drawing import board_of
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import Setup, parse_setup
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from anser_ros.cli.labels import Label, name_points
 from anser_ros.pictures import save
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.volume import tracked_volume
-from anser_ros.wire.setup import SensorSpec, Setup
+from anser_ros.wire.setup import SensorRows, SensorSpec, Setup
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def draw_setup(setup: Setup, path: Path) -> None:
 def _board(panel: Any, setup: Setup, across: int, up: int) -> Array:
     """Draw emitters and tracked volume; points of the lines."""
     lines = []
-    board = Drawing.of(setup).board
+    board = NominalBoard.of(setup).board
     for rank, coil in enumerate(setup.emitter.coils):
         centre = 1e3 * np.array(coil.centre_m)
         if board is not None:
@@ -105,8 +105,8 @@ def _sensors(
     if not sensors:
         return [], np.zeros((0, 2))
     sides = [across, up]
-    place = 1e3 * np.array([sensor.position_m for sensor in sensors])
-    axis = np.array([sensor.axis for sensor in sensors])
+    _, position, axis = SensorRows.of(sensors)
+    place = 1e3 * position
     reach = np.vstack([place, np.zeros((1, 3))])
     size = ARROW * max(float(np.ptp(reach, axis=0).max()), SMALLEST_MM)
     if names:

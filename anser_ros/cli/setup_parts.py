@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from anser_ros.errors import ParameterError
-from anser_ros.settings import SECTIONS
+from anser_ros.settings import sections_of
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import FIELD_GENERATOR, SCHEMA, Setup, parse_setup
 from anser_ros.wire.text_files import read_rows
@@ -173,10 +173,7 @@ def document_of(
     if volume_mm is not None:
         low, high = metres(volume_mm[:3]), metres(volume_mm[3:])
         document['volume'] = {'low_m': low, 'high_m': high}
-    for section, names in SECTIONS.items():
-        values = {name: stated[name] for name in names if name in stated}
-        if values:
-            document[section] = values
+    document |= {name: values for name, values in sections_of(stated).items() if values}
     return document
 
 

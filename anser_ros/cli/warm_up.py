@@ -19,8 +19,7 @@ from numba.core.dispatcher import Dispatcher
 from anser_ros.cli.progress import LINE_INTERVAL_S
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.frames.intake import fill_frame
-from anser_ros.kernel_cache import KernelCache, folder_of
+from anser_ros.kernel_cache import KernelCache
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import parse_setup
@@ -48,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     stream = sys.stderr if args.json else sys.stdout
     compile_kernels(lambda text: print(text, file=stream, flush=True))
     if args.json:
-        count = KernelCache(folder_of(fill_frame)).total
+        count = KernelCache().total
         print(json.dumps({'schema': SCHEMA, 'kernels': count}))
     else:
         print('all kernels are compiled')
@@ -72,7 +71,7 @@ def compile_kernels(
     ParameterError
         When a process fails, with its last line.
     """
-    cache = KernelCache(folder_of(fill_frame))
+    cache = KernelCache()
     if cache.is_full:
         return
     with cache.locked():
@@ -141,7 +140,7 @@ def kernels() -> dict[str, Dispatcher]:
 
 def main(part: str) -> int:
     """Call the kernels of one part the way that nodes and commands do."""
-    cache = KernelCache(folder_of(fill_frame))
+    cache = KernelCache()
     numba.core.event.register('numba:compile', _Listener(cache))
     for step in PARTS[part]:
         step()
@@ -178,7 +177,7 @@ def _refit() -> None:
     """Make a refit of the demo's board; its tables, most of the work, are kept for the demo."""
     from anser_ros.refit.live_refit import LiveRefit
     from anser_ros.refit.tables import build_tables
-    from anser_ros.sessions.drawing import Drawing
+    from anser_ros.sessions.drawing import NominalBoard
     from anser_ros.sessions.kept_tables import KeptTables, kept_folder
     from anser_ros.sessions.session import sensor_table
     from anser_ros.sessions.volume import stated_volume
@@ -196,7 +195,7 @@ def _refit() -> None:
     )
     model, folder = _demo_model(), kept_folder()
     tables = build_tables(
-        model, references, setup.refit, Drawing.of(setup).field, stated_volume(setup)
+        model, references, setup.refit, NominalBoard.of(setup).field, stated_volume(setup)
     )
     refit = LiveRefit(model, references, clean, setup.refit, tables=tables)
     if folder is not None:

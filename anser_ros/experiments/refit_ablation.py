@@ -17,7 +17,7 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.free import FreeDipoles
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.sessions.baseline import baseline_flux
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.session import Session
 from anser_ros.settings import Accuracy
 from anser_ros.stamps import NANO
@@ -115,7 +115,7 @@ def _models(
     """Return the model of every frame that is tracked."""
     reference = session.reference
     assert reference is not None
-    sensors, drawing = reference.sensors.select(chosen), Drawing.of(session.setup).field
+    sensors, drawing = reference.sensors.select(chosen), NominalBoard.of(session.setup).field
     flux = reference.flux[::every, chosen]
     if method == FREE:
         free = FreeDipoles(model, sensors, clean[chosen], drawing)

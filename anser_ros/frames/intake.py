@@ -10,13 +10,13 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import AnserError, LayoutError
 from anser_ros.frames import faults
 from anser_ros.frames.faults import FAULTS, GOOD
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.sensor import LARGEST_FLUX_T
 from anser_ros.stamps import JUMP_NS, NANO, Order, order_of
 
@@ -240,7 +240,7 @@ class Intake:
             self._last_order = layout
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def fill_frame(given, marks, rows, largest, spares_dead, flux, codes, received):  # type: ignore[no-untyped-def]
     """Write a frame's fluxes (S, K) in a table's order, and what each reading is.
 

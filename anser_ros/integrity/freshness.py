@@ -12,11 +12,11 @@ one exact repetition is enough, and one emitter needs a few.
 import math
 from dataclasses import replace
 
-import numba
 import numpy as np
 
 from anser_ros.frames.faults import STUCK_CODE
 from anser_ros.frames.intake import Frame
+from anser_ros.kernel_cache import kernel
 from anser_ros.stamps import NANO
 
 LEAST_NOISE = 0.1
@@ -42,7 +42,7 @@ HOPELESS = -60.0
 """Logarithm of the odds of one comparison below which the rest of it is not worked out."""
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _fill_terms(now, least, terms):  # type: ignore[no-untyped-def]
     """Write what makes the odds of a repetition of ``now`` (K,): a place and four numbers a row.
 
@@ -69,7 +69,7 @@ def _fill_terms(now, least, terms):  # type: ignore[no-untyped-def]
     return count
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # type: ignore[no-untyped-def]
     """Compare readings (S, K) with those of the ring (D, S, K), and put them into it.
 

@@ -13,11 +13,11 @@ noise with the body, and the covariances add up.
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.tangent import fill_tangent
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ class SurveyErrors:
     gain: float
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def fill_distances(  # type: ignore[no-untyped-def]
     position, rotation, covariance, offsets, axes, positions, directions, covariances, took_part,
     survey, found,

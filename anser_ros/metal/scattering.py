@@ -13,11 +13,11 @@ Couplings count in 1e-4 m^3.
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.dipoles import Dipoles
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT, MU_0
 from anser_ros.physics.dipole import GAUSS_OFFSET
 
@@ -196,7 +196,7 @@ def dipole_coupling(points: Array, centres: Array, axes: Array) -> Array:
     return out.reshape(*frames, *out.shape[1:])
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel(nogil=True)
 def _fill_coupling(points, centres, axes, out):  # type: ignore[no-untyped-def]
     """n . B of a moment m is m . (3 (n . d) d / d^5 - n / d^3)."""
     for f in range(centres.shape[0]):

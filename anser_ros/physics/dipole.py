@@ -10,10 +10,10 @@ with an error of order L^4.
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.kernel_cache import kernel
 from anser_ros.parallel import in_order, slices, slices_of
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 
@@ -29,7 +29,7 @@ POINTS_A_THREAD = 512
 """Points that one thread works out, a millisecond's work."""
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel(nogil=True)
 def _in_rows(positions, directions):  # type: ignore[no-untyped-def]
     """Return x, y, z, u_x, u_y, u_z of dipoles as rows (6, N), which vector registers can load."""
     out = np.empty((6, positions.shape[0]))
@@ -39,7 +39,7 @@ def _in_rows(positions, directions):  # type: ignore[no-untyped-def]
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel(nogil=True)
 def fill_flux_basis(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
     """Write each unit dipole's flux density along each coil's axis into ``out``, shape (P, N).
 
@@ -67,7 +67,7 @@ def fill_flux_basis(points, axes, lengths, positions, directions, out):  # type:
                 row[j] = value if s == 0 else row[j] + value
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def fill_field_and_gradient(point, positions, directions, basis):  # type: ignore[no-untyped-def]
     """Write each unit dipole's field and gradient at one point (m) into ``basis``, shape (9, N).
 
@@ -94,7 +94,7 @@ def fill_field_and_gradient(point, positions, directions, basis):  # type: ignor
         basis[8, j] = k5 * (2.0 * uz * dz + du - q * dz * dz)
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel(nogil=True)
 def _fill_near(px, py, pz, dipoles, offset, inverse, near, along):  # type: ignore[no-untyped-def]
     """Write offsets d (3, N), ``1/d^2``, ``k/d^3`` and ``d . u`` of dipoles, from `_in_rows`.
 
@@ -114,7 +114,7 @@ def _fill_near(px, py, pz, dipoles, offset, inverse, near, along):  # type: igno
         along[j] = dx[j] * u[j] + dy[j] * v[j] + dz[j] * w[j]
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel(nogil=True)
 def _fill_field_basis(points, dipoles, out):  # type: ignore[no-untyped-def]
     """Write the fields of unit dipoles, from `_in_rows`, at points into ``out``, (P, 3, N)."""
     count = dipoles.shape[1]
@@ -130,7 +130,7 @@ def _fill_field_basis(points, dipoles, out):  # type: ignore[no-untyped-def]
                 row[j] = near[j] * turned
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel(nogil=True)
 def _fill_slopes(px, py, pz, dipoles, work, basis):  # type: ignore[no-untyped-def]
     """Do what `fill_field_and_gradient` does, for one of many points and dipoles in rows.
 
@@ -158,7 +158,7 @@ def _fill_slopes(px, py, pz, dipoles, work, basis):  # type: ignore[no-untyped-d
             place += 1
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel(nogil=True)
 def _fill_flux_jacobian(points, axes, lengths, dipoles, moments, flux, d_r, d_n):  # type: ignore[no-untyped-def]
     """Add fluxes and derivatives to ``flux``, ``d_r`` and ``d_n``, as `flux_jacobian` has them.
 

@@ -1,11 +1,12 @@
 """Spans the plane across a direction by two unit vectors."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.kernel_cache import kernel
 
-@numba.njit(cache=True, error_model='numpy')
+
+@kernel
 def fill_tangent(n, t):  # type: ignore[no-untyped-def]
     """Write two unit vectors that complete the unit vector ``n`` to a right-handed frame.
 

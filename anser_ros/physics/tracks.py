@@ -10,16 +10,16 @@ that is curl-free outside the copper, and only such a field can be fitted by dip
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _add_segments(starts, ends, points, factor, out):  # type: ignore[no-untyped-def]
     for p in range(points.shape[0]):
         bx, by, bz = 0.0, 0.0, 0.0

@@ -20,6 +20,7 @@ from anser_ros.wire.pose_topics import (
     pose_setup,
     tracked_topic,
 )
+from anser_ros.wire.quaternion import pose_numbers
 from anser_ros.wire.session_writer import SessionWriter
 
 Array = NDArray[np.float64]
@@ -53,9 +54,8 @@ def read_pose_session(
     for raw in iter_messages(path, salvage):
         if raw.type_name == POSE_TYPE:
             message = decoder.decode(raw)
-            p, q = message.pose.position, message.pose.orientation
             stamps.setdefault(raw.topic, []).append(stamp_of(message))
-            rows.setdefault(raw.topic, []).append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+            rows.setdefault(raw.topic, []).append(pose_numbers(message.pose))
     chosen = tracked or {
         topic[len(TRACKED) : -len(ENDING)]: topic
         for topic in sorted(rows)

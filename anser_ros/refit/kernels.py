@@ -7,9 +7,9 @@ vector registers; infinities and NaN keep their meaning.
 
 import math
 
-import numba
 import numpy as np
 
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 
 FAST = {'reassoc', 'contract', 'nsz'}
@@ -18,7 +18,7 @@ TOGETHER = 8
 are between 1e-3 and 1e14 of the noise's, so this many are far from the ends of the range."""
 
 
-@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+@kernel(fastmath=FAST)
 def fill_products(matrix, columns, out):  # type: ignore[no-untyped-def]
     """Write a matrix (R, n) times two columns, given as rows (2, n), into ``out`` (R, 2)."""
     for i in range(matrix.shape[0]):
@@ -29,7 +29,7 @@ def fill_products(matrix, columns, out):  # type: ignore[no-untyped-def]
         out[i, 0], out[i, 1] = first, second
 
 
-@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+@kernel(fastmath=FAST)
 def fill_precision(spectra, strengths, noise, inverse, log_det):  # type: ignore[no-untyped-def]
     """Write the inverse variances (H, A, n) of spectra (H, n), and their log determinants (H, A).
 
@@ -48,7 +48,7 @@ def fill_precision(spectra, strengths, noise, inverse, log_det):  # type: ignore
             log_det[h, a] += math.log(product)
 
 
-@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+@kernel(fastmath=FAST)
 def _fill_probabilities(curve, probability):  # type: ignore[no-untyped-def]
     """Write the weights of log likelihoods (A,) and return the logarithm of their mean."""
     top, total = curve[0], 0.0
@@ -62,7 +62,7 @@ def _fill_probabilities(curve, probability):  # type: ignore[no-untyped-def]
     return top + math.log(total / curve.shape[0])
 
 
-@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+@kernel(fastmath=FAST)
 def fill_evidence(  # type: ignore[no-untyped-def]
     analysis, readings, precision, log_det, there, projected, curve, strength, log_evidence
 ):  # fmt: skip
@@ -93,7 +93,7 @@ def fill_evidence(  # type: ignore[no-untyped-def]
         log_evidence[h] += _fill_probabilities(curve[h, :, 1], strength[h, 1])
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=FAST)
+@kernel(nogil=True, fastmath=FAST)
 def fill_scores(directions, white, inside, rest, log_det, scores):  # type: ignore[no-untyped-def]
     """Write the approximate log evidence of bodies (L,) from whitened readings (2, n).
 
@@ -125,7 +125,7 @@ def fill_scores(directions, white, inside, rest, log_det, scores):  # type: igno
         scores[body] += _fill_probabilities(curve[1], probability)
 
 
-@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+@kernel(fastmath=FAST)
 def fill_left_out(  # type: ignore[no-untyped-def]
     analysis, projected, real_precision, imaginary_precision, real_block, imaginary_block, chi2,
     residual,
@@ -155,7 +155,7 @@ def fill_left_out(  # type: ignore[no-untyped-def]
                 chi2[s] += own[k] * total
 
 
-@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+@kernel(fastmath=FAST)
 def _fill_block(rows, precision, weighted, block):  # type: ignore[no-untyped-def]
     """Write ``rows diag(precision) rows^T`` of rows (m, n) into the lower half of (m, m).
 
@@ -179,7 +179,7 @@ def _fill_block(rows, precision, weighted, block):  # type: ignore[no-untyped-de
             block[also, s], block[also, beside] = third, fourth
 
 
-@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+@kernel(fastmath=FAST)
 def _fill_gains(rows, width, projected, precision, weighted, block, columns, gains):  # type: ignore[no-untyped-def]
     """Write by how much a log likelihood grows without the first coil, the first two, and so on.
 
@@ -216,7 +216,7 @@ def _fill_gains(rows, width, projected, precision, weighted, block, columns, gai
             gains[r // width, 1] = 0.5 * imaginary_power - half_log_det
 
 
-@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+@kernel(fastmath=FAST)
 def fill_without(  # type: ignore[no-untyped-def]
     bases, coils, width, projected, precision, curve, log_evidence, bounds, gain, strength
 ):  # fmt: skip
@@ -274,7 +274,7 @@ def fill_without(  # type: ignore[no-untyped-def]
                 best = np.maximum(best, log_evidence[h] + gain[h])
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def bend_power(flux, previous, before):  # type: ignore[no-untyped-def]
     """Return the median over coils of the mean squared second difference of fluxes (S, K)."""
     power, count = np.empty(flux.shape[0]), 0
@@ -289,7 +289,7 @@ def bend_power(flux, previous, before):  # type: ignore[no-untyped-def]
     return np.median(power[:count]) if count else math.nan
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def find_silent(flux, least, silent, no_baseline, codes):  # type: ignore[no-untyped-def]
     """Write which good readings (S, K) are silent, and which have no baseline.
 
@@ -308,7 +308,7 @@ def find_silent(flux, least, silent, no_baseline, codes):  # type: ignore[no-unt
                 codes[s] = silent
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def fill_dipole_tensors(points, sources, out):  # type: ignore[no-untyped-def]
     """Write the field (3P rows, T) of unit moments along x, y and z (3M columns) of sources."""
     for p in range(points.shape[0]):

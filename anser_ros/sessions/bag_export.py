@@ -2,9 +2,10 @@
 
 import csv
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +23,7 @@ POSE_COLUMNS = ('stamp_ns', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
 
 @dataclass(frozen=True)
 class ExportedBag:
-    """States what came of an export.
-
-    Attributes
-    ----------
-    rows : dict of str to int
-        Written rows by the file's name.
-    lost : str
-        What of the bag could not be read, in words.
-    """
+    """Holds how many rows each file got, by its name, and in words what could not be read."""
 
     rows: dict[str, int]
     lost: str
@@ -76,46 +69,36 @@ def _file_name(topic: str) -> str:
 
 
 def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
+    """A table of stamps, positions, m, and quaternions."""
+    numbers = np.column_stack([poses.position, poses.quaternion]).tolist()
+    rows = zip(poses.stamp_ns.tolist(), numbers, strict=True)
     if form == MAT:
-        _write_mat(
-            path,
-            {
-                'stamp_ns': poses.stamp_ns,
-                'position_m': poses.position,
-                'quaternion_xyzw': poses.quaternion,
-            },
-        )
-        return
-    rows = np.column_stack([poses.position, poses.quaternion]).tolist()
-    with path.open('w', encoding='utf-8', newline='') as stream:
-        if form == TUM:
-            for stamp, row in zip(poses.stamp_ns.tolist(), rows, strict=True):
+        parts = (poses.stamp_ns, poses.position, poses.quaternion)
+        _write_mat(path, ('stamp_ns', 'position_m', 'quaternion_xyzw'), parts)
+    elif form == TUM:
+        with path.open('w', encoding='utf-8') as stream:
+            for stamp, row in rows:
                 words = ' '.join(f'{value:.9g}' for value in row)
                 stream.write(f'{stamp // SECOND_NS}.{stamp % SECOND_NS:09d} {words}\n')
-            return
-        writer = csv.writer(stream)
-        writer.writerow(POSE_COLUMNS)
-        for stamp, row in zip(poses.stamp_ns.tolist(), rows, strict=True):
-            writer.writerow([stamp, *(f'{value:.9g}' for value in row)])
+    else:
+        _write_csv(path, POSE_COLUMNS, ([s, *(f'{v:.9g}' for v in row)] for s, row in rows))
 
 
 def _write_fluxes(path: Path, fluxes: RecordedFluxes, form: str) -> None:
+    """A table of stamps, channels, flags and phasors, T."""
     if form == MAT:
-        _write_mat(
-            path,
-            {
-                'stamp_ns': fluxes.stamp_ns,
-                'channel': fluxes.channel,
-                'flags': fluxes.flags,
-                'flux_t': fluxes.flux,
-            },
-        )
+        parts = (fluxes.stamp_ns, fluxes.channel, fluxes.flags, fluxes.flux)
+        _write_mat(path, ('stamp_ns', 'channel', 'flags', 'flux_t'), parts)
         return
+    columns = [f'coil{k}_{part}_t' for k in range(fluxes.flux.shape[2]) for part in ('re', 'im')]
+    _write_csv(path, ('stamp_ns', 'channel', 'flags', *columns), _flux_rows(fluxes))
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[list[object]]) -> None:
     with path.open('w', encoding='utf-8', newline='') as stream:
         writer = csv.writer(stream)
-        parts = [f'coil{k}_{part}_t' for k in range(fluxes.flux.shape[2]) for part in ('re', 'im')]
-        writer.writerow(['stamp_ns', 'channel', 'flags', *parts])
-        writer.writerows(_flux_rows(fluxes))
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
 def _flux_rows(fluxes: RecordedFluxes) -> Iterator[list[object]]:
@@ -127,7 +110,8 @@ def _flux_rows(fluxes: RecordedFluxes) -> Iterator[list[object]]:
             yield [stamp, channel, flag, *(f'{value:.9g}' for value in parts)]
 
 
-def _write_mat(path: Path, arrays: dict[str, NDArray[np.generic]]) -> None:
+def _write_mat(path: Path, names: Sequence[str], arrays: Sequence[NDArray[Any]]) -> None:
     from scipy.io import savemat
 
-    savemat(path, arrays, do_compression=True, oned_as='column')
+    content = dict(zip(names, arrays, strict=True))
+    savemat(path, content, do_compression=True, oned_as='column')

@@ -9,27 +9,16 @@ from pathlib import Path
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage
-from anser_ros.wire.bag_metadata import qos_profile
-from anser_ros.wire.bag_writer import BagWriter
 from anser_ros.wire.foreign_bag import read_foreign
+from anser_ros.wire.session_writer import SETUP_TYPE, SessionWriter
 from anser_ros.wire.setup import parse_setup
-
-SETUP_TOPIC = '/anser/setup'
-SETUP_TYPE = 'std_msgs/msg/String'
 
 
 @dataclass(frozen=True)
 class ImportedBag:
-    """States what came of an import.
+    """Holds how many messages each topic got, and how many were left out, by topic and type.
 
-    Attributes
-    ----------
-    messages : dict of str to int
-        Written messages by their topic's new name.
-    left_out : dict of str to int
-        Messages whose type has no known definition, by topic and type.
-    lost : str
-        What could not be read, in words.
+    What is left out has no known definition; ``lost`` says in words what could not be read.
     """
 
     messages: dict[str, int]
@@ -62,16 +51,8 @@ def import_bag(
 ) -> ImportedBag:
     """Write the messages of any ROS 2 bag as one MCAP file that every command reads.
 
-    Parameters
-    ----------
-    path : path
-        As `anser_ros.wire.foreign_bag.read_foreign`.
-    out : Path
-        The file to write; it must not exist yet.
-    remaps : mapping, optional
-        New names of topics.
-    setup_text : str, optional
-        Setup document that is written at the start, in place of any in the bag.
+    ``remaps`` are new names of topics; a setup document's text is written at the start, in place
+    of any in the bag.
 
     Raises
     ------
@@ -85,42 +66,28 @@ def import_bag(
     names, salvage = dict(remaps or {}), Salvage()
     written: Counter[str] = Counter()
     left_out: Counter[str] = Counter()
-    channels: dict[str, int] = {}
     types: dict[str, str] = {}
     seen: set[str] = set()
-    with BagWriter(out) as writer:
+    with SessionWriter(out) as writer:
         for message in read_foreign(path, salvage):
+            if setup_text is not None and not seen:
+                writer.write_setup(setup_text, message.log_time_ns)
             seen.add(message.topic)
-            topic = names.get(message.topic, message.topic)
-            if setup_text is not None and SETUP_TOPIC not in channels:
-                channels[SETUP_TOPIC] = _channel(writer, SETUP_TOPIC, SETUP_TYPE, '')
-                data = cdr.string_bytes(setup_text)
-                writer.write(channels[SETUP_TOPIC], message.log_time_ns, data)
-            if (
-                setup_text is not None
-                and topic.endswith('/setup')
-                and message.type_name == SETUP_TYPE
-            ):
+            topic, type_name = names.get(message.topic, message.topic), message.type_name
+            is_setup = topic.endswith('/setup') and type_name == SETUP_TYPE
+            if is_setup and setup_text is not None:
                 continue
-            if types.setdefault(topic, message.type_name) != message.type_name:
-                clash = f'{topic} would have {types[topic]} and {message.type_name}'
+            if types.setdefault(topic, type_name) != type_name:
+                clash = f'{topic} would have {types[topic]} and {type_name}'
                 raise BagError(f'{os.fspath(path)}: {clash}')
-            if topic not in channels:
-                text = cdr.DEFINITIONS.get(message.type_name, message.definition)
-                if not text:
-                    left_out[f'{message.topic} ({message.type_name})'] += 1
-                    continue
-                channels[topic] = _channel(writer, topic, message.type_name, text)
-            writer.write(channels[topic], message.log_time_ns, message.data)
+            if type_name not in cdr.DEFINITIONS and not message.definition:
+                left_out[f'{message.topic} ({type_name})'] += 1
+                continue
+            channel = writer.channel(topic, type_name, message.definition)
+            writer.write(channel, message.log_time_ns, message.data)
             written[topic] += 1
         missing = sorted(set(names) - seen)
         if missing or not written:
             what = f'no topic {", ".join(missing)}; there are: {", ".join(sorted(seen))}'
             raise BagError(f'{os.fspath(path)}: {what if missing else "no message can be read"}')
     return ImportedBag(dict(written), dict(left_out), salvage.lost)
-
-
-def _channel(writer: BagWriter, topic: str, type_name: str, text: str) -> int:
-    latched = topic.endswith('/setup')
-    qos = [qos_profile(latched=latched, depth=1 if latched else 100)]
-    return writer.add_topic(topic, type_name, text or cdr.DEFINITIONS[type_name], qos)

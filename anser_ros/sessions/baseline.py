@@ -18,7 +18,7 @@ from anser_ros.integrity.clean_references import (
 )
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import is_nominal
 from anser_ros.sessions.volume import tracked_volume
@@ -102,7 +102,7 @@ def check_clean(
     place = board_place_of(model, sensors, setup)
     if place is not None:
         place.check(flux)
-    board = Drawing.of(setup).board
+    board = NominalBoard.of(setup).board
     if not compared and board is not None and _is_without_metal(model):
         check_as_drawn(board.field, board.centres, sensors, flux, setup.accuracy)
 
@@ -112,7 +112,7 @@ def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> Boa
 
     None for the drawing itself, for a board that cannot be drawn, and for a model with metal.
     """
-    board = Drawing.of(setup).board
+    board = NominalBoard.of(setup).board
     if board is None or is_nominal(model) or not len(sensors) or not _is_without_metal(model):
         return None
     return BoardPlace(

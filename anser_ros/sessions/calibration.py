@@ -25,7 +25,7 @@ from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.baseline import readings_of
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.scan_metal import without_resting_metal
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import made_for
@@ -69,7 +69,7 @@ def is_estimated_jointly(session: Session) -> bool:
 
     Emitters that can be drawn are left to a model of their drawing, whatever the session.
     """
-    if Drawing.of(session.setup).model is not None:
+    if NominalBoard.of(session.setup).model is not None:
         return False
     tools = session.tools
     return is_still(tools) or is_at_one_place(tools, session.setup.accuracy)
@@ -97,7 +97,7 @@ def calibrate_sessions(
     measurements = [tool for session in sessions for tool in session.tools]
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     options = replace(options, accuracy=setup.accuracy)
-    generator, nominal = generator_of(setup), Drawing.of(setup).model
+    generator, nominal = generator_of(setup), NominalBoard.of(setup).model
     alone = options.layout is None and nominal is None
     if alone and is_at_one_place(measurements, options.accuracy):
         found = calibrate_at_one_place(

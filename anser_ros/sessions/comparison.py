@@ -7,7 +7,9 @@ Frames close in time share the causes of their errors, so whole stretches of tim
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,16 +41,17 @@ FEWEST_BLOCKS = 5
 
 @dataclass(frozen=True)
 class Difference:
-    """Holds the interval of a difference, second less first, and which side of zero it is on.
-
-    Attributes
-    ----------
-    low, high : float
-        NaN where the stretches are too few.
-    """
+    """Holds the interval of a difference, second less first; NaN where stretches are too few."""
 
     low: float
     high: float
+
+    MORE_IS_BETTER: ClassVar = False
+
+    @property
+    def verdict(self) -> str:
+        """Return which is better, ``a`` or ``b``; ``neither`` where both may be."""
+        return {0: 'neither', 1 if self.MORE_IS_BETTER else -1: 'b'}.get(self.sign, 'a')
 
     @property
     def sign(self) -> int:
@@ -58,16 +61,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class Compared(Difference):
-    """Compares the errors of one coil or body, or of all coils, in the frames that both have.
+    """Compares ``n`` pairs of errors, m or rad, of one coil or body, or of all coils.
 
-    Attributes
-    ----------
-    n : int
-        Pairs of errors.
-    only_a, only_b : int
-        Frames that only one of them has a pose for.
-    rmse_a, rmse_b : float
-        Root mean square of the errors, m or rad.
+    ``only_a`` and ``only_b`` are frames that only one of the two has a pose for.
     """
 
     n: int
@@ -76,34 +72,16 @@ class Compared(Difference):
     rmse_a: float
     rmse_b: float
 
-    @property
-    def verdict(self) -> str:
-        """Return which errs less: ``a``, ``b``, or ``neither``, where the interval has room for
-        both.
-        """
-        return {1: 'a', 0: 'neither', -1: 'b'}[self.sign]
-
 
 @dataclass(frozen=True)
 class ComparedShares(Difference):
-    """Compares the shares of frames with a pose, of one coil or body, in the frames both know.
+    """Compares the shares, 0 to 1, of ``n`` frames with a pose, of one coil or body."""
 
-    Attributes
-    ----------
-    n : int
-        Frames.
-    share_a, share_b : float
-        Shares of them with a pose, 0 to 1.
-    """
+    MORE_IS_BETTER = True
 
     n: int
     share_a: float
     share_b: float
-
-    @property
-    def verdict(self) -> str:
-        """Return which has poses more often: ``a``, ``b``, or ``neither``."""
-        return {1: 'b', 0: 'neither', -1: 'a'}[self.sign]
 
 
 def check_same_recording(first: Path, second: Path) -> None:
@@ -141,15 +119,9 @@ def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
     ParameterError
         When the folder has none, or the table is not one of ours.
     """
-    found: dict[str, dict[Key, float]] = {'position': {}, 'orientation': {}}
-
-    def take(row: dict[str, str]) -> None:
-        key = int(row['stamp_ns']), row['name']
-        for kind, unit in (('position', 'm'), ('orientation', 'rad')):
-            found[kind][key] = float(row[f'{kind}_error_{unit}'])
-
-    _each_row(folder, ERRORS_FILE, ERROR_COLUMNS, take)
-    return found
+    _, _, *kinds = ERROR_COLUMNS
+    errors = [_read(folder, ERRORS_FILE, ERROR_COLUMNS, itemgetter(kind)) for kind in kinds]
+    return {'position': errors[0], 'orientation': errors[1]}
 
 
 def read_states(folder: Path) -> dict[Key, float]:
@@ -160,22 +132,17 @@ def read_states(folder: Path) -> dict[Key, float]:
     ParameterError
         When the folder lacks a table, or one is not ours.
     """
+    tables = ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS))
     found: dict[Key, float] = {}
-
-    def take_as(column: str) -> Callable[[dict[str, str]], None]:
-        def take(row: dict[str, str]) -> None:
-            found[int(row['stamp_ns']), row[column]] = float(row['status'] == OK)
-
-        return take
-
-    _each_row(folder, POSES_FILE, POSE_COLUMNS, take_as('sensor'))
-    _each_row(folder, BODIES_FILE, BODY_COLUMNS, take_as('body'))
+    for name, columns in tables:
+        found |= _read(folder, name, columns, lambda row: row['status'] == OK)
     return found
 
 
-def _each_row(
-    folder: Path, name: str, columns: tuple[str, ...], take: Callable[[dict[str, str]], None]
-) -> None:
+def _read(
+    folder: Path, name: str, columns: tuple[str, ...], value: Callable[[dict[str, str]], Any]
+) -> dict[Key, float]:
+    """A value of each row of a table, by stamp and by the name in its second column."""
     path = folder / name
     if not path.is_file():
         raise ParameterError(f'{folder}: no {name}; is it a folder of anser evaluate?')
@@ -183,8 +150,7 @@ def _each_row(
     try:
         if tuple(names) != columns:
             raise ValueError(f'columns must be {", ".join(columns)}')
-        for row in rows:
-            take(row)
+        return {(int(row['stamp_ns']), row[columns[1]]): float(value(row)) for row in rows}
     except (ValueError, TypeError) as error:
         raise ParameterError(f'{path}: {error}') from error
 

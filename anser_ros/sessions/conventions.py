@@ -8,19 +8,20 @@ fits (an optical frame that is not the board's, a board that cannot be drawn), n
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.refit.excitation import FieldFunction
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.units import FLUX_UNITS, LENGTH_UNITS, unit_words
 from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 MOST_FRAMES = 40
 """Frames that are looked at, evenly over the recording: enough for shares, few enough for a
@@ -42,22 +43,11 @@ board that is not as drawn stay far below."""
 
 @dataclass(frozen=True)
 class Reading:
-    """Describes one way to read the numbers of a pose.
+    """Describes one way to read the numbers of a pose, and says in words what they then are.
 
-    Attributes
-    ----------
-    words : str
-        What the numbers then are.
-    order : tuple of int
-        Where x, y, z and w stand.
-    is_inverse : bool
-        Whether the rotation is from fg to the body.
-    scale : float
-        m in a unit of length.
-    axes : tuple of int
-        Which of the numbers, counted from one, are x, y and z; negative where they are reversed.
-    is_frame : bool
-        Whether rotations have these axes too, and not positions alone.
+    ``order`` is where x, y, z and w stand, ``scale`` m in a unit of length, and ``axes`` which of
+    the numbers, counted from one, are x, y and z: negative where they are reversed. A rotation
+    that is inverse is from fg to the body; in another frame rotations have these axes too.
     """
 
     words: str
@@ -108,7 +98,7 @@ OTHER_READINGS = (
 """What people write instead; the first that fits is named."""
 
 
-def check_conventions(path: str, setup: Setup, drawing: Drawing, tool: Measurements) -> None:
+def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Measurements) -> None:
     """Check units and order of a tool's poses, and the unit of its fluxes, against each other.
 
     Raises
@@ -117,18 +107,26 @@ def check_conventions(path: str, setup: Setup, drawing: Drawing, tool: Measureme
         When the poses contradict the fluxes as they stand and fit them when read in another way,
         or the fluxes are larger than the board can make by the factor of a unit.
     """
-    if drawing.field is None:
+    field = nominal.field
+    if field is None:
         return
     rows, columns = _chosen(tool)
-    flux = tool.flux[rows, columns]
-    if len(rows) >= FEWEST_READINGS:
-        share, gain = _fit(drawing, tool, rows, columns, flux, AS_WRITTEN)
-        if share < POOR:
-            _check_readings(path, drawing, tool, rows, columns, flux, share)
-        elif share > GOOD:
-            _check_flux(path, tool, float(np.median(np.linalg.norm(flux, axis=1))), gain)
-            return
-    _check_size(path, setup, drawing, tool)
+    fit = partial(_fit, field, tool, rows, columns)
+    share, gain = fit(AS_WRITTEN) if len(rows) >= FEWEST_READINGS else (np.nan, np.nan)
+    if share > GOOD:
+        median = float(np.median(np.linalg.norm(tool.flux[rows, columns], axis=1)))
+        _check_flux(path, tool, median, gain, 'at its poses')
+        return
+    for reading in OTHER_READINGS if share < POOR else ():
+        better, _ = fit(reading)
+        if better > GOOD:
+            span = float(np.linalg.norm(np.ptp(tool.position[rows], axis=0)))
+            raise PlausibilityError(
+                f'{path}: optical poses of {tool.body} (positions span {span:.3g} m) explain '
+                f'{100 * share:.0f} % of the fluxes as they stand, and {100 * better:.0f} % when '
+                f'read as {reading.words}'
+            )
+    _check_size(path, setup, field, tool)
 
 
 def _chosen(tool: Measurements) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -146,14 +144,14 @@ def _chosen(tool: Measurements) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _fit(
-    drawing: Drawing,
+    drawn: FieldFunction,
     tool: Measurements,
     rows: NDArray[np.int64],
     columns: NDArray[np.int64],
-    flux: ComplexArray,
     reading: Reading,
 ) -> tuple[float, float]:
     """Share of readings (P,) that fit when poses are read so, and the fluxes' common factor."""
+    flux = tool.flux[rows, columns]
     frames, where = np.unique(rows, return_inverse=True)
     # Loaded here, as each start of a node would pay for it that has no poses to read.
     from scipy.spatial.transform import Rotation
@@ -163,9 +161,7 @@ def _fit(
     )
     rotation = (turn.inv() if reading.is_inverse else turn).as_matrix()
     centres, axes = tool.sensors.placed(*reading.placed(tool.position[frames], rotation))
-    assert drawing.field is not None
-    field = drawing.field(centres[where, columns])
-    predicted = np.einsum('pki,pi->pk', field, axes[where, columns])
+    predicted = np.einsum('pki,pi->pk', drawn(centres[where, columns]), axes[where, columns])
     size = np.einsum('pk,pk->p', predicted, predicted)
     ratio = np.einsum('pk,pk->p', predicted, flux) / np.maximum(size, 1e-300)
     # All channels may lag by the same phase; their sign is left as it is.
@@ -175,30 +171,7 @@ def _fit(
     return float(np.mean(miss < MISFIT * np.linalg.norm(flux, axis=1))), gain
 
 
-def _check_readings(
-    path: str,
-    drawing: Drawing,
-    tool: Measurements,
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
-    flux: ComplexArray,
-    share: float,
-) -> None:
-    """Raise where one other way to read the poses explains the fluxes."""
-    for reading in OTHER_READINGS:
-        better, _ = _fit(drawing, tool, rows, columns, flux, reading)
-        if better > GOOD:
-            span = float(np.linalg.norm(np.ptp(tool.position[rows], axis=0)))
-            raise PlausibilityError(
-                f'{path}: optical poses of {tool.body} (positions span {span:.3g} m) explain '
-                f'{100 * share:.0f} % of the fluxes as they stand, and {100 * better:.0f} % when '
-                f'read as {reading.words}'
-            )
-
-
-def _check_flux(
-    path: str, tool: Measurements, median: float, gain: float, where: str = 'at its poses'
-) -> None:
+def _check_flux(path: str, tool: Measurements, median: float, gain: float, where: str) -> None:
     """Raise where fluxes are larger than the drawn board's by the factor of a unit."""
     if gain > TOO_LARGE:
         unit = unit_words(gain, FLUX_UNITS) or 'another unit than T'
@@ -208,13 +181,13 @@ def _check_flux(
         )
 
 
-def _check_size(path: str, setup: Setup, drawing: Drawing, tool: Measurements) -> None:
+def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurements) -> None:
     """Raise where fluxes are larger than the drawn board makes anywhere in the tracked volume."""
     whole = np.isfinite(tool.flux).all(axis=2) & (tool.flags == 0)
-    if not whole.any() or drawing.field is None:
+    if not whole.any():
         return
     median = float(np.median(np.linalg.norm(tool.flux[whole], axis=1)))
-    there = np.linalg.norm(drawing.field(tracked_volume(setup).samples(4, 3)), axis=(1, 2))
+    there = np.linalg.norm(drawn(tracked_volume(setup).samples(4, 3)), axis=(1, 2))
     if median > TOO_LARGE * float(there.max()):
         usual = float(np.median(there))
         _check_flux(path, tool, median, median / usual, 'in the tracked volume')

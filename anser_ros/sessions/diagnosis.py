@@ -37,12 +37,9 @@ poses."""
 
 @dataclass(frozen=True)
 class TrackingErrors:
-    """Holds errors of all coils tracked singly in the held-out part, or of the source seen there.
+    """Holds root mean square errors of all coils tracked singly in the held-out part.
 
-    Attributes
-    ----------
-    position_rmse_m, orientation_rmse_rad : float or None
-        Root mean square; None where no coil was tracked.
+    They are of the source where only that was seen; None where no coil was tracked.
     """
 
     position_rmse_m: float | None
@@ -51,14 +48,9 @@ class TrackingErrors:
 
 @dataclass(frozen=True)
 class SessionDiagnosis:
-    """Holds what a model lacks on a session.
+    """Holds what a model lacks on a session, and how its held-out part is tracked.
 
-    Attributes
-    ----------
-    diagnosis : Diagnosis
-        The effects that were found, and the model with them.
-    before, after : TrackingErrors
-        How the held-out part is tracked with the model as it was, and with the effects.
+    Before is with the model as it was, after with the effects that were found.
     """
 
     diagnosis: Diagnosis
@@ -72,18 +64,10 @@ def diagnose_session(
     baseline: Session | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> SessionDiagnosis:
-    """Find what a model lacks on a session.
+    """Find what a model lacks on a session with optical poses of at least one tool.
 
-    Parameters
-    ----------
-    session : Session
-        With optical poses of at least one tool.
-    model : FieldModel
-        Of the session's emitters.
-    baseline : Session, optional
-        Distortion-free recording of the same board; with it the reference sensors are used.
-    progress : callable, optional
-        Called with words on what goes on.
+    With a baseline, a distortion-free recording of the same board, the references are used.
+    ``progress`` is called with words on what goes on.
 
     Raises
     ------
@@ -107,14 +91,9 @@ def diagnose_session(
 
 
 def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Problem:
-    """Return the diagnosis problem of a session.
+    """Return the diagnosis problem of a session that was corrected (`correct`).
 
-    Parameters
-    ----------
-    corrected : PreparedSession
-        With the effects corrected that the model knows (`correct`).
-    spread : Spread, optional
-        How far readings and poses may be off; by default that of `spread_of`.
+    Readings and poses may be off by ``spread``, by default that of `spread_of`.
 
     Raises
     ------
@@ -131,7 +110,7 @@ def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Prob
         session.reference,
         None if clean is None else clean.flux,
         corrected.model,
-        corrected.drawing.model,
+        corrected.nominal.model,
         spread or spread_of(corrected),
     )
 
@@ -144,15 +123,7 @@ def spread_of(prepared: PreparedSession) -> Spread:
 
 
 def held_out_part(session: Session, problem: Problem) -> Session:
-    """Return the frames of the blocks that took no part, and the first one, which sets the clock.
-
-    Parameters
-    ----------
-    session : Session
-        As it was recorded.
-    problem : Problem
-        Made of that session.
-    """
+    """Return the frames of the blocks that took no part, and the first, which sets the clock."""
     held = {
         tool.body: tool.time[np.isin(blocks, test_blocks())]
         for tool, blocks in zip(problem.tools, problem.blocks, strict=True)
@@ -176,13 +147,6 @@ def track_held_out(
 
     The second time the model follows the references if only these can determine an effect live:
     metal that moves, and an emitter whose strength has no course of its own.
-
-    Parameters
-    ----------
-    unseen : PreparedSession
-        The held-out part, with the model as it was.
-    found : Diagnosis
-        Of the same session.
     """
     floor = max(found.flux_rms_floor_t, 1e-30)
     after = unseen.with_model(found.model)
@@ -206,8 +170,9 @@ def _errors(
     usual = TrackerSettings()
     settings = replace(usual, gate=usual.gate * max(1.0, ROOM * misfit))
     evaluation = compare(prepared, track(prepared, settings, follower))
-    # Where the field is the same all around its axis, no coil has a pose, but the source has.
-    series = (evaluation.sources or evaluation.sensors).values()
+    # Where no coil has a pose (a field that is the same all around an axis), the source has.
+    further = [one for group in evaluation.further.values() for one in group.values()]
+    series = further or list(evaluation.sensors.values())
     # The first frame of a held-out part is there for its stamp alone.
     return TrackingErrors(
         _rms([one.position_error[1:] for one in series]),

@@ -18,26 +18,41 @@ stand in the model file."""
 
 def to_document(result: SessionDiagnosis) -> dict[str, Any]:
     """Return what was found as plain data."""
-    found = result.diagnosis
+    found, before, after = result.diagnosis, result.before, result.after
+    return document_of(
+        (found.flux_rms_before_t, found.flux_rms_after_t, found.flux_rms_floor_t),
+        (before.position_rmse_m, after.position_rmse_m),
+        (before.orientation_rmse_rad, after.orientation_rmse_rad),
+        [effect_figures(one.record, one.flux_rms_without_t) for one in found.findings],
+        (found.unexplained, [name for name in found.depends_on if name in DEPENDENCIES]),
+    )
+
+
+def document_of(
+    flux_t: tuple[float, float, float],
+    position_m: tuple[float | None, float | None],
+    orientation_rad: tuple[float | None, float | None],
+    effects: list[dict[str, Any]],
+    unexplained: tuple[float, list[str]],
+) -> dict[str, Any]:
+    """Return the document of errors before and after, of effects, and of what is unexplained.
+
+    Of fluxes there is the error of noise alone too; the last are the share that is unexplained,
+    and what that depends on.
+    """
     return {
         'schema': SCHEMA,
         'held_out': {
-            'flux_rms_before_t': found.flux_rms_before_t,
-            'flux_rms_after_t': found.flux_rms_after_t,
-            'flux_rms_floor_t': found.flux_rms_floor_t,
-            'position_rmse_before_m': result.before.position_rmse_m,
-            'position_rmse_after_m': result.after.position_rmse_m,
-            'orientation_rmse_before_rad': result.before.orientation_rmse_rad,
-            'orientation_rmse_after_rad': result.after.orientation_rmse_rad,
+            'flux_rms_before_t': flux_t[0],
+            'flux_rms_after_t': flux_t[1],
+            'flux_rms_floor_t': flux_t[2],
+            'position_rmse_before_m': position_m[0],
+            'position_rmse_after_m': position_m[1],
+            'orientation_rmse_before_rad': orientation_rad[0],
+            'orientation_rmse_after_rad': orientation_rad[1],
         },
-        'effects': [
-            effect_figures(finding.record, finding.flux_rms_without_t)
-            for finding in found.findings
-        ],
-        'unexplained': {
-            'fraction': found.unexplained,
-            'depends_on': [name for name in found.depends_on if name in DEPENDENCIES],
-        },
+        'effects': effects,
+        'unexplained': {'fraction': unexplained[0], 'depends_on': unexplained[1]},
     }
 
 

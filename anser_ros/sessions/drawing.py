@@ -1,42 +1,48 @@
-"""Takes the emitters of a setup as it draws them: their field, and the nominal model of it."""
+"""Makes the nominal board of a setup: the emitters as it draws them, their field and model."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from anser_ros.errors import AnserError, SetupError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
-from anser_ros.physics.board import Board
+from anser_ros.physics.board import Board, build_board
 from anser_ros.refit.excitation import FieldFunction
-from anser_ros.sessions.starting_model import board_of
 from anser_ros.wire.setup import Setup
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """Holds what a setup's geometry gives; all of it is None for no known kind of board.
+def board_of(setup: Setup) -> Board:
+    """Return the emitters' geometry; `SetupError` when its kind is unknown or a key is missing."""
+    emitter = setup.emitter
+    return build_board(
+        emitter.kind,
+        emitter.geometry,
+        setup.emitter_names,
+        np.array([coil.centre_m for coil in emitter.coils]),
+        np.array([coil.rotation_deg for coil in emitter.coils]),
+        setup.frequencies_hz,
+    )
 
-    Attributes
-    ----------
-    board : Board or None
-        The emitters' coils.
-    """
+
+@dataclass(frozen=True)
+class NominalBoard:
+    """Holds what a setup's geometry gives; all of it is None for no known kind of board."""
 
     board: Board | None
 
     @staticmethod
-    def of(setup: Setup) -> 'Drawing':
-        """Return the drawing of a setup's emitters."""
+    def of(setup: Setup) -> 'NominalBoard':
+        """Return the nominal board of a setup."""
         try:
-            return Drawing(board_of(setup))
+            return NominalBoard(board_of(setup))
         except SetupError:
-            return Drawing(None)
+            return NominalBoard(None)
 
     @property
     def field(self) -> FieldFunction | None:
-        """Return the field at the nominal currents: points (P, 3) in m, frame fg, to (P, K, 3) in
-        T.
-        """
+        """Return the field at nominal currents: points (P, 3), m, frame fg, to (P, K, 3), T."""
         return None if self.board is None else self.board.field
 
     @cached_property

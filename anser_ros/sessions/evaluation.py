@@ -4,6 +4,7 @@ The stages are `prepare`, `track` and `compare`; each can be called alone, and `
 all of them. `evaluation_document` and `pose_table` write their results.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,37 +16,39 @@ from anser_ros.known_metal.known import KnownMetal
 from anser_ros.sessions.baseline import check_place
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.known_metal import KnownMetalModels
-from anser_ros.sessions.pose_errors import PoseSeries, body_series, sensor_series
+from anser_ros.sessions.pose_errors import PoseSeries, pose_series
 from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
 from anser_ros.sessions.session import Session
-from anser_ros.sessions.tracked_session import Progress, TrackedSession, in_phase_model, track
-from anser_ros.tracking.estimate import TrackerSettings
+from anser_ros.sessions.tracked_session import (
+    SOURCES,
+    Progress,
+    TrackedSession,
+    in_phase_model,
+    track,
+)
+from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.source_track import seen_from
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Holds tracked poses and their errors.
+    """Holds tracked poses and their errors, by the names of sensors, and of bodies in six degrees.
 
-    Attributes
-    ----------
-    sensors, bodies : dict of str to PoseSeries
-        Poses and errors of every tool sensor, and of every body whose six degrees of freedom were
-        tracked, by name.
-    seconds_per_frame : float
-        Mean wall time that a frame took.
-    refit : RefitSummary or None
-        What the refit did; None where the model did not follow the references.
-    sources : dict of str to PoseSeries
-        Of every body, where the field is the same all around an axis: place and axis of the source
-        in the body's frame, and their errors.
+    The seconds are the mean wall time of a frame; ``refit`` is what the refit did, None where the
+    model did not follow the references, and ``further`` what else was tracked (`FURTHER`), by kind
+    and name.
     """
 
     sensors: dict[str, PoseSeries]
     bodies: dict[str, PoseSeries]
     seconds_per_frame: float
     refit: RefitSummary | None = None
-    sources: dict[str, PoseSeries] = field(default_factory=dict)
+    further: dict[str, dict[str, PoseSeries]] = field(default_factory=dict)
+
+    @property
+    def groups(self) -> dict[str, dict[str, PoseSeries]]:
+        """Return all series by kind, sensors and bodies first."""
+        return {'sensors': self.sensors, 'bodies': self.bodies, **self.further}
 
 
 def track_session(
@@ -62,28 +65,11 @@ def track_session(
 ) -> Evaluation:
     """Track every tool sensor and body of a session at every frame, and compare with the optics.
 
-    Parameters
-    ----------
-    session : Session
-        What was recorded.
-    model : FieldModel
-        Of the session's emitters.
-    settings : TrackerSettings, optional
-        What the tracker may assume.
-    baseline : Session, optional
-        Distortion-free recording of the same board, whose reference readings are the clean ones.
-    refit : bool
-        Whether the model follows the session's reference sensors, as the node does live.
-    in_phase : bool
-        Whether only in-phase fluxes and moments are used (the article's way).
-    progress : callable, optional
-        Called with the finished share, 0 to 1.
-    patches : dict of str to str, optional
-        Bodies that carry further reference coils, each with the topic of its poses in the bag.
-    witnesses : bool
-        Whether the refit also uses what the coils of rigid tools contradict.
-    known_metal : KnownMetal, optional
-        Metal that the model follows by the tools alone, instead of a refit.
+    A baseline is a distortion-free recording of the same board. With ``refit`` the model follows
+    the references as it does live, with further ones on patches (bodies with the topic of their
+    poses in the bag), and with witnesses also what the coils of rigid tools contradict; known
+    metal is followed by the tools alone, instead. In phase, only these fluxes and moments are used
+    (the article's way). Progress gets the finished share, 0 to 1.
 
     Raises
     ------
@@ -122,24 +108,34 @@ def compare(prepared: PreparedSession, tracked: TrackedSession) -> Evaluation:
         centres, axes = true.sensors.placed(position, true.rotation)
         for column, name in enumerate(true.sensors.name):
             given = tracked.estimates.get(name, ())
-            sensors[name] = sensor_series(name, given, centres[:, column], axes[:, column])
+            sensors[name] = pose_series(name, given, centres[:, column], axes[:, column])
         if tool.body in tracked.estimates:
             given = tracked.estimates[tool.body]
-            bodies[tool.body] = body_series(tool.body, given, position, true.rotation)
-    sources = _sources(prepared, tracked)
-    return Evaluation(sensors, bodies, tracked.seconds_per_frame, tracked.refit, sources)
+            bodies[tool.body] = pose_series(tool.body, given, position, true.rotation)
+    further = {
+        kind: series
+        for kind, estimates in tracked.further.items()
+        if (series := FURTHER[kind](prepared, estimates))
+    }
+    return Evaluation(sensors, bodies, tracked.seconds_per_frame, tracked.refit, further)
 
 
-def _sources(prepared: PreparedSession, tracked: TrackedSession) -> dict[str, PoseSeries]:
+def _sources(
+    prepared: PreparedSession, estimates: Mapping[str, Sequence[PoseEstimate]]
+) -> dict[str, PoseSeries]:
     """Compare where bodies saw the source with where the optical poses say it was."""
     model, out = prepared.model, {}
     axis = symmetry_axis(model.positions, model.directions, model.moments)
     for tool in prepared.session.tools:
-        if axis is None or tool.body not in tracked.sources:
+        if axis is None or tool.body not in estimates:
             continue
         true = with_truth(tool, prepared.correction)
         position = np.where(true.has_pose[:, None], true.position, np.nan)
         place, direction = seen_from(axis, position, true.rotation)
         name = f'{tool.body}/source'
-        out[tool.body] = sensor_series(name, tracked.sources[tool.body], place, direction)
+        out[tool.body] = pose_series(name, estimates[tool.body], place, direction)
     return out
+
+
+FURTHER = {SOURCES: _sources}
+"""What compares tracked things other than sensors and bodies with the optical poses, by kind."""

@@ -22,13 +22,9 @@ def to_document(evaluation: Evaluation) -> dict[str, Any]:
     Where the model followed the references, the number of frames in each state of the refit, and
     in how many each reference sensor was left out, are there too.
     """
-    document: dict[str, Any] = {
-        'schema': SCHEMA,
-        'sensors': {name: metrics(series) for name, series in evaluation.sensors.items()},
-        'bodies': {name: metrics(series) for name, series in evaluation.bodies.items()},
-    }
-    if evaluation.sources:
-        document['sources'] = {name: metrics(s) for name, s in evaluation.sources.items()}
+    document: dict[str, Any] = {'schema': SCHEMA}
+    for kind, group in evaluation.groups.items():
+        document[kind] = {name: metrics(series) for name, series in group.items()}
     if evaluation.refit is not None:
         document['refit'] = {
             'states': dict(evaluation.refit.states),

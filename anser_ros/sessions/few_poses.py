@@ -22,11 +22,10 @@ from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.calibration.still import AS_STATED, BEND, PLACEMENT, STILL_ONLY
 from anser_ros.calibration.survey_records import SPREADS
 from anser_ros.diagnosis.decisions import UNSTRUCTURED
-from anser_ros.diagnosis.schema import SCHEMA
 from anser_ros.effects.registry import all_effects
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.sessions.calibration import calibrate_sessions
-from anser_ros.sessions.diagnosis_document import effect_figures
+from anser_ros.sessions.diagnosis_document import document_of, effect_figures
 from anser_ros.sessions.prepared import correct, prepare
 from anser_ros.sessions.session import Session
 
@@ -42,16 +41,9 @@ CHANCE = 1e-3
 class FewPosesDiagnosis:
     """Holds what is wrong with the sensors of a session of few poses.
 
-    Attributes
-    ----------
-    before, after : Calibration
-        With sensors as the given model has them, and with what was found.
-    effects : tuple of EffectRecord
-        What was found, with its evidence.
-    without_t : tuple of float
-        Held-out residual, T, with all effects but each of these.
-    model : FieldModel
-        The field as it was estimated, and the effects that were known and found.
+    Before is with sensors as the given model has them, after with the effects that were found, of
+    which each has the held-out residual without it, T. The model is the field as it was estimated,
+    and the effects that were known and found.
     """
 
     before: Calibration
@@ -90,13 +82,7 @@ def diagnose_few_poses(
 ) -> FewPosesDiagnosis:
     """Find what is wrong with the sensors of a session that `calibration.is_estimated_jointly`.
 
-    Parameters
-    ----------
-    session : Session
-    model : FieldModel
-        Of the session's emitters; the effects that it has are corrected first.
-    progress : callable, optional
-        Called with words on what goes on.
+    The effects that the model has are corrected first.
 
     Raises
     ------
@@ -181,22 +167,10 @@ def to_document(result: FewPosesDiagnosis) -> dict[str, Any]:
 
     Poses are not compared: there are too few of them.
     """
-    pose = ('position_rmse_before_m', 'position_rmse_after_m',
-            'orientation_rmse_before_rad', 'orientation_rmse_after_rad')  # fmt: skip
-    return {
-        'schema': SCHEMA,
-        'held_out': {
-            'flux_rms_before_t': rms(result.before.held_out.error),
-            'flux_rms_after_t': rms(result.after.held_out.error),
-            'flux_rms_floor_t': result.floor_t,
-            **dict.fromkeys(pose),
-        },
-        'effects': [
-            effect_figures(record, without)
-            for record, without in zip(result.effects, result.without_t, strict=True)
-        ],
-        'unexplained': {
-            'fraction': result.unexplained,
-            'depends_on': list(result.depends_on) if result.unexplained else [],
-        },
-    }
+    before, after = rms(result.before.held_out.error), rms(result.after.held_out.error)
+    effects = map(effect_figures, result.effects, result.without_t)
+    depends_on = list(result.depends_on) if result.unexplained else []
+    return document_of(
+        (before, after, result.floor_t), (None, None), (None, None), list(effects),
+        (result.unexplained, depends_on),
+    )  # fmt: skip

@@ -141,6 +141,6 @@ def _refit_of(prepared: PreparedSession, baseline: Baseline) -> LiveRefit | None
         session.reference.sensors,
         baseline.flux,
         session.setup.refit,
-        prepared.drawing.field,
+        prepared.nominal.field,
         volume=stated_volume(session.setup),
     )

@@ -15,17 +15,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class FrameReadings:
-    """Holds what S sensors read in one frame.
-
-    Attributes
-    ----------
-    channels : ndarray of int, shape (S,)
-        Channel of each sensor.
-    flux : ndarray, shape (S, K), complex
-        T.
-    flags : ndarray of int, shape (S,)
-        Flag bits of the flux messages.
-    """
+    """Holds what S sensors read in one frame: channels, fluxes (S, K), T, and flag bits."""
 
     channels: NDArray[np.int64]
     flux: ComplexArray
@@ -38,17 +28,7 @@ class FrameReadings:
 
 @dataclass(frozen=True)
 class SessionFrame:
-    """Holds all that was measured under one stamp.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp of the flux messages.
-    tools : FrameReadings or None
-        Of all tool sensors; None where only the references were read.
-    reference : FrameReadings or None
-        Of the reference sensors; None where only tools were read.
-    """
+    """Holds all that tools or references, or both, measured under one stamp."""
 
     stamp_ns: int
     tools: FrameReadings | None

@@ -22,7 +22,7 @@ from anser_ros.kernel_cache import PACKAGE
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.stored_tables import arrays_of, tables_of
 from anser_ros.refit.tables import RefitTables
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.setup import Setup
 
@@ -114,7 +114,7 @@ class KeptTables:
     def read(self) -> RefitTables | None:
         """Return the tables; None where there are none, or the file is damaged."""
         setup, model, references = self._given
-        drawing, volume = Drawing.of(setup).field, stated_volume(setup)
+        drawing, volume = NominalBoard.of(setup).field, stated_volume(setup)
         try:
             arrays = self._ahead.arrays_of(self._path)
             os.utime(self._path)

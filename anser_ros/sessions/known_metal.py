@@ -57,7 +57,7 @@ class KnownMetalModels:
                 f'have {mean_hz:.0f} Hz'
             )
         excitation, _ = excitation_for(
-            prepared.model, prepared.drawing.field, stated_volume(session.setup)
+            prepared.model, prepared.nominal.field, stated_volume(session.setup)
         )
         self._correction = prepared.correction
         sensors = self._correction.sensors()

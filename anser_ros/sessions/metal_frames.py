@@ -60,7 +60,7 @@ def learn(
         raise BagError('metal is learnt against --baseline, a recording without it')
     settings = session.setup.refit
     tables = build_tables(
-        prepared.model, session.reference.sensors, settings, prepared.drawing.field,
+        prepared.model, session.reference.sensors, settings, prepared.nominal.field,
         stated_volume(session.setup), report=lambda share: report('preparing', share),
     )  # fmt: skip
     refit = LiveRefit(

@@ -14,13 +14,7 @@ SNAPSHOT = 'snapshot of a refit with metal in force'
 
 
 def load_model(path: str | os.PathLike[str], snapshot: bool = False) -> FieldModel:
-    """Read a model file.
-
-    Parameters
-    ----------
-    path : path
-    snapshot : bool
-        Whether a snapshot of a refit is wanted too; it is no calibration of the board.
+    """Read a model file; a snapshot of a refit, which is no calibration, only if it is wanted.
 
     Raises
     ------
@@ -53,16 +47,9 @@ def is_snapshot(model: FieldModel) -> bool:
 
 
 def as_saved(model: FieldModel, base: FieldModel, stamp_ns: int) -> FieldModel:
-    """Return a model in force as it is written: with its source, where it is not the base.
+    """Return a model as it is written, active since a stamp: with its source, if not the base.
 
-    Parameters
-    ----------
-    model : FieldModel
-        In force.
-    base : FieldModel
-        The one that the refit started from.
-    stamp_ns : int
-        Since when the model is in force.
+    The base is the one that the refit started from.
     """
     parts = ('positions', 'directions', 'moments')
     if all(np.array_equal(getattr(model, part), getattr(base, part)) for part in parts):

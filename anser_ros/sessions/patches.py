@@ -72,7 +72,7 @@ class PatchFollower:
         self._refit = self._patches.started(
             prepared.model,
             session.reference.sensors,
-            drawing=prepared.drawing.field,
+            drawing=prepared.nominal.field,
             volume=stated_volume(session.setup),
         )
 

@@ -13,7 +13,7 @@ from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.sessions.conventions import check_conventions
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.units import LENGTH_UNITS, unit_words
 from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.pose_topics import optical_stem
@@ -45,48 +45,28 @@ def plausible_tools(
 ) -> tuple[tuple[Measurements, ...], str]:
     """Check a recording's tools, and leave out the poses of an optical tracker that stood still.
 
-    Parameters
-    ----------
-    path : str
-        Of the recording, for messages.
-    setup : Setup
-        Its setup document.
-    tools : tuple of Measurements
-        As they were recorded.
-    refused : mapping of str to int
-        What the reader refused, ``topic: reason``, and how often.
-
-    Returns
-    -------
-    tools : tuple of Measurements
-        Without frozen poses.
-    left_out : str
-        What was left out or refused, in words; empty when nothing was.
+    ``refused`` is what the reader refused, ``topic: reason``, and how often. What was left out or
+    refused is returned in words; empty when nothing was.
 
     Raises
     ------
     PlausibilityError
         With the evidence, in one line.
     """
-    drawing, kept, words = Drawing.of(setup), [], []
+    nominal, kept, words = NominalBoard.of(setup), [], []
     for tool in tools:
         words += _check_refused(path, tool, refused)
         _check_clocks(path, tool)
         thawed, remarks = _thawed(path, tool)
         words += remarks
-        check_conventions(path, setup, drawing, thawed)
+        check_conventions(path, setup, nominal, thawed)
         _check_distance(path, setup, thawed)
         kept.append(thawed)
     return tuple(kept), '; '.join(words)
 
 
 def check_points(tracked: Array, true: Array) -> None:
-    """Check the points that an error map shall be learnt from.
-
-    Parameters
-    ----------
-    tracked, true : ndarray, shape (M, 3)
-        m, in one frame; rows with NaN are not looked at.
+    """Check the points (M, 3), m, that an error map shall be learnt from; not rows with NaN.
 
     Raises
     ------
@@ -113,14 +93,7 @@ def check_points(tracked: Array, true: Array) -> None:
 
 
 def check_positions(what: str, places: Array) -> None:
-    """Check that the positions of a tracker can be in metres.
-
-    Parameters
-    ----------
-    what : str
-        Whose they are, for the message.
-    places : ndarray, shape (n, 3)
-        m, in the tracker's frame.
+    """Check that the positions (n, 3) of a tracker can be in m; ``what`` says whose they are.
 
     Raises
     ------

@@ -16,20 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PoseSeries:
-    """Holds every estimate of one sensor or body, with its error where the truth is known.
-
-    Attributes
-    ----------
-    name : str
-        Of the sensor or body.
-    estimates : tuple of PoseEstimate, length F
-        One a frame.
-    position_error : ndarray, shape (F,)
-        Distance from the optical pose, m; NaN where there is no pose or no optical one.
-    orientation_error : ndarray, shape (F,)
-        Angle to the optical pose, rad: of a sensor between the axes, of a body the whole turn;
-        NaN as above.
-    """
+    """Holds the estimates of one sensor or body, one a frame, and their errors where known."""
 
     name: str
     estimates: tuple[PoseEstimate, ...]
@@ -42,49 +29,21 @@ class PoseSeries:
         return np.array([estimate.state == OK for estimate in self.estimates], dtype=bool)
 
 
-def sensor_series(
-    name: str, estimates: Sequence[PoseEstimate], centres: Array, axes: Array
+def pose_series(
+    name: str, estimates: Sequence[PoseEstimate], position: Array, orientation: Array
 ) -> PoseSeries:
-    """Compare a sensor's poses with where it truly was.
-
-    Parameters
-    ----------
-    name : str
-        Of the sensor.
-    estimates : sequence of PoseEstimate, length F
-        One a frame.
-    centres, axes : ndarray, shape (F, 3)
-        True centres (m) and unit axes, frame fg; NaN where they are not known.
-    """
+    """Compare F poses of a sensor or body with where it truly was, m, frame fg; NaN if unknown."""
+    of_body = orientation.ndim == 3
     distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
     for i, estimate in enumerate(estimates):
-        if estimate.state == OK:
-            distance[i] = np.linalg.norm(estimate.position - centres[i])
-            angle[i] = axis_angles(estimate.axis, axes[i])
-    return PoseSeries(name, tuple(estimates), distance, angle)
-
-
-def body_series(
-    name: str, estimates: Sequence[PoseEstimate], position: Array, rotation: Array
-) -> PoseSeries:
-    """Compare a body's poses with the true ones.
-
-    Parameters
-    ----------
-    name : str
-        Of the body.
-    estimates : sequence of PoseEstimate, length F
-        One a frame.
-    position : ndarray, shape (F, 3)
-        True positions, m, frame fg; NaN where they are not known.
-    rotation : ndarray, shape (F, 3, 3)
-        True rotation matrices from the body's frame to fg.
-    """
-    distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
-    for i, estimate in enumerate(estimates):
-        if estimate.state == OK and estimate.rotation is not None:
-            distance[i] = np.linalg.norm(estimate.position - position[i])
-            angle[i] = rotation_angles(estimate.rotation.T @ rotation[i])
+        if estimate.state != OK or (of_body and estimate.rotation is None):
+            continue
+        distance[i] = np.linalg.norm(estimate.position - position[i])
+        if of_body:
+            assert estimate.rotation is not None
+            angle[i] = rotation_angles(estimate.rotation.T @ orientation[i])
+        else:
+            angle[i] = axis_angles(estimate.axis, orientation[i])
     return PoseSeries(name, tuple(estimates), distance, angle)
 
 

@@ -1,7 +1,9 @@
 """Writes the tables of poses that an evaluation leaves, as `docs/interfaces.md` promises them."""
 
 import csv
+from collections.abc import Mapping
 from math import isfinite
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.pose_states import OK
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import PoseSeries
+from anser_ros.tracking.estimate import PoseEstimate
 
 POSE_COLUMNS = (
     'stamp_ns', 'sensor', 'x_m', 'y_m', 'z_m', 'ax', 'ay', 'az', 'sigma_position_m', 'residual_t',
@@ -22,75 +25,70 @@ BODY_COLUMNS = (
 )  # fmt: skip
 """Columns of the bodies' table; the orientation is a quaternion."""
 POSES_FILE, BODIES_FILE, ERRORS_FILE = 'poses.csv', 'bodies.csv', 'errors.csv'
-SOURCES_FILE = 'sources.csv'
 ERROR_COLUMNS = ('stamp_ns', 'name', 'position_error_m', 'orientation_error_rad')
 """Columns of the table of errors, of coils and bodies."""
 
 
-def write_poses(path: Path, evaluation: Evaluation) -> None:
-    """Write every sensor's pose, or why there is none, by stamp."""
-    rows = [row for series in evaluation.sensors.values() for row in _sensor_rows(series)]
-    rows.sort(key=lambda row: row[0])
-    _write(path, POSE_COLUMNS, rows)
+def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
+    """Write the tables of poses and of errors into a folder; the files.
+
+    Sensors' poses, or why there is none, are sorted by stamp; those of bodies, and of what else
+    was tracked, are one after the other.
+    """
+    tables = {
+        POSES_FILE: (POSE_COLUMNS, sorted(_sensor_rows(evaluation.sensors), key=itemgetter(0))),
+        BODIES_FILE: (BODY_COLUMNS, _body_rows(evaluation.bodies)),
+        ERRORS_FILE: (ERROR_COLUMNS, _error_rows(evaluation)),
+        **{f'{k}.csv': (POSE_COLUMNS, _sensor_rows(g)) for k, g in evaluation.further.items()},
+    }
+    for name, (columns, rows) in tables.items():
+        with (folder / name).open('w', newline='', encoding='utf-8') as stream:
+            writer = csv.writer(stream)
+            writer.writerow(columns)
+            writer.writerows(rows)
+    return [folder / name for name in tables]
 
 
-def write_body_poses(path: Path, evaluation: Evaluation) -> None:
-    """Write every rigid tool's 6-DoF pose, or why there is none, one tool after the other."""
-    rows = [row for series in evaluation.bodies.values() for row in _body_rows(series)]
-    _write(path, BODY_COLUMNS, rows)
-
-
-def write_sources(path: Path, evaluation: Evaluation) -> None:
-    """Write where each body saw the source, in the body's frame, or why it did not."""
-    rows = [row for series in evaluation.sources.values() for row in _sensor_rows(series)]
-    _write(path, POSE_COLUMNS, rows)
-
-
-def write_errors(path: Path, evaluation: Evaluation) -> None:
-    """Write the error of every pose that has an optical one, of coils, bodies and sources."""
-    rows = [
+def _error_rows(evaluation: Evaluation) -> list[list[Any]]:
+    """The error of every pose that has an optical one."""
+    return [
         [estimate.stamp_ns, series.name, f'{place:.9g}', f'{turn:.9g}']
-        for series in (
-            *evaluation.sensors.values(),
-            *evaluation.bodies.values(),
-            *evaluation.sources.values(),
-        )
+        for group in evaluation.groups.values()
+        for series in group.values()
         for estimate, place, turn in zip(
             series.estimates, series.position_error.tolist(), series.orientation_error.tolist(),
             strict=True,
         )
         if isfinite(place)
     ]  # fmt: skip
-    _write(path, ERROR_COLUMNS, rows)
 
 
-def _write(path: Path, columns: tuple[str, ...], rows: list[list[Any]]) -> None:
-    with path.open('w', newline='', encoding='utf-8') as stream:
-        writer = csv.writer(stream)
-        writer.writerow(columns)
-        writer.writerows(rows)
+def _sensor_rows(group: Mapping[str, PoseSeries]) -> list[list[Any]]:
+    """Rows of what has a place and an axis."""
+    return [
+        _row(series, pose, [*pose.position, *pose.axis] if pose.state == OK else None, 6)
+        for series in group.values()
+        for pose in series.estimates
+    ]
 
 
-def _sensor_rows(series: PoseSeries) -> list[list[Any]]:
+def _body_rows(group: Mapping[str, PoseSeries]) -> list[list[Any]]:
     rows = []
-    for pose in series.estimates:
-        head = [pose.stamp_ns, series.name]
-        if pose.state == OK:
-            values = [*pose.position, *pose.axis, pose.sigma_position_m, pose.residual_t]
-            rows.append([*head, *(f'{float(v):.9g}' for v in values), OK])
-        else:
-            rows.append([*head, *[''] * 8, pose.state])
+    for series in group.values():
+        for pose in series.estimates:
+            values = None
+            if pose.state == OK and pose.rotation is not None:
+                values = [*pose.position, *Rotation.from_matrix(pose.rotation).as_quat()]
+            rows.append(_row(series, pose, values, 7))
     return rows
 
 
-def _body_rows(series: PoseSeries) -> list[list[Any]]:
-    rows = []
-    for pose in series.estimates:
-        head = [pose.stamp_ns, series.name]
-        if pose.state == OK and pose.rotation is not None:
-            quaternion = Rotation.from_matrix(pose.rotation).as_quat()
-            values = [*pose.position, *quaternion, pose.sigma_position_m, pose.residual_t]
-            rows.append([*head, *(f'{float(v):.9g}' for v in values), OK])
-        else:
-            rows.append([*head, *[''] * 9, pose.state])
-    return rows
+def _row(
+    series: PoseSeries, pose: PoseEstimate, values: list[float] | None, count: int
+) -> list[Any]:
+    """One pose of so many numbers, its sigma and residual; empty cells where there is none."""
+    cells = [''] * (count + 2)
+    if values is not None:
+        values = [*values, pose.sigma_position_m, pose.residual_t]
+        cells = [f'{float(value):.9g}' for value in values]
+    return [pose.stamp_ns, series.name, *cells, pose.state]

@@ -15,7 +15,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.baseline import Baseline, baseline_of
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.recorded_drift import is_recorded
 from anser_ros.sessions.session import Session, measured_noise
 from anser_ros.sessions.starting_model import check_fits
@@ -26,30 +26,15 @@ from anser_ros.sessions.volume import tracked_volume
 class PreparedSession:
     """Holds a session and a model that fits it, with what follows from the two.
 
-    Attributes
-    ----------
-    session : Session
-        What was recorded.
-    model : FieldModel
-        Of the session's emitters.
-    drawing : Drawing
-        The emitters as the setup draws them.
-    noise_t : float
-        Noise of the fluxes' components as the acquisition measured it, T; 0 where it did not, and
-        where the setup's accuracy states the noise, which goes before.
-    volume : TrackedVolume
-        The box in which poses are accepted.
-    baseline : Baseline or None
-        Clean readings of the session's reference sensors.
-    correction : Correction
-        Undoes the effects that the model knows.
-    recorded_drift : bool
-        Whether the model's drifts took their course on this very session.
+    ``noise_t`` is the noise of the fluxes' components as the acquisition measured it; 0 where it
+    did not, and where the setup states it. Poses are accepted in the volume. The baseline is of
+    the reference sensors, the correction undoes the effects that the model knows, and
+    ``recorded_drift`` says whether the model's drifts took their course on this very session.
     """
 
     session: Session
     model: FieldModel
-    drawing: Drawing
+    nominal: NominalBoard
     noise_t: float
     volume: TrackedVolume
     baseline: Baseline | None
@@ -62,9 +47,7 @@ class PreparedSession:
         return self.session.sensors
 
     def with_session(self, session: Session) -> 'PreparedSession':
-        """Return the same for a part of the session, or for another recording of the same
-        setup.
-        """
+        """Return the same for a part of the session, or another recording of its setup."""
         return replace(self, session=session, recorded_drift=is_recorded(self.model, session))
 
     def with_model(self, model: FieldModel) -> 'PreparedSession':
@@ -89,15 +72,7 @@ def prepare(
 ) -> PreparedSession:
     """Check a model against a session, and work out what follows from the two.
 
-    Parameters
-    ----------
-    session : Session
-        What was recorded.
-    model : FieldModel
-        Calibrated or nominal.
-    baseline : Session, optional
-        Distortion-free recording of the same board; its readings are not used where the session
-        has no reference fluxes.
+    A baseline's readings are not used where the session has no reference fluxes.
 
     Raises
     ------
@@ -116,7 +91,7 @@ def prepare(
     return PreparedSession(
         session,
         model,
-        Drawing.of(session.setup),
+        NominalBoard.of(session.setup),
         measured_noise(session.setup),
         tracked_volume(session.setup),
         clean,

@@ -1,7 +1,7 @@
 """Reads what the nodes reported about themselves in ``/diagnostics`` during a recording."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -33,29 +33,29 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
 
     A bag without diagnostics, or one that cannot be read yet, gives an empty mapping.
     """
-    found: dict[str, Mapping[str, str]] = {}
-    decoder = MessageDecoder()
     try:
-        for raw in iter_messages(path, Salvage()):
-            if raw.topic == TOPIC:
-                for status in decoder.decode(raw).status:
-                    found[status.name] = {item.key: item.value for item in status.values}
+        return {
+            status.name: {item.key: item.value for item in status.values}
+            for _, status in _statuses(path)
+        }
     except BagError:
         return {}
-    return found
+
+
+def _statuses(path: str | os.PathLike[str]) -> Iterator[tuple[int, Any]]:
+    """Every status of a recording with its log time, ns."""
+    decoder = MessageDecoder()
+    for raw in iter_messages(path, Salvage()):
+        if raw.topic == TOPIC:
+            for status in decoder.decode(raw).status:
+                yield raw.log_time_ns, status
 
 
 def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
     """Return the share of poses in state ok among all that a tracker judged; 0 if it judged none.
 
-    Frames that it never saw, because the machine was too slow for them, do not count.
-
-    Parameters
-    ----------
-    words : mapping
-        Of `last_words`.
-    tracker : str
-        The node, whose statuses of sensors and bodies are named ``NODE: SENSOR``.
+    Frames that it never saw, because the machine was too slow for them, do not count. The statuses
+    of its sensors and bodies, of `last_words`, are named ``NODE: SENSOR``.
     """
     ok = judged = 0
     for name, values in words.items():
@@ -67,19 +67,9 @@ def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
 
 
 def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
-    """Return when each part of a node first warned.
+    """Return when each part of a node first warned: log time, ns, by the part's name.
 
-    Parameters
-    ----------
-    path : path
-        The recording.
-    part_of : str
-        The node, whose statuses are named ``NODE: PART``.
-
-    Returns
-    -------
-    dict of str to int
-        Log time of the first warning, ns, by the part's name.
+    The statuses of a node's parts are named ``NODE: PART``.
 
     Raises
     ------
@@ -87,13 +77,10 @@ def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]
         When the recording cannot be read.
     """
     found: dict[str, int] = {}
-    decoder = MessageDecoder()
-    for raw in iter_messages(path, Salvage()):
-        if raw.topic == TOPIC:
-            for status in decoder.decode(raw).status:
-                node, _, name = status.name.partition(': ')
-                if node == part_of and name and _level(status) == WARN:
-                    found.setdefault(name, raw.log_time_ns)
+    for log_time_ns, status in _statuses(path):
+        node, _, name = status.name.partition(': ')
+        if node == part_of and name and _level(status) == WARN:
+            found.setdefault(name, log_time_ns)
     return found
 
 

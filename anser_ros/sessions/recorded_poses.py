@@ -14,6 +14,7 @@ from anser_ros.physics.angles import axis_angles, rotation_angles
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.session import Session
 from anser_ros.stamps import NANO, stamp_of
+from anser_ros.wire.quaternion import pose_numbers
 from anser_ros.wire.recorded import PoseStream
 from anser_ros.wire.setup import topic_of
 
@@ -22,14 +23,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LiveErrors:
-    """Holds errors of the poses of one sensor or body.
+    """Holds errors (n,) of the poses of one sensor or body against the optical ones, m and rad.
 
-    Attributes
-    ----------
-    position : ndarray, shape (n,)
-        Distance from the optical pose, m, where there is one.
-    orientation : ndarray, shape (n,)
-        Angle, rad: of a coil between the axes, of a body the whole turn.
+    The angle is of a coil between the axes, of a body the whole turn.
     """
 
     position: Array
@@ -47,9 +43,8 @@ def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict
     for raw in iter_messages(path, Salvage()):
         if raw.topic in rows and raw.type_name == POSE_TYPE:
             message = decoder.decode(raw)
-            place, turn = message.pose.position, message.pose.orientation
             stamps[raw.topic].append(stamp_of(message))
-            rows[raw.topic].append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+            rows[raw.topic].append(pose_numbers(message.pose))
     found = {}
     for topic, values in rows.items():
         table = np.array(values, dtype=np.float64).reshape(-1, 7)
@@ -59,15 +54,10 @@ def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict
 
 
 def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErrors]:
-    """Return errors of everything that the tracker of a namespace published, by sensor and body.
+    """Return errors of all that the tracker of a namespace published, by sensor and body.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        The recording, with optical poses, and the tracker's model, whose corrections of the
-        clock, the optical frame and the sensors are made.
-    namespace : str
-        Of the tracker, such as ``/anser``.
+    The recording has optical poses, and is prepared with the tracker's model, whose corrections of
+    the clock, the optical frame and the sensors are made.
 
     Raises
     ------

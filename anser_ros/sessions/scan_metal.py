@@ -23,8 +23,8 @@ from anser_ros.effects.prediction import tool_view
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.drawing import Drawing
-from anser_ros.sessions.session import Session
+from anser_ros.sessions.drawing import NominalBoard
+from anser_ros.sessions.session import Session, shifted
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,16 +43,10 @@ UNCERTAINTY_FRAMES = 60
 
 @dataclass(frozen=True)
 class RestingMetal:
-    """Holds what metal at rest did to the fluxes of a session's tools.
+    """Holds what metal at rest did to the fluxes of a session's tools, (F, S, K) each, T.
 
-    Attributes
-    ----------
-    flux : tuple of ndarray, one per tool, shape (F, S, K), complex
-        In the frames that a scan holds, T.
-    sigma_t : float
-        Its standard deviation, root mean square of a phasor component, T.
-    record : EffectRecord
-        Where it rested, and where it came.
+    Sigma is that of a phasor component, root mean square; the record says where it rested and
+    came.
     """
 
     flux: tuple[NDArray[np.complex128], ...]
@@ -67,14 +61,7 @@ def without_resting_metal(
 ) -> Scan | None:
     """Return a scan without metal that rested during it; None where there is none to take off.
 
-    Parameters
-    ----------
-    sessions : sequence of Session
-        That were calibrated.
-    calibration : Calibration
-        With the metal in its field.
-    progress : callable, optional
-        Called with the name of the stage.
+    The calibration has the metal in its field.
     """
     scan = calibration.scan
     if scan.survey is None:
@@ -119,7 +106,7 @@ def without_resting_metal(
 def _completed(
     record: EffectRecord, metal: RestingMetal, ends: tuple[float, float]
 ) -> EffectRecord:
-    """The telling of a span in which this metal moved, with where it rested."""
+    """The record of a span in which this metal moved, with where it rested."""
     parameters = record.parameters
     if not ends[0] <= parameters['t_start_s'] <= ends[1]:
         return record
@@ -202,7 +189,7 @@ def _problem(
     try:
         return build_problem(
             tools, _between(reference, begin, end), baseline, calibration.model,
-            Drawing.of(setup).model, Spread(noise, accuracy),
+            NominalBoard.of(setup).model, Spread(noise, accuracy),
         )  # fmt: skip
     except DiagnosisError:
         return None  # too few frames with a pose
@@ -218,7 +205,4 @@ def _near(learnt: cKDTree, tool: Measurements) -> Measurements:
 def _between(measurements: Measurements, begin: float, end: float) -> Measurements:
     """The frames between two times, the first of which becomes zero."""
     inside = (measurements.time >= begin) & (measurements.time <= end)
-    part, track = measurements.frames(inside), measurements.track
-    if track is not None:
-        track = replace(track, time=track.time - begin)
-    return replace(part, time=part.time - begin, track=track)
+    return shifted(measurements.frames(inside), -begin)

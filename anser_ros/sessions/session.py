@@ -3,9 +3,9 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
@@ -16,7 +16,7 @@ from anser_ros.sessions.plausibility import plausible_tools
 from anser_ros.stamps import NANO
 from anser_ros.wire.points import STALE
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
 
 MOST_NOISE_T = 1e-3
 """Noise, T, from which on a setup's statement is taken for a mistake and not used. The emitters
@@ -28,22 +28,10 @@ hand at 0.1 m/s would be a centimetre off. Smaller, a slow recorder could not sa
 
 @dataclass(frozen=True)
 class Session:
-    """Holds one recording as measurements of every body.
+    """Holds one recording as measurements of every body that moves, in the order of the setup.
 
-    Attributes
-    ----------
-    path : str
-        Of the bag.
-    setup : Setup
-        The setup document that the bag holds.
-    start_ns : int
-        The stamp at time 0 of all measurements.
-    tools : tuple of Measurements
-        One a body that moves, in the order of the setup.
-    reference : Measurements or None
-        Of the reference sensors, where their fluxes were recorded.
-    lost : str
-        What could not be read, in words; empty when nothing is missing.
+    Time 0 of all is at ``start_ns``. The references are there where their fluxes were recorded;
+    ``lost`` says in words what could not be read.
     """
 
     path: str
@@ -71,15 +59,23 @@ class Session:
 
 def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
     """Return the specified sensors as a table, in the given order."""
+    rows = SensorRows.of(specs)
     return SensorTable(
-        channel=np.array([s.channel for s in specs], dtype=np.int64),
+        channel=rows.channel,
         name=tuple(s.name for s in specs),
         body=tuple(s.body for s in specs),
-        position=np.array([s.position_m for s in specs], dtype=np.float64).reshape(-1, 3),
-        axis=np.array([s.axis for s in specs], dtype=np.float64).reshape(-1, 3),
+        position=rows.position,
+        axis=rows.axis,
         length=np.array([s.length_m for s in specs], dtype=np.float64),
         windings=Windings.of([s.windings for s in specs]),
     )
+
+
+def _measured(setup: Setup, name: str) -> float:
+    """What the acquisition wrote into the setup; NaN if nothing, and if a value was stated."""
+    value: Any = setup.extra.get(name)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if is_number and name not in setup.stated else np.nan
 
 
 def measured_noise(setup: Setup) -> float:
@@ -87,11 +83,8 @@ def measured_noise(setup: Setup) -> float:
 
     It is 0 if the setup contains none, and if ``flux_noise_t`` is stated, which takes precedence.
     """
-    if 'flux_noise_t' in setup.stated:
-        return 0.0
-    stated = setup.extra.get('flux_noise_t', 0.0)
-    is_number = isinstance(stated, (int, float)) and not isinstance(stated, bool)
-    return float(stated) if is_number and 0.0 < stated < MOST_NOISE_T else 0.0
+    measured = _measured(setup, 'flux_noise_t')
+    return measured if 0.0 < measured < MOST_NOISE_T else 0.0
 
 
 def tracking_noise(setup: Setup) -> float:
@@ -100,16 +93,12 @@ def tracking_noise(setup: Setup) -> float:
 
 
 def stamp_sigma(setup: Setup) -> float:
-    """Return the error of the fluxes' stamps, s: what is stated, else what the acquisition
-    measured.
+    """Return the error of the fluxes' stamps, s: what is stated, or else was measured.
 
     If the setup has neither, it is the default of `anser_ros.settings.Accuracy`.
     """
-    stated = setup.extra.get('stamp_sigma_s', -1.0)
-    is_number = isinstance(stated, (int, float)) and not isinstance(stated, bool)
-    if 'stamp_sigma_s' not in setup.stated and is_number and 0.0 <= stated <= MOST_STAMP_SIGMA_S:
-        return float(stated)
-    return setup.accuracy.stamp_sigma_s
+    measured = _measured(setup, 'stamp_sigma_s')
+    return measured if 0.0 <= measured <= MOST_STAMP_SIGMA_S else setup.accuracy.stamp_sigma_s
 
 
 def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
@@ -118,10 +107,14 @@ def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
     return PoseTrack(np.asarray(time, dtype=np.float64), stream.position, stream.quaternion)
 
 
-def _columns(
-    stream: RecordedFluxes, sensors: SensorTable
-) -> tuple[NDArray[np.complex128], NDArray[np.bool_], NDArray[np.int64]]:
-    """Flux (F, S, K), validity and flags (F, S) in the order of the sensor table."""
+def _measurements(
+    stream: RecordedFluxes,
+    sensors: SensorTable,
+    start: int,
+    body: str,
+    optical: PoseStream | None = None,
+) -> Measurements:
+    """Fluxes in the order of the sensor table, with the body's poses; the board does not move."""
     flux = np.full((stream.stamp_ns.size, len(sensors), stream.flux.shape[2]), np.nan, complex)
     flags = np.full(flux.shape[:2], STALE, dtype=np.int64)
     place = {int(channel): i for i, channel in enumerate(stream.channel)}
@@ -129,33 +122,29 @@ def _columns(
         if channel in place:
             flux[:, column] = stream.flux[:, place[channel]]
             flags[:, column] = stream.flags[:, place[channel]]
-    return flux, reading_codes(flux, flags) == GOOD, flags
-
-
-def _tool(
-    stream: RecordedFluxes, sensors: SensorTable, body: str, bag: Bag, start: int
-) -> Measurements:
-    flux, valid, flags = _columns(stream, sensors)
+    valid = reading_codes(flux, flags) == GOOD
     time = np.asarray((stream.stamp_ns - start) * NANO, dtype=np.float64)
-    count = time.size
-    position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
-    has_pose, track = np.zeros(count, dtype=bool), None
-    if body in bag.optical:
-        track = pose_track(bag.optical[body], start)
+    count, track = time.size, None
+    if body == FIELD_GENERATOR:
+        position, has_pose = np.zeros((count, 3)), np.ones(count, dtype=bool)
+        rotation = np.broadcast_to(np.eye(3), (count, 3, 3))
+    elif optical is not None:
+        track = pose_track(optical, start)
         position, rotation, has_pose = track.at(time)
+    else:
+        position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+        has_pose = np.zeros(count, dtype=bool)
     return Measurements(
         body, sensors, time, flux, valid, flags, position, rotation, has_pose, track
     )
 
 
-def _reference(stream: RecordedFluxes, sensors: SensorTable, start: int) -> Measurements:
-    flux, valid, flags = _columns(stream, sensors)
-    time = np.asarray((stream.stamp_ns - start) * NANO, dtype=np.float64)
-    count = time.size
-    return Measurements(
-        FIELD_GENERATOR, sensors, time, flux, valid, flags, np.zeros((count, 3)),
-        np.broadcast_to(np.eye(3), (count, 3, 3)), np.ones(count, dtype=bool),
-    )  # fmt: skip
+def shifted(measurements: Measurements, seconds: float) -> Measurements:
+    """Return measurements on a time axis that begins so much earlier."""
+    track = measurements.track
+    if track is not None:
+        track = replace(track, time=track.time + seconds)
+    return replace(measurements, time=measurements.time + seconds, track=track)
 
 
 def session_of(bag: Bag) -> Session:
@@ -179,9 +168,11 @@ def session_of(bag: Bag) -> Session:
     table = sensor_table(bag.setup.tool_sensors)
     if bag.tool is not None:
         for body in bag.setup.bodies:
-            tools.append(_tool(bag.tool, table.of_body(body), body, bag, start))
+            sensors, poses = table.of_body(body), bag.optical.get(body)
+            tools.append(_measurements(bag.tool, sensors, start, body, poses))
     if bag.reference is not None and bag.setup.reference_sensors:
-        reference = _reference(bag.reference, sensor_table(bag.setup.reference_sensors), start)
+        sensors = sensor_table(bag.setup.reference_sensors)
+        reference = _measurements(bag.reference, sensors, start, FIELD_GENERATOR)
     return Session(bag.path, bag.setup, start, tuple(tools), reference, bag.lost)
 
 

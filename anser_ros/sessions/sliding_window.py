@@ -39,20 +39,9 @@ class _Fluxes:
 class SlidingWindow:
     """Keeps what came in the last seconds by the stamps, thinned to a number of frames.
 
-    Parameters
-    ----------
-    setup : Setup
-    length_s : float
-    frames : int
-        Most readings of a topic that are kept, spread evenly over the window.
-
-    Attributes
-    ----------
-    setup : Setup
-    first_ns : int
-        Stamp of the first reading of all; 0 before.
-    restarts : int
-        How often time ran backwards, and all was forgotten.
+    ``frames`` is the most readings of a topic that are kept, spread evenly over the window;
+    ``first_ns`` the stamp of the first reading of all, 0 before; ``restarts`` how often time ran
+    backwards, and all was forgotten.
     """
 
     def __init__(self, setup: Setup, length_s: float, frames: int) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,30 +11,13 @@ from anser_ros.errors import ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.fingerprint import Identity
-from anser_ros.physics.board import Board, build_board
+from anser_ros.sessions.drawing import board_of
 from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import Session
 from anser_ros.wire.setup import Setup
-
-if TYPE_CHECKING:  # a session is checked against the drawing that is made here
-    from anser_ros.sessions.session import Session
 
 NOMINAL = 'nominal'
 """Name of the model of the setup's own geometry, given where a model file's path may stand."""
-
-
-def board_of(setup: Setup) -> Board:
-    """Return the emitter's geometry; raises `SetupError` when its kind is unknown or a key is
-    missing.
-    """
-    emitter = setup.emitter
-    return build_board(
-        emitter.kind,
-        emitter.geometry,
-        setup.emitter_names,
-        np.array([coil.centre_m for coil in emitter.coils]),
-        np.array([coil.rotation_deg for coil in emitter.coils]),
-        setup.frequencies_hz,
-    )
 
 
 def model_of(name: str) -> FieldModel | None:
@@ -76,7 +58,7 @@ def check_emitters(setup: Setup, given: FieldModel) -> None:
 
 
 def model_for(
-    name: str, session: 'Session', snapshot: bool = False, resurveyed: Sequence[str] = ()
+    name: str, session: Session, snapshot: bool = False, resurveyed: Sequence[str] = ()
 ) -> FieldModel:
     """Return the model that ``name`` stands for: a file's path, or ``nominal``.
 
@@ -178,7 +160,7 @@ def _listed(value: object) -> list[object]:
     return list(value) if isinstance(value, list | tuple) else []
 
 
-def check_fits(model: FieldModel, session: 'Session') -> None:
+def check_fits(model: FieldModel, session: Session) -> None:
     """Raise `ModelFileError` when the model's emitters are not the session's, or it is of another.
 
     What else a model may be of: see `check_made_for`.

@@ -5,8 +5,8 @@ The document names the files, their columns, units, the order of quaternions and
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from anser_ros.wire.pose_topics import (
 )
 from anser_ros.wire.quaternion import unit_quaternions
 from anser_ros.wire.session_writer import FLUX_TOPICS, SessionWriter
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, parse_setup
+from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
 from anser_ros.wire.text_files import read_text
 from anser_ros.wire.yaml_text import read_yaml
@@ -44,15 +44,10 @@ ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class ImportedTables:
-    """Counts the messages, by topic, that were written."""
+def import_tables(document: Path, out: Path) -> dict[str, int]:
+    """Write the session that a document describes; how many messages each topic got.
 
-    messages: dict[str, int]
-
-
-def import_tables(document: Path, out: Path) -> ImportedTables:
-    """Write the session that a document describes; files are looked for beside it.
+    Files are looked for beside the document.
 
     Raises
     ------
@@ -98,7 +93,7 @@ class _Import:
         elif 'setup' in spec:
             raise ParameterError('a setup describes fluxes; tracked poses have none')
         self._time = _time_base(spec, 'time')
-        self._entries: list[tuple[int, Callable[[SessionWriter], None]]] = []
+        self._entries: list[tuple[int, Callable[..., None]]] = []
         self._tables: dict[Path, NumberTable] = {}
         self._messages: Counter[str] = Counter()
         for key, entries in tables.items():
@@ -118,7 +113,7 @@ class _Import:
     def _names_of(self, kind: str) -> list[str]:
         return [t[len(kind) : -len(ENDING)] for t in self._messages if t.startswith(kind)]
 
-    def write(self, out: Path) -> ImportedTables:
+    def write(self, out: Path) -> dict[str, int]:
         """Write all by its stamps."""
         self._entries.sort(key=lambda entry: entry[0])
         frame = 'tracker' if self._setup is None else self._setup.frame_id
@@ -126,7 +121,7 @@ class _Import:
             writer.write_setup(self._setup_text, self._entries[0][0])
             for _, put in self._entries:
                 put(writer)
-        return ImportedTables(dict(self._messages))
+        return dict(self._messages)
 
     def _table(self, entry: Mapping[str, Any], what: str) -> NumberTable:
         path = self._folder / str(_needed(entry, 'file', what))
@@ -181,7 +176,10 @@ class _Import:
         flux = scale * np.asarray(flux, dtype=np.complex128)
         sensors = [by_name[name] for name in names]
         for stamp, values in zip(stamps, flux, strict=True):
-            self._entries.append((stamp, _flux_putter(sensors, stamp, values)))
+            put = partial(
+                SessionWriter.write_readings, sensors=sensors, stamp_ns=stamp, flux=values
+            )
+            self._entries.append((stamp, put))
         for topic, fixed in FLUX_TOPICS.items():
             if any((s.body == FIELD_GENERATOR) == fixed for s in sensors):
                 self._messages[topic] += len(stamps)
@@ -210,27 +208,12 @@ class _Import:
         if not np.isfinite(quaternion[good]).all():
             raise ParameterError(f'{table.path}: quaternions are not of unit length')
         for row in np.flatnonzero(good).tolist():
-            put = _pose_putter(topic, stamps[row], position[row], quaternion[row])
+            put = partial(
+                SessionWriter.write_pose, topic=topic, stamp_ns=stamps[row],
+                position=position[row].tolist(), quaternion_xyzw=quaternion[row].tolist(),
+            )  # fmt: skip
             self._entries.append((stamps[row], put))
         self._messages[topic] += int(good.sum())
-
-
-def _flux_putter(
-    sensors: Sequence[SensorSpec], stamp: int, flux: Array
-) -> Callable[[SessionWriter], None]:
-    def put(writer: SessionWriter) -> None:
-        writer.write_readings(sensors, stamp, flux)
-
-    return put
-
-
-def _pose_putter(
-    topic: str, stamp: int, position: Array, quaternion: Array
-) -> Callable[[SessionWriter], None]:
-    def put(writer: SessionWriter) -> None:
-        writer.write_pose(topic, stamp, position.tolist(), quaternion.tolist())
-
-    return put
 
 
 def _time_base(holder: Mapping[str, Any], what: str) -> tuple[float, int]:

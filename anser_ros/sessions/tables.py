@@ -22,11 +22,7 @@ ENDINGS = ('.csv', '.npy', '.npz', '.mat')
 class NumberTable:
     """Holds the arrays of one file by name; the first index of each counts rows.
 
-    Attributes
-    ----------
-    path : Path
-    arrays : mapping of str to ndarray, shapes (N, ...)
-        Of a CSV file one for each column, of a ``.npy`` file one called ``data``.
+    A CSV file has one for each column, a ``.npy`` file one called ``data``.
     """
 
     path: Path
@@ -115,7 +111,7 @@ def _numbers(cells: list[str]) -> NDArray[Any]:
     try:
         return np.array([float(cell) if cell else np.nan for cell in cells])
     except ValueError:
-        return np.array(cells)  # words; who asks for numbers of them is told
+        return np.array(cells)  # words; who asks for numbers of them gets an error
 
 
 def _mat(path: Path) -> dict[str, NDArray[Any]]:

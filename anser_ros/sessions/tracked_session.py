@@ -12,32 +12,27 @@ from anser_ros.sessions.frames import frames_of
 from anser_ros.sessions.known_metal import KnownMetalModels
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.tracker_settings import settings_for
-from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
+from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
+from anser_ros.tracking.tracker import Tracker
 
 Progress = Callable[[float], None]
+SOURCES = 'sources'
+"""Kind of tracked things: the source as a body sees it, place and axis in the body's frame, where
+the field is the same all around an axis."""
 
 
 @dataclass(frozen=True)
 class TrackedSession:
-    """Holds what tracking a session gave.
+    """Holds the estimates of every sensor and body by its name, one per frame by its stamp.
 
-    Attributes
-    ----------
-    estimates : dict of str to tuple of PoseEstimate
-        Of every sensor and body by its name, one per frame, in the order of the stamps.
-    seconds_per_frame : float
-        Mean wall time that a frame took, the refit included.
-    refit : RefitSummary or None
-        What the refit did; None where the model did not follow the references.
-    sources : dict of str to tuple of PoseEstimate
-        Of every body by its name, where the field is the same all around an axis: place and axis
-        of the source in the body's frame.
+    The seconds are the mean wall time that a frame took, the refit included; ``further`` is what
+    else was tracked, by kind and name: `SOURCES`.
     """
 
     estimates: dict[str, tuple[PoseEstimate, ...]]
     seconds_per_frame: float
     refit: RefitSummary | None = None
-    sources: dict[str, tuple[PoseEstimate, ...]] = field(default_factory=dict)
+    further: dict[str, dict[str, tuple[PoseEstimate, ...]]] = field(default_factory=dict)
 
 
 def in_phase_model(model: FieldModel) -> FieldModel:
@@ -55,20 +50,9 @@ def track(
 ) -> TrackedSession:
     """Track every tool sensor and body of a session at every frame.
 
-    The optical pose is never used: neither as a start value nor to refuse a pose.
-
-    Parameters
-    ----------
-    prepared : PreparedSession
-        The session and its model.
-    settings : TrackerSettings, optional
-        The noise is that of the session's setup.
-    follower : ModelFollower, optional
-        Refits the model on the way.
-    in_phase : bool
-        Whether only the fluxes' in-phase parts are used, for an `in_phase_model`.
-    progress : callable, optional
-        Called with the finished share, 0 to 1.
+    The optical pose is never used: neither as a start value nor to refuse a pose. The noise is
+    that of the session's setup. With ``in_phase``, for an `in_phase_model`, only the fluxes'
+    in-phase parts are used.
 
     Raises
     ------
@@ -107,13 +91,12 @@ def track(
     seconds = (time.perf_counter() - start) / max(len(frames), 1)
     by_name = {name: tuple(given) for name, given in estimates.items()}
     summary = None if follower is None else follower.summary
-    seen_from = {name: tuple(given) for name, given in sources.items()}
-    return TrackedSession(by_name, seconds, summary, seen_from)
+    further = {SOURCES: {name: tuple(given) for name, given in sources.items()}}
+    return TrackedSession(by_name, seconds, summary, further if sources else {})
 
 
 def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: bool) -> Tracker:
-    """A tracker told of the session's noise, and of a drift's course where nothing else
-    determines it."""
+    """A tracker that knows the session's noise, and a drift's course if nothing else does."""
     return Tracker(
         prepared.model,
         prepared.sensors,

@@ -17,14 +17,9 @@ for inches and centimetres, of which the nearer one is named."""
 
 
 def unit_words(ratio: float, units: Mapping[str, float]) -> str:
-    """Return the unit whose size a ratio is nearest to; nothing where none is near.
+    """Return the unit whose size a ratio, of what was written to what is expected, is nearest to.
 
-    Parameters
-    ----------
-    ratio : float
-        What was written over what is expected.
-    units : mapping of str to float
-        Names and how many there are in the SI unit.
+    It is empty where none is near. Units are given as how many there are in the SI unit.
     """
     if not 0.0 < ratio < math.inf:
         return ''

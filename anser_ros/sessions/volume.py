@@ -3,7 +3,7 @@
 from anser_ros.errors import FitError
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.excitation import region_of
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.wire.setup import Setup
 
 
@@ -17,12 +17,12 @@ def tracked_volume(setup: Setup) -> TrackedVolume:
 
     A board that can't be drawn from the setup gets the box of an Anser board.
     """
-    stated, drawing = stated_volume(setup), Drawing.of(setup).field
+    stated, field = stated_volume(setup), NominalBoard.of(setup).field
     if stated is not None:
         return stated
-    if drawing is None:
+    if field is None:
         return TrackedVolume()
     try:
-        return region_of(drawing).volume
+        return region_of(field).volume
     except FitError:  # a drawing without any field
         return TrackedVolume()

@@ -21,7 +21,7 @@ from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.pose_states import OK
 from anser_ros.sessions.diagnosis import problem_of, spread_of
 from anser_ros.sessions.prepared import PreparedSession, correct
-from anser_ros.sessions.session import Session
+from anser_ros.sessions.session import Session, shifted
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import NO_GATE, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
@@ -47,30 +47,12 @@ tool that stays closer shows that something is wrong, but not what."""
 
 @dataclass(frozen=True)
 class Sighting:
-    """Holds what a look found.
+    """Holds what a look found by comparing the fluxes with ``truth``.
 
-    Attributes
-    ----------
-    truth : str
-        What the fluxes were compared with.
-    frames : int
-        Tool frames that were compared.
-    findings : tuple of EffectRecord
-        What the model lacks; empty when all is well, or when no effect explains it.
-    excess : float
-        Mean square of the residuals in units of what is expected: 1 when all is well.
-    excess_left : float
-        The same with the findings in force.
-    flux_rms_t : float
-        Residual of the tools' fluxes, T a phasor component.
-    depends_on : tuple of str
-        What the unexplained part depends on.
-    remark : str
-        Why nothing is named although something is there.
-    terms : tuple of Term
-        The findings in force.
-    model : FieldModel or None
-        With the findings; None where there are none.
+    The excess is the mean square of the residuals of the tools' frames in units of what is
+    expected: 1 when all is well; ``excess_left`` is with the findings, empty also when no effect
+    explains it, as ``remark`` says. The residual is in T a phasor component; terms and model are
+    the findings', and ``depends_on`` is what the unexplained part depends on.
     """
 
     truth: str
@@ -93,16 +75,9 @@ class Sighting:
 class Watch:
     """Looks at one window after the other, and remembers what it found.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        Any session of the setup, an empty one too, with the model whose effects are corrected
-        already; without a baseline the references are not used.
-
-    Attributes
-    ----------
-    searches : int
-        How often something new was searched for.
+    It is made of any session of the setup, an empty one too, with the model whose effects are
+    corrected already; without a baseline the references are not used. ``searches`` counts how
+    often something new was searched for.
     """
 
     def __init__(self, prepared: PreparedSession) -> None:
@@ -112,14 +87,7 @@ class Watch:
         self.searches = 0
 
     def look(self, session: Session, first_ns: int) -> Sighting:
-        """Look at a window.
-
-        Parameters
-        ----------
-        session : Session
-            The last seconds.
-        first_ns : int
-            Stamp that the time of the model's own effects counts from.
+        """Look at the last seconds; the time of the model's own effects counts from a stamp.
 
         Raises
         ------
@@ -199,16 +167,9 @@ def _moved(session: Session, seconds: float) -> Session:
     reference = session.reference
     return replace(
         session,
-        tools=tuple(_shifted(tool, seconds) for tool in session.tools),
-        reference=None if reference is None else _shifted(reference, seconds),
+        tools=tuple(shifted(tool, seconds) for tool in session.tools),
+        reference=None if reference is None else shifted(reference, seconds),
     )
-
-
-def _shifted(measurements: Measurements, seconds: float) -> Measurements:
-    track = measurements.track
-    if track is not None:
-        track = replace(track, time=track.time + seconds)
-    return replace(measurements, time=measurements.time + seconds, track=track)
 
 
 def _posed_by_itself(tool: Measurements, model: FieldModel) -> Measurements:

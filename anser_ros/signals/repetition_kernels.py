@@ -4,8 +4,9 @@ All arrays have a place for each of C columns. Positions count samples since the
 sample at position p is in row p mod H of the history (H, C).
 """
 
-import numba
 import numpy as np
+
+from anser_ros.kernel_cache import kernel
 
 FINGERPRINT_SAMPLES = 32
 """Samples that a fingerprint depends on. The factor of its recursion holds the number 2 once, so
@@ -43,7 +44,7 @@ SAMPLED_SHARE = 16
 """One such stretch in so many is compared. All of them would cost as much as the search."""
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _run_length(history, row, column, lag, longest):  # type: ignore[no-untyped-def]
     """Return how many samples up to that of a row equal those `lag` before, at most `longest`."""
     rows = history.shape[0]
@@ -59,7 +60,7 @@ def _run_length(history, row, column, lag, longest):  # type: ignore[no-untyped-
     return longest
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _begin(  # type: ignore[no-untyped-def]
     history, row, at, found, known, needed, lag, run, until, age
 ):
@@ -80,7 +81,7 @@ def _begin(  # type: ignore[no-untyped-def]
     return begun
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def search(  # type: ignore[no-untyped-def]
     history, first, count, position, contiguous, fingerprint, probes, probed_at, slots, needed,
     lag, run, until, age,
@@ -140,7 +141,7 @@ def search(  # type: ignore[no-untyped-def]
                 probed_at[k] = at
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _follow(history, row, at, needed, lag, run, until, age):  # type: ignore[no-untyped-def]
     """Compare a sample with the one that each followed column's lag foretells; how many go on."""
     rows, columns = history.shape
@@ -161,7 +162,7 @@ def _follow(history, row, at, needed, lag, run, until, age):  # type: ignore[no-
     return followed
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def count_coincidences(  # type: ignore[no-untyped-def]
     history, first, count, position, lag, rails, is_new, equal, tried, same, continued
 ):  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.sessions.starting_model import board_of
+from anser_ros.sessions.drawing import board_of
 from anser_ros.simulation.world import FieldSource
 from anser_ros.wire.setup import Setup
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from anser_ros.physics.dipole import GAUSS_OFFSET, flux_basis
 from anser_ros.simulation.metal import MetalBody
 from anser_ros.simulation.motion import Path, Pose, tool_paths
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -52,8 +52,7 @@ class World:
         self._polarisability = [body.polarisability(tones) for body in self._metal]
         self._paths: dict[str, Path] = {**tool_paths(setup.bodies), **dict(paths or {})}
         self._groups = _by_body(self.sensors)
-        self._local = np.array([s.position_m for s in self.sensors])
-        self._local_axes = np.array([s.axis for s in self.sensors])
+        _, self._local, self._local_axes = SensorRows.of(self.sensors)
         self._lengths = np.array([s.length_m for s in self.sensors])
         fixed = self._groups.pop(FIELD_GENERATOR, np.zeros(0, np.intp))
         self._moving = np.concatenate([np.zeros(0, np.intp), *self._groups.values()])

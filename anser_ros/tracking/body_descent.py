@@ -6,9 +6,9 @@ noise alone; errors that coils share enter by `fill_common` (Woodbury's identity
 
 import math
 
-import numba
 import numpy as np
 
+from anser_ros.kernel_cache import kernel
 from anser_ros.tracking.descent import (
     CONVERGED_CHI2,
     FIRST_DAMPING,
@@ -20,7 +20,7 @@ from anser_ros.tracking.descent import (
 )
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def fill_common(modes, inverse_sigma, common):  # type: ignore[no-untyped-def]
     """Write E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E``; False when D is not finite.
 
@@ -52,7 +52,7 @@ def fill_common(modes, inverse_sigma, common):  # type: ignore[no-untyped-def]
     return True
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def fill_body(  # type: ignore[no-untyped-def]
     position, rotation, offsets, axes, lengths, flux, inverse_sigma, dipoles, moments, basis,
     residual, white,
@@ -83,7 +83,7 @@ def fill_body(  # type: ignore[no-untyped-def]
                 white[4 + i, column] = w * turn
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _products(white, common):  # type: ignore[no-untyped-def]
     """``W C^-1 W^T`` (7, 7) for the covariance I + D^T D."""
     products = np.dot(white, white.T)
@@ -93,7 +93,7 @@ def _products(white, common):  # type: ignore[no-untyped-def]
     return products
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _turned(vector, rotation):  # type: ignore[no-untyped-def]
     """A rotation after a further turn by a rotation vector, rad, kept orthonormal."""
     x, y, z = vector[0], vector[1], vector[2]
@@ -115,7 +115,7 @@ def _turned(vector, rotation):  # type: ignore[no-untyped-def]
     return 1.5 * new - 0.5 * np.dot(new, np.dot(new.T, new))
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def descend_body(  # type: ignore[no-untyped-def]
     position, rotation, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments,
     low, high, budget, residual, white, information,
@@ -173,7 +173,7 @@ def descend_body(  # type: ignore[no-untyped-def]
     return chi2, used, converged
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def step_to_coils(  # type: ignore[no-untyped-def]
     position, rotation, offsets, axes, coil_positions, coil_axes, normals, low, high
 ):  # fmt: skip

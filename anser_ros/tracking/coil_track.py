@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from itertools import repeat
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.kernel_cache import kernel
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.seed import solve_cold
@@ -94,7 +94,7 @@ class PoseErrors(NamedTuple):
         )
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def carried_on(position, old_position, axis, old_axis, steps):  # type: ignore[no-untyped-def]
     """Return position, m, and unit axis after so many more of the last steps."""
     new_position, new_axis, norm = np.empty(3), np.empty(3), 0.0

@@ -8,9 +8,9 @@ Numerical Optimization, section 10.3); each trial costs one evaluation of field 
 
 import math
 
-import numba
 import numpy as np
 
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.physics.dipole import GAUSS_OFFSET
 from anser_ros.physics.tangent import fill_tangent
@@ -30,7 +30,7 @@ TRUSTED_CHI2, TRUSTED_MOVE_M, TRUSTED_TURN = 0.03, 50e-6, 1e-3
 what a sixth of a sigma leaves, of second order, is less than a thousandth of a sigma."""
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def fill_coil_basis(point, axis, length, dipoles, basis):  # type: ignore[no-untyped-def]
     """Write what each unit dipole does to a coil into ``basis``, shape (7, N).
 
@@ -79,7 +79,7 @@ def fill_coil_basis(point, axis, length, dipoles, basis):  # type: ignore[no-unt
                     turn[j] += b
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _whiten(flux, model, whitening, residual, white):  # type: ignore[no-untyped-def]
     """Row 0 of ``white``: residual; rows 1 to 6: the flux's derivatives. Returns chi-square.
 
@@ -110,7 +110,7 @@ def _whiten(flux, model, whitening, residual, white):  # type: ignore[no-untyped
     return chi2
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _normal_equations(white, tangent, full, normal, gradient):  # type: ignore[no-untyped-def]
     """``full`` (6, 6) by position and free axis; ``normal``, ``gradient`` in the tangent plane."""
     g = np.zeros(6)
@@ -143,7 +143,7 @@ def _normal_equations(white, tangent, full, normal, gradient):  # type: ignore[n
             normal[3 + a, 3 + b] = total
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def damped_step(normal, gradient, damping, factor, step):  # type: ignore[no-untyped-def]
     """Solve ``(A + damping diag A) step = gradient`` by Cholesky; False when A is not positive."""
     n = gradient.shape[0]
@@ -173,7 +173,7 @@ def damped_step(normal, gradient, damping, factor, step):  # type: ignore[no-unt
     return True
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def limit_step(step):  # type: ignore[no-untyped-def]
     """Shorten a step to the largest move and turn that the local model is trusted for.
 
@@ -195,7 +195,7 @@ def limit_step(step):  # type: ignore[no-untyped-def]
     return move < TRUSTED_MOVE_M and turn < TRUSTED_TURN
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _advance(position, axis, tangent, step, low, high, new_position, new_axis):  # type: ignore[no-untyped-def]
     """Take a step: the position stays in the box, the axis stays a unit vector."""
     norm = 0.0
@@ -208,7 +208,7 @@ def _advance(position, axis, tangent, step, low, high, new_position, new_axis): 
         new_axis[i] *= norm
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _promised(normal, gradient, step):  # type: ignore[no-untyped-def]
     """Fall of chi-square that the local model promises for a step."""
     total = 0.0
@@ -220,7 +220,7 @@ def _promised(normal, gradient, step):  # type: ignore[no-untyped-def]
     return total
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def descend(  # type: ignore[no-untyped-def]
     position, axis, length, flux, whitening, dipoles, moments, low, high, budget, full, residual,
 ):  # fmt: skip

@@ -2,11 +2,11 @@
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.physics.dipole import GAUSS_OFFSET
 
@@ -17,7 +17,7 @@ SAME_PLACE_M = 1e-6
 less, and no layout has neighbours within a millimetre."""
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _fill_whitening(errors, sigma, factor, out):  # type: ignore[no-untyped-def]
     """Write the inverse Cholesky factor of ``diag(sigma)^2 + E^T E``; False if there is none."""
     width = sigma.shape[0]
@@ -50,7 +50,7 @@ def _fill_whitening(errors, sigma, factor, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _fill_spacing(positions, spacing):  # type: ignore[no-untyped-def]
     for i in range(positions.shape[0]):
         nearest = np.inf
@@ -75,7 +75,7 @@ def source_spacing(positions: Array, floor_m: float) -> Array:
     return spacing
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _fill_couplings(points, axes, lengths, dipoles, spacing, basis, away, among):  # type: ignore[no-untyped-def]
     """Write each unit dipole's flux in each coil, and how near each coil is to them."""
     px, py, pz = dipoles[0], dipoles[1], dipoles[2]
@@ -106,7 +106,7 @@ def _fill_couplings(points, axes, lengths, dipoles, spacing, basis, away, among)
         away[p], among[p] = math.sqrt(nearest), math.sqrt(deepest)
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _fill_all(  # type: ignore[no-untyped-def]
     points, axes, lengths, dipoles, spacing, modes, sigma, errors, out, away, among
 ):  # fmt: skip

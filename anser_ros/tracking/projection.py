@@ -8,9 +8,9 @@ taken for a point; the joint descent that follows knows its length.
 
 import math
 
-import numba
 import numpy as np
 
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.dipole import fill_field_and_gradient
 from anser_ros.physics.tangent import fill_tangent
 
@@ -23,7 +23,7 @@ NEAR = 1e-4
 """A relative fall of chi-square below this ends the descent: the joint one does the rest."""
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _turn(field, flux, axis, tangent, plane, residual):  # type: ignore[no-untyped-def]
     """Best small turn of the axis in a given whitened field (3, 2K); returns chi-square after it.
 
@@ -84,7 +84,7 @@ def _turn(field, flux, axis, tangent, plane, residual):  # type: ignore[no-untyp
     return chi2
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _look(  # type: ignore[no-untyped-def]
     position, axis, flux, inverse_sigma, positions, directions, moments, basis, field, tangent,
     plane, residual, slopes,
@@ -114,7 +114,7 @@ def _look(  # type: ignore[no-untyped-def]
     return chi2
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _step(slopes, residual, damping, step):  # type: ignore[no-untyped-def]
     """Damped step (3) by Cramer's rule, shortened to the largest move."""
     a, g = np.empty((3, 3)), np.empty(3)
@@ -146,7 +146,7 @@ def _step(slopes, residual, damping, step):  # type: ignore[no-untyped-def]
             step[i] *= LARGEST_MOVE_M / size
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def descend_projected(  # type: ignore[no-untyped-def]
     position, axis, flux, inverse_sigma, positions, directions, moments, low, high, budget,
 ):  # fmt: skip

@@ -10,11 +10,11 @@ length one is a constraint that distinguishes positions; its cost is added to se
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.dipole import fill_field_and_gradient
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.projection import descend_projected
@@ -64,7 +64,7 @@ class SeedGrid:
     spacing_m: float
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _fill_grid(points, positions, directions, moments, inverse_sigma, projectors, triangles):  # type: ignore[no-untyped-def]
     basis = np.empty((9, positions.shape[0]))
     width = moments.shape[1]
@@ -99,7 +99,7 @@ def _fill_grid(points, positions, directions, moments, inverse_sigma, projectors
                 projectors[g, i, k] = total
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _score(linear, triangles, power, cost, axes):  # type: ignore[no-untyped-def]
     """Cost of a unit axis at every grid point, and that axis."""
     for g in range(linear.shape[0]):
@@ -119,7 +119,7 @@ def _score(linear, triangles, power, cost, axes):  # type: ignore[no-untyped-def
         cost[g] = power - (c0 * c0 + c1 * c1 + c2 * c2) + (length - 1.0) ** 2 / variance
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def _pick(points, cost, axes, apart, count):  # type: ignore[no-untyped-def]
     """Indices of the cheapest points that are apart from each other in place or axis."""
     chosen = np.empty(count, np.int64)

@@ -8,11 +8,11 @@ is not observable: the rotation covariance is that of the tilt plus ``roll_varia
 import math
 from functools import lru_cache
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.tangent import fill_tangent
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ SMALLEST_PIVOT = 1e-9
 rounding is felt, and what the fluxes hardly determine is looked for among the eigenvectors."""
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def inverse_by_factor(matrix, inverse):  # type: ignore[no-untyped-def]
     """Write the inverse of a symmetric matrix (n, n) of unit diagonal into ``inverse``.
 
@@ -71,7 +71,7 @@ def inverse_by_factor(matrix, inverse):  # type: ignore[no-untyped-def]
     return True
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def bounded_inverse(information):  # type: ignore[no-untyped-def]
     """Return the covariance of a symmetric, positive semidefinite information matrix.
 
@@ -100,7 +100,7 @@ def bounded_inverse(information):  # type: ignore[no-untyped-def]
     return covariance
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def]
     """Return the covariance of a single coil's pose.
 
@@ -151,7 +151,7 @@ def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def
     return covariance
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def add_motion(covariance, position, next_position, axes, next_axes, share):  # type: ignore[no-untyped-def]
     """Add to a pose's covariance (6, 6), in place, a part of its last motion as an error.
 

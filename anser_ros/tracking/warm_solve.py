@@ -4,10 +4,10 @@ One by one, calling the kernels takes longer than what they calculate. The lock 
 is kept: who gives it away in the middle of a frame waits for another thread's turn to end.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.kernel_cache import kernel
 from anser_ros.stamps import NANO
 from anser_ros.tracking.coil_track import (
     UNKNOWNS,
@@ -24,7 +24,7 @@ from anser_ros.tracking.solve_context import SolveContext
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True, error_model='numpy')
+@kernel
 def descend_all(  # type: ignore[no-untyped-def]
     positions, axes, lengths, fluxes, whitening, dipoles, moments, low, high, budget, normals,
     residuals, found,

@@ -25,7 +25,7 @@ from anser_ros.errors import BagError, LayoutError, SetupError
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
 from anser_ros.wire.pose_topics import optical_stem
-from anser_ros.wire.quaternion import unit_quaternions
+from anser_ros.wire.quaternion import pose_numbers, unit_quaternions
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
 
@@ -162,13 +162,9 @@ def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[Ra
 
 
 def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[RawMessage]:
-    """Yield the messages of a bag by ascending log time.
+    """Yield the messages of a bag, or of its folder, by ascending log time.
 
-    Parameters
-    ----------
-    path : path of the ``.mcap`` file or of the bag's folder
-    salvage : Salvage
-        Filled with what could not be read.
+    What could not be read is filled into ``salvage``.
 
     Raises
     ------
@@ -181,55 +177,37 @@ def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[Ra
             words = 'not an MCAP file' if os.path.getsize(name) else 'the file is empty'
             raise BagError(f'{name}: {words}{_import_words(name)}')
         stream.seek(0)
-        count = 0
-        messages = _indexed(stream)
-        if messages is not None:
-            try:
-                for message in messages:
-                    count += 1
-                    yield message
+        last, messages = -1, _indexed(stream)
+        try:
+            for message in messages or ():
+                yield message
+                last = message.log_time_ns
+            if messages is not None:
                 return
-            except _BROKEN as error:
-                salvage.lost = f'{type(error).__name__}: {error}'
-                last = message.log_time_ns if count else -1
-                stream.seek(0)
-                rest = _streamed(stream, salvage, os.path.getsize(name))
-                rest = [message for message in rest if message.log_time_ns > last]
-                yield from rest
-                return
+        except _BROKEN as error:
+            salvage.lost = f'{type(error).__name__}: {error}'
         stream.seek(0)
-        for message in _streamed(stream, salvage, os.path.getsize(name)):
-            count += 1
-            yield message
-        if count == 0:
+        rest = _streamed(stream, salvage, os.path.getsize(name))
+        rest = [message for message in rest if message.log_time_ns > last]
+        if not rest and last < 0:
             raise BagError(f'{name}: no message can be read ({salvage.lost or "empty bag"})')
+        yield from rest
 
 
-class MessageDecoder:
+class MessageDecoder(DecoderFactory):  # type: ignore[misc]
     """Turns raw messages into objects with the message's attributes, without ROS."""
-
-    def __init__(self) -> None:
-        self._factory = DecoderFactory()
-        self._decoders: dict[int, Any] = {}
 
     def decode(self, message: RawMessage) -> Any:
         """Decode one message; raises `BagError` when its bytes don't fit its schema."""
-        decoder = self._decoders.get(message.schema.id)
         try:
-            if decoder is None:
-                decoder = self._factory.decoder_for(
-                    message.channel.message_encoding, message.schema
-                )
-                self._decoders[message.schema.id] = decoder
-            if decoder is None:
-                raise BagError(f'{message.topic}: no decoder for {message.type_name}')
-            return decoder(message.data)
-        except BagError:
-            raise
+            decoder = self.decoder_for(message.channel.message_encoding, message.schema)
+            if decoder is not None:
+                return decoder(message.data)
         except Exception as error:  # the decoder's errors have no root of their own
             raise BagError(
                 f'{message.topic}: {message.type_name} does not decode: {error}'
             ) from error
+        raise BagError(f'{message.topic}: no decoder for {message.type_name}')
 
 
 class _Collector:
@@ -271,8 +249,8 @@ class _Collector:
 
     def _add_pose(self, raw: RawMessage) -> None:
         message = self.decoder.decode(raw)
-        p, q = message.pose.position, message.pose.orientation
-        values = (p.x, p.y, p.z, *unit_quaternions((q.x, q.y, q.z, q.w)).tolist())
+        numbers = pose_numbers(message.pose)
+        values = (*numbers[:3], *unit_quaternions(numbers[3:]).tolist())
         if not np.isfinite(values).all():
             raise LayoutError('a pose with values not finite or a quaternion not of unit length')
         body = optical_stem(raw.topic)
@@ -334,7 +312,7 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
         collector.add(raw)
     if not collector.setups:
         raise BagError(f'{os.fspath(path)}: the bag has no setup; anser import --setup adds one')
-    text = collector.setups[-1]  # acquisition tells rate and noise once its stream is there
+    text = collector.setups[-1]  # acquisition adds rate and noise once its stream is there
     try:
         setup = parse_setup(text)
     except SetupError as error:

@@ -59,16 +59,7 @@ class BagRecord:
 def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bool = True) -> None:
     """Write ``metadata.yaml`` of the folder that holds one MCAP file, in place of an older one.
 
-    Parameters
-    ----------
-    path : Path
-        The MCAP file.
-    record : BagRecord
-        What it holds.
-    ros_distro : str
-        Name of the ROS distribution.
-    is_closed : bool
-        False while the bag is still being written.
+    The bag may still be written: then it is not ``is_closed``.
     """
     times = {
         'duration': {'nanoseconds': record.last_ns - record.first_ns},
@@ -99,8 +90,7 @@ def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bo
 
 
 def bag_summary(folder: Path) -> dict[str, Any]:
-    """Return what a bag's ``metadata.yaml`` tells: ``duration_s``, ``messages``, ``closed``; {}
-    without.
+    """Return ``duration_s``, ``messages`` and ``closed`` of a bag's ``metadata.yaml``; {} if none.
 
     A bag that was not closed may hold more than that; its readers do not use this file.
     """

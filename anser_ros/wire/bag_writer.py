@@ -7,15 +7,11 @@ leaves a bag with an index, a file without a name keeps the space for it.
 
 import contextlib
 import os
-import zlib
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
-import numpy as np
-from mcap.records import ChunkIndex
 from mcap.well_known import Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
@@ -62,99 +58,13 @@ class _Segments:
         self._waiting.clear()
 
 
-class _PackedIndices:
-    """The index of a bag's chunks as the MCAP writer fills it, reads it at the end and writes it.
+class BagWriter:
+    """Writes messages into one MCAP file, which is closed at the end of a ``with`` block.
 
-    An entry is a few hundred bytes; as objects of the writer, four a second take 40 MB an hour.
-    Kept are its numbers as they differ from those before, which hardly change from chunk to chunk.
-    """
-
-    def __init__(self) -> None:
-        self._compressor = zlib.compressobj()
-        self._packed = bytearray()
-        self._compression = ''
-        self._end_ns = self._end = 0
-
-    def append(self, index: ChunkIndex) -> None:
-        """Take in the entry of one more chunk."""
-        start, length = index.chunk_start_offset, index.chunk_length
-        offsets = index.message_index_offsets
-        places = np.diff([start + length, *offsets.values()]).tolist()
-        numbers = [
-            index.message_start_time - self._end_ns,
-            index.message_end_time - index.message_start_time,
-            start - self._end, length, index.message_index_length, index.compressed_size,
-            index.uncompressed_size, len(offsets), *offsets, *places,
-        ]  # fmt: skip
-        self._packed += self._compressor.compress(np.array(numbers, dtype=np.int64).tobytes())
-        self._compression = index.compression
-        self._end_ns, self._end = index.message_end_time, start + length
-
-    def __iter__(self) -> Iterator[ChunkIndex]:
-        ending = self._compressor.copy()
-        whole = zlib.decompress(bytes(self._packed) + ending.flush())
-        numbers, at, end_ns, end = np.frombuffer(whole, dtype=np.int64), 0, 0, 0
-        while at < numbers.size:
-            pause, span, gap, length, *sizes, count = numbers[at : at + 8].tolist()
-            at += 8
-            channels, places = numbers[at : at + 2 * count].reshape(2, count)
-            at += 2 * count
-            first_ns, start = end_ns + pause, end + gap
-            end_ns, end = first_ns + span, start + length
-            yield ChunkIndex(
-                chunk_length=length,
-                chunk_start_offset=start,
-                compression=self._compression,
-                message_start_time=first_ns,
-                message_end_time=end_ns,
-                message_index_offsets=dict(
-                    zip(channels.tolist(), (end + np.cumsum(places)).tolist(), strict=True)
-                ),
-                message_index_length=sizes[0],
-                compressed_size=sizes[1],
-                uncompressed_size=sizes[2],
-            )
-
-
-class Closing(ABC):
-    """Is closed at the end of a ``with`` block.
-
-    A block that fails leaves no file, as half of one would be taken for a whole session.
-    """
-
-    @abstractmethod
-    def close(self) -> None:
-        """Write what is left and close the file."""
-
-    @abstractmethod
-    def remove(self) -> None:
-        """Remove the closed file."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        try:
-            self.close()
-        finally:
-            if kind is not None:
-                self.remove()
-
-
-class BagWriter(Closing):
-    """Writes messages into one MCAP file.
-
-    Parameters
-    ----------
-    path : str or Path
-        The ``.mcap`` file; it must not exist yet, its folder is made.
-    raw : unbuffered binary stream, optional
-        Written to instead of a file at ``path``.
+    The file must not exist yet; its folder is made. An unbuffered binary stream may be given to be
+    written to instead. A block that fails leaves no file, as half of one would be taken for a
+    whole session. Until the end the index of all chunks is in memory, 40 MB for an hour of forty
+    topics.
 
     Raises
     ------
@@ -184,10 +94,23 @@ class BagWriter(Closing):
             chunk_size=CHUNK_BYTES,
             compression=CompressionType.ZSTD,
         )
-        # The writer keeps them in a list that it offers no other way to replace.
-        self._writer._Writer__chunk_indices = _PackedIndices()  # type: ignore[attr-defined]
         self._schemas: dict[str, int] = {}
         self._writer.start(profile=Profile.ROS2, library=LIBRARY)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.close()
+        finally:
+            if kind is not None and self._is_made:
+                self.path.unlink(missing_ok=True)
 
     @property
     def is_open(self) -> bool:
@@ -202,20 +125,11 @@ class BagWriter(Closing):
         qos: Sequence[Mapping[str, Any]] = (),
         type_hash: str = '',
     ) -> int:
-        """Announce a topic and return its channel.
+        """Announce a topic by its absolute name and return its channel.
 
-        Parameters
-        ----------
-        name : str
-            Absolute topic name.
-        type_name : str
-            Such as ``sensor_msgs/msg/PointCloud2``.
-        definition : str
-            The text of its definition, followed by those of all types that it contains.
-        qos : sequence of mapping
-            What its publishers offer (:func:`qos_profile`).
-        type_hash : str
-            REP 2011's hash, empty when it is not known.
+        The definition of its type is followed by those of all types in it; ``qos`` is what its
+        publishers offer (:func:`qos_profile`), and the hash, of REP 2011, empty when it is not
+        known.
         """
         if type_name not in self._schemas:
             self._schemas[type_name] = self._writer.register_schema(
@@ -257,7 +171,9 @@ class BagWriter(Closing):
         """
         if not self.is_open:
             return
-        self._free_space()
+        if self._reserve is not None:
+            os.close(self._reserve)
+            self._reserve = None
         try:
             self._writer.finish()
             self._segments.flush()
@@ -277,13 +193,3 @@ class BagWriter(Closing):
             self.path.unlink()
             raise
         return descriptor
-
-    def remove(self) -> None:
-        """Remove the closed file, unless the caller gave the stream."""
-        if self._is_made:
-            self.path.unlink(missing_ok=True)
-
-    def _free_space(self) -> None:
-        if self._reserve is not None:
-            os.close(self._reserve)
-            self._reserve = None

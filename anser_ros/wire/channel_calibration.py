@@ -33,13 +33,9 @@ class ChannelResponse:
 
 @dataclass(frozen=True)
 class ChannelCalibration:
-    """Holds the responses of all channels.
+    """Holds the responses of channels by number, and a default for all others.
 
-    Attributes
-    ----------
-    default : for channels that are not named
-    channels : by channel number
-    current_delay_s : delay of the sum-of-currents channel
+    ``current_delay_s`` is the delay of the sum-of-currents channel.
     """
 
     default: ChannelResponse

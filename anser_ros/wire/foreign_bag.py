@@ -10,7 +10,6 @@ import sqlite3
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,45 +36,34 @@ class ForeignMessage(NamedTuple):
     definition: str
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """The files of a bag, in order, and whether each message is compressed by itself."""
-
-    files: tuple[Path, ...]
-    by_message: bool
-
-
 def read_foreign(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[ForeignMessage]:
     """Yield the messages of a bag, one file after the other, each by its times of recording.
 
-    Parameters
-    ----------
-    path : path
-        A ``.db3`` or ``.mcap`` file, also with ``.zstd`` behind it, or a bag's folder.
-    salvage : Salvage
-        Filled with what could not be read.
+    The path is of a ``.db3`` or ``.mcap`` file, also with ``.zstd`` behind it, or of a bag's
+    folder. What could not be read is filled into ``salvage``.
 
     Raises
     ------
     BagError
         When there is no such bag, or a file of it is no bag or cannot be unpacked.
     """
-    parts = _parts(Path(path))
-    for file in parts.files:
+    files, by_message = _parts(Path(path))
+    for file in files:
         with tempfile.TemporaryDirectory() as folder:
             plain = _unpacked(file, Path(folder))
             messages = _sqlite(plain) if plain.suffix == '.db3' else _mcap(plain, salvage)
             try:
                 for message in messages:
-                    data = _unpack(message, file) if parts.by_message else message.data
+                    data = _unpack(message, file) if by_message else message.data
                     yield message._replace(data=data)
             except BagError as error:  # about what was unpacked, which nobody knows
                 raise BagError(str(error).replace(str(plain), str(file))) from error
 
 
-def _parts(path: Path) -> _Parts:
+def _parts(path: Path) -> tuple[list[Path], bool]:
+    """The files of a bag, in order, and whether each message is compressed by itself."""
     if path.is_file():
-        return _Parts((path,), False)
+        return [path], False
     if not path.is_dir():
         raise BagError(f'{path}: no such bag')
     described = path / 'metadata.yaml'
@@ -83,7 +71,7 @@ def _parts(path: Path) -> _Parts:
         found = sorted(f for f in path.iterdir() if _kind(f) in ('.db3', '.mcap'))
         if not found:
             raise BagError(f'{path}: a folder without metadata.yaml, .db3 and .mcap files')
-        return _Parts(tuple(found), False)
+        return found, False
     try:
         about = read_yaml(described.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
         names = [str(name) for name in about['relative_file_paths']]
@@ -95,12 +83,12 @@ def _parts(path: Path) -> _Parts:
         raise BagError(f'{described}: compressed by {form}, of which only zstd is read')
     files = []
     for name in names:
-        file = path / Path(name).name  # older versions of rosbag2 tell the folder too
+        file = path / Path(name).name  # older versions of rosbag2 write the folder too
         packed = file.with_name(file.name + ZSTD)
         files.append(packed if packed.is_file() and not file.is_file() else file)
         if not files[-1].is_file():
             raise BagError(f'{path}: {files[-1].name} of the bag is missing')
-    return _Parts(tuple(files), mode == 'MESSAGE')
+    return files, mode == 'MESSAGE'
 
 
 def _kind(path: Path) -> str:

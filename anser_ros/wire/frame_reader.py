@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from anser_ros.errors import FrameError
 from anser_ros.wire.frames import (
@@ -62,7 +62,7 @@ class FrameReader:
 
     def fault_counters(self) -> dict[str, int]:
         """Return names and values of the counters, in the order of declaration."""
-        return {field.name: getattr(self.counters, field.name) for field in fields(FrameCounters)}
+        return dict(vars(self.counters))
 
     def feed(self, data: bytes) -> list[Record]:
         """Take bytes as they come and return the records that they complete."""

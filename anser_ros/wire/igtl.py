@@ -86,9 +86,7 @@ def read_header(data: bytes) -> Header | None:
 
 
 def resolution_s(header: Header, body: bytes) -> float:
-    """Return the time between two TDATA that a client asked for, s; 0 for as often as there is
-    something.
-    """
+    """Return the time between two TDATA that a client asked for, s; 0 for as often as possible."""
     content = body[12:] if header.version > 1 else body  # behind the extended header
     if len(content) < 4:
         return 0.0
@@ -96,8 +94,7 @@ def resolution_s(header: Header, body: bytes) -> float:
 
 
 def device_names(named: Mapping[str, str]) -> dict[str, str]:
-    """Return the device of each name; a longer name than the protocol has room for loses its
-    beginning.
+    """Return the device of each name; one too long for the protocol loses its beginning.
 
     Raises
     ------
@@ -123,7 +120,7 @@ def device_names(named: Mapping[str, str]) -> dict[str, str]:
 
 
 def state_device(device: str) -> str:
-    """Return the name of the device that tells the state of another one."""
+    """Return the name of the device that reports the state of another one."""
     return (device + '/state')[-NAME_BYTES:]
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import LayoutError
 from anser_ros.fingerprint import DIGITS
-from anser_ros.wire.points import FLOAT32, UINT16, UINT32, PointFieldTuple
+from anser_ros.wire.points import FLOAT32, UINT16, UINT32, PointFieldTuple, packed, phasor_names
 
 ComplexArray = NDArray[np.complex128]
 
@@ -54,22 +54,15 @@ def _layout(
     n_emitters: int, has_origin: bool = True
 ) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]']:
     """Fields and record; what was recorded before 0.2 does not state which model it is from."""
-    fields: list[PointFieldTuple] = [
-        ('mode', 0, UINT16, 1),
-        ('dipole', 2, UINT16, 1),
-        ('flux_error', 4, FLOAT32, 1),
-        ('follows', 8, UINT32, 1),
-        ('withheld', 12, UINT32, 1),
-    ]
-    for k in range(n_emitters):
-        fields.append((f'm{k}_re', 16 + 8 * k, FLOAT32, 1))
-        fields.append((f'm{k}_im', 20 + 8 * k, FLOAT32, 1))
+    columns = [
+        ('mode', UINT16), ('dipole', UINT16), ('flux_error', FLOAT32), ('follows', UINT32),
+        ('withheld', UINT32), *((name, FLOAT32) for name in phasor_names('m', n_emitters)),
+    ]  # fmt: skip
     record: list[Any] = [*_HEAD, ('m', '<f4', 2 * n_emitters)]
     if has_origin:
-        end = 16 + 8 * n_emitters
-        fields += [('fingerprint', end, UINT32, 1), ('effects', end + 4, UINT32, 1)]
+        columns += [('fingerprint', UINT32), ('effects', UINT32)]
         record += [('fingerprint', '<u4'), ('effects', '<u4')]
-    return fields, np.dtype(record)
+    return packed(columns)[0], np.dtype(record)
 
 
 def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, bytes]:

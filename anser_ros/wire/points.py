@@ -5,7 +5,7 @@ or in another order, is read right. A field is the tuple ``(name, offset, dataty
 the datatype codes of ``sensor_msgs/PointField``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -168,16 +168,25 @@ def decode_flux(
     )
 
 
+def packed(columns: Iterable[tuple[str, int]]) -> tuple[list[PointFieldTuple], int]:
+    """Return the fields of columns (name, datatype) without gaps, and point_step."""
+    fields, step = [], 0
+    for name, datatype in columns:
+        fields.append((name, step, datatype, 1))
+        step += np.dtype(_CODES[datatype]).itemsize
+    return fields, step
+
+
+def phasor_names(stem: str, n_emitters: int) -> list[str]:
+    """Return the names of the columns of phasors, real and imaginary part of each emitter."""
+    return [f'{stem}{k}_{part}' for k in range(n_emitters) for part in ('re', 'im')]
+
+
 def flux_fields(n_emitters: int) -> tuple[list[PointFieldTuple], int]:
     """Return the fields and point_step of the flux layout (92 bytes with eight emitters)."""
-    fields = [
-        (name, 4 * i, FLOAT32, 1) for i, name in enumerate(('x', 'y', 'z', 'nx', 'ny', 'nz'))
-    ]
-    fields += [('channel', 24, UINT16, 1), ('flags', 26, UINT16, 1)]
-    for k in range(n_emitters):
-        fields.append((f'coil{k}_re', 28 + 8 * k, FLOAT32, 1))
-        fields.append((f'coil{k}_im', 32 + 8 * k, FLOAT32, 1))
-    return fields, 28 + 8 * n_emitters
+    geometry = [(name, FLOAT32) for name in ('x', 'y', 'z', 'nx', 'ny', 'nz')]
+    phasors = [(name, FLOAT32) for name in phasor_names('coil', n_emitters)]
+    return packed([*geometry, ('channel', UINT16), ('flags', UINT16), *phasors])
 
 
 def encode_flux(points: FluxPoints) -> tuple[list[PointFieldTuple], int, bytes]:
@@ -217,10 +226,8 @@ def decode_field_model(
 def encode_field_model(points: DipolePoints) -> tuple[list[PointFieldTuple], int, bytes]:
     """Pack a field model cloud: fields, point_step and bytes."""
     count, n_emitters = points.moments.shape
-    names = ['x', 'y', 'z', 'ux', 'uy', 'uz']
-    names += [f'm{k}_{part}' for k in range(n_emitters) for part in ('re', 'im')]
+    names = ['x', 'y', 'z', 'ux', 'uy', 'uz', *phasor_names('m', n_emitters)]
     values = np.empty((count, len(names)), dtype='<f8')
     values[:, :3], values[:, 3:6] = points.positions, points.directions
     values[:, 6::2], values[:, 7::2] = points.moments.real, points.moments.imag
-    fields = [(name, 8 * i, FLOAT64, 1) for i, name in enumerate(names)]
-    return fields, 8 * len(names), values.tobytes()
+    return *packed((name, FLOAT64) for name in names), values.tobytes()

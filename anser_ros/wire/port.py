@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import Enum
 
 import serial
@@ -67,14 +67,10 @@ class PortCounters:
 
 @dataclass(frozen=True)
 class Batch:
-    """Holds records that were received together.
+    """Holds records that were received together, in the order of the stream.
 
-    Attributes
-    ----------
-    arrival_ns : monotonic host time right after the read of the last one
-    records : in the order of the stream; empty when the connection began or ended
-    connected : False tells that the connection ended
-    arrivals_ns : the same time of each record
+    Times are those of the monotonic host clock right after the read of each, and of the last one.
+    There is no record when the connection began, or ended and is not ``connected``.
     """
 
     arrival_ns: int
@@ -86,20 +82,11 @@ class Batch:
 class ControlUnitPort:
     """Reads the control unit in a separate thread.
 
-    Parameters
-    ----------
-    device : device path, or any pyserial URL
-    protocol : how the control unit speaks
-    baud : line speed; without meaning on USB and pseudo-terminals
-    silence_s : no byte for so long is a fault; a hello comes once a second even when idle
-    queue_blocks : blocks of samples that may wait for the receiver
-    pause_s, longest_pause_s : first and longest pause between attempts to open, doubled each time
-
-    Attributes
-    ----------
-    blocks_wanted : blocks to collect before the receiver is woken; it may change this at any time
-        by `want`. A receiver that needs twenty blocks for a window is spared nineteen changes of
-        threads.
+    The device is a path or any pyserial URL; ``baud`` is without meaning on USB. No byte for
+    ``silence_s`` is a fault, as a hello comes once a second. So many blocks of samples may wait
+    for the receiver, and the pause between attempts to open is doubled up to the longest. The
+    receiver is woken for ``blocks_wanted`` blocks, which it may change by `want`: one that needs
+    twenty for a window is spared nineteen changes of threads.
     """
 
     def __init__(
@@ -197,8 +184,7 @@ class ControlUnitPort:
 
     def fault_counters(self) -> dict[str, int]:
         """Return all counters by name, the frame reader's included."""
-        ours = {field.name: getattr(self.counters, field.name) for field in fields(self.counters)}
-        return ours | self._reader.fault_counters()
+        return vars(self.counters) | self._reader.fault_counters()
 
     @property
     def last_refusal(self) -> str:
@@ -324,12 +310,7 @@ def find_port(
 ) -> str:
     """Find the control unit's port by listening for its hello; nothing is written to any device.
 
-    Parameters
-    ----------
-    candidates : device paths to try; all serial ports of the computer by default
-    protocol : how the control unit speaks
-    baud : line speed
-    listen_s : how long to listen to each; a hello comes once a second
+    All serial ports of the computer are tried where no candidates are given.
 
     Raises
     ------

@@ -18,10 +18,7 @@ from anser_ros.wire.records import Hello, Payload, Record, SetFrequencies, check
 class RecordReader(Protocol):
     """Finds records in received bytes; one instance serves one port for as long as it exists.
 
-    Attributes
-    ----------
-    last_refusal : str
-        Why the last refused record was refused, in words for an operator; empty when none was.
+    ``last_refusal`` says in words for an operator why the last refused record was refused.
     """
 
     last_refusal: str

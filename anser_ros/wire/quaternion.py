@@ -1,4 +1,6 @@
-"""Judges whether four numbers that came from outside are the quaternion of a rotation."""
+"""Takes numbers of a pose message, and judges whether four are the quaternion of a rotation."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,3 +18,9 @@ def unit_quaternions(given: ArrayLike) -> NDArray[np.float64]:
     with np.errstate(invalid='ignore', divide='ignore'):
         unit = np.where(abs(length - 1.0) <= LENGTH_TOLERANCE, quaternions / length, np.nan)
     return np.asarray(unit)
+
+
+def pose_numbers(pose: Any) -> tuple[float, ...]:
+    """Return x y z and the quaternion x y z w of a ``geometry_msgs/Pose``, whoever decoded it."""
+    p, q = pose.position, pose.orientation
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w

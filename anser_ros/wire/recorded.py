@@ -10,17 +10,7 @@ from anser_ros.wire.setup import Setup
 
 @dataclass(frozen=True)
 class RecordedFluxes:
-    """Holds the fluxes of one topic.
-
-    Attributes
-    ----------
-    stamp_ns : ndarray, shape (F,)
-        Header stamps, ascending.
-    channel : ndarray, shape (S,)
-    flags : ndarray, shape (F, S)
-    flux : ndarray, shape (F, S, K), complex
-        T; NaN (with the flag `STALE`) where a frame lacks the channel.
-    """
+    """Holds the fluxes (F, S, K) of one topic, T, with flags (F, S), by ascending stamps (F,)."""
 
     stamp_ns: NDArray[np.int64]
     channel: NDArray[np.int64]

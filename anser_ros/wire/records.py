@@ -72,13 +72,9 @@ class ReplyCode(IntEnum):
 
 @dataclass(frozen=True)
 class Channel:
-    """Describes one column of the sample blocks.
+    """Describes one column of the sample blocks by its channel number in the setup document.
 
-    Attributes
-    ----------
-    number : the channel number of the setup document (the current channel's is its own)
-    kind : what it measures
-    full_scale : volts (sense) or amperes (current) at code 32768
+    The full scale is in volts (sense) or amperes (current), at code 32768.
     """
 
     number: int
@@ -88,17 +84,10 @@ class Channel:
 
 @dataclass(frozen=True)
 class Hello:
-    """States what the control unit is and how it samples; sent once a second and after each
-    change.
+    """States what the control unit is and how it samples, once a second and after each change.
 
-    Attributes
-    ----------
-    device : name and serial number, UTF-8
-    sample_rate_hz, tick_hz : sampling rate a channel, rate of the device's timestamp counter
-    block_samples : sampling instants in every block
-    channels : columns of a block, in their order
-    frequencies_hz, currents_a : drive tone and nominal peak current of each emitter coil
-    minor : minor version of the protocol
+    Rates are those of sampling, a channel, and of the device's timestamp counter; channels are the
+    columns of a block, and tones and nominal peak currents those of the emitter coils.
     """
 
     device: str
@@ -117,14 +106,9 @@ class Hello:
 
 @dataclass(frozen=True)
 class SampleBlock:
-    """Holds consecutive samples of all channels.
+    """Holds consecutive samples of all channels: codes (n, C), a view into the received bytes.
 
-    Attributes
-    ----------
-    sequence : number of the block since START, modulo 2^32
-    timestamp_ticks : device time of the first sample
-    codes : ndarray, shape (n, C), int16, ADC codes, read-only view into the received bytes
-    flags : bits of `SamplesFlag`
+    Blocks are numbered since START, modulo 2^32; ticks are the device's time of the first sample.
     """
 
     sequence: int

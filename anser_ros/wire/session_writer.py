@@ -8,23 +8,17 @@ from numpy.typing import NDArray
 
 from anser_ros.wire import cdr
 from anser_ros.wire.bag_metadata import qos_profile
-from anser_ros.wire.bag_writer import BagWriter, Closing
+from anser_ros.wire.bag_writer import BagWriter
 from anser_ros.wire.points import STALE, FluxPoints, PointFieldTuple, encode_flux
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec
 
+SETUP_TOPIC, SETUP_TYPE = '/anser/setup', 'std_msgs/msg/String'
 FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
 """Topics of a session's fluxes, and whether their sensors are fixed to the field generator."""
 
 
-class SessionWriter(Closing):
-    """Writes a session without ROS: setup, fluxes and poses, log time = stamp.
-
-    Parameters
-    ----------
-    path : str or Path
-        The ``.mcap`` file; it must not exist yet.
-    frame_id : str
-        Frame of the fluxes and poses.
+class SessionWriter(BagWriter):
+    """Writes a session without ROS: setup, fluxes and poses of one frame, log time = stamp.
 
     Raises
     ------
@@ -33,33 +27,27 @@ class SessionWriter(Closing):
     """
 
     def __init__(self, path: str | Path, frame_id: str = 'fg') -> None:
-        self._bag = BagWriter(path)
+        super().__init__(path)
         self._frame_id = frame_id
         self._channels: dict[str, int] = {}
 
     def write_setup(self, text: str, stamp_ns: int) -> None:
         """Write the setup document."""
-        channel = self._channel('/anser/setup', 'std_msgs/msg/String', latched=True)
-        self._bag.write(channel, stamp_ns, cdr.string_bytes(text))
+        channel = self.channel(SETUP_TOPIC, SETUP_TYPE)
+        self.write(channel, stamp_ns, cdr.string_bytes(text))
 
     def write_readings(
         self, sensors: Sequence[SensorSpec], stamp_ns: int, flux: NDArray[np.complex128]
     ) -> None:
-        """Write one window: a message of the tools' sensors and one of the references, if any.
+        """Write one window, stamped with its middle: a message of tools, and one of references.
 
-        Parameters
-        ----------
-        sensors : sequence of SensorSpec
-            The S sensors that the window is of.
-        stamp_ns : int
-            Its middle.
-        flux : ndarray, shape (S, K), complex
-            T; NaN where there is no reading, and for emitters without current.
+        Fluxes are (S, K), T, of the S sensors that are given: NaN where there is no reading, and
+        for emitters without current.
         """
         for topic, fixed in FLUX_TOPICS.items():
             rows = [i for i, s in enumerate(sensors) if (s.body == FIELD_GENERATOR) == fixed]
             if rows:
-                points = _points([sensors[i] for i in rows], flux[rows], fixed)
+                points = _points([sensors[i] for i in rows], flux[rows])
                 fields, step, data = encode_flux(points)
                 self.write_flux(topic, stamp_ns, fields, step, len(rows), data)
 
@@ -73,10 +61,10 @@ class SessionWriter(Closing):
         data: bytes,
     ) -> None:
         """Write one window's cloud, as `anser_ros.wire.points.encode_flux` packs it."""
-        channel = self._channel(topic, 'sensor_msgs/msg/PointCloud2')
+        channel = self.channel(topic, 'sensor_msgs/msg/PointCloud2')
         frame = self._frame_id
         message = cdr.cloud_bytes(stamp_ns, frame, fields, point_step, width, data)
-        self._bag.write(channel, stamp_ns, message)
+        self.write(channel, stamp_ns, message)
 
     def write_pose(
         self,
@@ -86,40 +74,28 @@ class SessionWriter(Closing):
         quaternion_xyzw: Sequence[float],
     ) -> None:
         """Write one pose: position in m, unit quaternion."""
-        channel = self._channel(topic, 'geometry_msgs/msg/PoseStamped')
+        channel = self.channel(topic, 'geometry_msgs/msg/PoseStamped')
         message = cdr.pose_bytes(stamp_ns, self._frame_id, position, quaternion_xyzw)
-        self._bag.write(channel, stamp_ns, message)
+        self.write(channel, stamp_ns, message)
 
-    def close(self) -> None:
-        """Write the index and close the file."""
-        self._bag.close()
+    def channel(self, topic: str, type_name: str, definition: str = '') -> int:
+        """Return the channel of a topic, announced when it is first asked for; a setup is latched.
 
-    def remove(self) -> None:
-        """Remove the closed file."""
-        self._bag.remove()
-
-    def _channel(self, topic: str, type_name: str, latched: bool = False) -> int:
+        The types of a session need no definition.
+        """
         if topic not in self._channels:
+            latched = topic.endswith('/setup')
             qos = [qos_profile(latched=latched, depth=1 if latched else 100)]
-            definition = cdr.DEFINITIONS[type_name]
-            self._channels[topic] = self._bag.add_topic(topic, type_name, definition, qos)
+            text = cdr.DEFINITIONS.get(type_name, definition)
+            self._channels[topic] = self.add_topic(topic, type_name, text, qos)
         return self._channels[topic]
 
 
-def _points(
-    sensors: Sequence[SensorSpec], flux: NDArray[np.complex128], fixed: bool
-) -> FluxPoints:
-    """One window's cloud; a sensor lacks its reading where it has none of an emitter in force.
+def _points(sensors: Sequence[SensorSpec], flux: NDArray[np.complex128]) -> FluxPoints:
+    """One window's cloud; a sensor lacks its reading where it has none of a driven emitter.
 
     The place of a sensor that moves is not known to its fluxes.
     """
-    known = np.isfinite(flux)
+    known, rows = np.isfinite(flux), SensorRows.of(sensors, fixed_only=True)
     lacks = (known != known.any(axis=0)).any(axis=1) | ~known.any()
-    nothing = np.full((len(sensors), 3), np.nan)
-    return FluxPoints(
-        channel=np.array([sensor.channel for sensor in sensors]),
-        flags=np.where(lacks, STALE, 0),
-        flux=flux,
-        position=np.array([sensor.position_m for sensor in sensors]) if fixed else nothing,
-        axis=np.array([sensor.axis for sensor in sensors]) if fixed else nothing,
-    )
+    return FluxPoints(rows.channel, np.where(lacks, STALE, 0), flux, rows.position, rows.axis)

@@ -5,16 +5,18 @@ positions and axes are given in the frame of the sensor's body; the body ``fg`` 
 generator itself.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.fingerprint import Identity, fingerprint_of
-from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
+from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, sections_of, settings_from
 from anser_ros.wire.setup_tips import TipSpec, dump_tips, parse_tips, refuse_unknown_bodies
 from anser_ros.wire.setup_values import (
     Vector,
@@ -79,6 +81,24 @@ class SensorSpec:
     axis: Vector
     length_m: float
     windings: tuple[Winding, ...] = ()
+
+
+class SensorRows(NamedTuple):
+    """Holds channels (S,), positions, m, and unit axes (S, 3), in the frames of bodies."""
+
+    channel: NDArray[np.int64]
+    position: NDArray[np.float64]
+    axis: NDArray[np.float64]
+
+    @staticmethod
+    def of(sensors: Sequence[SensorSpec], fixed_only: bool = False) -> 'SensorRows':
+        """Return sensors in their order; with ``fixed_only`` places of what moves are NaN."""
+        position = np.array([s.position_m for s in sensors], np.float64).reshape(-1, 3)
+        axis = np.array([s.axis for s in sensors], np.float64).reshape(-1, 3)
+        if fixed_only:
+            moves = np.array([s.body != FIELD_GENERATOR for s in sensors], bool)
+            position[moves] = axis[moves] = np.nan
+        return SensorRows(np.array([s.channel for s in sensors], np.int64), position, axis)
 
 
 @dataclass(frozen=True)
@@ -283,15 +303,6 @@ def _parse_stated(root: dict[str, Any]) -> dict[str, float]:
     return stated
 
 
-def _stated_sections(stated: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """The sections that `_parse_stated` reads back; none that would be empty."""
-    sections = {
-        section: {name: stated[name] for name in names if name in stated}
-        for section, names in SECTIONS.items()
-    }
-    return {section: values for section, values in sections.items() if values}
-
-
 def parse_setup(text: str) -> Setup:
     """Read and check a setup document.
 
@@ -300,15 +311,6 @@ def parse_setup(text: str) -> Setup:
     `anser_ros.settings.Accuracy` and `anser_ros.settings.RefitSettings`; a value that is not
     stated has its default. ``fingerprint`` is for other readers and is computed again. Any other
     key is kept in ``extra``; one that looks like a misspelling is refused.
-
-    Parameters
-    ----------
-    text : str
-        YAML, schema ``anser_setup/1``.
-
-    Returns
-    -------
-    Setup
 
     Raises
     ------
@@ -361,27 +363,11 @@ def parse_setup(text: str) -> Setup:
 
 def dump_setup(setup: Setup) -> str:
     """Write a setup as the YAML document that `parse_setup` reads back unchanged."""
-    coils = [
-        {
-            'name': coil.name,
-            'centre_m': list(coil.centre_m),
-            'rotation_deg': coil.rotation_deg,
-            'frequency_hz': coil.frequency_hz,
-        }
-        for coil in setup.emitter.coils
-    ]
-    sensors = [
-        {
-            'channel': s.channel,
-            'name': s.name,
-            'body': s.body,
-            'position_m': list(s.position_m),
-            'axis': list(s.axis),
-            'length_m': s.length_m,
-            **({'windings': [list(w) for w in s.windings]} if s.windings else {}),
-        }
-        for s in setup.sensors
-    ]
+    emitter = setup.emitter
+    sensors = [asdict(sensor) for sensor in setup.sensors]
+    for sensor in sensors:
+        if not sensor['windings']:
+            del sensor['windings']
     corners = zip(('low_m', 'high_m'), setup.volume or (), strict=False)
     volume = {key: list(corner) for key, corner in corners}
     document = {
@@ -390,11 +376,15 @@ def dump_setup(setup: Setup) -> str:
         'frame_id': setup.frame_id,
         'flux_rate_hz': setup.flux_rate_hz,
         'flux_unit': 'T',
-        'emitter': {'kind': setup.emitter.kind, **setup.emitter.geometry, 'coils': coils},
+        'emitter': {
+            'kind': emitter.kind,
+            **emitter.geometry,
+            'coils': list(map(asdict, emitter.coils)),
+        },
         'sensors': sensors,
         **({'volume': volume} if volume else {}),
         **({'tips': dump_tips(setup.tips)} if setup.tips else {}),
-        **_stated_sections(setup.stated),
+        **{name: values for name, values in sections_of(setup.stated).items() if values},
         **setup.extra,
     }
     return str(yaml.dump(document, Dumper=DUMPER, sort_keys=False))

@@ -29,7 +29,7 @@ def read_number(value: Any, where: str, low: float = -math.inf, high: float = ma
     """Return a finite number within bounds."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise SetupError(f'setup: {where} must be a number, got {value!r}')
-    # A whole number may be too large for a float; its digits then are too many to be told.
+    # A whole number may be too large for a float; its digits then are too many to show.
     number = float(value) if abs(value) < LARGEST_NUMBER else math.inf
     if not math.isfinite(number) or not low <= number <= high:
         shown = repr(value) if math.isfinite(number) else 'a number that is not finite'

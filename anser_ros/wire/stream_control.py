@@ -30,15 +30,10 @@ round."""
 class StreamControl:
     """Follows the records of one connection and determines the commands to send.
 
-    The order is: hello, right tones, start, samples. Each command is repeated every half second
-    until the control unit does what it asks; a refusal is kept as text and not repeated. After a
-    hello that contradicts a good one, the unit is asked again for a minute. Samples that arrive
-    before the reply to the start command are left over from a buffer.
-
-    Parameters
-    ----------
-    frequencies_hz : drive tones that the setup document asks for
-    set_frequencies : whether the host may change the control unit's tones
+    The order is: hello, right tones (where the host may set them), start, samples. Each command is
+    repeated every half second until the control unit does what it asks; a refusal is kept as text
+    and not repeated. After a hello that contradicts a good one, the unit is asked again for a
+    minute. Samples that arrive before the reply to the start command are left over from a buffer.
     """
 
     def __init__(self, frequencies_hz: tuple[float, ...], *, set_frequencies: bool = True) -> None:

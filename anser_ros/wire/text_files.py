@@ -3,7 +3,11 @@
 import csv
 import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.errors import AnserError, ParameterError
 
@@ -38,3 +42,30 @@ def read_rows(path: str | os.PathLike[str]) -> tuple[list[str], list[dict[str, s
     except csv.Error as error:
         raise ParameterError(f'{os.fspath(path)}: no table: {error}') from error
     return list(reader.fieldnames or []), rows
+
+
+def numbers_of(
+    path: str | os.PathLike[str],
+    rows: Sequence[dict[str, str]],
+    names: Sequence[str],
+    *,
+    with_gaps: bool = False,
+) -> NDArray[np.float64]:
+    """Return columns of a table's rows as numbers, shape (rows, names).
+
+    Raises
+    ------
+    ParameterError
+        When a column is missing or a cell is no finite number; ``with_gaps`` empty ones are NaN.
+    """
+    try:
+        values = np.array(
+            [[float((row[n] or 'nan') if with_gaps else row[n]) for n in names] for row in rows]
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ParameterError(
+            f'{os.fspath(path)}: needs the columns {", ".join(names)} with numbers: {error}'
+        ) from error
+    if not (with_gaps or np.isfinite(values).all()):
+        raise ParameterError(f'{os.fspath(path)}: the columns {", ".join(names)} must be finite')
+    return values

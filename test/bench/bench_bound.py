@@ -56,7 +56,7 @@ from anser_ros.refit.tool_readings import (  # noqa: E402
     linearised,
 )
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.drawing import Drawing  # noqa: E402
+from anser_ros.sessions.drawing import NominalBoard  # noqa: E402
 from anser_ros.sessions.session import Session, load_session  # noqa: E402
 from anser_ros.sessions.volume import stated_volume  # noqa: E402
 
@@ -242,7 +242,7 @@ def rows(
     model = calibrate_sessions([load_session(scan)], Options(layout=LAYOUT, damping=1e-6)).model
     sessions = {name: load_session(paths[name]) for name in PATHS}
     setup = sessions['online/sweep'].setup
-    exc, _ = excitation_for(model, Drawing.of(setup).field, stated_volume(setup))
+    exc, _ = excitation_for(model, NominalBoard.of(setup).field, stated_volume(setup))
     tilt = np.log(model.frequencies_hz) - np.log(model.frequencies_hz).mean()
     found: dict[tuple[str, int, str], list[tuple[float, float]]] = {}
     for index in range(bodies):

@@ -112,7 +112,7 @@ def costs(session: Any, model: Any, baseline: Any) -> Iterator[dict[str, Any]]:
     """
     clean = np.nanmean(baseline.reference.flux, axis=0)
     begin = time.perf_counter()
-    drawing = ablation.Drawing.of(session.setup).field
+    drawing = ablation.NominalBoard.of(session.setup).field
     refit = LiveRefit(model, session.reference.sensors, clean, drawing=drawing)
     yield {'name': 'refit made ready', 'value': time.perf_counter() - begin, 'unit': 's'}
     spend(session, model, refit, slice(0, None, 3), 0.0)  # tables that are worked out once

@@ -18,7 +18,7 @@ import numpy as np
 from live_chain import METAL_FROM_S, world
 
 from anser_ros.refit.live_refit import LiveRefit
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.volume import stated_volume
@@ -43,7 +43,12 @@ def rows() -> Iterator[dict]:
         load_model(config_path('demo_model.yaml')),
     )
     refit = LiveRefit(
-        model, references, clean, setup.refit, Drawing.of(setup).field, volume=stated_volume(setup)
+        model,
+        references,
+        clean,
+        setup.refit,
+        NominalBoard.of(setup).field,
+        volume=stated_volume(setup),
     )
     spent, due = [], time.monotonic()
     for number, flux in enumerate(frames):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +19,7 @@ from anser_ros.signals.window import Window, WindowCutter
 from anser_ros.wire.channel_calibration import ChannelCalibration
 from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
 from anser_ros.wire.records import FULL_SCALE_CODE, ChannelKind, Hello, SampleBlock
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
-
-Array = NDArray[np.float64]
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, Setup
 
 
 @dataclass(frozen=True)
@@ -92,8 +89,8 @@ class FluxStream:
         self._newest: Window | None = None
         self._columns = np.array([columns[s.channel] for s in self.sensors])
         self._split = sum(s.body != FIELD_GENERATOR for s in self.sensors)
-        self._tool = _geometry(self.sensors[: self._split])
-        self._reference = _geometry(self.sensors[self._split :])
+        self._tool = SensorRows.of(self.sensors[: self._split], fixed_only=True)
+        self._reference = SensorRows.of(self.sensors[self._split :], fixed_only=True)
 
     @property
     def blocks_wanted(self) -> int:
@@ -193,22 +190,10 @@ class FluxStream:
         return converted
 
 
-def _geometry(sensors: Sequence[SensorSpec]) -> tuple[NDArray[np.int64], Array, Array]:
-    """Channels, and positions and axes in fg: NaN for what moves."""
-    fixed = np.array([s.body == FIELD_GENERATOR for s in sensors], bool)[:, None]
-    position = np.array([s.position_m for s in sensors]).reshape(-1, 3)
-    axis = np.array([s.axis for s in sensors]).reshape(-1, 3)
-    channel = np.array([s.channel for s in sensors], np.int64)
-    return channel, np.where(fixed, position, np.nan), np.where(fixed, axis, np.nan)
-
-
 def _points(
-    geometry: tuple[NDArray[np.int64], Array, Array],
-    flux: NDArray[np.complex128],
-    flags: NDArray[np.int64],
+    rows: SensorRows, flux: NDArray[np.complex128], flags: NDArray[np.int64]
 ) -> FluxPoints:
-    channel, position, axis = geometry
-    return FluxPoints(channel, flags, flux, position, axis)
+    return FluxPoints(rows.channel, flags, flux, rows.position, rows.axis)
 
 
 def _current_column(hello: Hello) -> int:

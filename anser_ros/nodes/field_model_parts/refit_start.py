@@ -20,7 +20,7 @@ from anser_ros.physics.tracks import loop_field
 from anser_ros.refit import tables
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.patches import start_table
-from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.kept_tables import KeptTables, ReadAhead
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.volume import stated_volume
@@ -155,7 +155,7 @@ class RefitStart:
         kept = None if self._folder is None else self._file(self._folder).read()
         if kept is not None:
             return kept
-        drawing, volume = Drawing.of(self._setup).field, stated_volume(self._setup)
+        drawing, volume = NominalBoard.of(self._setup).field, stated_volume(self._setup)
         settings = self._setup.refit
         return tables.build_tables(
             self._model, self._references, settings, drawing, volume, report=self._report

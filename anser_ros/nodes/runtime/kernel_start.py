@@ -5,8 +5,7 @@ import sys
 import time
 from collections.abc import Callable
 
-from anser_ros.frames.intake import fill_frame
-from anser_ros.kernel_cache import KernelCache, folder_of
+from anser_ros.kernel_cache import KernelCache
 
 POLL_S = 0.1
 """Time from one look at the compiling process to the next, s: how late its end is noticed."""
@@ -23,7 +22,7 @@ def wait_for_kernels(say: Callable[[str], None]) -> str:
     returned is why it failed, empty when all is there: the node may go on all the same, and then
     compiles what it needs when it needs it.
     """
-    cache = KernelCache(folder_of(fill_frame))
+    cache = KernelCache()
     if cache.is_full:
         return ''
     command = [sys.executable, '-P', '-m', 'anser_ros.cli.main', 'warm_up']
