@@ -36,13 +36,7 @@ CONVERGED = 1e-3
 
 
 class CoilPlacer:
-    """Places the coils of a drawn board by readings whose poses are right.
-
-    Parameters
-    ----------
-    nominal : FieldModel
-        The drawn board; its dipoles belong to one emitter each.
-    """
+    """Places the coils of a drawn board by readings whose poses are right."""
 
     def __init__(self, nominal: FieldModel) -> None:
         self.nominal = nominal
@@ -60,19 +54,7 @@ class CoilPlacer:
     ) -> tuple[DipoleSites, ComplexArray]:
         """Return the coils' dipoles where the readings put them, and their moments.
 
-        Parameters
-        ----------
-        corrected : sequence of Measurements
-            Measurements at their corrected poses, one per body and session.
-        weights : sequence of ndarray, shape (F, S)
-            Weights of the readings.
-
-        Returns
-        -------
-        sites : DipoleSites
-            N dipoles.
-        moments : ndarray, shape (N, K), complex
-            Their moments, A m^2.
+        Returns N dipoles, and their moments (N, K), A m^2.
         """
         (points, axes, lengths, flux), root = weighted_readings(corrected, weights)
         positions, directions = self.nominal.positions.copy(), self.nominal.directions.copy()

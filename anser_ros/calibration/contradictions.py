@@ -28,25 +28,14 @@ moves poses by less than a tenth of a millimetre."""
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Names a sensor, or body, of which two sessions say different things.
+    """Names a sensor, or body, of which two sessions say different things."""
 
-    Attributes
-    ----------
-    kind : str
-        Of `sensor_parameters.KINDS`.
-    place : str
-        Name of the sensor, or of the body.
-    size, sigma : float
-        Difference and its standard deviation, in the parameter's unit.
-    sessions : tuple of two int
-        Which of the measurements.
-    """
-
-    kind: str
-    place: str
+    kind: str  # of `sensor_parameters.KINDS`
+    place: str  # name of the sensor, or of the body
+    # size, sigma: difference and its standard deviation, in the parameter's unit
     size: float
     sigma: float
-    sessions: tuple[int, int]
+    sessions: tuple[int, int]  # which of the measurements
 
 
 def contradictions(
@@ -54,15 +43,8 @@ def contradictions(
 ) -> tuple[Contradiction, ...]:
     """Return of what two sessions say different things, the worst pair of each once.
 
-    Parameters
-    ----------
-    parts : sequence of Measurements
-        One a body and session, corrected by the joint estimate.
-    kinds : sequence of str
-        What is corrected.
-    sums : callable
-        Given parameters and measurements, what these say about the parameters, with the field
-        unknown.
+    ``parts``: one a body and session, corrected by the joint estimate. ``sums``: given parameters
+    and measurements, what these say about the parameters, with the field unknown.
     """
     bodies = [part.body for part in parts]
     if len(set(bodies)) == len(bodies):

@@ -56,19 +56,9 @@ def _fill_slopes(points, axes, lengths, positions, directions, out):  # type: ig
 def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleSites) -> Array:
     """Return the derivative of the flux basis by the dipoles' positions.
 
-    Parameters
-    ----------
-    points, axes : ndarray, shape (P, 3)
-        Sensor centres (m) and unit axes, frame fg.
-    lengths : ndarray, shape (P,)
-        Coil lengths, m.
-    dipoles : DipoleSites
-        N dipoles.
-
-    Returns
-    -------
-    ndarray, shape (P, N, 3)
-        Derivatives, T / (A m^3).
+    ``points``, ``axes`` (P, 3): sensor centres (m) and unit axes, frame fg. ``lengths`` (P,): coil
+    lengths, m.
+    Returns (P, N, 3): derivatives, T / (A m^3).
     """
     out = np.empty((points.shape[0], len(dipoles), 3))
     _fill_slopes(
@@ -80,42 +70,21 @@ def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleS
 
 @dataclass(frozen=True)
 class PositionFit:
-    """Holds dipoles at optimised positions with their damped moments.
+    """Holds dipoles at optimised positions with their damped moments."""
 
-    Attributes
-    ----------
-    dipoles : DipoleSites
-        The moved dipoles.
-    moments : ndarray, shape (N, K), complex
-        Moments, A m^2.
-    start_t, end_t : float
-        Root mean square of the weighted residual of a phasor component before and after, T.
-    steps : int
-        Number of steps.
-    """
-
-    dipoles: DipoleSites
-    moments: ComplexArray
+    dipoles: DipoleSites  # the moved dipoles
+    moments: ComplexArray  # (N, K): moments, A m^2
+    # start_t, end_t: root mean square of the weighted residual of a phasor component before and
+    # after, T
     start_t: float
     end_t: float
-    steps: int
+    steps: int  # number of steps
 
 
 class PositionFitter:
     """Moves dipoles to lower the damped residual of measurements at fixed, corrected poses.
 
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Measurements at their corrected poses, one per body and session.
-    weights : sequence of ndarray, shape (F, S)
-        Weights of the readings in [0, 1].
-    dipoles : DipoleSites
-        The positions to start from; the directions stay.
-    damping : float
-        Tikhonov's parameter of the moments, as for `MomentFitter`.
-    prior : ndarray, shape (N, K), complex, optional
-        Moments towards which the damping pulls, A m^2; zero by default.
+    ``prior``: moments towards which the damping pulls, A m^2; zero by default.
     """
 
     def __init__(

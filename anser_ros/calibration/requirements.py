@@ -31,25 +31,11 @@ def check_measurements(
 ) -> int:
     """Check that measurements determine a field model.
 
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Tool measurements, one per body and session.
-    needed : int
-        Number of readings per emitter that the dipoles need.
-    field_alone : bool
-        Whether nothing is estimated of the sensors, so that few poses of many sensors do.
-
-    Returns
-    -------
-    int
-        The number of readings per emitter.
-
-    Raises
-    ------
-    FitError
-        When there are too few frames with a pose or too few readings, or all readings lie in one
-        plane; the message has the number needed and the number found.
+    ``needed``: number of readings per emitter that the dipoles need. ``field_alone``: whether
+    nothing is estimated of the sensors, so that few poses of many sensors do.
+    Returns the number of readings per emitter.
+    Raises `FitError` when there are too few frames with a pose or too few readings, or all
+    readings lie in one plane; the message has the number needed and the number found.
     """
     if not measurements:
         raise FitError(
@@ -99,19 +85,12 @@ def check_single_coils(measurements: Sequence[Measurements]) -> None:
 def check_kept(
     measurements: Sequence[Measurements], kept: Sequence[Measurements], needed: int
 ) -> None:
-    """Check that the frames that a survey kept still determine a field model.
+    """Check that the frames that a fit of sensors kept still determine a field model.
 
-    Parameters
-    ----------
-    measurements, kept : sequence of Measurements
-        Tool measurements, one per body and session, before and after frames were left out.
-    needed : int
-        Number of readings per emitter that the dipoles need.
-
-    Raises
-    ------
-    FitError
-        When too little is left; the message has how many frames were left out, and why.
+    ``measurements``, ``kept``: tool measurements, one per body and session, before and after
+    frames were left out. ``needed``: number of readings per emitter that the dipoles need.
+    Raises `FitError` when too little is left; the message has how many frames were left out, and
+    why.
     """
     try:
         check_measurements([m for m in kept if len(m.time)], needed)
@@ -146,22 +125,10 @@ def check_agreement(
 ) -> None:
     """Check that one field explains all sessions.
 
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Tool measurements, one per body and session.
-    names : sequence of str
-        Name of the session of each.
-    joint : MomentFit
-        The fit to all measurements together.
-    fit_part : callable
-        Fits some of the measurements alone in the same way.
-
-    Raises
-    ------
-    FitError
-        When the residual of the common fit is more than `DISAGREEMENT` times the largest one of
-        the sessions alone.
+    ``joint``: the fit to all measurements together. ``fit_part``: fits some of the measurements
+    alone in the same way.
+    Raises `FitError` when the residual of the common fit is more than `DISAGREEMENT` times the
+    largest one of the sessions alone.
     """
     sessions = list(dict.fromkeys(names))
     if len(sessions) < 2:
