@@ -116,7 +116,7 @@ class LayoutPlacer:
         if layout.kind == 'coaxial':
             found = fit_coaxial(thin, shares, dipoles, layout.count)
         else:
-            found = PositionFitter(thin, shares, dipoles, MOVING_DAMPING, prior).fit().dipoles
+            found = PositionFitter(thin, shares, dipoles, MOVING_DAMPING, prior).fit()
         return found, self._prior(layout, found)
 
 

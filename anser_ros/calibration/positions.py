@@ -8,14 +8,13 @@ number of emitters nor on that of readings.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites
-from anser_ros.calibration.factors import ComplexArray, as_complex, as_real
+from anser_ros.calibration.factors import ComplexArray, as_real
 from anser_ros.calibration.readings import BLOCK_ROWS, frame_blocks, weighted_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import GAUSS_OFFSET, fill_field_and_gradient, flux_basis
@@ -68,19 +67,6 @@ def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleS
     return out
 
 
-@dataclass(frozen=True)
-class PositionFit:
-    """Holds dipoles at optimised positions with their damped moments."""
-
-    dipoles: DipoleSites  # the moved dipoles
-    moments: ComplexArray  # (N, K): moments, A m^2
-    # start_t, end_t: root mean square of the weighted residual of a phasor component before and
-    # after, T
-    start_t: float
-    end_t: float
-    steps: int  # number of steps
-
-
 class PositionFitter:
     """Moves dipoles to lower the damped residual of measurements at fixed, corrected poses.
 
@@ -103,7 +89,6 @@ class PositionFitter:
         self.dipoles, self.damping = dipoles, damping
         parts = self.blocks[0][4].shape[1]
         self.prior = np.zeros((len(dipoles), parts)) if prior is None else as_real(prior)
-        self.count = sum(float((b[3] ** 2).sum()) for b in self.blocks) * parts
         self.ridge = self._ridge()
 
     def _ridge(self) -> Array:
@@ -155,13 +140,11 @@ class PositionFitter:
         pairs = np.repeat(np.repeat(moments @ moments.T, 3, axis=0), 3, axis=1)
         return inner * pairs, gradient.ravel()
 
-    def fit(self, most_steps: int = MOST_STEPS) -> PositionFit:
+    def fit(self, most_steps: int = MOST_STEPS) -> DipoleSites:
         """Take Levenberg-Marquardt steps until the cost hardly falls any more."""
-        dipoles, strength, steps = self.dipoles, 1e-2, 0
+        dipoles, strength = self.dipoles, 1e-2
         moments, cost = self.solve(dipoles)
-        start = cost
-        while steps < most_steps:
-            steps += 1
+        for _ in range(most_steps):
             normal, gradient = self._normal(dipoles, moments)
             before = cost
             for _ in range(MOST_TRIALS):
@@ -174,11 +157,7 @@ class PositionFitter:
                 strength *= 5.0
             if before - cost < CONVERGED * before:
                 break
-        scale = 1.0 / self.count
-        return PositionFit(
-            dipoles, as_complex(moments), float(np.sqrt(start * scale)),
-            float(np.sqrt(cost * scale)), steps,
-        )  # fmt: skip
+        return dipoles
 
     def _moved(
         self, dipoles: DipoleSites, normal: Array, gradient: Array, strength: float

@@ -29,16 +29,6 @@ STATIC_NOISE_T = 30e-12
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Holds standard deviations of the errors of a recording's instruments."""
-
-    flux_noise_t: float = Accuracy.flux_noise_t  # noise of each phasor component, T
-    # optical_jitter_m, optical_jitter_rad: jitter of each axis of the optical pose, m and rad
-    optical_jitter_m: float = Accuracy.optical_position_m
-    optical_jitter_rad: float = Accuracy.optical_rotation_rad
-
-
-@dataclass(frozen=True)
 class GridScan:
     """Moves a body so that it rests at one grid point after another, layer by layer."""
 
@@ -66,10 +56,10 @@ class GridScan:
         return position, np.asarray(rotation)
 
 
-def _jittered(pose: Pose, errors: Errors, rng: np.random.Generator) -> tuple[Array, Array]:
+def _jittered(pose: Pose, errors: Accuracy, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return a pose as an optical tracker reports it: position (m) and quaternion x y z w."""
-    position = pose[0] + rng.normal(scale=errors.optical_jitter_m, size=3)
-    turn = Rotation.from_rotvec(rng.normal(scale=errors.optical_jitter_rad, size=3))
+    position = pose[0] + rng.normal(scale=errors.optical_position_m, size=3)
+    turn = Rotation.from_rotvec(rng.normal(scale=errors.optical_rotation_rad, size=3))
     return position, np.asarray((turn * Rotation.from_matrix(pose[1])).as_quat())
 
 
@@ -80,7 +70,7 @@ def record(
     frames: int,
     rate_hz: float,
     optical_rate_hz: float | None,
-    errors: Errors,
+    errors: Accuracy,
     rng: np.random.Generator,
 ) -> None:
     """Write a session of a world into a bag.
