@@ -18,7 +18,7 @@ EIGHT = np.array([[x, y, 0.0] for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 
 
 
 def surveyed(seed, coils, seconds, turn_rad, errors, centres=EIGHT, flat=False):
-    """A survey of a scan by a hand, and what is true of it."""
+    """A joint fit of a scan by a hand, and what is true of it."""
     rng = np.random.default_rng(seed)
     world, table = scene(rng, side=4, centres=centres), tool_of(coils)
     told, truth = moved_scan(world, table, rng, seconds, errors, turn_rad, flat)
@@ -59,8 +59,8 @@ def test_a_scan_of_seconds_tells_nothing_of_the_sensors_and_takes_the_setup():
     found, _ = surveyed(23, 9, 2.0, 0.6, Errors())
     assert set(found.undetermined) == set(KINDS) and not found.evidence
     assert len(undetermined_words(found)) == len(KINDS)
-    survey = found.errors_of('tool')
-    assert (survey.gain == 1.0).all() and not survey.place.any() and not survey.lever_arm.any()
+    own = found.errors_of('tool')
+    assert (own.gain == 1.0).all() and not own.place.any() and not own.lever_arm.any()
     assert found.kept[0].sum() >= 45
 
 

@@ -145,10 +145,10 @@ def test_gains_of_an_array_are_found_and_no_lever_arm_that_it_does_not_have(seed
         [replace(measured, track=track)], KINDS, generator, Accuracy(NOISE_T, 2e-4, 2e-3)
     )
     found = fitter.fit()
-    survey = found.errors_of('array')
+    own = found.errors_of('array')
     assert 'gains' in found.evidence
-    assert np.std(survey.gain.real / gains) < np.std(gains) / 3.0
-    assert np.abs(survey.lever_arm).max() < 1e-4
+    assert np.std(own.gain.real / gains) < np.std(gains) / 3.0
+    assert np.abs(own.lever_arm).max() < 1e-4
 
 
 @pytest.mark.parametrize('rate_hz', [0.2, 25.0])

@@ -112,10 +112,10 @@ def fit_scan(
     whole = LayoutFitter(posed, generator, accuracy).fit(layout, damping, progress=progress)
     if not _is_explained(scan):
 
-        def alone(part: list[Measurements]) -> LayoutFit:
-            return _fitted(LayoutFitter(part, generator, accuracy), chosen)
+        def alone(part: list[Measurements]) -> float:
+            return _fitted(LayoutFitter(part, generator, accuracy), chosen).fit.noise_t
 
-        check_agreement(posed, names, whole.fit, alone)
+        check_agreement(posed, names, whole.fit.noise_t, alone)
     sensors = scan.sensor_fit
     model = FieldModel(
         positions=whole.dipoles.positions,

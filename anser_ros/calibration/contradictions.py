@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.joint_system import Eliminated
+from anser_ros.calibration.population import Likelihood, solve
 from anser_ros.calibration.sensor_parameters import CLOCKS, EACH, PRIOR, USEFUL, SensorParameters
 from anser_ros.field.measurements import Measurements
 
@@ -57,9 +58,8 @@ def contradictions(
         width[parameters.rows(kind)] = PRIOR[kind]
     inflation = max(1.0, rest.inflation)
     information = rest.information / inflation + parameters.rule()
-    scaled = np.eye(width.size) + width[:, None] * information * width[None, :]
-    covariance = width[:, None] * np.linalg.solve(scaled, np.diag(width))
-    change = covariance @ rest.gradient / inflation
+    posterior = solve(Likelihood(information, rest.gradient / inflation), width)
+    change, covariance = posterior.values, posterior.covariance
     worst: dict[tuple[str, str], Contradiction] = {}
     for i, j in combinations(range(len(bodies)), 2):
         if bodies[i] != bodies[j]:
@@ -67,12 +67,8 @@ def contradictions(
         for kind in parameters.kinds:
             for name, one, other in _pairs(parameters, kind, i, j):
                 difference = change[one] - change[other]
-                variance = np.diag(
-                    covariance[np.ix_(one, one)]
-                    + covariance[np.ix_(other, other)]
-                    - covariance[np.ix_(one, other)]
-                    - covariance[np.ix_(other, one)]
-                )
+                variance = covariance[one, one] + covariance[other, other]
+                variance = variance - 2.0 * covariance[one, other]
                 sigma = float(np.sqrt(variance[int(np.argmax(np.abs(difference)))]))
                 size = float(np.linalg.norm(difference))
                 found = Contradiction(kind, name or bodies[i], size, sigma, (i, j))

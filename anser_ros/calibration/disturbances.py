@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_propagation
 from scipy.spatial import cKDTree
 
 from anser_ros.field.measurements import Measurements
@@ -106,7 +107,7 @@ def unsteady_references(reference: Measurements) -> Mask:
         if quiet.sum() < 2:
             break
         steady = np.average(means[quiet], axis=0, weights=size[quiet])
-    return np.asarray(_grown(excess > SEEN, excess > EDGE)[bins])
+    return np.asarray(binary_propagation(excess > SEEN, mask=excess > EDGE)[bins])
 
 
 def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask:
@@ -123,7 +124,9 @@ def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask
     total = np.bincount(bins[usable], power[usable], count)
     mean = np.asarray(total / np.maximum(size, 1), dtype=np.float64)
     ratio = mean / max(float(np.median(mean[size > 0])), 1e-300)
-    found = np.asarray(_grown(ratio > LEFT_OVER, ratio > np.sqrt(LEFT_OVER))[bins])
+    # With the stretches on the edge of it, as far as they adjoin.
+    grown = binary_propagation(ratio > LEFT_OVER, mask=ratio > np.sqrt(LEFT_OVER))
+    found = np.asarray(grown[bins])
     quiet = usable & ~found
     for span in spans_of(time, found):
         rows = np.flatnonzero(span.holds(time) & usable)
@@ -136,18 +139,6 @@ def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask
         if float(power[rows].mean()) < np.sqrt(LEFT_OVER) * beside:
             found[span.holds(time)] = False
     return found
-
-
-def _grown(core: Mask, edge: Mask) -> Mask:
-    """The core with all edges that adjoin it."""
-    out = core.copy()
-    for index in np.flatnonzero(core):
-        for way in (-1, 1):
-            at = index + way
-            while 0 <= at < edge.size and edge[at] and not out[at]:
-                out[at] = True
-                at += way
-    return out
 
 
 def spans_of(time: Array, unsteady: Mask) -> list[Span]:

@@ -228,22 +228,18 @@ class SensorParameters:
     def errors_of(self, body: str, values: Array) -> BodyErrors:
         """Return the errors of a body's sensors for all parameters, shape (Q,)."""
         table = self.tables[self.bodies.index(body)]
-        gain, axis = np.ones(len(table), complex), table.axis
-        place, lever, clock = np.zeros((len(table), 3)), np.zeros(3), [0.0, 0.0]
-        if (pairs := self.of('gains', body, values)) is not None:
-            gain = 1.0 + pairs[:, 0] + 1j * pairs[:, 1]
-        if (pairs := self.of('axes', body, values)) is not None:
-            axis = tilted(axis, pairs)
-        if (part := self.of('places', body, values)) is not None:
-            place = part
-        if (part := self.of('lever_arm', body, values)) is not None:
-            lever = part
-        for index, kind in enumerate(CLOCKS):
-            if (part := self.of(kind, '', values)) is not None:
-                clock[index] = float(part[0])
-        pickup = np.zeros((len(table), self.emitters), complex)
-        if (pairs := self.of('offsets', body, values)) is not None:
-            pickup = self.unit_t * (pairs[:, 0::2] + 1j * pairs[:, 1::2])
+
+        def part(kind: str, *shape: int) -> Array:
+            found = self.of(kind, '' if kind in CLOCKS else body, values)
+            return np.zeros(shape) if found is None else found
+
+        count, tilts = len(table), self.of('axes', body, values)
+        gains, pickups = part('gains', count, 2), part('offsets', count, 2 * self.emitters)
+        gain = 1.0 + gains[:, 0] + 1j * gains[:, 1]
+        pickup = self.unit_t * (pickups[:, 0::2] + 1j * pickups[:, 1::2])
+        axis = table.axis if tilts is None else tilted(table.axis, tilts)
+        place, lever = part('places', count, 3), part('lever_arm', 3)
+        clock = [float(part(kind, 1)[0]) for kind in CLOCKS]
         return BodyErrors(
             gain, axis, place, lever, pickup, clock[0] - clock[1] * self.middle_s, clock[1]
         )

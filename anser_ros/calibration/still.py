@@ -33,6 +33,7 @@ from anser_ros.calibration.requirements import (
     FEWEST_SCAN_FRAMES,
     MANY_SENSORS,
     check_measurements,
+    usable_frames,
 )
 from anser_ros.calibration.result import Calibration, Scan, residuals, with_provenance
 from anser_ros.calibration.sensor_parameters import SensorParameters
@@ -72,9 +73,8 @@ POSE_STEPS = 4
 
 def is_still(measurements: Sequence[Measurements]) -> bool:
     """Return whether there are few poses of one body with many sensors, and no more."""
-    frames = sum(int(m.usable.any(axis=1).sum()) for m in measurements)
     many = len(measurements) == 1 and len(measurements[0].sensors) >= MANY_SENSORS
-    return many and FEWEST_FRAMES_OF_MANY <= frames < FEWEST_SCAN_FRAMES
+    return many and FEWEST_FRAMES_OF_MANY <= usable_frames(measurements) < FEWEST_SCAN_FRAMES
 
 
 def calibrate_still(
@@ -159,21 +159,18 @@ def _moments(fit: StillFit) -> NDArray[np.complex128]:
     return as_complex(found) if fit.model.is_complex else found.astype(complex)
 
 
-def _columns(fit: StillFit) -> tuple[tuple[str, slice], ...]:
-    """Which columns of the sensors' unknowns are gains, and which are tilts of the axes."""
-    gains = fit.model.gains
-    return ('gains', slice(0, gains)), ('axes', slice(gains, None))
-
-
-def _parameters(measured: Measurements, fit: StillFit) -> tuple[SensorParameters, Array, Array]:
-    """The sensors' errors as parameters of a joint fit: values and standard deviations."""
-    parameters = SensorParameters([measured], POPULATIONS)
-    values, sigma = np.zeros(len(parameters)), np.zeros(len(parameters))
-    for kind, columns in _columns(fit):
+def _parameters(
+    measured: Measurements, fit: StillFit
+) -> tuple[SensorParameters, Array, Array, Array]:
+    """The sensors' errors as those of a joint fit: values, standard deviations, prior widths."""
+    parameters, gains = SensorParameters([measured], POPULATIONS), fit.model.gains
+    values, sigma, width = np.zeros((3, len(parameters)))
+    for kind, columns in (('gains', slice(0, gains)), ('axes', slice(gains, None))):
         own = fit.unknowns.sensors[:, columns]
         rows = parameters.rows(kind).reshape(len(own), -1)[:, : own.shape[1]]
         values[rows], sigma[rows] = own, fit.sensor_sigma[:, columns]
-    return parameters, values, sigma
+        width[rows] = fit.widths.sensors[columns]
+    return parameters, values, sigma, width
 
 
 def _held_out(
@@ -187,7 +184,7 @@ def _held_out(
     tally = HeldOutTally(noise, noise, accuracy, max(len(fit.sites) for fit in folds))
     for frame, fit in enumerate(folds):
         part = posed.frames(np.array([frame]))
-        parameters, values, _ = _parameters(part, fit)
+        parameters, values, *_ = _parameters(part, fit)
         sound = parameters.errors_of(part.body, values).apply(part)
         tally.add(predicted(sound, fit, accuracy), usable_weights(sound), sound.position)
     return tally.result()
@@ -235,12 +232,7 @@ def _scan(
     """The frames as ideal sensors on a flat body would have given them, and what was not ideal;
     ``frames`` are those of the session, without a pose too.
     """
-    parameters, values, sigma = _parameters(posed, fit)
-    width = np.zeros(len(parameters))
-    for kind, columns in _columns(fit):
-        found = fit.widths.sensors[columns]
-        rows = parameters.rows(kind).reshape(len(posed.sensors), -1)
-        width[rows[:, : len(found)]] = found
+    parameters, values, sigma, width = _parameters(posed, fit)
     offsets = fit.unknowns.frames[:, :POSE]
     poses = OpticalNoise(
         float(np.sqrt(np.mean(offsets[:, :3] ** 2))),

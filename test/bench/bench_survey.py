@@ -145,12 +145,12 @@ def row_of(coils: int, seconds: float, turns_deg: float, errors: Errors, seed: i
     begin = time.process_time()
     found = SensorFitter([told], KINDS, world.generator, Accuracy()).fit()
     spent = time.process_time() - begin
-    survey = found.errors_of('tool')
-    gain = 100.0 * np.sqrt(np.mean(np.abs(survey.gain - truth.gain) ** 2))
-    axis = 1e3 * np.sqrt(np.mean(np.sum((survey.axis - truth.axis) ** 2, axis=1)))
-    place = 1e3 * np.sqrt(np.mean(np.sum((survey.place - truth.place) ** 2, axis=1)))
-    lever = 1e3 * np.linalg.norm(survey.lever_arm - truth.lever)
-    offset = 1e3 * abs(survey.offset_s - errors.offset_s)
+    own = found.errors_of('tool')
+    gain = 100.0 * np.sqrt(np.mean(np.abs(own.gain - truth.gain) ** 2))
+    axis = 1e3 * np.sqrt(np.mean(np.sum((own.axis - truth.axis) ** 2, axis=1)))
+    place = 1e3 * np.sqrt(np.mean(np.sum((own.place - truth.place) ** 2, axis=1)))
+    lever = 1e3 * np.linalg.norm(own.lever_arm - truth.lever)
+    offset = 1e3 * abs(own.offset_s - errors.offset_s)
     undetermined = ', '.join(sorted(found.undetermined)) or 'nothing'
     values = (
         coils, f'{seconds:g}', f'{turns_deg:g}', f'{100 * errors.gain:g}',
