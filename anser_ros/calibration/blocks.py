@@ -26,7 +26,7 @@ def fold_of_frames(positions: Sequence[Array]) -> list[NDArray[np.int64]]:
     to fold (i + 2 j + 3 k) mod `FOLDS`, so that a fold is spread over the volume and its cells
     do not touch. All frames of a cell are held out together, never a single point.
 
-    ``positions`` (F, 3): body positions, m, one array per body and session.
+    ``positions`` (F, 3) are the bodies', m, one array per body and session.
     Returns (F,): folds of the frames, one array per body and session.
     Raises `FitError` when the frames fill fewer than two folds.
     """

@@ -51,9 +51,8 @@ def fit_coaxial(
 ) -> DipoleSites:
     """Return coaxial dipoles where they explain the measurements best, one source after the other.
 
-    ``corrected``: measurements at their corrected poses, one per body and session; K emitters.
-    ``start``: ``count`` dipoles for each of the K emitters, in the order of the emitters.
-    ``count``: dipoles a source.
+    ``corrected`` are at their corrected poses; ``start`` has ``count`` dipoles for each of the K
+    emitters, in their order.
     """
     middle = (count - 1) // 2
     centres, axes = start.positions[middle::count], start.directions[middle::count]

@@ -23,7 +23,7 @@ CERTAIN = 6.0
 """Standard deviations between two sessions from which on they contradict each other: a value of a
 normal variable is that far out once in a billion."""
 NOTICEABLE = 0.5
-"""Share of the useful size of a parameter (`USEFUL`) below which a difference is not told: it
+"""Share of the useful size of a parameter (`USEFUL`) below which a difference is not reported: it
 moves poses by less than a tenth of a millimetre."""
 
 

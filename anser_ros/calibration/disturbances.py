@@ -55,7 +55,7 @@ class Span:
 def glitches(steps: Array, usable: Mask, stated: Array) -> Mask:
     """Return which frames' poses are far from where their fluxes put them, shape (F,).
 
-    ``steps`` (F, 6): from each optical pose to the one that the fluxes tell, m and rad. ``usable``
+    ``steps`` (F, 6): from each optical pose to where the fluxes put it, m and rad. ``usable``
     (F,): frames to judge by. ``stated`` (6,): jitter that the optical tracker is said to have, m
     and rad. A deviation that is usual for it is not taken for a wrong pose where its jitter shows
     to be less: then what the field's model misses near the board stands out first.

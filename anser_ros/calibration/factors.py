@@ -14,10 +14,7 @@ columns (some 1e-7 / (0.1 m)^3 T / (A m^2)); it only avoids numbers of very diff
 
 
 class TriangularFactor:
-    """Keeps a least-squares problem as the triangular factor of its rows, by QR, block by block.
-
-    ``unknowns``: number of columns N of the matrix. ``right_sides``: number of right-hand sides M.
-    """
+    """Keeps a least-squares problem as the triangular factor of its rows, by QR, in blocks."""
 
     def __init__(self, unknowns: int, right_sides: int) -> None:
         self.unknowns = unknowns

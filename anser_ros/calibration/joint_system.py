@@ -159,10 +159,7 @@ class JointSystem:
         self.scores: list[Array] = []
 
     def add(self, linear: Linear, weights: Array, noise_t: float, along: Array) -> None:
-        """Take in the frames of a body.
-
-        ``linear``: F frames. ``along`` (F, 6, S, 2K): of `open_directions`.
-        """
+        """Take in the frames of a body; ``along`` is that of `open_directions`."""
         velocity, along = velocity_of(linear.part), np.where(self.tied, along, 0.0)
         count, sensors = weights.shape
         stretches = max(STRETCHES, len(frame_blocks(count, sensors, SYSTEM_ROWS)))

@@ -31,10 +31,7 @@ and would not determine the field's change across them."""
 
 
 class Regions:
-    """Divides the volume of some points smoothly: the weights of all regions add up to one.
-
-    ``points`` (P, 3): positions of readings, m, frame fg.
-    """
+    """Divides the volume of points (P, 3), m, smoothly: all regions' weights add up to one."""
 
     def __init__(self, points: Array) -> None:
         low, high = points.min(axis=0), points.max(axis=0)

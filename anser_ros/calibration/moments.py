@@ -89,12 +89,7 @@ class _State:
 class MomentFitter:
     """Alternates between the poses of the frames and the moments of the dipoles.
 
-    `fit` runs the alternation to its end.
-
-    ``measurements``: one a body and session; reference sensors may be among them (their pose does
-    not jitter). ``damping``: Tikhonov's parameter as a fraction of the largest singular value of
-    the scaled matrix. ``prior``: moments towards which the damping pulls, A m^2; zero by default.
-    Raises `FitError` when no reading has a pose.
+    `fit` runs the alternation to its end. Raises `FitError` when no reading has a pose.
     """
 
     def __init__(
@@ -148,11 +143,11 @@ class MomentFitter:
     def correct(self, moments: ComplexArray, freedom: float) -> float:
         """Move all poses to their most probable values and return the new noise estimate, T.
 
-        ``freedom``: effective number of parameters of each right-hand side.
+        ``freedom`` is the effective number of parameters of each right-hand side.
         """
         power, turned, count, used = 0.0, 0.0, 0.0, 0.0
+        precision = pose_precision(self.accuracy)
         for state in self.states:
-            precision = self._precision(state)
             for block in frame_blocks(*state.weights.shape):
                 part = state.corrected.frames(block)
                 terms = pose_terms(part, self.dipoles, moments)
@@ -172,18 +167,10 @@ class MomentFitter:
         self.quadrature_noise_t = max(float(np.sqrt(turned / halved)), SMALLEST_NOISE_T)
         return max(float(np.sqrt(power / left_over)), SMALLEST_NOISE_T)
 
-    def _precision(self, state: _State) -> Array:
-        if state.measured.body == 'fg':
-            return pose_precision(Accuracy(optical_position_m=0.0, optical_rotation_rad=0.0))
-        return pose_precision(self.accuracy)
-
     def fit(
         self, alternations: int = 5, progress: Progress | None = None, exact: bool = True
     ) -> MomentFit:
-        """Alternate until the noise estimate no longer changes.
-
-        ``alternations``: largest number of rounds. ``exact``: whether the last solution is by QR.
-        """
+        """Alternate until the noise estimate no longer changes; the last solution may be exact."""
         done = 0
         moments, spectrum = self.solve(exact=False)
         for done in range(1, alternations + 1):

@@ -70,9 +70,8 @@ def estimate_noise(
     The squares of the steps are divided by the number of steps that the fluxes determined (MacKay,
     Bayesian interpolation, Neural Computation 1992): a single coil does not see every direction.
 
-    ``steps``, ``variances`` (F, 6): steps of the poses (m, rad) and what is uncertain in them, one
-    per body and session. ``shares`` (F,): of `interpolation_share`. ``kept`` (F,): frames to use.
-    ``present``: the jitter that the steps were found with.
+    For each of the measurements: the ``steps`` (F, 6), m and rad, found with the ``present``
+    jitter, their ``variances``, the ``shares`` of `interpolation_share`, and which frames to use.
     """
     parts = [
         (step[keep] ** 2 / share[keep, None], variance[keep] / share[keep, None])

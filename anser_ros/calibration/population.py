@@ -109,10 +109,7 @@ class Population:
         return width
 
     def fit(self, likelihood: Likelihood, fixed: Sequence[str] = ()) -> Posterior:
-        """Return the parameters with the widths that make the data most probable.
-
-        ``fixed``: kinds that are held at zero.
-        """
+        """Return the parameters with the most probable widths; ``fixed`` kinds stay at zero."""
         width = self._start(fixed)
         shared = [
             (kind, np.setdiff1d(rows, self.alone[kind]))
@@ -202,10 +199,7 @@ class Population:
         return out
 
     def shift_sigma_m(self, likelihood: Likelihood, found: Posterior) -> float:
-        """Return how well a shift of all of a body's sensors is known, m along each axis.
-
-        ``found``: with all kinds.
-        """
+        """Return how well a shift of all of a body's sensors is known, m along each axis."""
         parameters, sigmas = self.parameters, self._data_sigmas(likelihood)
         if SHARED_SHIFT not in parameters.asked:
             return 0.0

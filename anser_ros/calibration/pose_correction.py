@@ -56,8 +56,8 @@ def pose_slopes(
 ) -> Array:
     """Return the derivatives of fluxes by the body's pose, shape (F, S, 2K, 6).
 
-    ``points``, ``axes`` (F, S, 3): sensor centres (m) and unit axes, frame fg. ``position`` (F,
-    3): origin of the body, m, frame fg. ``by_place``, ``by_axis`` (F, S, 3, K): derivatives by the
+    ``points``, ``axes`` (F, S, 3): sensor centres (m) and unit axes, frame fg; ``position``
+    (F, 3): the body's origin, m. ``by_place``, ``by_axis`` (F, S, 3, K): derivatives by the
     sensors' centres (T/m) and axes (T).
     """
     place, turn = as_real(by_place), as_real(by_axis)
@@ -78,8 +78,7 @@ def most_probable_step(
     """Return the step of each frame's pose to its most probable value.
 
     ``offset`` (F, 6): difference between the present pose and the measured one, m and rad.
-    Returns ``step`` (F, 6): shift (m) and rotation vector (rad), frame fg; ``residual`` (F, S,
-    2K): residual after the step to first order, T.
+    Returns the steps (F, 6), and the residuals (F, S, 2K) after them to first order, T.
     """
     slope, weighted, normal = _normal_equations(terms, weights, noise_t)
     normal = normal + np.diag(precision)
@@ -107,9 +106,6 @@ def outlier_weights(residual: Array, weights: Array) -> Array:
 
     Beyond `OUTLIER_SCALE` times the median size the weight falls with the square of the size, so
     that the influence of a gross outlier vanishes.
-
-    ``residual`` (F, S, 2K): residuals, T.
-    Returns (F, S): weights in [0, 1].
     """
     size = np.sqrt((residual**2).mean(axis=2))
     used = weights > 0.0

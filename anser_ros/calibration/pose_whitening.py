@@ -58,8 +58,7 @@ class PoseWhitener:
         the assumed jitter leaves ``sigma^2 (tr(W) - tr(W^2))``. The eigenvalues of W are one
         minus those of the matrix that tells how far the readings determine the pose parameters.
 
-        ``residual`` (F, S, 2K): residuals at the measured poses, T. ``flux_noise_t``: flux noise
-        alone, T a component; sigma by default.
+        ``residual`` is that at the measured poses; ``flux_noise_t`` without the jitter's part.
         Returns (F,): variance, T^2 a component; negative where the frame has less power than
         expected.
         """

@@ -68,10 +68,7 @@ def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleS
 
 
 class PositionFitter:
-    """Moves dipoles to lower the damped residual of measurements at fixed, corrected poses.
-
-    ``prior``: moments towards which the damping pulls, A m^2; zero by default.
-    """
+    """Moves dipoles to lower the damped residual of measurements at fixed, corrected poses."""
 
     def __init__(
         self,

@@ -85,8 +85,6 @@ def check_kept(
 ) -> None:
     """Check that the frames that a fit of sensors kept still determine a field model.
 
-    ``measurements``, ``kept``: tool measurements, one per body and session, before and after
-    frames were left out. ``needed``: number of readings per emitter that the dipoles need.
     Raises `FitError` when too little is left; the message has how many frames were left out, and
     why.
     """

@@ -2,7 +2,7 @@
 
 A damped fit is the most probable one where moments differ from those that they are pulled to by
 random amounts, as large as the damping implies. Its covariance is largest where no reading was:
-it tells gaps from places that were scanned, but is too small, for what a layout cannot represent
+it shows gaps beside places that were scanned, but is too small, for what a layout cannot represent
 is not random. Blocks of space that were held out say by which factor.
 """
 

@@ -93,9 +93,8 @@ def choose_layout(
     progress: Progress | None = None,
     asked: Layout | None = None,
 ) -> Selection:
-    """Search the layouts and dampings with the least held-out error.
+    """Search the layouts, or one asked for, and the dampings with the least held-out error.
 
-    ``asked``: the layout to use; then only its damping is chosen.
     Raises `FitError` when there are fewer readings than the smallest layout has dipoles.
     """
     rows = sum(int(m.usable.sum()) for m in measurements)

@@ -105,9 +105,7 @@ class _Tool:
 class SensorFitter:
     """Estimates the parameters; sessions with the same body share them.
 
-    ``measurements``: tool measurements, one per body and session; frames without a pose are left
-    as they are. ``steady``: frames of each of the measurements in which the references saw nothing
-    move; else all.
+    ``steady``: frames of each of the measurements in which the references saw nothing move.
     """
 
     def __init__(

@@ -32,7 +32,7 @@ ComplexArray = NDArray[np.complex128]
 POINT, SIZED = COAXIAL[:2]
 """Layouts of emitters without a size, and of those that have no more than a size."""
 LEAST_SIGMAS = 5.0
-"""Standard deviations from zero at which a size is told. They come from five blocks, so that
+"""Standard deviations from zero at which a size is reported. They come from five blocks, so that
 chance alone reaches so many in one of 130 emitters without a size."""
 STEPS = 4
 """Steps of the fit, which starts where the dipoles were fitted: each leaves a small part of the

@@ -50,7 +50,7 @@ from anser_ros.settings import Accuracy
 Array = NDArray[np.float64]
 
 STILL_KINDS = ('gains', 'axes', 'bend', 'poses')
-"""Kinds of errors that few poses of many sensors tell. The poses' errors are part of every fit;
+"""Kinds of errors that few poses of many sensors show. The poses' errors are part of every fit;
 looked for, they are reported, and what is predicted is predicted where they are."""
 STILL_ONLY = ('bend', 'poses')
 """Those of them that nothing else determines."""

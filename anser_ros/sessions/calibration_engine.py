@@ -33,7 +33,7 @@ class Engine:
     fit: Callable[[Sessions, Options, Progress | None], Calibration]
     # Whether it finds field, sensors and poses of few frames of many sensors jointly.
     is_joint: bool = False
-    kinds: tuple[str, ...] = ()  # of errors that no scan tells, estimated only when named
+    kinds: tuple[str, ...] = ()  # of errors that no scan shows, estimated only when named
     needs: str = ''  # what they can be determined from, in words
 
 

@@ -58,9 +58,8 @@ class Piece:
 class ControlUnit:
     """Speaks the protocol of `docs/cu_protocol.md` as a control unit does.
 
-    ``world``: true fluxes of the sensors that it is connected to. ``calibration``: true response
-    of its channels. ``front_end``: converter and noise. ``block_samples``: samples in a block.
-    ``effects``: changes of the signals. ``seed``: seed of the noise.
+    ``world`` has the true fluxes of the sensors that it is connected to, ``calibration`` the true
+    response of its channels.
     """
 
     def __init__(

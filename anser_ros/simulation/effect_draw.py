@@ -198,8 +198,6 @@ CATALOGUE: dict[str, Callable[[Unit, np.random.Generator], Drawn]] = {
 def draw(name: str, setup: Setup, channels: ChannelCalibration, rng: np.random.Generator) -> Drawn:
     """Draw the parameters of an effect, and the effect itself when `name` is ``random``.
 
-    ``setup``: the sensors and coils. ``channels``: response of the channels. ``rng``: source of
-    the draw.
     Raises `ParameterError` when there is no effect of that name.
     """
     if name == NONE:

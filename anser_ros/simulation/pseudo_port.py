@@ -20,9 +20,8 @@ loses blocks instead of falling behind more and more."""
 
 
 class PseudoPort:
-    """Holds the device's end of the line, which never blocks.
+    """Holds the device's end of the line, which never blocks; the host opens the link.
 
-    ``link``: path under which the host opens the port.
     Raises `PortError` when something other than a link has that path, another simulated device has
     it, or the link cannot be made.
     """

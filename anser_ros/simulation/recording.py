@@ -75,11 +75,8 @@ def record(
 ) -> None:
     """Write a session of a world into a bag.
 
-    ``path``: the ``.mcap`` file; it must not exist yet. ``world``: true fluxes and poses.
-    ``frames``: number of flux windows. ``rate_hz``: their rate, Hz. ``optical_rate_hz``: rate of
-    the optical poses, Hz, which begin and end `OPTICAL_MARGIN_S` outside the fluxes; None for one
-    pose at every flux stamp (a static recording). ``errors``: noise and jitter. ``rng``: source of
-    the errors.
+    It has so many flux ``frames``. The optical poses begin and end `OPTICAL_MARGIN_S` outside of
+    them; without a rate of their own (a static recording) there is one at every flux stamp.
     Raises `BagError` when the file exists or cannot be written.
     """
     stamps = {(START_NS + round(i / rate_hz * SECOND_NS), i / rate_hz) for i in range(frames)}

@@ -43,9 +43,8 @@ class Sampler:
     Within a stretch the phasors change linearly between the world's at its two ends, so that
     stretches of 5 ms follow a tool at 0.1 m/s to some 10 pT.
 
-    ``world``: true fluxes. ``calibration``: true response of the channels. ``front_end``:
-    converter and noise. ``nominal_current_a``: peak current that the world's fluxes are given for,
-    A. ``effects``: changes of the signals, in order. ``seed``: seed of the noise.
+    ``calibration`` is the true response of the channels, ``nominal_current_a`` the peak current
+    that the world's fluxes are given for, A.
     """
 
     def __init__(
