@@ -236,7 +236,7 @@ class SensorParameters:
         count, tilts = len(table), self.of('axes', body, values)
         gains, pickups = part('gains', count, 2), part('offsets', count, 2 * self.emitters)
         gain = 1.0 + gains[:, 0] + 1j * gains[:, 1]
-        pickup = self.unit_t * (pickups[:, 0::2] + 1j * pickups[:, 1::2])
+        pickup = np.asarray(self.unit_t * (pickups[:, 0::2] + 1j * pickups[:, 1::2]), complex)
         axis = table.axis if tilts is None else tilted(table.axis, tilts)
         place, lever = part('places', count, 3), part('lever_arm', 3)
         clock = [float(part(kind, 1)[0]) for kind in CLOCKS]
