@@ -16,7 +16,8 @@ from anser_ros.cli import calibrate as command
 from anser_ros.cli.main import main
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.calibration import calibrate_sessions, generator_of
+from anser_ros.sessions.calibration import calibrate_sessions
+from anser_ros.sessions.calibration_engine import generator_of
 from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model

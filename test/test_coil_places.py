@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.calibration.coil_places import CoilPlacer
 from anser_ros.calibration.held_out import rms
-from anser_ros.calibration.layout_fit import LayoutFitter, placed, rich_layout
+from anser_ros.calibration.layout_fit import LayoutFitter, LayoutPlacer, rich_layout
 from anser_ros.calibration.layout_score import LayoutScorer
 from anser_ros.calibration.layouts import Layout, place
-from anser_ros.calibration.prior import DrawnBoard
+from anser_ros.calibration.prior import ScaledNominal
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
 
@@ -67,7 +67,7 @@ def test_placed_coils_hold_where_nothing_was_read(world, drawing):
     found = FieldModel(
         sites.positions, sites.directions, moments, drawing.emitters, drawing.frequencies_hz
     )
-    gains = DrawnBoard(drawing, [told]).gains
+    gains = ScaledNominal(drawing, [told]).gains
     assert rms(found.flux(points, axes) - truth) < 0.05 * rms(
         drawing.flux(points, axes) * gains - truth
     )
@@ -87,19 +87,17 @@ def test_dipoles_of_several_emitters_are_no_coils(drawing):
 
 def test_held_out_blocks_choose_placed_coils(world, drawing):
     told = [world.measurements]
-    board = DrawnBoard(drawing, told)
+    generator = replace(world.generator, nominal=drawing)
     scorer = LayoutScorer(
         told, fold_of_frames([world.measurements.position]),
-        place(rich_layout(told, world.generator), world.generator), Accuracy(),
+        place(rich_layout(told, generator), generator), Accuracy(),
+        LayoutPlacer(generator, told),
     )  # fmt: skip
     coils = Layout('drawing', 21, 1.0, 0.0, 'nominal', True)
     still = Layout('layer', 10, 1.25, 0.0, 'nominal')
-    scores = [
-        scorer.score(layout, placed(layout, world.generator, board)[0], board).score
-        for layout in (coils, still)
-    ]
+    scores = [scorer.score(layout).score for layout in (coils, still)]
     assert scores[0] < 0.7 * scores[1]
-    whole = LayoutFitter(told, world.generator, Accuracy(), drawing).fit(coils, 1e-2)
+    whole = LayoutFitter(told, generator, Accuracy()).fit(coils, 1e-2)
     points, axes, truth = below(world)
     model = FieldModel(
         whole.dipoles.positions, whole.dipoles.directions, whole.fit.moments, drawing.emitters,

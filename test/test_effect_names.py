@@ -31,6 +31,8 @@ ALLOWED = {
     'calibration/sensor_parameters.py': 'parameters of a fit below the effects, as they are named',
     'calibration/survey_records.py': 'writes records as `docs/interfaces.md` names them, from '
     'below the effects: a scan finds what is wrong with itself by its own fit',
+    'calibration/one_place.py': 'the same, of a body of many sensors at one place',
+    'calibration/source_size.py': 'the same, of the sizes of magnets',
 }
 GENERAL = {
     'apparatus', 'body_term', 'correction', 'effect', 'prediction', 'registry', 'term', 'view',

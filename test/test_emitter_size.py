@@ -19,6 +19,7 @@ from anser_ros.calibration.calibrate import Options, fit_scan
 from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.result import Scan
+from anser_ros.calibration.source_size import with_source_sizes
 from anser_ros.diagnosis.diagnose import diagnose
 from anser_ros.diagnosis.prepare import build_problem
 from anser_ros.diagnosis.whitening import Spread
@@ -197,10 +198,11 @@ def test_sizes_of_either_sign_have_a_source_that_they_are_of():
 @pytest.mark.parametrize('world', [LONG, FLAT, POINT])
 def test_calibrate_tells_the_size_from_blocks_left_out(world):
     tool = recorded(world, np.random.default_rng(7), 150)
-    calibration = fit_scan(
-        Scan((tool,), ACCURACY), ['scan'], Generator(np.zeros((1, 3)), np.zeros(1), 0.1),
-        ('magnet',), (1.0,), Options(accuracy=ACCURACY),
-    )  # fmt: skip
+    generator = Generator(np.zeros((1, 3)), np.zeros(1), 0.1, ('magnet',), (1.0,))
+    scan = Scan((tool,), ACCURACY)
+    calibration = with_source_sizes(
+        fit_scan(scan, ['scan'], generator, Options(accuracy=ACCURACY))
+    )
     assert 'axis of its own' in calibration.layout.describe()
     found = to_document(calibration)['effects']
     if world is POINT:

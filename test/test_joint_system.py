@@ -1,4 +1,4 @@
-"""The survey's normal equations against the same written out whole, with every covariance."""
+"""The joint fit's normal equations against the same written out whole, with every covariance."""
 
 from types import SimpleNamespace
 

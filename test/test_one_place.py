@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.one_place import calibrate_at_one_place, is_at_one_place
 from anser_ros.calibration.requirements import check_single_coils
 from anser_ros.calibration.sources import KINDS
@@ -49,6 +50,7 @@ def helmet(count, rng):
 
 
 PLACES = np.array([[0.05, 0.02, 0.13], [-0.04, 0.04, 0.15]])
+GENERATOR = Generator(PLACES, np.zeros(2), 0.01, NAMES, TONES)
 MOMENTS = np.array([[2e-9, 1e-9, 8e-9], [-5e-9, 3e-9, 6e-9]])
 
 
@@ -78,7 +80,7 @@ def resting(rng, *, tilt=0.01, inverted=(), noisy=(), count=60):
 
 
 def calibrated(measured, kinds=KINDS):
-    return calibrate_at_one_place(measured, 'simulated', NAMES, TONES, kinds, ACCURACY)
+    return calibrate_at_one_place(measured, 'simulated', GENERATOR, kinds, ACCURACY)
 
 
 class TestPlacedPoints:
@@ -187,10 +189,10 @@ class TestOnePlace:
         assert polarity.evidence['held_out_log_probability'] > 0.0
         (loud,) = found.scan.reported_effects
         assert loud.name == 'excess_noise' and loud.parameters['channels'] == [30]
-        for source, place, moment in zip(found.sources, PLACES, MOMENTS, strict=True):
-            assert np.linalg.norm(source.position_m - place) < 4.0 * source.sigma_m < 4e-3
-            np.testing.assert_allclose(source.moment_am2, moment, atol=5e-10)
-        assert set(found.sensor_widths) == set(KINDS)
+        for source, place, moment in zip(found.more['sources'], PLACES, MOMENTS, strict=True):
+            assert np.linalg.norm(source['position_m'] - place) < 4.0 * source['sigma_m'] < 4e-3
+            np.testing.assert_allclose(source['moment_am2'], moment, atol=5e-10)
+        assert set(found.more['sensor_widths']) == set(KINDS)
         assert np.median(np.abs(found.held_out.error)) < 1e-3 * found.residuals.span_t
 
     def test_sound_sensors_are_not_named(self):
@@ -201,7 +203,7 @@ class TestOnePlace:
         wrong = (3, 10, 17, 28, 41, 44, 51, 57)
         measured = resting(np.random.default_rng(6), inverted=wrong)
         stated, free = calibrated(measured, ()), calibrated(measured)
-        assert stated.model.effects == () and stated.sensor_widths == {}
+        assert stated.model.effects == () and stated.more['sensor_widths'] == {}
         error = [np.sqrt(np.mean(np.abs(c.held_out.error) ** 2)) for c in (stated, free)]
         assert error[1] < 0.5 * error[0]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from calibration_world import NOISE_T, scene
 
-from anser_ros.calibration.calibrate import Options, _better, fit_scan, survey
+from anser_ros.calibration.calibrate import Options, _better, correct_scan, fit_scan
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.scan_gaps import factor_of
 from anser_ros.diagnosis.prepare import build_problem
@@ -28,9 +28,9 @@ def scanned():
     side = world.measurements.position[:, 0] > 0.04
     part = world.measurements.frames(np.flatnonzero(~side))
     options = Options(layout=LAYER)
-    scan = survey([part], world.generator, options)
     tones = (1000.0, 1100.0, 1200.0)
-    found = fit_scan(scan, ['scan'], world.generator, ('a', 'b', 'c'), tones, options)
+    generator = replace(world.generator, emitters=('a', 'b', 'c'), frequencies_hz=tones)
+    found = fit_scan(correct_scan([part], generator, options), ['scan'], generator, options)
     return world, side, found.model
 
 

@@ -8,7 +8,7 @@ from calibration_world import CENTRES, Errors, moved_scan, scene, tool_of
 
 from anser_ros.calibration.population import Likelihood, Population
 from anser_ros.calibration.sensor_parameters import KINDS, SURVEYED_M
-from anser_ros.calibration.sensor_survey import SensorSurveyor
+from anser_ros.calibration.sensor_survey import SensorFitter
 from anser_ros.calibration.survey_records import contradiction_words, undetermined_words
 from anser_ros.settings import Accuracy
 
@@ -18,16 +18,16 @@ EIGHT = np.array([[x, y, 0.0] for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 
 
 
 def surveyed(seed, coils, seconds, turn_rad, errors, centres=EIGHT, flat=False):
-    """A survey of a scan by a hand, and what is true of it."""
+    """A joint fit of a scan by a hand, and what is true of it."""
     rng = np.random.default_rng(seed)
     world, table = scene(rng, side=4, centres=centres), tool_of(coils)
     told, truth = moved_scan(world, table, rng, seconds, errors, turn_rad, flat)
-    return SensorSurveyor([told], KINDS, world.generator, Accuracy()).fit(), truth
+    return SensorFitter([told], KINDS, world.generator, Accuracy()).fit(), truth
 
 
 def test_a_camera_that_jitters_shifts_neither_field_nor_tool():
     found, truth = surveyed(26, 3, 20.0, 0.6, Errors(jitter=4.3))
-    assert np.abs(found.survey('tool').lever_arm - truth.lever).max() < 1e-4
+    assert np.abs(found.errors_of('tool').lever_arm - truth.lever).max() < 1e-4
     assert 5e-6 < found.shift_sigma_m < 5e-5
 
 
@@ -39,7 +39,7 @@ def test_what_the_cameras_jitter_limits_is_not_said_to_be_known_better():
     assert 6e-5 < offset[0] < 1e-4
     assert lever.min() > 2.4e-5
     assert lever.max() < 4e-5
-    assert (np.abs(found.survey('tool').lever_arm - truth.lever) < 3.0 * lever).all()
+    assert (np.abs(found.errors_of('tool').lever_arm - truth.lever) < 3.0 * lever).all()
 
 
 def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
@@ -59,8 +59,8 @@ def test_a_scan_of_seconds_tells_nothing_of_the_sensors_and_takes_the_setup():
     found, _ = surveyed(23, 9, 2.0, 0.6, Errors())
     assert set(found.undetermined) == set(KINDS) and not found.evidence
     assert len(undetermined_words(found)) == len(KINDS)
-    survey = found.survey('tool')
-    assert (survey.gain == 1.0).all() and not survey.place.any() and not survey.lever_arm.any()
+    own = found.errors_of('tool')
+    assert (own.gain == 1.0).all() and not own.place.any() and not own.lever_arm.any()
     assert found.kept[0].sum() >= 45
 
 
@@ -68,7 +68,7 @@ def test_of_one_coil_in_seconds_what_is_not_told_stays_at_the_setups():
     found, _ = surveyed(31, 1, 8.0, 0.6, Errors())
     assert {'axes', 'lever_arm'} <= set(found.undetermined)
     assert not set(found.undetermined) & set(found.evidence)
-    assert np.abs(found.survey('tool').lever_arm).max() < 1e-9
+    assert np.abs(found.errors_of('tool').lever_arm).max() < 1e-9
 
 
 def test_scans_that_contradict_each_other_name_the_channel_and_the_size():
@@ -79,7 +79,7 @@ def test_scans_that_contradict_each_other_name_the_channel_and_the_size():
     flux = second.flux.copy()
     flux[:, 1] *= 1.01
     scans = [first, replace(second, flux=flux)]
-    found = SensorSurveyor(scans, KINDS, world.generator, Accuracy()).fit()
+    found = SensorFitter(scans, KINDS, world.generator, Accuracy()).fit()
     (one,) = found.contradictions
     assert (one.kind, one.place, one.sessions) == ('gains', 'tool/0/y', (0, 1))
     assert one.size == pytest.approx(0.01, rel=0.1)

@@ -9,14 +9,14 @@ from calibration_world import NOISE_T, scene
 
 from anser_ros.calibration import selection
 from anser_ros.calibration.blocks import FOLDS, fold_of_frames
-from anser_ros.calibration.calibrate import Options, best_damped, fit_scan, survey
+from anser_ros.calibration.calibrate import Options, best_damped, correct_scan, fit_scan
 from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
 from anser_ros.calibration.held_out import rms
-from anser_ros.calibration.layout_fit import LayoutFitter
+from anser_ros.calibration.layout_fit import LayoutFitter, LayoutPlacer
 from anser_ros.calibration.layout_score import DAMPINGS, LayoutCandidate, LayoutScorer
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.local import Regions
-from anser_ros.calibration.prior import DrawnBoard, emitter_gains
+from anser_ros.calibration.prior import ScaledNominal, emitter_gains
 from anser_ros.calibration.selection import choose_layout, thin_frames
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
@@ -28,10 +28,11 @@ GENERATOR = Generator(np.zeros((1, 3)), np.zeros(1), 0.07)
 
 
 def calibrate(measurements, names, generator, emitters, tones, options=None, nominal=None):
-    """Survey measurements and fit a model to them, as a session's calibration does."""
+    """Correct measurements and fit a model to them, as a session's calibration does."""
     options = options or Options()
-    scan = survey(measurements, generator, options, nominal)
-    return fit_scan(scan, names, generator, emitters, tones, options, nominal)
+    generator = replace(generator, emitters=emitters, frequencies_hz=tones, nominal=nominal)
+    scan = correct_scan(measurements, generator, options)
+    return fit_scan(scan, names, generator, options)
 
 
 @pytest.fixture
@@ -105,7 +106,7 @@ def test_layouts_lie_where_they_say():
 
 
 def test_the_drawn_board_is_expressed_by_any_layer(world):
-    board = DrawnBoard(drawn(world), [world.measurements])
+    board = ScaledNominal(drawn(world), [world.measurements])
     layer = place(Layout('layer', 14, 1.6, 0.0), world.generator)
     model = FieldModel(layer.positions, layer.directions, board.moments(layer), EMITTERS, TONES)
     rng = np.random.default_rng(0)
@@ -126,13 +127,13 @@ def test_gains_of_the_drawn_board_are_found(world):
 def test_the_choice_is_neither_too_coarse_nor_undamped(world):
     thin = thin_frames([world.measurements])
     folds = fold_of_frames([m.position for m in thin])
-    scorer = LayoutScorer(
-        thin, folds, place(Layout('layer', 10, 1.25, 0.0), world.generator), Accuracy()
-    )
+    rich = place(Layout('layer', 10, 1.25, 0.0), world.generator)
+    placer = LayoutPlacer(world.generator, thin)
+    scorer = LayoutScorer(thin, folds, rich, Accuracy(), placer)
     scores = {}
     for count in (3, 9):
         layout = Layout('layer', count, 1.25, 0.0)
-        scores[count] = scorer.score(layout, place(layout, world.generator))
+        scores[count] = scorer.score(layout)
     assert scores[9].score < 0.5 * scores[3].score
     curve = dict(scores[9].curve)
     assert scores[9].score == min(curve.values())
@@ -144,8 +145,8 @@ def test_selection_finds_a_prior_and_is_deterministic(world, monkeypatch):
     monkeypatch.setattr(selection, 'MOST_ROWS', 300)
     thin = thin_frames([world.measurements])
     folds = fold_of_frames([m.position for m in thin])
-    board = DrawnBoard(drawn(world, 0.9), thin)
-    runs = [choose_layout(thin, folds, world.generator, Accuracy(), drawn=board) for _ in range(2)]
+    generator = replace(world.generator, nominal=drawn(world, 0.9))
+    runs = [choose_layout(thin, folds, generator, Accuracy()) for _ in range(2)]
     assert runs[0].finalists[0].layout == runs[1].finalists[0].layout
     assert runs[0].finalists[0].layout.prior == 'nominal'
     assert len(runs[0].candidates) > 10

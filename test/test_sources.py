@@ -15,7 +15,7 @@ from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.requirements import check_kept, check_measurements
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.calibration.sensor_survey import SensorSurveyor
+from anser_ros.calibration.sensor_survey import SensorFitter
 from anser_ros.calibration.survey_records import corrections, reported_effects
 from anser_ros.diagnosis import decisions, outlying
 from anser_ros.effects.apparatus import Apparatus
@@ -141,14 +141,14 @@ def test_gains_of_an_array_are_found_and_no_lever_arm_that_it_does_not_have(seed
         measured.time, measured.position, Rotation.from_matrix(measured.rotation).as_quat()
     )
     generator = Generator(np.zeros((1, 3)), np.zeros(1), 0.02)
-    surveyor = SensorSurveyor(
+    fitter = SensorFitter(
         [replace(measured, track=track)], KINDS, generator, Accuracy(NOISE_T, 2e-4, 2e-3)
     )
-    found = surveyor.fit()
-    survey = found.survey('array')
+    found = fitter.fit()
+    own = found.errors_of('array')
     assert 'gains' in found.evidence
-    assert np.std(survey.gain.real / gains) < np.std(gains) / 3.0
-    assert np.abs(survey.lever_arm).max() < 1e-4
+    assert np.std(own.gain.real / gains) < np.std(gains) / 3.0
+    assert np.abs(own.lever_arm).max() < 1e-4
 
 
 @pytest.mark.parametrize('rate_hz', [0.2, 25.0])
@@ -166,7 +166,7 @@ def test_poses_that_are_seconds_apart_say_nothing_of_movement(rate_hz, monkeypat
     measured = replace(measured, time=time, track=track)
     generator = Generator(np.zeros((1, 3)), np.zeros(1), 0.1)
     accuracy = Accuracy(flux_noise_t=NOISE_T, optical_position_m=1e-5, optical_rotation_rad=1e-4)
-    found = SensorSurveyor([measured], ('gains',), generator, accuracy).fit()
+    found = SensorFitter([measured], ('gains',), generator, accuracy).fit()
     assert bool(reported_effects(found, [measured])) is (rate_hz > 1.0)
 
 
@@ -209,9 +209,9 @@ class TestPickup:
             flux_noise_t=NOISE_T, optical_position_m=1e-5, optical_rotation_rad=1e-4
         )
         generator = Generator(np.zeros((1, 3)), np.zeros(1), 0.1)
-        found = SensorSurveyor([dirty], ('offsets',), generator, accuracy).fit()
+        found = SensorFitter([dirty], ('offsets',), generator, accuracy).fit()
         assert set(found.evidence) == {'offsets'}
-        left = found.survey('array').pickup - added
+        left = found.errors_of('array').pickup - added
         assert np.sqrt(np.mean(np.abs(left) ** 2)) < 0.1 * np.sqrt(np.mean(added**2))
         (record,) = (r for r in corrections(found) if r.name == 'sensor_pickup_spread')
         assert record.parameters['spread'] == pytest.approx(5e-6 / np.sqrt(2.0), rel=0.4)

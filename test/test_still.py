@@ -93,10 +93,9 @@ def recorded(seed, *, gain=0.02, tilt=0.03, bend=5e-4, iron=True, off=None, per_
 
 
 def calibrated(measured, kinds):
-    generator = Generator(CENTRES + [[0.01, -0.01, 0.0]], np.zeros(3), 0.1)
-    return calibrate_still(
-        measured, 'made.mcap', generator, ('a', 'b', 'c'), (1.0, 2.0, 3.0), kinds, STATED
-    )
+    centres = CENTRES + [[0.01, -0.01, 0.0]]
+    generator = Generator(centres, np.zeros(3), 0.1, ('a', 'b', 'c'), (1.0, 2.0, 3.0))
+    return calibrate_still(measured, 'made.mcap', generator, kinds, STATED)
 
 
 class TestModel:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
 from anser_ros.calibration.population import Likelihood, Population, solve
 from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters
-from anser_ros.calibration.sensor_survey import SensorSurveyor
+from anser_ros.calibration.sensor_survey import SensorFitter
 from anser_ros.calibration.survey_records import (
     contradiction_words,
     corrections,
@@ -62,19 +62,19 @@ def dirty():
         has_pose=has_pose, track=track, valid=np.ones((FRAMES, 6), dtype=bool),
         flags=np.zeros((FRAMES, 6), dtype=np.int64),
     )  # fmt: skip
-    found = SensorSurveyor([told], KINDS, world.generator, Accuracy()).fit()
+    found = SensorFitter([told], KINDS, world.generator, Accuracy()).fit()
     return told, found, {'gain': gain, 'axis': axis, 'place': place}
 
 
 def test_all_that_is_wrong_is_found(dirty):
     _, found, truth = dirty
-    survey = found.survey('tool')
-    assert np.abs(survey.gain - truth['gain']).max() < 3e-4
-    assert np.abs(survey.gain).mean() == pytest.approx(1.0, abs=1e-12)
-    assert np.linalg.norm(survey.axis - truth['axis'], axis=1).max() < 5e-4
-    assert np.abs(survey.place - truth['place']).max() < 2e-5
-    assert np.abs(survey.lever_arm - LEVER_M).max() < 5e-5
-    assert abs(survey.offset_s - OFFSET_S) < 1e-4
+    own = found.errors_of('tool')
+    assert np.abs(own.gain - truth['gain']).max() < 3e-4
+    assert np.abs(own.gain).mean() == pytest.approx(1.0, abs=1e-12)
+    assert np.linalg.norm(own.axis - truth['axis'], axis=1).max() < 5e-4
+    assert np.abs(own.place - truth['place']).max() < 2e-5
+    assert np.abs(own.lever_arm - LEVER_M).max() < 5e-5
+    assert abs(own.offset_s - OFFSET_S) < 1e-4
     assert found.left_out == ('clock_rate',)
 
 
@@ -82,8 +82,8 @@ def test_uncertainties_hold(dirty):
     _, found, truth = dirty
     sigma = np.sqrt(np.diag(found.posterior.covariance))
     rows = found.parameters.rows('gains')
-    survey = found.survey('tool')
-    error = np.stack([survey.gain.real, survey.gain.imag], axis=1)
+    own = found.errors_of('tool')
+    error = np.stack([own.gain.real, own.gain.imag], axis=1)
     error -= np.stack([truth['gain'].real, truth['gain'].imag], axis=1)
     assert np.sqrt(np.mean((error.ravel() / sigma[rows]) ** 2)) < 2.0
     assert sigma[rows].max() < 1e-3
@@ -110,8 +110,8 @@ def test_records_undo_what_was_found(dirty):
     ]  # fmt: skip
     correction = Correction.of(records, told.sensors, (1.0, 2.0, 3.0))
     assert correction.corrected[0] == 'sensor_gain_spread'
-    survey = found.survey('tool')
-    repaired = survey.apply(told)
+    own = found.errors_of('tool')
+    repaired = own.apply(told)
     assert np.allclose(correction.sensors().position, repaired.sensors.position, atol=1e-12)
     assert np.allclose(correction.sensors().axis, repaired.sensors.axis, atol=1e-12)
     assert np.allclose(correction.optical(told.track).time, repaired.track.time)
@@ -231,7 +231,7 @@ def test_sessions_that_say_different_things_of_a_sensor_are_told(dirty):
     other = replace(halves[1], flux=changed)
     generator = scene(np.random.default_rng(5), side=2).generator
     same, differ = (
-        SensorSurveyor([halves[0], second], KINDS, generator, Accuracy()).fit()
+        SensorFitter([halves[0], second], KINDS, generator, Accuracy()).fit()
         for second in (halves[1], other)
     )
     assert whole.contradictions == () and same.contradictions == ()

@@ -26,20 +26,9 @@ def fold_of_frames(positions: Sequence[Array]) -> list[NDArray[np.int64]]:
     to fold (i + 2 j + 3 k) mod `FOLDS`, so that a fold is spread over the volume and its cells
     do not touch. All frames of a cell are held out together, never a single point.
 
-    Parameters
-    ----------
-    positions : sequence of ndarray, shape (F, 3)
-        Body positions, m, one array per body and session.
-
-    Returns
-    -------
-    list of ndarray of int, shape (F,)
-        Folds of the frames, one array per body and session.
-
-    Raises
-    ------
-    FitError
-        When the frames fill fewer than two folds.
+    ``positions`` (F, 3) are the bodies', m, one array per body and session.
+    Returns (F,): folds of the frames, one array per body and session.
+    Raises `FitError` when the frames fill fewer than two folds.
     """
     everywhere = np.concatenate(positions)
     low, high = everywhere.min(axis=0), everywhere.max(axis=0)

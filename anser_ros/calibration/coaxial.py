@@ -25,9 +25,8 @@ from anser_ros.physics.tangent import tilted
 Array = NDArray[np.float64]
 
 SPREAD = 0.2
-"""Distance of neighbouring dipoles as a fraction of that from the source to the nearest sensor. As
-a fraction s it makes the first multipole that is left out smaller than what is kept by s squared;
-much smaller fractions make columns that only differ by rounding."""
+"""Distance of neighbouring dipoles, as a fraction s of that from the source to the nearest sensor:
+the first multipole that is left out is smaller than what is kept by s squared."""
 FIRST_SPACING_M = 1e-3
 """Distance of the dipoles before any data are seen, m. Any value far below the distance of the
 sensors gives the same first fit."""
@@ -38,14 +37,8 @@ ENDED = 1e-10
 def coaxial(centres: Array, axes: Array, count: int, spacing_m: Array) -> DipoleSites:
     """Return ``count`` dipoles along the axis of each of K sources.
 
-    Parameters
-    ----------
-    centres, axes : ndarray, shape (K, 3)
-        Middles (m) and unit axes, frame fg.
-    count : int
-        Dipoles a source, odd.
-    spacing_m : ndarray, shape (K,)
-        Distance of neighbours, m.
+    ``centres``, ``axes`` (K, 3): middles (m) and unit axes, frame fg. ``count``: dipoles a source,
+    odd. ``spacing_m`` (K,): distance of neighbours, m.
     """
     steps = np.arange(count) - (count - 1) / 2.0
     along = steps[None, :, None] * spacing_m[:, None, None] * axes[:, None, :]
@@ -58,16 +51,8 @@ def fit_coaxial(
 ) -> DipoleSites:
     """Return coaxial dipoles where they explain the measurements best, one source after the other.
 
-    Parameters
-    ----------
-    corrected : sequence of Measurements
-        Measurements at their corrected poses, one per body and session; K emitters.
-    weights : sequence of ndarray, shape (F, S)
-        Weights of the readings.
-    start : DipoleSites
-        ``count`` dipoles for each of the K emitters, in the order of the emitters.
-    count : int
-        Dipoles a source.
+    ``corrected`` are at their corrected poses; ``start`` has ``count`` dipoles for each of the K
+    emitters, in their order.
     """
     middle = (count - 1) // 2
     centres, axes = start.positions[middle::count], start.directions[middle::count]

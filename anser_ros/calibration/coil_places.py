@@ -29,20 +29,14 @@ TURN_RAD = 0.03
 DIFFERENCE = 1e-2
 """Step by which derivatives are taken, as a fraction of these widths: small compared with any
 curvature of the field, and far above rounding."""
-MOST_STEPS = 5
+COIL_STEPS = 5
 """Gauss-Newton steps of a coil at most; two are enough for shifts of a millimetre."""
-CONVERGED = 1e-3
+COIL_AT_REST = 1e-3
 """Step, as a fraction of the widths, below which a coil stays where it is."""
 
 
 class CoilPlacer:
-    """Places the coils of a drawn board by readings whose poses are right.
-
-    Parameters
-    ----------
-    nominal : FieldModel
-        The drawn board; its dipoles belong to one emitter each.
-    """
+    """Places the coils of a drawn board by readings whose poses are right."""
 
     def __init__(self, nominal: FieldModel) -> None:
         self.nominal = nominal
@@ -60,19 +54,7 @@ class CoilPlacer:
     ) -> tuple[DipoleSites, ComplexArray]:
         """Return the coils' dipoles where the readings put them, and their moments.
 
-        Parameters
-        ----------
-        corrected : sequence of Measurements
-            Measurements at their corrected poses, one per body and session.
-        weights : sequence of ndarray, shape (F, S)
-            Weights of the readings.
-
-        Returns
-        -------
-        sites : DipoleSites
-            N dipoles.
-        moments : ndarray, shape (N, K), complex
-            Their moments, A m^2.
+        Returns N dipoles, and their moments (N, K), A m^2.
         """
         (points, axes, lengths, flux), root = weighted_readings(corrected, weights)
         positions, directions = self.nominal.positions.copy(), self.nominal.directions.copy()
@@ -105,7 +87,7 @@ def _coil_fit(field: Callable[[Array], ComplexArray], flux: ComplexArray) -> tup
     """Return the shift and turn (6,) of one coil, and its complex gain, by weighted readings."""
     widths = np.repeat([SHIFT_M, TURN_RAD], 3)
     at, best = np.zeros(6), None
-    for _ in range(MOST_STEPS):
+    for _ in range(COIL_STEPS):
         drawn = field(at)
         gain = complex(np.vdot(drawn, flux)) / max(float(np.vdot(drawn, drawn).real), 1e-300)
         rest = flux - gain * drawn
@@ -122,7 +104,7 @@ def _coil_fit(field: Callable[[Array], ComplexArray], flux: ComplexArray) -> tup
         right = np.concatenate([rest.real, rest.imag, -noise * at / widths])
         step = np.linalg.lstsq(np.concatenate([rows, hold]), right, rcond=None)[0][:6]
         at = at + widths * step
-        if np.abs(step).max() < CONVERGED:
+        if np.abs(step).max() < COIL_AT_REST:
             break
     assert best is not None
     return best[1], best[2]

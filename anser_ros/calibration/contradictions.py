@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.joint_system import Eliminated
+from anser_ros.calibration.population import Likelihood, solve
 from anser_ros.calibration.sensor_parameters import CLOCKS, EACH, PRIOR, USEFUL, SensorParameters
 from anser_ros.field.measurements import Measurements
 
@@ -22,31 +23,20 @@ CERTAIN = 6.0
 """Standard deviations between two sessions from which on they contradict each other: a value of a
 normal variable is that far out once in a billion."""
 NOTICEABLE = 0.5
-"""Share of the useful size of a parameter (`USEFUL`) below which a difference is not told: it
+"""Share of the useful size of a parameter (`USEFUL`) below which a difference is not reported: it
 moves poses by less than a tenth of a millimetre."""
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Names a sensor, or body, of which two sessions say different things.
+    """Names a sensor, or body, of which two sessions say different things."""
 
-    Attributes
-    ----------
-    kind : str
-        Of `sensor_parameters.KINDS`.
-    place : str
-        Name of the sensor, or of the body.
-    size, sigma : float
-        Difference and its standard deviation, in the parameter's unit.
-    sessions : tuple of two int
-        Which of the measurements.
-    """
-
-    kind: str
-    place: str
+    kind: str  # of `sensor_parameters.KINDS`
+    place: str  # name of the sensor, or of the body
+    # size, sigma: difference and its standard deviation, in the parameter's unit
     size: float
     sigma: float
-    sessions: tuple[int, int]
+    sessions: tuple[int, int]  # which of the measurements
 
 
 def contradictions(
@@ -54,15 +44,8 @@ def contradictions(
 ) -> tuple[Contradiction, ...]:
     """Return of what two sessions say different things, the worst pair of each once.
 
-    Parameters
-    ----------
-    parts : sequence of Measurements
-        One a body and session, corrected by the joint estimate.
-    kinds : sequence of str
-        What is corrected.
-    sums : callable
-        Given parameters and measurements, what these say about the parameters, with the field
-        unknown.
+    ``parts``: one a body and session, corrected by the joint estimate. ``sums``: given parameters
+    and measurements, what these say about the parameters, with the field unknown.
     """
     bodies = [part.body for part in parts]
     if len(set(bodies)) == len(bodies):
@@ -75,9 +58,8 @@ def contradictions(
         width[parameters.rows(kind)] = PRIOR[kind]
     inflation = max(1.0, rest.inflation)
     information = rest.information / inflation + parameters.rule()
-    scaled = np.eye(width.size) + width[:, None] * information * width[None, :]
-    covariance = width[:, None] * np.linalg.solve(scaled, np.diag(width))
-    change = covariance @ rest.gradient / inflation
+    posterior = solve(Likelihood(information, rest.gradient / inflation), width)
+    change, covariance = posterior.values, posterior.covariance
     worst: dict[tuple[str, str], Contradiction] = {}
     for i, j in combinations(range(len(bodies)), 2):
         if bodies[i] != bodies[j]:
@@ -85,12 +67,8 @@ def contradictions(
         for kind in parameters.kinds:
             for name, one, other in _pairs(parameters, kind, i, j):
                 difference = change[one] - change[other]
-                variance = np.diag(
-                    covariance[np.ix_(one, one)]
-                    + covariance[np.ix_(other, other)]
-                    - covariance[np.ix_(one, other)]
-                    - covariance[np.ix_(other, one)]
-                )
+                variance = covariance[one, one] + covariance[other, other]
+                variance = variance - 2.0 * covariance[one, other]
                 sigma = float(np.sqrt(variance[int(np.argmax(np.abs(difference)))]))
                 size = float(np.linalg.norm(difference))
                 found = Contradiction(kind, name or bodies[i], size, sigma, (i, j))

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.measurements import Measurements
-from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.dipole import flux_basis, flux_jacobian
 from anser_ros.physics.sensor import along_each_axis
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -36,17 +37,24 @@ class DipoleSites:
 
 
 def basis_rows(measurements: Measurements, dipoles: DipoleSites) -> Array:
-    """Return the article's matrix M for all readings, shape (F S, N), T / (A m^2).
+    """Return the article's matrix M for all readings, shape (F S, N), T / (A m^2)."""
+    return flux_basis(*_rows(measurements), dipoles.positions, dipoles.directions)
 
-    Parameters
-    ----------
-    measurements : Measurements
-        F frames of S sensors, each with a pose.
-    dipoles : DipoleSites
-        N dipoles.
+
+def flux_slopes(
+    measurements: Measurements, dipoles: DipoleSites, moments: ComplexArray
+) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """Return modelled fluxes (F, S, K), T, and their derivatives (F, S, 3, K).
+
+    These are by the sensors' centres (T/m) and axes (T).
     """
+    rows, sites = _rows(measurements), (dipoles.positions, dipoles.directions)
+    flux, by_place, by_axis = flux_jacobian(*rows, *sites, moments)
+    shape = (len(measurements.time), len(measurements.sensors), 3, moments.shape[1])
+    return flux.reshape(*shape[:2], -1), by_place.reshape(shape), by_axis.reshape(shape)
+
+
+def _rows(measurements: Measurements) -> tuple[Array, Array, Array]:
     points, axes = measurements.placed()
-    lengths = np.tile(measurements.sensors.length, len(measurements.time))
-    return flux_basis(
-        points.reshape(-1, 3), axes.reshape(-1, 3), lengths, dipoles.positions, dipoles.directions
-    )
+    lengths = np.tile(measurements.sensors.length, len(points))
+    return points.reshape(-1, 3), axes.reshape(-1, 3), lengths

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_propagation
 from scipy.spatial import cKDTree
 
 from anser_ros.field.measurements import Measurements
@@ -19,25 +20,20 @@ BIN_FRAMES = 4
 """Frames of a stretch at least: their mean has half the noise of one."""
 GLITCH = 6.0
 """Deviation of a pose from where the fluxes put it, in robust standard deviations, from which on
-it is left out. A Gaussian jitter is that far off once in a billion. Smaller leaves out poses that
-only jitter; larger lets reflections into the fit."""
+it is left out: a Gaussian jitter is that far off once in a billion."""
 LEFT_OVER = 25.0
 """Power that no pose explains, in a stretch against the median stretch and against where the tool
-was near the same place, from which on something moved. What a field's model misses at the edge of
-a scan is a few times the noise, in power; what moves there leaves it also a millimetre away.
-Smaller takes the edge of a scan for metal; larger fits a field to metal that moved."""
+was near the same place, from which on something moved; what a model misses at the edge of a scan
+is a few times the noise."""
 SHORTEST_S = 2.0
 """Time, s, for which a tool must see that something moves: four stretches, as a path needs a
-beginning, an end and a way between. Shorter takes single bad stretches for metal; longer misses
-what passes quickly."""
+beginning, an end and a way between."""
 SEEN = 8.0
 """Power of the references' deviation in a stretch, in standard deviations beyond the noise's, from
-which on something moved; noise reaches it once in 1e15 stretches. Smaller takes slow drifts for
-metal; larger misses small metal far away."""
+which on something moved; noise reaches it once in 1e15 stretches."""
 EDGE = 3.0
 """The same, beside a stretch that something moved in: it comes and goes gradually, and noise alone
-reaches it in one stretch of 700. Smaller spreads a disturbance over quiet stretches next to it;
-larger leaves its beginning and end in the data."""
+reaches it in one stretch of 700."""
 QUIET_ROUNDS = 6
 """Rounds in which the quiet stretches are distinguished from the others. Fewer may end before the
 stretches have settled; more cost a fit each."""
@@ -45,14 +41,9 @@ stretches have settled; more cost a fit each."""
 
 @dataclass(frozen=True)
 class Span:
-    """Marks a part of a session in which the field was not steady.
+    """Marks a part of a session in which the field was not steady."""
 
-    Attributes
-    ----------
-    start_s, end_s : float
-        s since the session's start.
-    """
-
+    # start_s, end_s: s since the session's start
     start_s: float
     end_s: float
 
@@ -64,16 +55,10 @@ class Span:
 def glitches(steps: Array, usable: Mask, stated: Array) -> Mask:
     """Return which frames' poses are far from where their fluxes put them, shape (F,).
 
-    Parameters
-    ----------
-    steps : ndarray, shape (F, 6)
-        From each optical pose to the one that the fluxes tell, m and rad.
-    usable : ndarray of bool, shape (F,)
-        Frames to judge by.
-    stated : ndarray, shape (6,)
-        Jitter that the optical tracker is said to have, m and rad. A deviation that is usual for
-        it is not taken for a wrong pose where its jitter shows to be less: then what the field's
-        model misses near the board stands out first.
+    ``steps`` (F, 6): from each optical pose to where the fluxes put it, m and rad. ``usable``
+    (F,): frames to judge by. ``stated`` (6,): jitter that the optical tracker is said to have, m
+    and rad. A deviation that is usual for it is not taken for a wrong pose where its jitter shows
+    to be less: then what the field's model misses near the board stands out first.
     """
     if usable.sum() < BIN_FRAMES:
         return np.zeros(len(steps), dtype=bool)
@@ -122,22 +107,14 @@ def unsteady_references(reference: Measurements) -> Mask:
         if quiet.sum() < 2:
             break
         steady = np.average(means[quiet], axis=0, weights=size[quiet])
-    return np.asarray(_grown(excess > SEEN, excess > EDGE)[bins])
+    return np.asarray(binary_propagation(excess > SEEN, mask=excess > EDGE)[bins])
 
 
 def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask:
     """Return which frames lie in stretches that no pose explains, shape (F,).
 
-    Parameters
-    ----------
-    time : ndarray, shape (F,)
-        s, ascending.
-    place : ndarray, shape (F, 3)
-        Of the body, m.
-    power : ndarray, shape (F,)
-        Mean square of what no pose explains in each frame.
-    usable : ndarray of bool, shape (F,)
-        Frames to judge by.
+    ``time`` (F,): s, ascending. ``place`` (F, 3): of the body, m. ``power`` (F,): mean square of
+    what no pose explains in each frame. ``usable`` (F,): frames to judge by.
     """
     bins = stretches(time)
     count = int(bins.max()) + 1 if bins.size else 0
@@ -147,7 +124,9 @@ def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask
     total = np.bincount(bins[usable], power[usable], count)
     mean = np.asarray(total / np.maximum(size, 1), dtype=np.float64)
     ratio = mean / max(float(np.median(mean[size > 0])), 1e-300)
-    found = np.asarray(_grown(ratio > LEFT_OVER, ratio > np.sqrt(LEFT_OVER))[bins])
+    # With the stretches on the edge of it, as far as they adjoin.
+    grown = binary_propagation(ratio > LEFT_OVER, mask=ratio > np.sqrt(LEFT_OVER))
+    found = np.asarray(grown[bins])
     quiet = usable & ~found
     for span in spans_of(time, found):
         rows = np.flatnonzero(span.holds(time) & usable)
@@ -160,18 +139,6 @@ def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask
         if float(power[rows].mean()) < np.sqrt(LEFT_OVER) * beside:
             found[span.holds(time)] = False
     return found
-
-
-def _grown(core: Mask, edge: Mask) -> Mask:
-    """The core with all edges that adjoin it."""
-    out = core.copy()
-    for index in np.flatnonzero(core):
-        for way in (-1, 1):
-            at = index + way
-            while 0 <= at < edge.size and edge[at] and not out[at]:
-                out[at] = True
-                at += way
-    return out
 
 
 def spans_of(time: Array, unsteady: Mask) -> list[Span]:

@@ -1,12 +1,13 @@
 """Makes the document ``calibration.json`` that a calibration writes (see docs/interfaces.md)."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.calibration.factors import as_real
 from anser_ros.calibration.held_out import HeldOut, rms
-from anser_ros.calibration.moments import MomentFit
 from anser_ros.calibration.optical_noise import OpticalNoise
 from anser_ros.calibration.requirements import FEWEST_SCAN_FRAMES
 from anser_ros.calibration.result import Calibration
@@ -48,7 +49,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
             'heldout_chi_square': held_out.chi_square,
             'flux_error_t': held_out.flux_error_t,
             'fit_noise_t': calibration.fit.noise_t,
-            'outlier_fraction': _outlier_fraction(calibration.fit),
+            'outlier_fraction': _outlier_fraction(calibration.fit.weights),
         },
         **_by_pose(held_out),
         'choice': {
@@ -72,31 +73,14 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
         'nominal_flux_rmse_t': nominal,
         'effects': [_effect(record) for record in (*scan.corrections, *scan.reported_effects)],
         'unobservable': [
-            *([] if scan.survey is None else undetermined_words(scan.survey)),
+            *([] if scan.sensor_fit is None else undetermined_words(scan.sensor_fit)),
             *calibration.undetermined,
         ],
-        **_sources(calibration),
+        **calibration.more,
         'shift_sigma_m': calibration.model.shift_sigma_m,
         'contradictions': list(calibration.contradictions),
-        'optical_noise': None if scan.survey is None else _optical(scan.survey.optical),
+        'optical_noise': None if scan.sensor_fit is None else _optical(scan.sensor_fit.optical),
     }
-
-
-def _sources(calibration: Calibration) -> dict[str, Any]:
-    """Places of emitters that were found, and how far the sensors are off altogether."""
-    if not calibration.sources:
-        return {}
-    found = [
-        {
-            'name': one.name,
-            'position_m': one.position_m.tolist(),
-            'sigma_m': one.sigma_m,
-            'moment_am2': one.moment_am2.tolist(),
-            'stray_dipoles': one.stray_dipoles,
-        }
-        for one in calibration.sources
-    ]
-    return {'sources': found, 'sensor_widths': dict(calibration.sensor_widths)}
 
 
 def _by_pose(held_out: HeldOut) -> dict[str, Any]:
@@ -136,6 +120,6 @@ def _optical(noise: OpticalNoise) -> dict[str, Any]:
     }
 
 
-def _outlier_fraction(fit: MomentFit) -> float:
-    weights = np.concatenate([w.ravel() for w in fit.weights])
-    return float((weights[weights > 0.0] < OUTLIER_WEIGHT).mean())
+def _outlier_fraction(weights: Sequence[NDArray[np.float64]]) -> float:
+    every = np.concatenate([w.ravel() for w in weights])
+    return float((every[every > 0.0] < OUTLIER_WEIGHT).mean())

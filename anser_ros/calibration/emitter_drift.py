@@ -24,12 +24,10 @@ LEAST_DRIFT = 2e-4
 a millimetre."""
 CERTAIN = 5.0
 """The same in standard deviations of what noise makes of it: of a mean over the session, noise
-alone hardly ever makes five times what it usually does. Smaller takes noise for a drift; larger
-leaves a drift in the data where references are noisy."""
+alone hardly ever makes five times what it usually does."""
 COMMON = 0.995
-"""Share of the power of an emitter's changes that one factor must explain. It explains all of a
-drift; of a large metal body that comes up from below it explains up to 97 %, so that less would
-take metal for a drift, and more would miss a drift with a little of anything else."""
+"""Share of the power of an emitter's changes that one factor must explain: all of a drift, but of
+a large metal body that comes up from below up to 97 %."""
 
 
 def emitter_strength(reference: Measurements) -> ComplexArray:
@@ -37,10 +35,7 @@ def emitter_strength(reference: Measurements) -> ComplexArray:
 
     It is one for emitters that do not drift, and for all emitters if there are too few references.
 
-    Parameters
-    ----------
-    reference : Measurements
-        F frames of the R references.
+    ``reference``: F frames of the R references.
     """
     count, emitters = len(reference.time), reference.flux.shape[2]
     out = np.ones((count, emitters), dtype=np.complex128)
@@ -77,13 +72,8 @@ def emitter_strength(reference: Measurements) -> ComplexArray:
 def at_strength(measurements: Measurements, time: Array, strength: ComplexArray) -> Measurements:
     """Return measurements as emitters of constant strength would have given them.
 
-    Parameters
-    ----------
-    measurements : Measurements
-    time : ndarray, shape (G,)
-        s, ascending.
-    strength : ndarray, shape (G, K), complex
-        Of the emitters at these times, as of `emitter_strength`.
+    ``time`` (G,): s, ascending. ``strength`` (G, K): of the emitters at these times, as of
+    `emitter_strength`.
     """
     now = np.stack([np.interp(measurements.time, time, column) for column in strength.T], axis=1)
     return replace(measurements, flux=measurements.flux / now[:, None, :])

@@ -53,17 +53,11 @@ plane: a board that is drilled on a machine is thinner, a volume is not."""
 
 @dataclass(frozen=True)
 class HeldOutError:
-    """Holds root mean square errors, m, of places that took no part.
+    """Holds root mean square errors, m, of places that took no part."""
 
-    Attributes
-    ----------
-    whole : float
-        Of the distance.
-    in_plane, out_of_plane : float or None
-        Along and across the plane of the true places, where these were registered and lie in one.
-    """
-
-    whole: float
+    whole: float  # of the distance
+    # in_plane, out_of_plane: along and across the plane of the true places, where these were
+    # registered and lie in one
     in_plane: float | None = None
     out_of_plane: float | None = None
 
@@ -75,34 +69,23 @@ class HeldOutError:
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Maps tracked to true positions as it was fitted.
+    """Maps tracked to true positions as it was fitted."""
 
-    Attributes
-    ----------
-    correction : PositionMap
-        What it adds to tracked positions.
-    rotation, translation : ndarray, shapes (3, 3) and (3,)
-        From the frame of the true positions to that of the tracked ones, m; none where both are
-        in one frame.
-    places, errors : ndarray, shape (M, 3)
-        The tracked positions that it was learnt from, and what they lacked, m.
-    before, after : HeldOutError
-        Without a map and with one, in blocks held out of registration, choice, decision and fit.
-        The latter may be the larger: then the map does not help.
-    clearness : float
-        The fall of the held-out mean square from one to the other, in its standard errors.
-    tried : tuple of (Shape, float)
-        Every shape with its held-out error (m), by which the shape was chosen.
-    """
-
-    correction: PositionMap
+    correction: PositionMap  # what it adds to tracked positions
+    # rotation, translation (3, 3) and (3,): from the frame of the true positions to that of the
+    # tracked ones, m; none where both are in one frame
     rotation: Array
     translation: Array
+    # places, errors (M, 3): the tracked positions that it was learnt from, and what they lacked, m
     places: Array
     errors: Array
+    # before, after: without a map and with one, in blocks held out of registration, choice,
+    # decision and fit. The latter may be the larger: then the map does not help.
     before: HeldOutError
     after: HeldOutError
+    # the fall of the held-out mean square from one to the other, in its standard errors
     clearness: float
+    # every shape with its held-out error (m), by which the shape was chosen
     tried: tuple[tuple[Shape, float], ...]
 
     @property
@@ -143,17 +126,9 @@ class ErrorMap:
 def learn_error_map(tracked: Array, true: Array, *, registers: bool = False) -> ErrorMap:
     """Learn a map from points at which both positions are known.
 
-    Parameters
-    ----------
-    tracked, true : ndarray, shape (M, 3)
-        m, in one frame, or in two.
-    registers : bool
-        Whether each has a frame of its own. Then a shift or turn of all is no error.
-
-    Raises
-    ------
-    FitError
-        When shapes differ, or there are too few points, or all are at one place.
+    ``tracked``, ``true`` (M, 3): m, in one frame, or in two. ``registers``: whether each has a
+    frame of its own. Then a shift or turn of all is no error.
+    Raises `FitError` when shapes differ, or there are too few points, or all are at one place.
     """
     if tracked.shape != true.shape or tracked.ndim != 2 or tracked.shape[1] != 3:
         raise FitError(

@@ -14,15 +14,7 @@ columns (some 1e-7 / (0.1 m)^3 T / (A m^2)); it only avoids numbers of very diff
 
 
 class TriangularFactor:
-    """Keeps a least-squares problem as the triangular factor of its rows, by QR, block by block.
-
-    Parameters
-    ----------
-    unknowns : int
-        Number of columns N of the matrix.
-    right_sides : int
-        Number of right-hand sides M.
-    """
+    """Keeps a least-squares problem as the triangular factor of its rows, by QR, in blocks."""
 
     def __init__(self, unknowns: int, right_sides: int) -> None:
         self.unknowns = unknowns
@@ -80,24 +72,12 @@ class GramFactor:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Keeps a least-squares problem in its singular vectors, which make every damping cheap.
+    """Keeps a least-squares problem in its singular vectors, which make every damping cheap."""
 
-    Attributes
-    ----------
-    scale : ndarray, shape (N,)
-        Norms by which the columns were divided.
-    values : ndarray, shape (R,)
-        Singular values of the scaled matrix, descending.
-    vectors : ndarray, shape (R, N)
-        Right singular vectors.
-    projected : ndarray, shape (R, M)
-        Right-hand sides in the left singular vectors.
-    """
-
-    scale: Array
-    values: Array
-    vectors: Array
-    projected: Array
+    scale: Array  # (N,): norms by which the columns were divided
+    values: Array  # (R,): singular values of the scaled matrix, descending
+    vectors: Array  # (R, N): right singular vectors
+    projected: Array  # (R, M): right-hand sides in the left singular vectors
 
     @property
     def rank(self) -> int:

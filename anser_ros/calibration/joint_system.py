@@ -19,22 +19,20 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
+from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows, flux_slopes
 from anser_ros.calibration.factors import as_complex, as_real
 from anser_ros.calibration.normal_factor import NormalFactor, subtract_gram
-from anser_ros.calibration.pose_correction import pose_slopes
+from anser_ros.calibration.pose_correction import PoseTerms, pose_slopes
 from anser_ros.calibration.readings import frame_blocks
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
 from anser_ros.field.measurements import Measurements
-from anser_ros.physics.dipole import flux_jacobian
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 LEAST_MOST_MODES, MOST_MODES = 160, 240
-"""Modes of the field at most, for a scan of minutes and for a short one. With fewer, what they
-miss of a wide board's field passes for an error of the lever arm: with 160, 20 pT and 0.1 mm in
-20 s by a camera that jitters by 0.3 mm. The size of the system grows in proportion."""
+"""Modes of the field at most, for a scan of minutes and for a short one. What fewer miss of a
+wide board's field passes for an error of the lever arm: 0.1 mm with 160, for a poor camera."""
 MODES_WORK = 6e7
 """Frames times the square of the modes, to which the time of a step is proportional."""
 POSES_A_MODE = 2.0
@@ -48,30 +46,19 @@ POSE_ROWS = 1800
 the large matrix takes as long as the products; more only take memory."""
 LEAST_OPEN = 1e-4
 """Variance that open poses add to a part's readings on average, relative to the noise's, up to
-which they have nothing to do with it: 1e-9 without metal, 4e-5 to 1e-4 a few centimetres from
-large pieces. A larger one begins to change what readings weigh."""
+which they have nothing to do with it: 1e-9 without metal, 4e-5 to 1e-4 near large pieces."""
 STRETCHES = 20
-"""Stretches of a body's frames at least: how much their scores scatter tells the weight of the
-fluxes, of which two stretches tell nothing. Many more are shorter than the way over which errors
-of the field's model are alike."""
+"""Stretches of a body's frames at least, whose scores' scatter tells the weight of the fluxes.
+Many more are shorter than the way over which errors of the field's model are alike."""
 
 
 @dataclass(frozen=True)
 class FieldModes:
-    """Combines dipoles whose fluxes are orthogonal over a scan's readings.
+    """Combines dipoles whose fluxes are orthogonal over a scan's readings."""
 
-    Attributes
-    ----------
-    sites : DipoleSites
-        N dipoles.
-    vectors : ndarray, shape (N, M)
-        Moments of each mode, A m^2, for a flux of 1 T rms over the readings.
-    size : ndarray, shape (M,)
-        Singular values relative to the largest: how strongly a moment makes each mode.
-    """
-
-    sites: DipoleSites
-    vectors: Array
+    sites: DipoleSites  # N dipoles
+    vectors: Array  # (N, M): moments of each mode, A m^2, for a flux of 1 T rms over the readings
+    # (M,): singular values relative to the largest: how strongly a moment makes each mode
     size: Array
 
     @staticmethod
@@ -99,30 +86,13 @@ class FieldModes:
 
 
 @dataclass(frozen=True)
-class Linear:
-    """Holds the readings of one body about the present estimate.
+class Linear(PoseTerms):
+    """Holds the readings of one body, at the present estimate, with all of their derivatives."""
 
-    Attributes
-    ----------
-    part : Measurements
-        F frames, corrected by the present parameters.
-    residual : ndarray, shape (F, S, 2K)
-        Measured minus modelled flux, T; real and imaginary parts by turns.
-    slope : ndarray, shape (F, S, 2K, 6)
-        Derivative of the flux by the pose, T/m and T/rad.
-    rows : ndarray, shape (F, S, M)
-        Flux of each mode.
-    flux : ndarray, shape (F, S, K), complex
-        Modelled, T.
-    by_place, by_axis : ndarray, shape (F, S, 3, K), complex
-        Its derivatives by the sensors' places (T/m) and axes (T).
-    """
-
-    part: Measurements
-    residual: Array
-    slope: Array
-    rows: Array
-    flux: ComplexArray
+    part: Measurements  # F frames, corrected by the present parameters
+    rows: Array  # (F, S, M): flux of each mode
+    flux: ComplexArray  # (F, S, K): modelled, T
+    # by_place, by_axis (F, S, 3, K): its derivatives by the sensors' places (T/m) and axes (T)
     by_place: ComplexArray
     by_axis: ComplexArray
 
@@ -130,20 +100,12 @@ class Linear:
 def linearise(part: Measurements, modes: FieldModes, field: Array) -> Linear:
     """Evaluate a field, given by its modes (M, 2K), and all derivatives at a body's poses."""
     points, axes = part.placed()
-    frames, sensors = points.shape[:2]
-    lengths = np.tile(part.sensors.length, frames)
-    flat = (points.reshape(-1, 3), axes.reshape(-1, 3), lengths)
-    moments = as_complex(modes.vectors @ field)
-    sites = (modes.sites.positions, modes.sites.directions)
-    flux, by_place, by_axis = flux_jacobian(*flat, *sites, moments)
-    shape = (frames, sensors, 3, moments.shape[1])
-    by_place, by_axis = by_place.reshape(shape), by_axis.reshape(shape)
-    flux = flux.reshape(frames, sensors, -1)
+    flux, by_place, by_axis = flux_slopes(part, modes.sites, as_complex(modes.vectors @ field))
     return Linear(
-        part,
         as_real(part.flux) - as_real(flux),
         pose_slopes(points, axes, part.position, by_place, by_axis),
-        (basis_rows(part, modes.sites) @ modes.vectors).reshape(frames, sensors, -1),
+        part,
+        (basis_rows(part, modes.sites) @ modes.vectors).reshape(*points.shape[:2], -1),
         flux,
         by_place,
         by_axis,
@@ -158,18 +120,7 @@ def open_directions(
     In units of the noise; the readings' inverse covariance is the unit matrix less the product of
     a frame's six rows with themselves.
 
-    Parameters
-    ----------
-    linear : Linear
-        F frames.
-    weights : ndarray, shape (F, S)
-        Weights of the readings in [0, 1].
-    noise_t : float
-        Flux noise of a phasor component, T.
-    jitter : ndarray, shape (6,)
-        Standard deviations of an optical pose, m and rad.
-    share : ndarray, shape (F,)
-        Share of its variance that is left after interpolation.
+    ``linear``: F frames. ``share`` (F,): share of its variance that is left after interpolation.
     """
     slope = linear.slope * (np.sqrt(weights) / noise_t)[:, :, None, None]
     flat = slope.reshape(len(slope), -1, 6)
@@ -189,14 +140,8 @@ def tied_parts(along: Sequence[Array]) -> NDArray[np.bool_]:
 class JointSystem:
     """Sums of the weighted readings: what they say of field and parameters together.
 
-    Parameters
-    ----------
-    parameters : SensorParameters
-        Q of them.
-    modes : FieldModes
-        M of them.
-    tied : ndarray of bool, shape (2K,)
-        Real and imaginary parts of the emitters' field that poses tie together.
+    ``modes``: M of them. ``tied`` (2K,): real and imaginary parts of the emitters' field that
+    poses tie together.
     """
 
     def __init__(
@@ -214,19 +159,7 @@ class JointSystem:
         self.scores: list[Array] = []
 
     def add(self, linear: Linear, weights: Array, noise_t: float, along: Array) -> None:
-        """Take in the frames of a body.
-
-        Parameters
-        ----------
-        linear : Linear
-            F frames.
-        weights : ndarray, shape (F, S)
-            Weights of the readings in [0, 1].
-        noise_t : float
-            Flux noise of a phasor component, T.
-        along : ndarray, shape (F, 6, S, 2K)
-            Of `open_directions`.
-        """
+        """Take in the frames of a body; ``along`` is that of `open_directions`."""
         velocity, along = velocity_of(linear.part), np.where(self.tied, along, 0.0)
         count, sensors = weights.shape
         stretches = max(STRETCHES, len(frame_blocks(count, sensors, SYSTEM_ROWS)))
@@ -281,12 +214,8 @@ class JointSystem:
     def eliminate(self, field_precision: Array, pull: Array) -> 'Eliminated':
         """Return what is left for the parameters when the field is eliminated.
 
-        Parameters
-        ----------
-        field_precision : ndarray, shape (M,)
-            Prior precision of each mode's amplitude.
-        pull : ndarray, shape (M, 2K)
-            Prior mean minus present amplitude, T.
+        ``field_precision`` (M,): prior precision of each mode's amplitude. ``pull`` (M, 2K): prior
+        mean minus present amplitude, T.
         """
         tied, n = self.tied, int(self.tied.sum()) * self.count
         block = self.gram + np.diag(field_precision)
@@ -320,27 +249,13 @@ class JointSystem:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Holds what remains for the parameters once the field is eliminated.
+    """Holds what remains for the parameters once the field is eliminated."""
 
-    Attributes
-    ----------
-    information : ndarray, shape (Q, Q)
-        Of the parameters.
-    gradient : ndarray, shape (Q,)
-        Of the log-likelihood at the present parameters.
-    inside : ndarray, shape (2KM, Q + 1)
-        The field's answer to each parameter, and its own step.
-    scores : ndarray, shape (B, Q)
-        The gradient's parts from the blocks of frames.
-    field_variance : ndarray, shape (M, 2K)
-        Of the modes' amplitudes at fixed parameters, T^2.
-    """
-
-    information: Array
-    gradient: Array
-    inside: Array
-    scores: Array
-    field_variance: Array
+    information: Array  # (Q, Q): of the parameters
+    gradient: Array  # (Q,): of the log-likelihood at the present parameters
+    inside: Array  # (2KM, Q + 1): the field's answer to each parameter, and its own step
+    scores: Array  # (B, Q): the gradient's parts from the blocks of frames
+    field_variance: Array  # (M, 2K): of the modes' amplitudes at fixed parameters, T^2
 
     @property
     def inflation(self) -> float:

@@ -1,8 +1,9 @@
 """Fits a layout: its dipoles are placed, pulled towards the drawn board, moved if asked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,8 @@ from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.local import join_regions
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
 from anser_ros.calibration.positions import PositionFitter
-from anser_ros.calibration.prior import DrawnBoard
+from anser_ros.calibration.prior import ScaledNominal
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -46,22 +46,10 @@ LEAST_EXTENSION = 1.1
 """Size of the rich layer at least, as a multiple of the coils' extent."""
 
 
-@dataclass(frozen=True)
-class LayoutFit:
-    """Holds the dipoles of a fitted layout, the moments that they are pulled to, and the fit.
-
-    Attributes
-    ----------
-    dipoles : DipoleSites
-        N dipoles as placed or moved.
-    prior : ndarray, shape (N, K), complex, or None
-        Moments towards which the damping pulls, A m^2; None for zero.
-    fit : MomentFit
-        The fit of their moments.
-    """
+class LayoutFit(NamedTuple):
+    """Holds the dipoles of a fitted layout, as placed or moved, and the fit of their moments."""
 
     dipoles: DipoleSites
-    prior: ComplexArray | None
     fit: MomentFit
 
 
@@ -83,86 +71,63 @@ def rich_layout(measurements: Sequence[Measurements], generator: Generator) -> L
     return replace(RICH, count=count, extension=extension)
 
 
-def placed(
-    layout: Layout, generator: Generator, drawn: DrawnBoard | None
-) -> tuple[DipoleSites, ComplexArray | None]:
-    """Return a layout's dipoles, and the moments towards which the damping pulls."""
-    if layout.kind == 'drawing' and drawn is not None:
-        return CoilPlacer(drawn.nominal).sites, drawn.nominal.moments * drawn.gains
-    dipoles = place(layout, generator)
-    return dipoles, prior_of(layout, dipoles, drawn)
+class LayoutPlacer:
+    """Places dipoles over a generator, pulled to what it is drawn like if their layout says so.
 
-
-def prior_of(
-    layout: Layout, dipoles: DipoleSites, drawn: DrawnBoard | None
-) -> ComplexArray | None:
-    """Return the drawn board's moments on dipoles, or None if the layout is not pulled to it."""
-    return drawn.moments(dipoles) if layout.prior == 'nominal' and drawn is not None else None
-
-
-def optimise_positions(
-    corrected: Sequence[Measurements],
-    weights: Sequence[Array],
-    dipoles: DipoleSites,
-    prior: ComplexArray | None,
-    layout: Layout,
-    drawn: DrawnBoard | None,
-) -> tuple[DipoleSites, ComplexArray | None]:
-    """Return dipoles moved to where they explain the measurements best, and their prior there.
-
-    Parameters
-    ----------
-    corrected : sequence of Measurements
-        Measurements at their corrected poses, one per body and session.
-    weights : sequence of ndarray, shape (F, S)
-        Weights of the readings.
-    dipoles : DipoleSites
-        The dipoles to start from.
-    prior : ndarray, shape (N, K), complex, or None
-        Moments towards which the damping pulls, A m^2.
-    layout : Layout
-        Of the dipoles: those on an axis stay on it, those of a drawn coil move together, and all
-        others each by itself.
-    drawn : DrawnBoard or None
-        The drawn board.
+    Dipoles and the moments (N, K) that their damping pulls to go together; None for zero.
     """
-    rows = sum(m.flux.shape[0] * m.flux.shape[1] for m in corrected)
-    step = max(1, -(-rows // MOST_MOVING_ROWS))
-    thin = [m.frames(np.arange(0, len(m.time), step)) for m in corrected]
-    shares = [w[::step] for w in weights]
-    if layout.kind == 'drawing' and drawn is not None:
-        return CoilPlacer(drawn.nominal).fit(thin, shares)
-    if layout.kind == 'coaxial':
-        moved = fit_coaxial(thin, shares, dipoles, layout.count)
-    else:
-        moved = PositionFitter(thin, shares, dipoles, MOVING_DAMPING, prior).fit().dipoles
-    return moved, prior_of(layout, moved, drawn)
+
+    def __init__(self, generator: Generator, measurements: Sequence[Measurements]) -> None:
+        self.generator, self.measurements = generator, measurements
+
+    @cached_property
+    def scaled(self) -> ScaledNominal | None:
+        """Return the nominal model at the scale of the measurements, where there is one."""
+        nominal = self.generator.nominal
+        return None if nominal is None else ScaledNominal(nominal, self.measurements)
+
+    def placed(self, layout: Layout) -> tuple[DipoleSites, ComplexArray | None]:
+        """Return a layout's dipoles as its rule places them."""
+        if layout.kind == 'drawing' and self.scaled is not None:
+            nominal = self.scaled.nominal
+            return CoilPlacer(nominal).sites, nominal.moments * self.scaled.gains
+        dipoles = place(layout, self.generator)
+        return dipoles, self._prior(layout, dipoles)
+
+    def _prior(self, layout: Layout, dipoles: DipoleSites) -> ComplexArray | None:
+        if layout.prior != 'nominal' or self.scaled is None:
+            return None
+        return self.scaled.moments(dipoles)
+
+    def moved(
+        self, layout: Layout, corrected: Sequence[Measurements], weights: Sequence[Array]
+    ) -> tuple[DipoleSites, ComplexArray | None]:
+        """Return a layout's dipoles where they explain measurements at corrected poses best.
+
+        Those on an axis stay on it, those of a drawn coil move together, others by themselves.
+        """
+        rows = sum(m.flux.shape[0] * m.flux.shape[1] for m in corrected)
+        step = max(1, -(-rows // MOST_MOVING_ROWS))
+        thin = [m.frames(np.arange(0, len(m.time), step)) for m in corrected]
+        shares = [w[::step] for w in weights]
+        if layout.kind == 'drawing' and self.scaled is not None:
+            return CoilPlacer(self.scaled.nominal).fit(thin, shares)
+        dipoles, prior = self.placed(layout)
+        if layout.kind == 'coaxial':
+            found = fit_coaxial(thin, shares, dipoles, layout.count)
+        else:
+            found = PositionFitter(thin, shares, dipoles, MOVING_DAMPING, prior).fit()
+        return found, self._prior(layout, found)
 
 
 class LayoutFitter:
-    """Fits layouts to the same measurements; what several fits have in common is done once.
-
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Tool measurements with poses, one per body and session.
-    generator : Generator
-        Places of the coils.
-    accuracy : Accuracy
-        Flux noise and pose jitter.
-    nominal : FieldModel, optional
-        The drawn board, for layouts that are pulled towards it.
-    """
+    """Fits layouts to the same measurements; what several fits have in common is done once."""
 
     def __init__(
-        self,
-        measurements: Sequence[Measurements],
-        generator: Generator,
-        accuracy: Accuracy,
-        nominal: FieldModel | None = None,
+        self, measurements: Sequence[Measurements], generator: Generator, accuracy: Accuracy
     ) -> None:
-        self.measurements, self.generator = measurements, generator
-        self.accuracy, self.nominal = accuracy, nominal
+        self.measurements, self.accuracy = measurements, accuracy
+        self.placer = LayoutPlacer(generator, measurements)
         self._placed: dict[Layout, tuple[DipoleSites, ComplexArray | None]] = {}
 
     def fit(
@@ -173,48 +138,31 @@ class LayoutFitter:
         exact: bool = True,
         progress: Progress | None = None,
     ) -> LayoutFit:
-        """Fit a layout from the start, without using any other data.
-
-        Parameters
-        ----------
-        layout : Layout
-            The layout.
-        damping : float
-            Damping of the moments.
-        alternations, exact, progress
-            As for `MomentFitter.fit`.
-        """
+        """Fit a layout from the start, without any other data; the rest as `MomentFitter.fit`."""
         dipoles, prior = self._sites(layout)
         fitter = MomentFitter(self.measurements, dipoles, damping, self.accuracy, prior)
         if layout.moved:
             fitter.start_at(self._rich[0])
         fit = fitter.fit(alternations, progress, exact)
         if not layout.local:
-            return LayoutFit(dipoles, prior, fit)
-        layer = self._layer
-        moments = join_regions(self.measurements, dipoles, fit, damping, layer)
-        return LayoutFit(layer, None, replace(fit, moments=moments))
+            return LayoutFit(dipoles, fit)
+        moments = join_regions(self.measurements, dipoles, fit, damping, self._layer)
+        return LayoutFit(self._layer, replace(fit, moments=moments))
 
     def _sites(self, layout: Layout) -> tuple[DipoleSites, ComplexArray | None]:
-        """A layout's dipoles where the measurements put them, and what they are pulled to."""
         if layout not in self._placed:
-            drawn = self._drawn if layout.prior == 'nominal' else None
-            dipoles, prior = placed(layout, self.generator, drawn)
             if layout.moved:
                 _, fit = self._rich
-                dipoles, prior = optimise_positions(
-                    fit.measurements, fit.weights, dipoles, prior, layout, drawn
-                )
-            self._placed[layout] = dipoles, prior
+                found = self.placer.moved(layout, fit.measurements, fit.weights)
+            else:
+                found = self.placer.placed(layout)
+            self._placed[layout] = found
         return self._placed[layout]
 
     @cached_property
-    def _drawn(self) -> DrawnBoard | None:
-        return None if self.nominal is None else DrawnBoard(self.nominal, self.measurements)
-
-    @cached_property
     def _layer(self) -> DipoleSites:
-        return place(rich_layout(self.measurements, self.generator), self.generator)
+        generator = self.placer.generator
+        return place(rich_layout(self.measurements, generator), generator)
 
     @cached_property
     def _rich(self) -> tuple[MomentFitter, MomentFit]:

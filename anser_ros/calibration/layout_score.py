@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.factors import ComplexArray, as_real
-from anser_ros.calibration.layout_fit import optimise_positions, prior_of
+from anser_ros.calibration.layout_fit import LayoutPlacer
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.moments import MomentFit, MomentFitter
 from anser_ros.calibration.pose_correction import pose_precision, pose_terms
 from anser_ros.calibration.pose_whitening import PoseWhitener
-from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import with_pose
 from anser_ros.field.measurements import Measurements
 from anser_ros.parallel import in_order
@@ -31,9 +30,8 @@ from anser_ros.settings import Accuracy
 Array = NDArray[np.float64]
 
 DAMPINGS = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
-"""Dampings that are tried, as a fraction of the largest singular value of the scaled matrix. The
-smallest is far above the rounding of a Gram matrix (1e-8); beyond the largest only the drawn board
-would be left."""
+"""Dampings that are tried: from far above the rounding of a Gram matrix (1e-8) to where only the
+prior would be left."""
 REFERENCE_DAMPING = DAMPINGS[1]
 """Damping of the fit by which poses are corrected before layouts are compared: small, so that the
 field is not biased, and enough to hold a rich layer."""
@@ -41,30 +39,17 @@ field is not biased, and enough to hold a rich layer."""
 
 @dataclass(frozen=True)
 class LayoutCandidate:
-    """Holds a layout with its best damping and its score on held-out blocks.
+    """Holds a layout with its best damping and its score on held-out blocks."""
 
-    Attributes
-    ----------
-    layout : Layout
-        The layout that was scored.
-    dipoles : DipoleSites
-        Its dipoles as placed, before any of them are moved.
-    damping : float
-        The damping with the best score.
-    score : float
-        Square root of the mean predictive chi-square a phasor component, times the noise, T.
-    curve : tuple of (float, float)
-        Damping and score (T) for every damping that was tried.
-    """
-
-    layout: Layout
-    dipoles: DipoleSites
-    damping: float
+    layout: Layout  # the layout that was scored
+    dipoles: DipoleSites  # its dipoles as placed, before any of them are moved
+    damping: float  # the damping with the best score
+    # square root of the mean predictive chi-square a phasor component, times the noise, T
     score: float
+    # damping and score (T) for every damping that was tried
     curve: tuple[tuple[float, float], ...]
 
 
-@dataclass(frozen=True)
 class _BodyReadings:
     """One body's readings at corrected poses with what the score of each fold needs.
 
@@ -72,138 +57,85 @@ class _BodyReadings:
     T.
     """
 
-    corrected: Measurements
-    folds: NDArray[np.int64]
-    weights: Array
-    back: Array
-    whiteners: dict[int, PoseWhitener]
-
-
-def _body_readings(
-    corrected: Measurements,
-    measured: Measurements,
-    folds: NDArray[np.int64],
-    weights: Array,
-    dipoles: DipoleSites,
-    fit: MomentFit,
-    accuracy: Accuracy,
-) -> _BodyReadings:
-    terms = pose_terms(corrected, dipoles, fit.moments)
-    # The correction is undone to first order, since predictions are judged at measured poses.
-    at_measured = pose_terms(measured, dipoles, fit.moments).residual
-    whiteners = {
-        int(fold): PoseWhitener(
-            terms.slope[folds == fold], weights[folds == fold], fit.noise_t,
-            pose_precision(accuracy),
-        )
-        for fold in np.unique(folds)
-    }  # fmt: skip
-    return _BodyReadings(corrected, folds, weights, at_measured - terms.residual, whiteners)
+    def __init__(
+        self, corrected: Measurements, measured: Measurements, folds: NDArray[np.int64],
+        weights: Array, dipoles: DipoleSites, fit: MomentFit, precision: Array,
+    ) -> None:  # fmt: skip
+        self.corrected, self.folds, self.weights = corrected, folds, weights
+        terms = pose_terms(corrected, dipoles, fit.moments)
+        # The correction is undone to first order, since predictions are judged at measured poses.
+        self.back = pose_terms(measured, dipoles, fit.moments).residual - terms.residual
+        self.whiteners = {
+            int(k): PoseWhitener(terms.slope[own], weights[own], fit.noise_t, precision)
+            for k, own in ((k, folds == k) for k in np.unique(folds))
+        }
 
 
 class LayoutScorer:
-    """Scores layouts on one set of measurements.
-
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Tool measurements with poses, one per body and session.
-    folds : sequence of ndarray, shape (F,)
-        Fold of each frame.
-    reference : DipoleSites
-        A rich set of dipoles for the correction of the poses.
-    accuracy : Accuracy
-        Flux noise and pose jitter.
-    """
+    """Scores layouts on one set of measurements, whose poses a fit of a rich layer corrects."""
 
     def __init__(
         self,
         measurements: Sequence[Measurements],
         folds: Sequence[NDArray[np.int64]],
-        reference: DipoleSites,
+        rich: DipoleSites,
         accuracy: Accuracy,
+        placer: LayoutPlacer,
     ) -> None:
+        self.placer = placer
         kept = [m.usable.any(axis=1) for m in measurements]
         posed = [with_pose(m) for m in measurements]
-        fitter = MomentFitter(posed, reference, REFERENCE_DAMPING, accuracy)
-        self.reference = fitter.fit(exact=False)
-        self.noise_t = self.reference.noise_t
+        self.reference = fit = MomentFitter(posed, rich, REFERENCE_DAMPING, accuracy).fit(
+            exact=False
+        )
+        self.noise_t = fit.noise_t
         self._bodies = [
-            _body_readings(c, m, f[k], w, reference, self.reference, accuracy)
-            for c, m, f, k, w in zip(
-                self.reference.measurements, posed, folds, kept, self.reference.weights,
-                strict=True,
+            _BodyReadings(corrected, m, fold[k], weights, rich, fit, pose_precision(accuracy))
+            for corrected, m, fold, k, weights in zip(
+                fit.measurements, posed, folds, kept, fit.weights, strict=True
             )
-        ]  # fmt: skip
-        self._folds = np.unique(np.concatenate([body.folds for body in self._bodies]))
+        ]
+        self._folds = np.unique(np.concatenate([body.folds for body in self._bodies])).tolist()
 
-    def score(
-        self,
-        layout: Layout,
-        dipoles: DipoleSites,
-        drawn: DrawnBoard | None = None,
-    ) -> LayoutCandidate:
+    def score(self, layout: Layout) -> LayoutCandidate:
         """Return the held-out score of a layout for every damping, with the best one.
 
         Movable dipoles are fitted again for each fold, to the data of the other folds.
-
-        Parameters
-        ----------
-        layout : Layout
-            The layout.
-        dipoles : DipoleSites
-            Its dipoles as placed.
-        drawn : DrawnBoard, optional
-            The drawn board, for layouts pulled towards it.
         """
-        prior = prior_of(layout, dipoles, drawn)
-        same = None if layout.moved else self._tables(dipoles)
+        placed = self.placer.placed(layout)
+        same = None if layout.moved else self._tables(placed[0])
 
         def scored(fold: int) -> tuple[Array, float]:
             chi, count = np.zeros(len(DAMPINGS)), 0.0
-            sites, moments_prior = dipoles, prior
-            if layout.moved:
-                sites, moments_prior = self._moved_without(fold, dipoles, prior, layout, drawn)
+            sites, prior = self._moved_without(fold, layout) if layout.moved else placed
             matrices, grams = same or self._tables(sites)
-            start = None if moments_prior is None else as_real(moments_prior) / self.noise_t
+            start = None if prior is None else as_real(prior) / self.noise_t
             total = sum(gram for other, gram in grams.items() if other != fold)
             moments = _ridge(np.asarray(total), len(sites), start)
             for body, matrix in zip(self._bodies, matrices, strict=True):
-                if fold not in body.whiteners:
-                    continue
-                part, used = self._chi(body, matrix, fold, moments)
-                chi, count = chi + part, count + used
+                if fold in body.whiteners:
+                    part, used = self._chi(body, matrix, fold, moments)
+                    chi, count = chi + part, count + used
             return chi, count
 
-        parts = in_order(scored, [int(fold) for fold in self._folds])
+        parts = in_order(scored, self._folds)
         chi = np.sum([part for part, _ in parts], axis=0)
         scores = self.noise_t * np.sqrt(chi / sum(count for _, count in parts))
         best = int(np.argmin(scores))
         curve = tuple(zip(DAMPINGS, map(float, scores), strict=True))
-        return LayoutCandidate(layout, dipoles, DAMPINGS[best], float(scores[best]), curve)
+        return LayoutCandidate(layout, placed[0], DAMPINGS[best], float(scores[best]), curve)
 
     def _tables(self, dipoles: DipoleSites) -> tuple[list[Array], dict[int, Array]]:
         matrices = [basis_rows(body.corrected, dipoles) for body in self._bodies]
-        folds = [int(fold) for fold in self._folds]
-        grams = in_order(lambda fold: self._gram(fold, matrices), folds)
-        return matrices, dict(zip(folds, grams, strict=True))
+        grams = in_order(lambda fold: self._gram(fold, matrices), self._folds)
+        return matrices, dict(zip(self._folds, grams, strict=True))
 
-    def _moved_without(
-        self,
-        fold: int,
-        dipoles: DipoleSites,
-        prior: ComplexArray | None,
-        layout: Layout,
-        drawn: DrawnBoard | None,
-    ) -> tuple[DipoleSites, ComplexArray | None]:
-        kept = [body.folds != fold for body in self._bodies]
-        return optimise_positions(
-            [body.corrected.frames(k) for body, k in zip(self._bodies, kept, strict=True)],
-            [body.weights[k] for body, k in zip(self._bodies, kept, strict=True)],
-            dipoles,
-            prior,
+    def _moved_without(self, fold: int, layout: Layout) -> tuple[DipoleSites, ComplexArray | None]:
+        rest = [(body, body.folds != fold) for body in self._bodies]
+        return self.placer.moved(
             layout,
-            drawn,
+            [body.corrected.frames(kept) for body, kept in rest],
+            [body.weights[kept] for body, kept in rest],
         )
 
     @property

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.coaxial import FIRST_SPACING_M, coaxial
 from anser_ros.calibration.dipole_sites import DipoleSites
+from anser_ros.field.model import FieldModel
 
 Array = NDArray[np.float64]
 
@@ -16,21 +17,14 @@ UNIT_Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Generator:
-    """Holds places and size of the coils of a field generator.
+    """Holds what is known of a field generator before any readings."""
 
-    Attributes
-    ----------
-    centres : ndarray, shape (K, 3)
-        Coil centres, m, frame fg.
-    turns_deg : ndarray, shape (K,)
-        Rotation of each coil about z, degrees.
-    side_m : float
-        Outer side of a coil, m.
-    """
-
-    centres: Array
-    turns_deg: Array
-    side_m: float
+    centres: Array  # (K, 3): coil centres, m, frame fg
+    turns_deg: Array  # (K,): rotation of each coil about z, degrees
+    side_m: float  # outer side of a coil, m
+    emitters: tuple[str, ...] = ()  # names of the coils
+    frequencies_hz: tuple[float, ...] = ()
+    nominal: FieldModel | None = None  # of its drawing: a prior of fits, compared with the result
 
     @property
     def half_extent(self) -> Array:
@@ -53,61 +47,37 @@ class Generator:
 
 @dataclass(frozen=True)
 class Layout:
-    """Describes a rule by which dipoles are placed and fitted.
+    """Describes a rule by which dipoles are placed and fitted."""
 
-    Attributes
-    ----------
-    kind : {'layer', 'layer_xyz', 'coils', 'coaxial', 'drawing', 'free', 'sources'}
-        A layer of z-dipoles, a layer of dipoles with three free components, z-dipoles on the
-        coils, dipoles along an axis of its own for each coil, those of the drawn coils, or some
-        about each coil (or one in its place) and ``count`` beside them, where the data put them.
-    count : int
-        Number of dipoles along a side of the layer, of each coil, along each axis, or in all.
-    extension : float
-        Size of the layer as a multiple of the field generator's.
-    depth_m : float
-        Depth of the layer below the coils, m.
-    prior : {'none', 'nominal'}
-        Whether the damping pulls the moments towards zero or towards those of the drawn board.
-    moved : bool
-        Whether the dipoles are then moved to where they explain the data best.
-    local : bool
-        Whether overlapping regions get separate moments.
-    """
-
+    # 'layer' of z-dipoles, 'layer_xyz' of dipoles with three free components, z-dipoles on the
+    # 'coils', 'coaxial' dipoles along an axis of its own for each coil, those of the coils of the
+    # 'drawing', or another rule, which has its own words
     kind: str
-    count: int
-    extension: float
-    depth_m: float
-    prior: str = 'none'
-    moved: bool = False
-    local: bool = False
+    count: int  # dipoles along a side of the layer, of each coil, along each axis, or in all
+    extension: float  # size of the layer as a multiple of the field generator's
+    depth_m: float  # depth of the layer below the coils, m
+    prior: str = 'none'  # what the damping pulls the moments to: 'none' (zero) or 'nominal'
+    moved: bool = False  # whether the dipoles are then moved to where they explain the data best
+    local: bool = False  # whether overlapping regions get separate moments
+    words: str = ''  # for a report, where the rule is none of these
 
     def describe(self) -> str:
         """Return the layout in words for a report."""
-        drawn = ', pulled to the drawn board' if self.prior == 'nominal' else ''
-        drawn += ', positions optimised' if self.moved else ''
-        drawn += ', in overlapping regions' if self.local else ''
+        if self.words:
+            return self.words
         if self.kind == 'coaxial':
             return f'{self.count} on an axis of its own for every emitter, place and axis free'
-        if self.kind == 'free':
-            return (
-                f'three-component dipoles at 7 places about every emitter, place free, and at '
-                f'{self.count} beside them'
-            )
-        if self.kind == 'sources':
-            return (
-                f'a three-component dipole for every emitter, place free, and {self.count} of '
-                'their stray fields'
-            )
         if self.kind == 'drawing':
             return f'{self.count} of the drawn coils, each coil placed where it fits, pulled to it'
+        more = ', pulled to the drawn board' if self.prior == 'nominal' else ''
+        more += ', positions optimised' if self.moved else ''
+        more += ', in overlapping regions' if self.local else ''
         if self.kind == 'coils':
-            return f'{self.count}x{self.count} z-dipoles on every coil{drawn}'
+            return f'{self.count}x{self.count} z-dipoles on every coil{more}'
         parts = 'z-dipoles' if self.kind == 'layer' else 'three-component dipoles'
         return (
             f"{self.count}x{self.count} {parts}, {self.extension:.2f} x the coils' extent, "
-            f'{1e3 * self.depth_m:.1f} mm below{drawn}'
+            f'{1e3 * self.depth_m:.1f} mm below{more}'
         )
 
 

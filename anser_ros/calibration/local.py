@@ -31,13 +31,7 @@ and would not determine the field's change across them."""
 
 
 class Regions:
-    """Divides the volume of some points smoothly: the weights of all regions add up to one.
-
-    Parameters
-    ----------
-    points : ndarray, shape (P, 3)
-        Positions of readings, m, frame fg.
-    """
+    """Divides the volume of points (P, 3), m, smoothly: all regions' weights add up to one."""
 
     def __init__(self, points: Array) -> None:
         low, high = points.min(axis=0), points.max(axis=0)
@@ -66,24 +60,9 @@ def join_regions(
 ) -> NDArray[np.complex128]:
     """Return the moments of a finer layer that make the blended field of the regions.
 
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Measurements at their measured poses, which determine the volume.
-    dipoles : DipoleSites
-        Dipoles of the common fit.
-    fit : MomentFit
-        The common fit: its poses and weights are kept, and the damping pulls the regions' moments
-        towards its moments.
-    damping : float
-        Damping of the regions' fits.
-    layer : DipoleSites
-        The N' dipoles to express the blended field by.
-
-    Returns
-    -------
-    ndarray, shape (N', K), complex
-        Moments, A m^2.
+    ``fit``: the common fit: its poses and weights are kept, and the damping pulls the regions'
+    moments towards its moments. ``layer``: the N' dipoles to express the blended field by.
+    Returns (N', K): moments, A m^2.
     """
     regions = Regions(
         np.concatenate(

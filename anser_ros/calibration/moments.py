@@ -50,43 +50,29 @@ LEAST_FREEDOM = 0.05
 fits with nearly as many parameters as readings, whose noise would be divided by zero."""
 
 
-@dataclass(frozen=True)
-class MomentFit:
-    """Holds fitted moments with their residual noise and condition.
+@dataclass(frozen=True, kw_only=True)
+class FitFigures:
+    """Says how well a fit of moments went."""
 
-    Attributes
-    ----------
-    moments : ndarray, shape (N, K), complex
-        Moments, A m^2.
-    measurements : tuple of Measurements
-        The measurements at their corrected poses.
-    weights : tuple of ndarray, shape (F, S)
-        Weight of each reading in [0, 1]; 0 where it is unusable.
-    noise_t : float
-        Root mean square residual of a phasor component, corrected for the degrees of freedom, T.
-        It holds the flux noise and all that the model cannot explain.
-    quadrature_noise_t : float
-        The same of the imaginary parts alone. Where no metal turns the phase, the field is in
-        phase, and this is the flux noise whatever the errors of poses and model.
-    rank : int
-        Numerical rank of the matrix.
-    freedom : float
-        Effective number of parameters of each right-hand side.
-    condition : float
-        Condition of the column-scaled matrix.
-    alternations : int
-        Number of rounds.
-    """
+    weights: tuple[Array, ...]
+    # root mean square residual of a phasor component, corrected for the degrees of freedom, T. It
+    # holds the flux noise and all that the model cannot explain.
+    noise_t: float
+    rank: int  # of the matrix, numerically
+    freedom: float  # effective number of parameters of each right-hand side
+    condition: float  # of the column-scaled matrix
+    alternations: int  # number of rounds
+
+
+@dataclass(frozen=True, kw_only=True)
+class MomentFit(FitFigures):
+    """Holds fitted moments with their residual noise and condition."""
 
     moments: ComplexArray
-    measurements: tuple[Measurements, ...]
-    weights: tuple[Array, ...]
-    noise_t: float
+    measurements: tuple[Measurements, ...]  # at their corrected poses
+    # the noise of the imaginary parts alone. Where no metal turns the phase, the field is in
+    # phase, and this is the flux noise whatever the errors of poses and model.
     quadrature_noise_t: float
-    rank: int
-    freedom: float
-    condition: float
-    alternations: int
 
 
 @dataclass
@@ -103,25 +89,7 @@ class _State:
 class MomentFitter:
     """Alternates between the poses of the frames and the moments of the dipoles.
 
-    `fit` runs the alternation to its end.
-
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        One a body and session; reference sensors may be among them (their pose does not jitter).
-    dipoles : DipoleSites
-        N dipoles.
-    damping : float
-        Tikhonov's parameter as a fraction of the largest singular value of the scaled matrix.
-    accuracy : Accuracy
-        Flux noise to begin with, and pose jitter.
-    prior : ndarray, shape (N, K), complex, optional
-        Moments towards which the damping pulls, A m^2; zero by default.
-
-    Raises
-    ------
-    FitError
-        When no reading has a pose.
+    `fit` runs the alternation to its end. Raises `FitError` when no reading has a pose.
     """
 
     def __init__(
@@ -175,16 +143,11 @@ class MomentFitter:
     def correct(self, moments: ComplexArray, freedom: float) -> float:
         """Move all poses to their most probable values and return the new noise estimate, T.
 
-        Parameters
-        ----------
-        moments : ndarray, shape (N, K), complex
-            Present moments, A m^2.
-        freedom : float
-            Effective number of parameters of each right-hand side.
+        ``freedom`` is the effective number of parameters of each right-hand side.
         """
         power, turned, count, used = 0.0, 0.0, 0.0, 0.0
+        precision = pose_precision(self.accuracy)
         for state in self.states:
-            precision = self._precision(state)
             for block in frame_blocks(*state.weights.shape):
                 part = state.corrected.frames(block)
                 terms = pose_terms(part, self.dipoles, moments)
@@ -204,25 +167,10 @@ class MomentFitter:
         self.quadrature_noise_t = max(float(np.sqrt(turned / halved)), SMALLEST_NOISE_T)
         return max(float(np.sqrt(power / left_over)), SMALLEST_NOISE_T)
 
-    def _precision(self, state: _State) -> Array:
-        if state.measured.body == 'fg':
-            return pose_precision(Accuracy(optical_position_m=0.0, optical_rotation_rad=0.0))
-        return pose_precision(self.accuracy)
-
     def fit(
         self, alternations: int = 5, progress: Progress | None = None, exact: bool = True
     ) -> MomentFit:
-        """Alternate until the noise estimate no longer changes.
-
-        Parameters
-        ----------
-        alternations : int
-            Largest number of rounds.
-        progress : callable, optional
-            Called with the name of the stage and its finished fraction.
-        exact : bool
-            Whether the last solution is by QR.
-        """
+        """Alternate until the noise estimate no longer changes; the last solution may be exact."""
         done = 0
         moments, spectrum = self.solve(exact=False)
         for done in range(1, alternations + 1):

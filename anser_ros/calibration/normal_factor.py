@@ -21,11 +21,8 @@ work at the end of a matrix of some thousand columns."""
 def subtract_gram(out: Array, rows: Array) -> None:
     """Subtract the products of all pairs of columns from the upper triangle of a matrix.
 
-    Parameters
-    ----------
-    out : ndarray, shape (N, N)
-        Changed from the diagonal on, and below it inside the blocks on the diagonal.
-    rows : ndarray, shape (R, N)
+    ``out`` (N, N): changed from the diagonal on, and below it inside the blocks on the diagonal.
+    ``rows`` (R, N).
     """
 
     def work(own: slice) -> None:
@@ -37,15 +34,8 @@ def subtract_gram(out: Array, rows: Array) -> None:
 class NormalFactor:
     """Holds the upper factor U of a positive definite matrix ``U^T U``.
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (N, N)
-        Of which only the upper triangle is read; the factor takes its place.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        When it is not positive definite.
+    ``matrix`` (N, N): of which only the upper triangle is read; the factor takes its place.
+    Raises `numpy.linalg.LinAlgError` when it is not positive definite.
     """
 
     def __init__(self, matrix: Array) -> None:

@@ -7,27 +7,26 @@ is that of sensors: each fifth of them predicted by the others, from the start.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.blocks import FOLDS
-from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import as_real
-from anser_ros.calibration.held_out import HeldOut
-from anser_ros.calibration.layout_score import LayoutCandidate
-from anser_ros.calibration.layouts import Layout
-from anser_ros.calibration.moments import MomentFit, Progress
+from anser_ros.calibration.held_out import HeldOut, rms
+from anser_ros.calibration.layouts import Generator, Layout
+from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.population import LEAST_EVIDENCE
 from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.requirements import MANY_SENSORS
-from anser_ros.calibration.result import Calibration, Residuals, Scan, SourcePlace, provenance
+from anser_ros.calibration.result import Calibration, Residuals, Scan, with_provenance
 from anser_ros.calibration.sources import KINDS, SourceReadings, SourcesFit, SourcesFitter
-from anser_ros.calibration.survey_records import noisy_sensors, reversed_sensors
+from anser_ros.calibration.still_system import figures_of
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.windings import PlacedPoints
 from anser_ros.settings import Accuracy
 
@@ -41,6 +40,8 @@ NOISY = 5.0
 freedom with two frames of four emitters, which make such a ratio in no sensor of a thousand."""
 FEWEST_SCATTERS = 4
 """Degrees of freedom of a sensor's scatter from which on it is called noisy."""
+WORDS = 'a three-component dipole for every emitter, place free, and {} of their stray fields'
+"""The layout in words, with the number of dipoles of stray fields."""
 REACH = 0.1
 """How far beyond the box around the sensors sources are looked for, as a fraction of its longest
 side."""
@@ -58,26 +59,79 @@ def is_at_one_place(measurements: Sequence[Measurements], accuracy: Accuracy) ->
     return not (moved or turned)
 
 
-@dataclass(frozen=True)
-class _Mean:
-    """The frames of a body at rest as one, with the noise of each sensor's mean."""
+def calibrate_at_one_place(
+    measurements: Measurements,
+    name: str,
+    generator: Generator,
+    kinds: Sequence[str],
+    accuracy: Accuracy,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Find each emitter's place and field, and which sensors are the wrong way round.
 
-    measured: Measurements
-    readings: SourceReadings
-    noise_ratio: Array
+    ``kinds``: of `KINDS`; others keep the setup's values. With none, sensors are as stated.
+    Raises `FitError` when all fluxes of an emitter are zero.
+    """
+    posed, emitters = with_pose(measurements), generator.emitters
+    readings, noise_ratio = _mean(posed, accuracy)
+    received = readings.flux[readings.used].any(axis=(0, 2))
+    if not received.all():
+        silent = ', '.join(emitters[k] for k in np.flatnonzero(~received))
+        raise FitError(f'{measurements.body}: all fluxes of {silent} are zero')
+    looked_for = tuple(kind for kind in KINDS if kind in kinds)
+    looked_for += ('polarity',) if looked_for else ()
+    predicted, spread, evidence = _each_fifth(readings, looked_for, progress)
+    fit = _fitted(readings, looked_for)
+    turned = (fit.sign_evidence > LEAST_EVIDENCE) & (evidence > 0.0) & readings.used
+    turned &= bool(looked_for)
+    sign = np.where(turned, -1.0, 1.0)
+    sound = replace(readings, flux=readings.flux * sign[:, None, None])
+    held_out = _held_out(sound, predicted, spread, fit, posed.position[:1])
+    effects = _reversed(posed.sensors.channel[turned], fit.sign_evidence[turned], evidence[turned])
+    model = FieldModel(
+        *_dipoles(fit), emitters=emitters, frequencies_hz=generator.frequencies_hz,
+        flux_error_t=held_out.flux_error_t, effects=effects,
+    )  # fmt: skip
+    right = replace(posed, flux=posed.flux * sign[:, None])
+    flux = _phasors(sound.flux)[sound.used]
+    left = flux - _phasors(fit.predicted)[sound.used]
+    strays = sum(len(one.places) - 1 for one in fit.sources)
+    calibration = Calibration(
+        model=model,
+        fit=figures_of(
+            readings.points.basis(model.positions, model.directions),
+            posed.usable.astype(np.float64),
+            float(np.sqrt(np.mean(as_real(left) ** 2))),
+            float(len(model.moments)) / len(fit.sources),
+            alternations=1,
+        ),
+        held_out=held_out,
+        layout=Layout('sources', strays, 1.0, 0.0, words=WORDS.format(strays)),
+        damping=0.0,
+        n_measurements=int(posed.usable.sum()),
+        residuals=Residuals(
+            np.sqrt((np.abs(left) ** 2).mean(axis=0)),
+            float(flux.real.max() - flux.real.min()),
+        ),
+        scan=Scan((right,), accuracy, effects, _noisy(posed.sensors.channel, noise_ratio)),
+        undetermined=_unclear(posed, fit, readings.used & ~turned) if looked_for else (),
+        more={'sources': _places(emitters, fit), 'sensor_widths': dict(fit.widths)},
+    )
+    return with_provenance(calibration, [name])
 
-    @staticmethod
-    def of(measured: Measurements, accuracy: Accuracy) -> '_Mean':
-        good = measured.usable[:, :, None]
-        count = np.maximum(measured.usable.sum(axis=0), 1)
-        flux = np.where(good, measured.flux, 0.0).sum(axis=0) / count[:, None]
-        is_constant = not (measured.flux[measured.usable].imag != 0.0).any()
-        parts = flux.real[:, :, None] if is_constant else np.stack([flux.real, flux.imag], axis=2)
-        noise, ratio = _noise(measured, flux, parts.shape[2], accuracy)
-        rotation = measured.rotation[0]
-        points = PlacedPoints.of(measured.sensors, measured.position.mean(axis=0), rotation)
-        used = np.asarray(measured.usable.any(axis=0))
-        return _Mean(measured, SourceReadings(points, parts, noise / np.sqrt(count), used), ratio)
+
+def _mean(measured: Measurements, accuracy: Accuracy) -> tuple[SourceReadings, Array]:
+    """The frames of a body at rest as one, and each sensor's noise by the median sensor's."""
+    good = measured.usable[:, :, None]
+    count = np.maximum(measured.usable.sum(axis=0), 1)
+    flux = np.where(good, measured.flux, 0.0).sum(axis=0) / count[:, None]
+    is_constant = not (measured.flux[measured.usable].imag != 0.0).any()
+    parts = flux.real[:, :, None] if is_constant else np.stack([flux.real, flux.imag], axis=2)
+    noise, ratio = _noise(measured, flux, parts.shape[2], accuracy)
+    rotation = measured.rotation[0]
+    points = PlacedPoints.of(measured.sensors, measured.position.mean(axis=0), rotation)
+    used = np.asarray(measured.usable.any(axis=0))
+    return SourceReadings(points, parts, noise / np.sqrt(count), used), ratio
 
 
 def _noise(
@@ -102,85 +156,22 @@ def _noise(
     return noise, np.where(is_measured, scatter / max(middle, 1e-300), 1.0)
 
 
-def calibrate_at_one_place(
-    measurements: Measurements,
-    name: str,
-    emitters: tuple[str, ...],
-    frequencies_hz: tuple[float, ...],
-    kinds: Sequence[str],
-    accuracy: Accuracy,
-    progress: Progress | None = None,
-) -> Calibration:
-    """Find each emitter's place and field, and which sensors are the wrong way round.
-
-    Parameters
-    ----------
-    measurements : Measurements
-        Frames of one body at rest, with poses.
-    name : str
-        Of the session.
-    emitters, frequencies_hz : tuple, length K
-        Names of the emitters, and their frequencies, Hz.
-    kinds : sequence of str
-        Of `KINDS`; others keep the setup's values. With none, sensors are as stated.
-    accuracy : Accuracy
-        Noise of a single frame.
-    progress : callable, optional
-        Called with the name of the stage and its finished fraction.
-
-    Raises
-    ------
-    FitError
-        When all fluxes of an emitter are zero.
+def _each_fifth(
+    readings: SourceReadings, kinds: Sequence[str], progress: Progress | None
+) -> tuple[Array, Array, Array]:
+    """Readings (S, K, C) as the sensors of the other folds predict them, how far they may be off,
+    and the evidence (S,) of a reversed sensor.
     """
-    posed = with_pose(measurements)
-    mean = _Mean.of(posed, accuracy)
-    received = mean.readings.flux[mean.readings.used].any(axis=(0, 2))
-    if not received.all():
-        silent = ', '.join(emitters[k] for k in np.flatnonzero(~received))
-        raise FitError(f'{measurements.body}: all fluxes of {silent} are zero')
-    looked_for = tuple(kind for kind in KINDS if kind in kinds)
-    looked_for += ('polarity',) if looked_for else ()
-    fold = np.arange(len(mean.readings.used)) % FOLDS
-    foretold = np.zeros_like(mean.readings.flux)
-    spread, evidence = np.ones_like(foretold), np.zeros(len(fold))
+    predicted, fold = np.zeros_like(readings.flux), np.arange(len(readings.used)) % FOLDS
+    spread, evidence = np.ones_like(predicted), np.zeros(len(fold))
     for k in range(FOLDS):
         if progress is not None:
             progress('each fifth of the sensors from the others', k / (FOLDS + 1.0))
         out = fold == k
-        rest = replace(mean.readings, used=mean.readings.used & ~out)
-        part = _fitted(rest, looked_for)
-        foretold[out], spread[out] = part.predicted[out], part.sigma[out]
+        part = _fitted(replace(readings, used=readings.used & ~out), kinds)
+        predicted[out], spread[out] = part.predicted[out], part.sigma[out]
         evidence[out] = part.sign_evidence[out]
-    fit = _fitted(mean.readings, looked_for)
-    turned = (fit.sign_evidence > LEAST_EVIDENCE) & (evidence > 0.0) & mean.readings.used
-    turned &= bool(looked_for)
-    sign = np.where(turned, -1.0, 1.0)
-    held_out = _held_out(mean, fit, foretold, spread, sign)
-    effects = reversed_sensors(
-        posed.sensors.channel[turned], fit.sign_evidence[turned], evidence[turned]
-    )
-    loud = mean.noise_ratio > NOISY
-    model = FieldModel(
-        *_dipoles(fit), emitters=emitters, frequencies_hz=frequencies_hz,
-        flux_error_t=held_out.flux_error_t, effects=effects,
-    )  # fmt: skip
-    sound = replace(posed, flux=posed.flux * sign[:, None])
-    scan = Scan(
-        (sound,),
-        accuracy,
-        effects,
-        noisy_sensors(posed.sensors.channel[loud], mean.noise_ratio[loud]),
-    )
-    calibration = Calibration(
-        model, _moment_fit(mean, fit, sign, model), held_out, None, (),
-        LayoutCandidate(_layout(fit), DipoleSites(model.positions, model.directions), 0.0,
-                        held_out.score_t, ()),
-        _layout(fit), 0.0, int(posed.usable.sum()), _residuals(mean, fit, sign), scan,
-        sources=_places(emitters, fit), sensor_widths=fit.widths,
-        undetermined=_unclear(posed, fit, mean.readings.used & ~turned) if looked_for else (),
-    )  # fmt: skip
-    return replace(calibration, model=replace(model, provenance=provenance(calibration, [name])))
+    return predicted, spread, evidence
 
 
 def _fitted(readings: SourceReadings, kinds: Sequence[str]) -> SourcesFit:
@@ -188,10 +179,6 @@ def _fitted(readings: SourceReadings, kinds: Sequence[str]) -> SourcesFit:
     low, high = points.min(axis=0), points.max(axis=0)
     margin = REACH * float((high - low).max())
     return SourcesFitter(readings, (low - margin, high + margin), kinds).fit()
-
-
-def _layout(fit: SourcesFit) -> Layout:
-    return Layout('sources', sum(len(one.places) - 1 for one in fit.sources), 1.0, 0.0)
 
 
 def _dipoles(fit: SourcesFit) -> tuple[Array, Array, NDArray[np.complex128]]:
@@ -217,41 +204,45 @@ def _phasors(parts: Array) -> NDArray[np.complex128]:
     return np.asarray(parts[..., 0] + (1j * parts[..., 1] if parts.shape[-1] == 2 else 0.0))
 
 
-def _residuals(mean: _Mean, fit: SourcesFit, sign: Array) -> Residuals:
-    used = mean.readings.used
-    flux = _phasors(mean.readings.flux * sign[:, None, None])[used]
-    left = flux - _phasors(fit.predicted)[used]
-    span = float(flux.real.max() - flux.real.min())
-    return Residuals(np.sqrt((np.abs(left) ** 2).mean(axis=0)), span)
-
-
 def _held_out(
-    mean: _Mean, fit: SourcesFit, foretold: Array, spread: Array, sign: Array
+    sound: SourceReadings, predicted: Array, spread: Array, fit: SourcesFit, place: Array
 ) -> HeldOut:
-    used = mean.readings.used
-    left = mean.readings.flux * sign[:, None, None] - foretold
+    left, used = sound.flux - predicted, sound.used
     error = _phasors(left)[used]
-    noise = float(np.median(mean.readings.noise_t[used]))
+    noise = float(np.median(sound.noise_t[used]))
     excess = float(np.median((left[used] ** 2).mean(axis=(1, 2)))) - noise**2
     return HeldOut(
-        error, error, float(np.mean((left / spread)[used] ** 2)), noise, noise,
-        float(np.sqrt(max(excess, 0.0))), sum(len(one.moments) for one in fit.sources),
-        mean.measured.position[:1], np.array([np.sqrt(np.mean(np.abs(error) ** 2))]),
-        gap_factor=1.0,
-    )  # fmt: skip
+        error=error,
+        left_over=error,
+        chi_square=float(np.mean((left / spread)[used] ** 2)),
+        noise_t=noise,
+        flux_noise_t=noise,
+        flux_error_t=float(np.sqrt(max(excess, 0.0))),
+        n_dipoles=sum(len(one.moments) for one in fit.sources),
+        place=place,
+        frame_rmse_t=np.array([rms(error)]),
+    )
 
 
-def _moment_fit(mean: _Mean, fit: SourcesFit, sign: Array, model: FieldModel) -> MomentFit:
-    basis = mean.readings.points.basis(model.positions, model.directions)
-    size = np.linalg.svd(basis / np.linalg.norm(basis, axis=0), compute_uv=False)
-    left = (mean.readings.flux * sign[:, None, None] - fit.predicted)[mean.readings.used]
-    noise = float(np.sqrt(np.mean(as_real(_phasors(left)) ** 2)))
-    return MomentFit(
-        model.moments, (mean.measured,), (mean.measured.usable.astype(np.float64),), noise, noise,
-        int((size > size[0] * len(basis) * np.finfo(float).eps).sum()),
-        float(len(model.moments)) / len(fit.sources),
-        float(size[0] / max(size[-1], np.finfo(float).tiny)), 1,
-    )  # fmt: skip
+def _reversed(
+    channels: NDArray[np.int64], evidence: Array, held_out: Array
+) -> tuple[EffectRecord, ...]:
+    """A record of the channels that are the wrong way round, with the least evidence of one."""
+    if not channels.size:
+        return ()
+    found = {
+        'log_probability': float(evidence.min()),
+        'held_out_log_probability': float(held_out.min()),
+    }
+    return (EffectRecord('sensor_polarity', {'channels': channels.tolist()}, {}, found),)
+
+
+def _noisy(channels: NDArray[np.int64], ratio: Array) -> tuple[EffectRecord, ...]:
+    """A record of each channel that is noisier than the median one."""
+    return tuple(
+        EffectRecord('excess_noise', {'factor': float(ratio[k]), 'channels': [int(channels[k])]})
+        for k in np.flatnonzero(ratio > NOISY)
+    )
 
 
 def _unclear(posed: Measurements, fit: SourcesFit, others: Mask) -> tuple[str, ...]:
@@ -263,10 +254,15 @@ def _unclear(posed: Measurements, fit: SourcesFit, others: Mask) -> tuple[str, .
     return (f'polarity: the readings do not determine it for {names}; taken as stated',)
 
 
-def _places(emitters: tuple[str, ...], fit: SourcesFit) -> tuple[SourcePlace, ...]:
-    return tuple(
-        SourcePlace(
-            name, one.places[0], float(sigma), one.moments[:3, 0], len(one.places) - 1
-        )
+def _places(emitters: tuple[str, ...], fit: SourcesFit) -> list[dict[str, Any]]:
+    """Where each emitter was found, in frame fg, and the in-phase part of its moment."""
+    return [
+        {
+            'name': name,
+            'position_m': one.places[0].tolist(),
+            'sigma_m': float(sigma),
+            'moment_am2': one.moments[:3, 0].tolist(),
+            'stray_dipoles': len(one.places) - 1,
+        }
         for name, one, sigma in zip(emitters, fit.sources, fit.place_sigma_m, strict=True)
-    )  # fmt: skip
+    ]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.calibration.population import width_by_evidence
 from anser_ros.field.measurements import Measurements
 
 Array = NDArray[np.float64]
@@ -18,21 +19,13 @@ SMALLEST_RAD = 1e-7
 
 @dataclass(frozen=True)
 class OpticalNoise:
-    """Holds the jitter of an optical pose along and about each axis, before interpolation.
+    """Holds the jitter of an optical pose along and about each axis, before interpolation."""
 
-    Attributes
-    ----------
-    position_m, rotation_rad : float
-        Standard deviations of a component.
-    poses : float
-        Number of poses' worth of data behind them.
-    interpolated : float
-        Share of the variance that is left in a pose at a flux's stamp, on the average.
-    """
-
+    # position_m, rotation_rad: standard deviations of a component
     position_m: float
     rotation_rad: float
-    poses: float = 0.0
+    poses: float = 0.0  # number of poses' worth of data behind them
+    # share of the variance that is left in a pose at a flux's stamp, on the average
     interpolated: float = 1.0
 
     @property
@@ -77,28 +70,22 @@ def estimate_noise(
     The squares of the steps are divided by the number of steps that the fluxes determined (MacKay,
     Bayesian interpolation, Neural Computation 1992): a single coil does not see every direction.
 
-    Parameters
-    ----------
-    steps, variances : sequence of ndarray, shape (F, 6)
-        Steps of the poses (m, rad) and what is uncertain in them, one per body and session.
-    shares : sequence of ndarray, shape (F,)
-        Of `interpolation_share`.
-    kept : sequence of ndarray of bool, shape (F,)
-        Frames to use.
-    present : OpticalNoise
-        The jitter that the steps were found with.
+    For each of the measurements: the ``steps`` (F, 6), m and rad, found with the ``present``
+    jitter, their ``variances``, the ``shares`` of `interpolation_share`, and which frames to use.
     """
-    power, information, count, share_sum = np.zeros(2), np.zeros(2), 0, 0.0
-    for step, variance, share, keep in zip(steps, variances, shares, kept, strict=True):
-        each = (step**2 / share[:, None])[keep]
-        seen = (1.0 - variance / (present.jitter**2 * share[:, None]))[keep]
-        power += [each[:, :3].sum(), each[:, 3:].sum()]
-        information += [seen[:, :3].sum(), seen[:, 3:].sum()]
-        count, share_sum = count + int(keep.sum()), share_sum + float(share[keep].sum())
-    sigma = np.sqrt(power / np.maximum(information, 1.0))
+    parts = [
+        (step[keep] ** 2 / share[keep, None], variance[keep] / share[keep, None])
+        for step, variance, share, keep in zip(steps, variances, shares, kept, strict=True)
+    ]
+    square, uncertain = (np.concatenate(part) for part in zip(*parts, strict=True))
+    ratio = uncertain / present.jitter**2
+    (along, seen), (about, turned) = (
+        width_by_evidence(square[:, own], ratio[:, own], 1.0) for own in (slice(0, 3), slice(3, 6))
+    )
+    left = np.concatenate([share[keep] for share, keep in zip(shares, kept, strict=True)])
     return OpticalNoise(
-        max(float(sigma[0]), SMALLEST_M),
-        max(float(sigma[1]), SMALLEST_RAD),
-        float(information.min()) / 3.0,
-        share_sum / max(count, 1),
+        max(along, SMALLEST_M),
+        max(about, SMALLEST_RAD),
+        min(seen, turned) / 3.0,
+        float(left.sum()) / max(left.size, 1),
     )

@@ -46,43 +46,39 @@ FEWEST_POPULATION = 4
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Holds what the data say of Q parameters: a Gaussian about ``values``.
+    """Holds what the data say of Q parameters: a Gaussian about ``values``."""
 
-    Attributes
-    ----------
-    information : ndarray, shape (Q, Q)
-        Inverse covariance.
-    natural : ndarray, shape (Q,)
-        Information times the most probable values.
-    readings : float
-        Phasor components of independent noise that the information is from.
-    """
-
-    information: Array
-    natural: Array
-    readings: float = 0.0
+    information: Array  # (Q, Q): inverse covariance
+    natural: Array  # (Q,): information times the most probable values
+    readings: float = 0.0  # phasor components of independent noise that the information is from
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Holds parameters with their widths.
+    """Holds parameters with their widths."""
 
-    Attributes
-    ----------
-    values, width : ndarray, shape (Q,)
-        Most probable values, and their prior widths.
-    covariance : ndarray, shape (Q, Q)
-    evidence : float
-        Log probability of the data, up to a constant.
-    shared : float
-        Share of the gains' variance that sensors at one place have in common.
-    """
-
+    # values, width (Q,): most probable values, and their prior widths
     values: Array
     width: Array
-    covariance: Array
-    evidence: float
-    shared: float = 0.0
+    covariance: Array  # (Q, Q)
+    evidence: float  # log probability of the data, up to a constant
+    shared: float = 0.0  # share of the gains' variance that sensors at one place have in common
+
+    @property
+    def sigma(self) -> Array:
+        """Return the standard deviations of the values, (Q,)."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
+
+
+def width_by_evidence(square: Array, ratio: Array, least: float) -> tuple[float, float]:
+    """Return the prior width that makes values most probable, and how many the data determine.
+
+    It is the fixed point of MacKay's rule, taken once: the squared values over their number less
+    what is not determined of them, the ``ratio`` of each one's variance to the squared width that
+    it was found with; ``least`` is the least such number.
+    """
+    freedom = square.size - float(ratio.sum())
+    return float(np.sqrt(float(square.sum()) / max(freedom, least))), freedom
 
 
 def solve(likelihood: Likelihood, width: Array, root: Array | None = None) -> Posterior:
@@ -99,13 +95,7 @@ def solve(likelihood: Likelihood, width: Array, root: Array | None = None) -> Po
 
 
 class Population:
-    """Finds the widths of all kinds of parameters.
-
-    Parameters
-    ----------
-    parameters : SensorParameters
-        What is estimated.
-    """
+    """Finds the widths of all kinds of parameters."""
 
     def __init__(self, parameters: SensorParameters) -> None:
         self.parameters = parameters
@@ -119,15 +109,7 @@ class Population:
         return width
 
     def fit(self, likelihood: Likelihood, fixed: Sequence[str] = ()) -> Posterior:
-        """Return the parameters with the widths that make the data most probable.
-
-        Parameters
-        ----------
-        likelihood : Likelihood
-            Of all parameters.
-        fixed : sequence of str
-            Kinds that are held at zero.
-        """
+        """Return the parameters with the most probable widths; ``fixed`` kinds stay at zero."""
         width = self._start(fixed)
         shared = [
             (kind, np.setdiff1d(rows, self.alone[kind]))
@@ -139,10 +121,8 @@ class Population:
             for kind, rows in shared:
                 if not rows.size:
                     continue
-                variance = np.diag(found.covariance)[rows]
-                freedom = rows.size - float((variance / width[rows] ** 2).sum())
-                power = float((found.values[rows] ** 2).sum())
-                new = np.sqrt(power / max(freedom, 1e-3))
+                ratio = np.diag(found.covariance)[rows] / width[rows] ** 2
+                new, _ = width_by_evidence(found.values[rows] ** 2, ratio, 1e-3)
                 width[rows] = np.clip(new, NARROWEST[kind], PRIOR[kind])
             found = solve(likelihood, width)
         return found
@@ -219,15 +199,7 @@ class Population:
         return out
 
     def shift_sigma_m(self, likelihood: Likelihood, found: Posterior) -> float:
-        """Return how well a shift of all of a body's sensors is known, m along each axis.
-
-        Parameters
-        ----------
-        likelihood : Likelihood
-            Of all parameters.
-        found : Posterior
-            With all kinds.
-        """
+        """Return how well a shift of all of a body's sensors is known, m along each axis."""
         parameters, sigmas = self.parameters, self._data_sigmas(likelihood)
         if SHARED_SHIFT not in parameters.asked:
             return 0.0
@@ -238,15 +210,6 @@ class Population:
             return SURVEYED_M
         width = np.sqrt(np.mean(found.width[parameters.rows('places')] ** 2))
         return float(min(SURVEYED_M, AS_PLACES * np.hypot(width, sigmas['places'])))
-
-    def fixed(self, likelihood: Likelihood) -> tuple[str, ...]:
-        """Return the kinds that the data do not determine: they stay at zero.
-
-        Otherwise the field's prior, which does not know the tools, would divide what the field
-        and, say, a lever arm could both explain; and the width of a population is found from its
-        values.
-        """
-        return tuple(self.undetermined(likelihood))
 
     def _power(self, likelihood: Likelihood, found: Posterior, kind: str) -> float:
         """What a kind of error does to the fluxes, in the power of their noise."""
@@ -260,16 +223,13 @@ class Population:
     ) -> tuple[Posterior, tuple[str, ...], dict[str, float]]:
         """Leave out every kind that the data are more probable without.
 
-        Returns
-        -------
-        found : Posterior
-            With the kinds that are kept.
-        left_out : tuple of str
-            The others, which stay at zero.
-        evidence : dict of str to float
-            Gain of the log probability by each kind that is kept.
+        Returns the posterior with the kinds that are kept, the others, which stay at zero, and the
+        gain of the log probability by each kind that is kept.
         """
-        left_out = self.fixed(likelihood)
+        # What the data do not determine stays at zero. Otherwise the field's prior, which does not
+        # know the tools, would divide what the field and, say, a lever arm could both explain; and
+        # the width of a population is found from its values.
+        left_out = tuple(self.undetermined(likelihood))
         while True:
             found = self.fit(likelihood, left_out)
             gains = {

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration.dipole_sites import DipoleSites
+from anser_ros.calibration.dipole_sites import DipoleSites, flux_slopes
 from anser_ros.calibration.factors import as_real
 from anser_ros.field.measurements import Measurements
-from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -33,49 +32,23 @@ def pose_precision(accuracy: Accuracy) -> Array:
 
 @dataclass(frozen=True)
 class PoseTerms:
-    """Holds residuals of the fluxes with their derivatives by the pose.
+    """Holds residuals of the fluxes with their derivatives by the pose."""
 
-    Attributes
-    ----------
-    residual : ndarray, shape (F, S, 2K)
-        Measured minus modelled flux, T; real and imaginary parts by turns.
-    slope : ndarray, shape (F, S, 2K, 6)
-        Derivative of the modelled flux by a shift (T/m) and a rotation (T/rad) of the body, both
-        in fg, the rotation about the body's origin.
-    """
-
+    # (F, S, 2K): measured minus modelled flux, T; real and imaginary parts by turns
     residual: Array
+    # (F, S, 2K, 6): derivative of the modelled flux by a shift (T/m) and a rotation (T/rad) of the
+    # body, both in fg, the rotation about the body's origin
     slope: Array
 
 
 def pose_terms(
     measurements: Measurements, dipoles: DipoleSites, moments: ComplexArray
 ) -> PoseTerms:
-    """Evaluate a model at the poses of measurements.
-
-    Parameters
-    ----------
-    measurements : Measurements
-        F frames of S sensors, each with a pose.
-    dipoles : DipoleSites
-        N dipoles.
-    moments : ndarray, shape (N, K), complex
-        Their moments, A m^2.
-    """
+    """Evaluate a model at the poses of measurements."""
     points, axes = measurements.placed()
-    frames, sensors = points.shape[:2]
-    lengths = np.tile(measurements.sensors.length, frames)
-    flux, by_place, by_axis = flux_jacobian(
-        points.reshape(-1, 3), axes.reshape(-1, 3), lengths,
-        dipoles.positions, dipoles.directions, moments,
-    )  # fmt: skip
-    shape = (frames, sensors, 3, moments.shape[1])
-    slope = pose_slopes(
-        points, axes, measurements.position, by_place.reshape(shape), by_axis.reshape(shape)
-    )
-    modelled = as_real(flux).reshape(frames, sensors, -1)
-    residual = (as_real(measurements.flux) - modelled).astype(np.float64)
-    return PoseTerms(residual, slope)
+    flux, by_place, by_axis = flux_slopes(measurements, dipoles, moments)
+    residual = (as_real(measurements.flux) - as_real(flux)).astype(np.float64)
+    return PoseTerms(residual, pose_slopes(points, axes, measurements.position, by_place, by_axis))
 
 
 def pose_slopes(
@@ -83,14 +56,9 @@ def pose_slopes(
 ) -> Array:
     """Return the derivatives of fluxes by the body's pose, shape (F, S, 2K, 6).
 
-    Parameters
-    ----------
-    points, axes : ndarray, shape (F, S, 3)
-        Sensor centres (m) and unit axes, frame fg.
-    position : ndarray, shape (F, 3)
-        Origin of the body, m, frame fg.
-    by_place, by_axis : ndarray, shape (F, S, 3, K), complex
-        Derivatives by the sensors' centres (T/m) and axes (T).
+    ``points``, ``axes`` (F, S, 3): sensor centres (m) and unit axes, frame fg; ``position``
+    (F, 3): the body's origin, m. ``by_place``, ``by_axis`` (F, S, 3, K): derivatives by the
+    sensors' centres (T/m) and axes (T).
     """
     place, turn = as_real(by_place), as_real(by_axis)
     arms = points - position[:, None, :]
@@ -109,25 +77,8 @@ def most_probable_step(
 ) -> tuple[Array, Array]:
     """Return the step of each frame's pose to its most probable value.
 
-    Parameters
-    ----------
-    terms : PoseTerms
-        Residuals and derivatives at the present poses.
-    weights : ndarray, shape (F, S)
-        Weights of the readings in [0, 1].
-    noise_t : float
-        Flux noise of a phasor component, T.
-    precision : ndarray, shape (6,)
-        Inverse variances of the pose.
-    offset : ndarray, shape (F, 6)
-        Difference between the present pose and the measured one, m and rad.
-
-    Returns
-    -------
-    step : ndarray, shape (F, 6)
-        Shift (m) and rotation vector (rad), frame fg.
-    residual : ndarray, shape (F, S, 2K)
-        Residual after the step to first order, T.
+    ``offset`` (F, 6): difference between the present pose and the measured one, m and rad.
+    Returns the steps (F, 6), and the residuals (F, S, 2K) after them to first order, T.
     """
     slope, weighted, normal = _normal_equations(terms, weights, noise_t)
     normal = normal + np.diag(precision)
@@ -155,18 +106,6 @@ def outlier_weights(residual: Array, weights: Array) -> Array:
 
     Beyond `OUTLIER_SCALE` times the median size the weight falls with the square of the size, so
     that the influence of a gross outlier vanishes.
-
-    Parameters
-    ----------
-    residual : ndarray, shape (F, S, 2K)
-        Residuals, T.
-    weights : ndarray, shape (F, S)
-        Readings of weight 0 are not used and stay so.
-
-    Returns
-    -------
-    ndarray, shape (F, S)
-        Weights in [0, 1].
     """
     size = np.sqrt((residual**2).mean(axis=2))
     used = weights > 0.0

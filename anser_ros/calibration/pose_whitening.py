@@ -18,16 +18,7 @@ class PoseWhitener:
     By the matrix inversion lemma it takes a 6 x 6 matrix a frame (Golub and Van Loan, Matrix
     Computations, section 2.1.4).
 
-    Parameters
-    ----------
-    slope : ndarray, shape (F, S, 2K, 6)
-        Derivatives of the fluxes by the pose, as in `PoseTerms`.
-    weights : ndarray, shape (F, S)
-        Weights of the readings in [0, 1].
-    noise_t : float
-        Flux noise of a phasor component, T.
-    precision : ndarray, shape (6,)
-        Inverse variances of the pose.
+    ``slope`` (F, S, 2K, 6): derivatives of the fluxes by the pose, as in `PoseTerms`.
     """
 
     def __init__(self, slope: Array, weights: Array, noise_t: float, precision: Array) -> None:
@@ -67,17 +58,9 @@ class PoseWhitener:
         the assumed jitter leaves ``sigma^2 (tr(W) - tr(W^2))``. The eigenvalues of W are one
         minus those of the matrix that tells how far the readings determine the pose parameters.
 
-        Parameters
-        ----------
-        residual : ndarray, shape (F, S, 2K)
-            Residuals at the measured poses, T.
-        flux_noise_t : float, optional
-            Flux noise alone, T a component; sigma by default.
-
-        Returns
-        -------
-        ndarray, shape (F,)
-            Variance, T^2 a component; negative where the frame has less power than expected.
+        ``residual`` is that at the measured poses; ``flux_noise_t`` without the jitter's part.
+        Returns (F,): variance, T^2 a component; negative where the frame has less power than
+        expected.
         """
         left = self.left_over(residual).reshape(self.root.shape)
         power = (left**2).sum(axis=1)

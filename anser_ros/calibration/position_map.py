@@ -15,21 +15,11 @@ trend and no distance: what differs there is the rounding of the numbers."""
 
 @dataclass(frozen=True)
 class Shape:
-    """Describes a choice of map.
+    """Describes a choice of map."""
 
-    Attributes
-    ----------
-    trend : int
-        Polynomial degree of the trend; -1 for no map.
-    length_m : float
-        Covariance length, m; 0 for a trend alone.
-    noise : float
-        Noise as a part of the errors' standard deviation about the trend.
-    """
-
-    trend: int
-    length_m: float
-    noise: float
+    trend: int  # polynomial degree of the trend; -1 for no map
+    length_m: float  # covariance length, m; 0 for a trend alone
+    noise: float  # noise as a part of the errors' standard deviation about the trend
 
     def describe(self) -> str:
         """Return the shape in words for a report."""
@@ -48,13 +38,7 @@ IDENTITY = Shape(-1, 0.0, 0.0)
 class PositionMap:
     """Holds what a map of one shape, fitted to some points, adds to tracked positions.
 
-    Parameters
-    ----------
-    places : ndarray, shape (M, 3)
-        Tracked positions, m.
-    errors : ndarray, shape (M, 3)
-        True less tracked positions, m.
-    shape : Shape
+    ``places`` (M, 3): tracked positions, m. ``errors`` (M, 3): true less tracked positions, m.
     """
 
     def __init__(self, places: Array, errors: Array, shape: Shape) -> None:

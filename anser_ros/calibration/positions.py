@@ -8,13 +8,12 @@ number of emitters nor on that of readings.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites
-from anser_ros.calibration.factors import ComplexArray, as_complex, as_real
+from anser_ros.calibration.factors import ComplexArray, as_real
 from anser_ros.calibration.readings import BLOCK_ROWS, frame_blocks, weighted_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.kernel_cache import kernel
@@ -56,19 +55,9 @@ def _fill_slopes(points, axes, lengths, positions, directions, out):  # type: ig
 def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleSites) -> Array:
     """Return the derivative of the flux basis by the dipoles' positions.
 
-    Parameters
-    ----------
-    points, axes : ndarray, shape (P, 3)
-        Sensor centres (m) and unit axes, frame fg.
-    lengths : ndarray, shape (P,)
-        Coil lengths, m.
-    dipoles : DipoleSites
-        N dipoles.
-
-    Returns
-    -------
-    ndarray, shape (P, N, 3)
-        Derivatives, T / (A m^3).
+    ``points``, ``axes`` (P, 3): sensor centres (m) and unit axes, frame fg. ``lengths`` (P,): coil
+    lengths, m.
+    Returns (P, N, 3): derivatives, T / (A m^3).
     """
     out = np.empty((points.shape[0], len(dipoles), 3))
     _fill_slopes(
@@ -78,45 +67,8 @@ def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleS
     return out
 
 
-@dataclass(frozen=True)
-class PositionFit:
-    """Holds dipoles at optimised positions with their damped moments.
-
-    Attributes
-    ----------
-    dipoles : DipoleSites
-        The moved dipoles.
-    moments : ndarray, shape (N, K), complex
-        Moments, A m^2.
-    start_t, end_t : float
-        Root mean square of the weighted residual of a phasor component before and after, T.
-    steps : int
-        Number of steps.
-    """
-
-    dipoles: DipoleSites
-    moments: ComplexArray
-    start_t: float
-    end_t: float
-    steps: int
-
-
 class PositionFitter:
-    """Moves dipoles to lower the damped residual of measurements at fixed, corrected poses.
-
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Measurements at their corrected poses, one per body and session.
-    weights : sequence of ndarray, shape (F, S)
-        Weights of the readings in [0, 1].
-    dipoles : DipoleSites
-        The positions to start from; the directions stay.
-    damping : float
-        Tikhonov's parameter of the moments, as for `MomentFitter`.
-    prior : ndarray, shape (N, K), complex, optional
-        Moments towards which the damping pulls, A m^2; zero by default.
-    """
+    """Moves dipoles to lower the damped residual of measurements at fixed, corrected poses."""
 
     def __init__(
         self,
@@ -134,7 +86,6 @@ class PositionFitter:
         self.dipoles, self.damping = dipoles, damping
         parts = self.blocks[0][4].shape[1]
         self.prior = np.zeros((len(dipoles), parts)) if prior is None else as_real(prior)
-        self.count = sum(float((b[3] ** 2).sum()) for b in self.blocks) * parts
         self.ridge = self._ridge()
 
     def _ridge(self) -> Array:
@@ -186,13 +137,11 @@ class PositionFitter:
         pairs = np.repeat(np.repeat(moments @ moments.T, 3, axis=0), 3, axis=1)
         return inner * pairs, gradient.ravel()
 
-    def fit(self, most_steps: int = MOST_STEPS) -> PositionFit:
+    def fit(self, most_steps: int = MOST_STEPS) -> DipoleSites:
         """Take Levenberg-Marquardt steps until the cost hardly falls any more."""
-        dipoles, strength, steps = self.dipoles, 1e-2, 0
+        dipoles, strength = self.dipoles, 1e-2
         moments, cost = self.solve(dipoles)
-        start = cost
-        while steps < most_steps:
-            steps += 1
+        for _ in range(most_steps):
             normal, gradient = self._normal(dipoles, moments)
             before = cost
             for _ in range(MOST_TRIALS):
@@ -205,11 +154,7 @@ class PositionFitter:
                 strength *= 5.0
             if before - cost < CONVERGED * before:
                 break
-        scale = 1.0 / self.count
-        return PositionFit(
-            dipoles, as_complex(moments), float(np.sqrt(start * scale)),
-            float(np.sqrt(cost * scale)), steps,
-        )  # fmt: skip
+        return dipoles
 
     def _moved(
         self, dipoles: DipoleSites, normal: Array, gradient: Array, strength: float

@@ -21,38 +21,24 @@ from anser_ros.physics.sensor import along_each_axis
 Array = NDArray[np.float64]
 
 POINTS_ALONG = 11
-"""Lattice points along x and y of the volume in which dipoles are to make the drawn field (every
-second one along z). With three axes a point they are some 2000 equations for at most a few hundred
-dipoles; fewer would leave the field between the points free."""
+"""Lattice points along x and y of the volume in which dipoles are to make the nominal field (every
+second one along z): some 2000 equations for at most a few hundred dipoles."""
 MARGIN = 0.3
-"""How far beyond the measured volume the drawn field is followed, as a fraction of its half size,
-so that a model extrapolates as the drawing does: a scan as wide as the board then covers the
-default tracked volume (`volume.REACH`). Smaller leaves the field beyond the edge of a
-scan free; larger spends dipoles on places where nothing was measured."""
+"""How far beyond the measured volume the nominal field is followed, as a fraction of its half
+size: a scan as wide as the board then covers the default tracked volume (`volume.REACH`)."""
 LEAST_HALF_SIZE_M = 0.02
 """Half size of that volume at least, m, for measurements along a line or in a plane: over 2 cm a
-field 10 cm from its coils changes by half, which shows how it falls. Smaller gives a lattice so
-flat that it does not tell the field across it; larger follows the drawing far from what was
-measured."""
+field 10 cm from its coils changes by half, which shows how it falls."""
 LEAST_HEIGHT = 0.8
 """Lowest point of that volume as a fraction of the lowest reading's height: there the field is at
-most twice as strong as at that reading. Smaller asks for the field farther down, where that of the
-drawn coils changes too fast for a layer of dipoles; larger leaves it free just below the scan."""
+most twice as strong, and farther down it changes too fast for a layer of dipoles."""
 PROJECTION_DAMPING = 1e-6
 """Damping when a known field without noise is expressed by dipoles, as a fraction of the largest
 singular value. It only keeps nearly parallel columns from making huge moments."""
 
 
-class DrawnBoard:
-    """Holds the drawn board's field in and around a measured volume, scaled to the measurements.
-
-    Parameters
-    ----------
-    nominal : FieldModel
-        The nominal model of the drawing.
-    measurements : sequence of Measurements
-        They determine the volume and the emitters' gains.
-    """
+class ScaledNominal:
+    """Holds the nominal field in and around a measured volume, scaled to the measurements."""
 
     def __init__(self, nominal: FieldModel, measurements: Sequence[Measurements]) -> None:
         self.nominal = nominal
@@ -71,10 +57,8 @@ class DrawnBoard:
 def volume_lattice(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
     """Return a lattice of sensors in and around the volume of the usable readings.
 
-    Returns
-    -------
-    points, axes : ndarray, shape (P, 3)
-        Positions (m) and unit axes, frame fg; three sensors along x, y and z at each point.
+    Returns ``points``, ``axes`` (P, 3): positions (m) and unit axes, frame fg; three sensors along
+    x, y and z at each point.
     """
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     low, high = points.min(axis=0), points.max(axis=0)

@@ -18,22 +18,13 @@ BLOCK_ROWS = 8192
 
 
 class Readings(NamedTuple):
-    """Holds P usable readings of sensors with a pose, for K emitters.
+    """Holds P usable readings of sensors with a pose, for K emitters."""
 
-    Attributes
-    ----------
-    points, axes : ndarray, shape (P, 3)
-        Sensor centres (m) and unit axes, frame fg.
-    lengths : ndarray, shape (P,)
-        Coil lengths, m.
-    flux : ndarray, shape (P, K), complex
-        Measured flux density along the axes, T.
-    """
-
+    # points, axes (P, 3): sensor centres (m) and unit axes, frame fg
     points: Array
     axes: Array
-    lengths: Array
-    flux: ComplexArray
+    lengths: Array  # (P,): coil lengths, m
+    flux: ComplexArray  # (P, K): measured flux density along the axes, T
 
 
 def frame_blocks(count: int, sensors: int, rows: int = BLOCK_ROWS) -> list[slice]:
@@ -57,22 +48,7 @@ def usable_readings(measurements: Sequence[Measurements]) -> Iterator[Readings]:
 def weighted_readings(
     measurements: Sequence[Measurements], weights: Sequence[Array]
 ) -> tuple[Readings, Array]:
-    """Return the P readings that have weight, at their poses, and the roots of their weights.
-
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        F frames of S sensors each.
-    weights : sequence of ndarray, shape (F, S)
-        Weights of the readings.
-
-    Returns
-    -------
-    readings : Readings
-        The readings whose weight is above zero.
-    root : ndarray, shape (P,)
-        Square roots of their weights.
-    """
+    """Return the P readings that have weight, at their poses, and the roots of their weights."""
     parts, roots = [], []
     for m, weight in zip(measurements, weights, strict=True):
         points, axes = m.placed()

@@ -4,8 +4,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from anser_ros.calibration.layout_fit import LayoutFit
-from anser_ros.calibration.moments import MomentFit
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 
@@ -31,25 +29,11 @@ def check_measurements(
 ) -> int:
     """Check that measurements determine a field model.
 
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Tool measurements, one per body and session.
-    needed : int
-        Number of readings per emitter that the dipoles need.
-    field_alone : bool
-        Whether nothing is estimated of the sensors, so that few poses of many sensors do.
-
-    Returns
-    -------
-    int
-        The number of readings per emitter.
-
-    Raises
-    ------
-    FitError
-        When there are too few frames with a pose or too few readings, or all readings lie in one
-        plane; the message has the number needed and the number found.
+    ``needed``: number of readings per emitter that the dipoles need. ``field_alone``: whether
+    nothing is estimated of the sensors, so that few poses of many sensors do.
+    Returns the number of readings per emitter.
+    Raises `FitError` when there are too few frames with a pose or too few readings, or all
+    readings lie in one plane; the message has the number needed and the number found.
     """
     if not measurements:
         raise FitError(
@@ -62,7 +46,7 @@ def check_measurements(
                 f'{m.body}: a calibration needs at least {FEWEST_SCAN_FRAMES} frames with a pose, '
                 f'got 0 of {len(m.time)} (is /optical/{m.body}/pose recorded?)'
             )
-    frames = _usable_frames(measurements)
+    frames = usable_frames(measurements)
     many = all(len(m.sensors) >= MANY_SENSORS for m in measurements)
     fewest = FEWEST_FRAMES_OF_MANY if many and field_alone else FEWEST_SCAN_FRAMES
     if frames < fewest:
@@ -99,31 +83,23 @@ def check_single_coils(measurements: Sequence[Measurements]) -> None:
 def check_kept(
     measurements: Sequence[Measurements], kept: Sequence[Measurements], needed: int
 ) -> None:
-    """Check that the frames that a survey kept still determine a field model.
+    """Check that the frames that a fit of sensors kept still determine a field model.
 
-    Parameters
-    ----------
-    measurements, kept : sequence of Measurements
-        Tool measurements, one per body and session, before and after frames were left out.
-    needed : int
-        Number of readings per emitter that the dipoles need.
-
-    Raises
-    ------
-    FitError
-        When too little is left; the message has how many frames were left out, and why.
+    Raises `FitError` when too little is left; the message has how many frames were left out, and
+    why.
     """
     try:
         check_measurements([m for m in kept if len(m.time)], needed)
     except FitError as error:
-        before, after = _usable_frames(measurements), _usable_frames(kept)
+        before, after = usable_frames(measurements), usable_frames(kept)
         raise FitError(
             f'{before - after} of {before} frames were left out, because their poses contradict '
             f'their fluxes or something moved; of the others: {error}'
         ) from error
 
 
-def _usable_frames(measurements: Sequence[Measurements]) -> int:
+def usable_frames(measurements: Sequence[Measurements]) -> int:
+    """Return the number of frames with a pose and a valid reading."""
     return sum(int(m.usable.any(axis=1).sum()) for m in measurements)
 
 
@@ -141,39 +117,24 @@ def _check_thickness(measurements: Sequence[Measurements]) -> None:
 def check_agreement(
     measurements: Sequence[Measurements],
     names: Sequence[str],
-    joint: MomentFit,
-    fit_part: Callable[[list[Measurements]], LayoutFit],
+    noise_t: float,
+    noise_of: Callable[[list[Measurements]], float],
 ) -> None:
     """Check that one field explains all sessions.
 
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Tool measurements, one per body and session.
-    names : sequence of str
-        Name of the session of each.
-    joint : MomentFit
-        The fit to all measurements together.
-    fit_part : callable
-        Fits some of the measurements alone in the same way.
-
-    Raises
-    ------
-    FitError
-        When the residual of the common fit is more than `DISAGREEMENT` times the largest one of
-        the sessions alone.
+    Raises `FitError` when the residual ``noise_t`` of the common fit is more than `DISAGREEMENT`
+    times the largest one of the sessions alone, by ``noise_of``.
     """
     sessions = list(dict.fromkeys(names))
     if len(sessions) < 2:
         return
-    alone = [
-        fit_part([m for m, name in zip(measurements, names, strict=True) if name == session])
+    worst = max(
+        noise_of([m for m, name in zip(measurements, names, strict=True) if name == session])
         for session in sessions
-    ]
-    worst = max(part.fit.noise_t for part in alone)
-    if joint.noise_t > DISAGREEMENT * worst:
+    )
+    if noise_t > DISAGREEMENT * worst:
         raise FitError(
             'the sessions are of different boards: the residual of one field for all is '
-            f'{joint.noise_t:.3g} T, more than {DISAGREEMENT:g} times the {worst:.3g} T of a '
+            f'{noise_t:.3g} T, more than {DISAGREEMENT:g} times the {worst:.3g} T of a '
             'field for each'
         )

@@ -1,7 +1,7 @@
 """Holds the result of a calibration with its residuals and its provenance."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,9 @@ from anser_ros.calibration.factors import as_real
 from anser_ros.calibration.held_out import HeldOut, rms
 from anser_ros.calibration.layout_score import LayoutCandidate
 from anser_ros.calibration.layouts import Layout
-from anser_ros.calibration.moments import MomentFit
+from anser_ros.calibration.moments import FitFigures
 from anser_ros.calibration.readings import usable_readings
-from anser_ros.calibration.survey_result import SurveyResult
+from anser_ros.calibration.survey_result import SensorFit
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.settings import Accuracy
@@ -23,18 +23,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Residuals:
-    """Holds the residuals of a model at the measured poses.
+    """Holds the residuals of a model at the measured poses."""
 
-    Attributes
-    ----------
-    each_t : ndarray, shape (K,)
-        Root mean square of the magnitude of each emitter's complex residual, T.
-    span_t : float
-        Range of the measured in-phase fluxes, T.
-    """
-
-    each_t: Array
-    span_t: float
+    each_t: Array  # (K,): root mean square of the magnitude of each emitter's complex residual, T
+    span_t: float  # range of the measured in-phase fluxes, T
 
     @property
     def rmse_t(self) -> float:
@@ -55,111 +47,38 @@ def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residu
 
 @dataclass(frozen=True)
 class Scan:
-    """Holds a scan as ideal sensors and an ideal clock would have given it.
+    """Holds a scan as ideal sensors and an ideal clock would have given it."""
 
-    Attributes
-    ----------
-    measurements : tuple of Measurements
-        The frames that are used, one per body and session.
-    accuracy : Accuracy
-        Noise and jitter, estimated where they were.
-    corrections : tuple of EffectRecord
-        What was wrong with sensors and clock; the model corrects it.
-    reported_effects : tuple of EffectRecord
-        What the scan contained besides.
-    survey : SurveyResult or None
-        How that was found; None where nothing was estimated.
-    field_sigma_t : float
-        Standard deviation of what was taken off the fluxes, T a phasor component: the field that
-        is learnt from them is no better.
-    """
-
-    measurements: tuple[Measurements, ...]
-    accuracy: Accuracy
+    measurements: tuple[Measurements, ...]  # the frames that are used, one per body and session
+    accuracy: Accuracy  # noise and jitter, estimated where they were
+    # what was wrong with sensors and clock; the model corrects it
     corrections: tuple[EffectRecord, ...] = ()
-    reported_effects: tuple[EffectRecord, ...] = ()
-    survey: SurveyResult | None = None
+    reported_effects: tuple[EffectRecord, ...] = ()  # what the scan contained besides
+    sensor_fit: SensorFit | None = None  # how that was found; None where nothing was estimated
+    # standard deviation of what was taken off the fluxes, T a phasor component: the field that is
+    # learnt from them is no better
     field_sigma_t: float = 0.0
 
 
 @dataclass(frozen=True)
-class SourcePlace:
-    """States where an emitter of unknown place was found.
-
-    Attributes
-    ----------
-    name : str
-        Of the emitter.
-    position_m, moment_am2 : ndarray, shape (3,)
-        Place, and the in-phase part of its moment, frame fg.
-    sigma_m : float
-        Standard deviation of the place, root of the sum over three axes.
-    stray_dipoles : int
-        Dipoles that describe its stray field.
-    """
-
-    name: str
-    position_m: Array
-    sigma_m: float
-    moment_am2: Array
-    stray_dipoles: int
-
-
-@dataclass(frozen=True)
 class Calibration:
-    """Holds a field model with the figures of its fit and of its choice.
-
-    Attributes
-    ----------
-    model : FieldModel
-        The calibrated field model.
-    fit : MomentFit
-        The fit of the moments to all readings.
-    held_out : HeldOut
-        Held-out errors of the chosen layout, with every fold fitted from the start.
-    nominal_rmse_t : float or None
-        Root mean square of the magnitude of the nominal model's residual on the same readings, T;
-        None without a nominal model.
-    candidates : tuple of LayoutCandidate
-        All layouts that were compared.
-    chosen : LayoutCandidate
-        The chosen one of them.
-    layout : Layout
-        The chosen layout.
-    damping : float
-        The damping of the fit, chosen or given.
-    n_measurements : int
-        Number of readings of each emitter.
-    residuals : Residuals
-        Residuals of the model on all readings that it was fitted to.
-    scan : Scan
-        The scan with what was wrong with it.
-    contradictions : tuple of str
-        A line for every sensor of which two sessions say different things.
-    sources : tuple of SourcePlace
-        Of the emitters whose places are not in the setup, where these were found.
-    sensor_widths : mapping of str to float
-        Standard deviations of the sensors' places (m), axes (rad) and gains, where only these can
-        be told.
-    undetermined : tuple of str
-        Lines on what the readings of one place do not determine: the polarity of some sensors.
-    """
+    """Holds a field model with the figures of its fit and of its choice."""
 
     model: FieldModel
-    fit: MomentFit
-    held_out: HeldOut
-    nominal_rmse_t: float | None
-    candidates: tuple[LayoutCandidate, ...]
-    chosen: LayoutCandidate
-    layout: Layout
+    fit: FitFigures  # of the moments, to all readings
+    held_out: HeldOut  # of the chosen layout, with every fold fitted from the start
+    layout: Layout  # chosen or given, as is the damping
     damping: float
-    n_measurements: int
-    residuals: Residuals
-    scan: Scan
-    contradictions: tuple[str, ...] = ()
-    sources: tuple[SourcePlace, ...] = ()
-    sensor_widths: Mapping[str, float] = field(default_factory=dict)
-    undetermined: tuple[str, ...] = ()
+    n_measurements: int  # readings of each emitter
+    residuals: Residuals  # on all readings that the model was fitted to
+    scan: Scan  # with what was wrong with it
+    # root mean square of the magnitude of the nominal model's residual on the same readings, T
+    nominal_rmse_t: float | None = None
+    candidates: tuple[LayoutCandidate, ...] = ()  # all layouts that were compared
+    contradictions: tuple[str, ...] = ()  # a line for everything of which two sessions disagree
+    undetermined: tuple[str, ...] = ()  # lines on what the readings cannot determine
+    # sections that only some engine's calibrations have in their document, as plain data
+    more: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def better_than_nominal(self) -> bool:
@@ -167,21 +86,22 @@ class Calibration:
         return self.nominal_rmse_t is None or rms(self.held_out.error) < self.nominal_rmse_t
 
 
-def provenance(calibration: Calibration, names: Sequence[str]) -> Mapping[str, Any]:
-    """Return how the model was made, as plain data for its file."""
-    held_out = calibration.held_out
-    return {
+def with_provenance(calibration: Calibration, names: Sequence[str]) -> Calibration:
+    """Return a calibration whose model says for its file how it was made, of named sessions."""
+    held_out, fit = calibration.held_out, calibration.fit
+    provenance = {
         'method': 'calibration',
         'sessions': list(dict.fromkeys(names)),
         'n_measurements': calibration.n_measurements,
         'layout': calibration.layout.describe(),
         'damping': calibration.damping,
-        'rank': calibration.fit.rank,
-        'condition': calibration.fit.condition,
-        'noise_t': calibration.fit.noise_t,
+        'rank': fit.rank,
+        'condition': fit.condition,
+        'noise_t': fit.noise_t,
         'heldout_flux_rmse_t': rms(held_out.error),
         'heldout_marginal_rmse_t': float(np.sqrt(np.mean(as_real(held_out.left_over) ** 2))),
         'heldout_chi_square': held_out.chi_square,
         'flux_error_t': calibration.model.flux_error_t,
         'nominal_flux_rmse_t': calibration.nominal_rmse_t,
     }
+    return replace(calibration, model=replace(calibration.model, provenance=provenance))

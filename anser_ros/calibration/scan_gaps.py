@@ -2,7 +2,7 @@
 
 A damped fit is the most probable one where moments differ from those that they are pulled to by
 random amounts, as large as the damping implies. Its covariance is largest where no reading was:
-it tells gaps from places that were scanned, but is too small, for what a layout cannot represent
+it shows gaps beside places that were scanned, but is too small, for what a layout cannot represent
 is not random. Blocks of space that were held out say by which factor.
 """
 
@@ -59,11 +59,8 @@ def expected_power(moments: Array, sites: DipoleSites, frames: Measurements) -> 
 def factor_of(expected: Array, found: Array) -> float:
     """Return by which factor errors of held-out frames are larger than expected, at least one.
 
-    Parameters
-    ----------
-    expected, found : ndarray, shape (F,)
-        Variances of a phasor component, T^2. The half of the frames with the larger expected ones
-        counts: elsewhere what is found is noise.
+    ``expected``, ``found`` (F,): variances of a phasor component, T^2. The half of the frames with
+    the larger expected ones counts: elsewhere what is found is noise.
     """
     if expected.size < FEWEST_HELD_OUT_FRAMES:
         return 1.0
@@ -76,21 +73,9 @@ def gaps_of(
 ) -> ScanGaps | None:
     """Return what a fit leaves open of the field in and about the volume that was scanned.
 
-    Parameters
-    ----------
-    fitted : LayoutFit
-        Of the whole scan.
-    damping : float
-        Of its moments.
-    measurements : sequence of Measurements
-        The scan.
-    factor : float
-        By which errors are larger than the moments' covariance says (`factor_of`).
-
-    Returns
-    -------
-    ScanGaps or None
-        None where no place is uncertain by more than a share of the noise.
+    ``fitted``: of the whole scan. ``factor``: by which errors are larger than the moments'
+    covariance says (`factor_of`).
+    Returns none where no place is uncertain by more than a share of the noise.
     """
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M

@@ -6,17 +6,17 @@ which a complete fit decides (`fit_scan`).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.coil_places import CoilPlacer
-from anser_ros.calibration.layout_fit import lowest_height, placed, rich_layout
+from anser_ros.calibration.layout_fit import LayoutPlacer, lowest_height, rich_layout
 from anser_ros.calibration.layout_score import LayoutCandidate, LayoutScorer
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.moments import MomentFit
-from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.settings import Accuracy
@@ -62,33 +62,20 @@ readings per dipole each then."""
 MOVING_READINGS = 12
 """Fewest readings for each moved dipole: three times its three coordinates and its moment."""
 LEAST_GAIN = 0.08
-"""Fraction by which more dipoles must lower the predictive error to be chosen. Below the noise a
-lower error changes no pose, while tracking takes time in proportion to the dipoles. A smaller
-value chooses larger layouts, a larger one gives accuracy away."""
+"""Fraction by which more dipoles must lower the predictive error to be chosen: below the noise it
+changes no pose, while tracking takes time in proportion to the dipoles."""
 LOSS_FOR_A_THIRD = 1.15
-"""Factor by which a finalist's predictive error may be larger if it has a third of the dipoles: as
-many as moved ones need for the error of a layer of fixed ones. A finalist with nearly as many
-dipoles must be nearly as good: where a scan has gaps, some percent of the error of blocks, most of
-which is noise, are half of what the field is wrong by in the gaps."""
+"""Factor by which a finalist's predictive error may be larger if it has a third of the dipoles, as
+moved ones have. Where a scan has gaps, some percent of the error of blocks, most of it noise, are
+half of what the field is wrong by in the gaps."""
 
 
-@dataclass(frozen=True)
-class Selection:
-    """Holds the result of a search through layouts.
+class Selection(NamedTuple):
+    """Holds the result of a search through layouts."""
 
-    Attributes
-    ----------
-    finalists : tuple of LayoutCandidate
-        The layouts among which a fit from the start decides.
-    candidates : tuple of LayoutCandidate
-        Every layout that was scored.
-    reference : MomentFit
-        The fit of a rich layer that corrected the poses.
-    """
-
-    finalists: tuple[LayoutCandidate, ...]
-    candidates: tuple[LayoutCandidate, ...]
-    reference: MomentFit
+    finalists: tuple[LayoutCandidate, ...]  # the layouts among which a fit from the start decides
+    candidates: tuple[LayoutCandidate, ...]  # every layout that was scored
+    reference: MomentFit  # the fit of a rich layer that corrected the poses
 
 
 def thin_frames(measurements: Sequence[Measurements]) -> list[Measurements]:
@@ -105,31 +92,10 @@ def choose_layout(
     accuracy: Accuracy,
     progress: Progress | None = None,
     asked: Layout | None = None,
-    drawn: DrawnBoard | None = None,
 ) -> Selection:
-    """Search the layouts and dampings with the least held-out error.
+    """Search the layouts, or one asked for, and the dampings with the least held-out error.
 
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Tool measurements with poses, one per body and session.
-    folds : sequence of ndarray, shape (F,)
-        Fold of each frame.
-    generator : Generator
-        Places of the coils.
-    accuracy : Accuracy
-        Flux noise and pose jitter.
-    progress : callable, optional
-        Called with the name of the stage and its finished fraction.
-    asked : Layout, optional
-        The layout to use; then only its damping is chosen.
-    drawn : DrawnBoard, optional
-        The drawn board, towards which the damping pulls.
-
-    Raises
-    ------
-    FitError
-        When there are fewer readings than the smallest layout has dipoles.
+    Raises `FitError` when there are fewer readings than the smallest layout has dipoles.
     """
     rows = sum(int(m.usable.sum()) for m in measurements)
     if rows < COUNTS[0] ** 2:
@@ -142,8 +108,9 @@ def choose_layout(
     rich = rich_layout(measurements, generator)
     if rows < rich.count**2:
         rich = replace(rich, count=affordable[-1])
-    scorer = LayoutScorer(measurements, folds, place(rich, generator), accuracy)
-    search = _Search(scorer, generator, progress, drawn)
+    placer = LayoutPlacer(generator, measurements)
+    scorer = LayoutScorer(measurements, folds, place(rich, generator), accuracy, placer)
+    search = _Search(scorer, generator, progress)
     if asked is not None:
         finalists = [search.score(asked)]
     else:
@@ -156,20 +123,15 @@ class _Search:
     """The layouts as they are tried, each of them once."""
 
     def __init__(
-        self,
-        scorer: LayoutScorer,
-        generator: Generator,
-        progress: Progress | None,
-        drawn: DrawnBoard | None,
+        self, scorer: LayoutScorer, generator: Generator, progress: Progress | None
     ) -> None:
         self.scorer, self.generator, self.progress = scorer, generator, progress
-        self.drawn, self.prior = drawn, 'none' if drawn is None else 'nominal'
+        self.prior = 'none' if generator.nominal is None else 'nominal'
         self.tried: dict[Layout, LayoutCandidate] = {}
 
     def score(self, layout: Layout) -> LayoutCandidate:
         if layout not in self.tried:
-            dipoles, _ = placed(layout, self.generator, self.drawn)
-            self.tried[layout] = self.scorer.score(layout, dipoles, self.drawn)
+            self.tried[layout] = self.scorer.score(layout)
             if self.progress is not None:
                 # How many layouts will be tried is not known: the bar slows down towards its end.
                 self.progress('layouts', 1.0 - 0.9 ** len(self.tried))
@@ -193,7 +155,7 @@ class _Search:
         triple = max(SMALLEST_TRIPLE, round(layer.count / np.sqrt(3.0)))
         others = [replace(layer, kind='layer_xyz', count=triple)]
         others += [Layout('coils', n, 1.0, 0.0, self.prior) for n in (2, 3, 4)]
-        if self.drawn is not None:
+        if self.generator.nominal is not None:
             others.append(replace(layer, prior='none'))
         return [o for o in others if len(place(o, self.generator)) <= MOST_DIPOLES]
 
@@ -204,11 +166,11 @@ class _Search:
         moving = [m for m in moving if MOVING_READINGS * len(place(m, self.generator)) <= rows]
         if moving:
             found.append(min(map(self.score, moving), key=lambda c: c.score))
-        if self.drawn is None:
+        if self.generator.nominal is None:
             # A few dipoles more cost a tracker nothing: the best of them, not the leanest.
             found.append(min(map(self.score, COAXIAL), key=lambda c: c.score))
         else:
-            coils = CoilPlacer(self.drawn.nominal)
+            coils = CoilPlacer(self.generator.nominal)
             if coils.possible and len(coils.sites) <= MOST_DIPOLES:
                 found.append(
                     self.score(Layout('drawing', len(coils.sites), 1.0, 0.0, self.prior, True))

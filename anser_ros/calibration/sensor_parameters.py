@@ -36,9 +36,8 @@ PRIOR = {
     'gains': 0.05, 'axes': 0.05, 'places': 5e-3, 'lever_arm': 5e-3,
     'time_offset': 0.1, 'clock_rate': 3e-3, 'offsets': 0.3,
 }  # fmt: skip
-"""Standard deviation of each parameter before any data: relative, rad, m, m, s, s a second;
-offsets are relative to the fluxes' root mean square. They are wide for a tool that was built and
-surveyed at all, and only hold what the data leave open."""
+"""Standard deviation of each parameter before any data: relative, rad, m, m, s, s a second,
+relative to the fluxes' root mean square. Wide, for they only hold what the data leave open."""
 USEFUL = {
     'gains': 2e-3, 'axes': 5e-3, 'places': 2e-4, 'lever_arm': 2e-4, 'time_offset': 1e-3,
     'clock_rate': 1e-4, 'offsets': 2e-3,
@@ -56,38 +55,22 @@ AS_PLACES = 4.0
 its setup has them is one that was measured well. An assumption, not a result."""
 TURNED_RAD = 0.05
 """Turn of a body, rad rms, about a second axis from which on it determines a lever arm: a
-millimetre is then 0.05 mm of movement. With less, what a field's model misses decides how a shift
-is shared out between lever arm and field: an example with 0.02 rad was off by 1.3 mm."""
+millimetre is then 0.05 mm of movement. With 0.02 rad, an example was off by 1.3 mm."""
 BY_RULE = 1e-9
 """Standard deviation, relative or m, of what a rule sets: far below any spread, and above what
 rounding makes of it."""
 
 
 @dataclass(frozen=True)
-class Survey:
-    """Holds estimated errors of the sensors of one body and of the optical clock.
+class BodyErrors:
+    """Holds estimated errors of the sensors of one body and of the optical clock."""
 
-    Attributes
-    ----------
-    gain : ndarray, shape (S,), complex
-        Factor of each sensor's fluxes.
-    axis : ndarray, shape (S, 3)
-        Unit axes in the body's frame.
-    place : ndarray, shape (S, 3)
-        Shift of each sensor in the body's frame, m, without the lever arm.
-    lever_arm : ndarray, shape (3,)
-        Shift of all sensors in the body's frame, m.
-    pickup : ndarray, shape (S, K), complex
-        Added to each sensor's fluxes, T.
-    offset_s, rate : float
-        An optical stamp t counts as ``t (1 + rate) + offset_s``.
-    """
-
-    gain: ComplexArray
-    axis: Array
-    place: Array
-    lever_arm: Array
-    pickup: ComplexArray
+    gain: ComplexArray  # (S,): factor of each sensor's fluxes
+    axis: Array  # (S, 3): unit axes in the body's frame
+    place: Array  # (S, 3): shift of each sensor in the body's frame, m, without the lever arm
+    lever_arm: Array  # (3,): shift of all sensors in the body's frame, m
+    pickup: ComplexArray  # (S, K): added to each sensor's fluxes, T
+    # offset_s, rate: an optical stamp t counts as ``t (1 + rate) + offset_s``
     offset_s: float
     rate: float
 
@@ -140,23 +123,17 @@ def velocity_of(measurements: Measurements) -> Array:
 
 
 class SensorParameters:
-    """Orders the parameters in their vector, and knows what they do to fluxes.
-
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Sessions with the same body share the parameters of its sensors.
-    kinds : sequence of str
-        What is estimated, of `KINDS`.
-    """
+    """Orders the parameters in their vector, and knows what they do to fluxes."""
 
     def __init__(self, measurements: Sequence[Measurements], kinds: Sequence[str]) -> None:
-        told = set(kinds) if all(m.is_followed for m in measurements) else {*kinds} - {*CLOCKS}
+        estimated = (
+            set(kinds) if all(m.is_followed for m in measurements) else {*kinds} - {*CLOCKS}
+        )
         if not all(has_turned(m) for m in measurements):
-            told -= {SHARED_SHIFT}
+            estimated -= {SHARED_SHIFT}
         known = (*KINDS, *EXTRA_KINDS)
         self.asked = tuple(kind for kind in known if kind in kinds)
-        self.kinds = tuple(kind for kind in known if kind in told)
+        self.kinds = tuple(kind for kind in known if kind in estimated)
         self.emitters = int(measurements[0].flux.shape[2])
         self.each = {**EACH, 'offsets': 2 * self.emitters}
         power = [np.mean(np.abs(m.flux[m.usable]) ** 2) for m in measurements if m.usable.any()]
@@ -248,26 +225,22 @@ class SensorParameters:
         part = values[self.slices[kind, body]]
         return part.reshape(-1, self.each[kind]) if kind in self.each else part
 
-    def survey(self, body: str, values: Array) -> Survey:
-        """Return the survey of a body's sensors for all parameters, shape (Q,)."""
+    def errors_of(self, body: str, values: Array) -> BodyErrors:
+        """Return the errors of a body's sensors for all parameters, shape (Q,)."""
         table = self.tables[self.bodies.index(body)]
-        gain, axis = np.ones(len(table), complex), table.axis
-        place, lever, clock = np.zeros((len(table), 3)), np.zeros(3), [0.0, 0.0]
-        if (pairs := self.of('gains', body, values)) is not None:
-            gain = 1.0 + pairs[:, 0] + 1j * pairs[:, 1]
-        if (pairs := self.of('axes', body, values)) is not None:
-            axis = tilted(axis, pairs)
-        if (part := self.of('places', body, values)) is not None:
-            place = part
-        if (part := self.of('lever_arm', body, values)) is not None:
-            lever = part
-        for index, kind in enumerate(CLOCKS):
-            if (part := self.of(kind, '', values)) is not None:
-                clock[index] = float(part[0])
-        pickup = np.zeros((len(table), self.emitters), complex)
-        if (pairs := self.of('offsets', body, values)) is not None:
-            pickup = self.unit_t * (pairs[:, 0::2] + 1j * pairs[:, 1::2])
-        return Survey(
+
+        def part(kind: str, *shape: int) -> Array:
+            found = self.of(kind, '' if kind in CLOCKS else body, values)
+            return np.zeros(shape) if found is None else found
+
+        count, tilts = len(table), self.of('axes', body, values)
+        gains, pickups = part('gains', count, 2), part('offsets', count, 2 * self.emitters)
+        gain = 1.0 + gains[:, 0] + 1j * gains[:, 1]
+        pickup = np.asarray(self.unit_t * (pickups[:, 0::2] + 1j * pickups[:, 1::2]), complex)
+        axis = table.axis if tilts is None else tilted(table.axis, tilts)
+        place, lever = part('places', count, 3), part('lever_arm', 3)
+        clock = [float(part(kind, 1)[0]) for kind in CLOCKS]
+        return BodyErrors(
             gain, axis, place, lever, pickup, clock[0] - clock[1] * self.middle_s, clock[1]
         )
 
@@ -277,21 +250,10 @@ class SensorParameters:
     ) -> ComplexArray:  # fmt: skip
         """Return the derivatives of fluxes by all parameters.
 
-        Parameters
-        ----------
-        part : Measurements
-            F frames of the S sensors of one body.
-        modelled : ndarray, shape (F, S, K), complex
-            Modelled fluxes, T.
-        by_place, by_axis : ndarray, shape (F, S, 3, K), complex
-            Their derivatives by the sensors' positions (T/m) and axes (T), frame fg.
-        velocity : ndarray, shape (F, 6)
-            Of the body, m/s and rad/s, frame fg.
-
-        Returns
-        -------
-        ndarray, shape (F, S, Q, K), complex
-            T per unit of the parameter; zero for the parameters of other bodies.
+        ``part``: F frames of the S sensors of one body. ``modelled`` (F, S, K): modelled fluxes,
+        T. ``by_place``, ``by_axis`` (F, S, 3, K): their derivatives by the sensors' positions
+        (T/m) and axes (T), frame fg. ``velocity`` (F, 6): of the body, m/s and rad/s, frame fg.
+        Returns (F, S, Q, K): T per unit of the parameter; zero for the parameters of other bodies.
         """
         frames, sensors, emitters = modelled.shape
         out = np.zeros((frames, sensors, len(self), emitters), complex)

@@ -39,24 +39,18 @@ from anser_ros.calibration.layout_fit import RICH_DAMPING, rich_layout
 from anser_ros.calibration.layouts import Generator, place
 from anser_ros.calibration.moments import MomentFitter, Progress
 from anser_ros.calibration.optical_noise import OpticalNoise, estimate_noise, interpolation_share
-from anser_ros.calibration.population import Likelihood, Population, Posterior
+from anser_ros.calibration.population import Likelihood, Population, Posterior, width_by_evidence
 from anser_ros.calibration.pose_correction import (
     SMALLEST_NOISE_T,
-    PoseTerms,
     most_probable_step,
     moved,
     outlier_weights,
 )
-from anser_ros.calibration.prior import DrawnBoard
+from anser_ros.calibration.prior import ScaledNominal
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
-from anser_ros.calibration.sensor_parameters import (
-    PRIOR,
-    SensorParameters,
-    Survey,
-)
-from anser_ros.calibration.survey_result import SurveyResult
+from anser_ros.calibration.sensor_parameters import PRIOR, SensorParameters
+from anser_ros.calibration.survey_result import SensorFit
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -67,8 +61,7 @@ MOST_ROWS = 22_000
 """Readings of the last steps; more are thinned. Their time grows in proportion."""
 COARSE_MODES = 120
 """Modes of the field, the strongest, that the first steps solve for; the time of a step grows with
-the third power. The others stay as drawn, and what that leaves in the parameters the last steps
-undo."""
+the third power, and the last steps undo what it leaves in the parameters."""
 COARSE_STEPS = 6
 """First steps at most, with `COARSE_ROWS`; `SMALL_STEP` ends them earlier."""
 FINE_STEPS = 6
@@ -86,10 +79,8 @@ FIELD_WIDTH = 0.3
 """Prior width of the field's deviation from the drawing, relative to the flux, to begin with.
 Smaller holds the first steps to a poor drawing; larger lets it take up what is the sensors'."""
 WIDTH_ALONE = 100.0
-"""The same without a drawing, where the prior's middle is no field at all; it is not learnt. A
-learnt width is that of the strongest modes, shrinks the fine ones, and a shift of all sensors
-makes up for it: lever arms came out 60 um too low where 24 um were said. This wide, the prior only
-holds what no reading determines."""
+"""The same without a drawing. It is not learnt: a learnt width shrinks the fine modes, and a shift
+of all sensors makes up for it. This wide, the prior only holds what no reading determines."""
 LEAST_FIELD_WIDTH = 1e-3
 """Least such width: no board is made more exactly than that."""
 FEWEST_READINGS = 7.0
@@ -103,49 +94,18 @@ FIT_NOISE = 10.0
 
 @dataclass
 class _Tool:
-    """One body's frames with a pose, with their present weights.
+    """One body's frames with a pose, with their present weights."""
 
-    Attributes
-    ----------
-    measured : Measurements
-        As recorded.
-    known : ndarray of bool, shape (F,)
-        Frames that nothing speaks against beforehand.
-    steady : ndarray of bool, shape (F,)
-        Those of them in which the tool saw nothing move either.
-    weights : ndarray, shape (F, S)
-        Of the readings, in [0, 1].
-    """
-
-    measured: Measurements
-    known: NDArray[np.bool_]
-    steady: NDArray[np.bool_]
-    weights: Array
-
-    @property
-    def kept(self) -> NDArray[np.bool_]:
-        return np.asarray((self.weights > 0.0).any(axis=1))
+    measured: Measurements  # as recorded
+    known: NDArray[np.bool_]  # (F,): frames that nothing speaks against beforehand
+    steady: NDArray[np.bool_]  # (F,): those of them in which the tool saw nothing move either
+    weights: Array  # (F, S): of the readings, in [0, 1]
 
 
-class SensorSurveyor:
+class SensorFitter:
     """Estimates the parameters; sessions with the same body share them.
 
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        Tool measurements, one per body and session; frames without a pose are left as they are.
-    kinds : sequence of str
-        What is estimated, of `sensor_parameters.KINDS`.
-    generator : Generator
-        Places of the coils, for the layer of dipoles that represents the field.
-    accuracy : Accuracy
-        Flux noise and pose jitter to begin with.
-    nominal : FieldModel, optional
-        The drawn board.
-    progress : callable, optional
-        Called with the name of the stage and its finished fraction.
-    steady : sequence of ndarray of bool, optional
-        Frames of each of the measurements in which the references saw nothing move; else all.
+    ``steady``: frames of each of the measurements in which the references saw nothing move.
     """
 
     def __init__(
@@ -154,14 +114,13 @@ class SensorSurveyor:
         kinds: Sequence[str],
         generator: Generator,
         accuracy: Accuracy,
-        nominal: FieldModel | None = None,
         progress: Progress | None = None,
         steady: Sequence[NDArray[np.bool_]] | None = None,
     ) -> None:
         self.measured = list(measurements)
         every = [np.ones(len(m.time), dtype=bool) for m in measurements]
         self.steady = every if steady is None else list(steady)
-        self.generator, self.accuracy, self.nominal = generator, accuracy, nominal
+        self.generator, self.accuracy, self.nominal = generator, accuracy, generator.nominal
         self.progress = progress
         self.parameters = SensorParameters(measurements, kinds)
         self.population = Population(self.parameters)
@@ -170,14 +129,10 @@ class SensorSurveyor:
         self.posterior: Posterior
         self.noise_t = FIT_NOISE * accuracy.flux_noise_t
         self.optical = LOOSE
-        self.field_width = WIDTH_ALONE if nominal is None else FIELD_WIDTH
+        self.field_width = WIDTH_ALONE if generator.nominal is None else FIELD_WIDTH
         self.inflation = 1.0
 
-    def survey(self, body: str) -> Survey:
-        """Return the survey of a body's sensors by the present estimate."""
-        return self.parameters.survey(body, self.values)
-
-    def fit(self) -> SurveyResult:
+    def fit(self) -> SensorFit:
         """Find field and parameters, first with few frames and then with all."""
         total = COARSE_STEPS + 3 * FINE_STEPS
         tools = self._tools(COARSE_ROWS)
@@ -223,9 +178,9 @@ class SensorSurveyor:
         )
         kept, reflected = self._all_frames(steady)
         mean = self.optical.mean_sigma_m(sum(int(mask.sum()) for mask in kept))
-        return SurveyResult(
+        return SensorFit(
             self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
-            self.population.alone, kept, steady, reflected, self._untold(),
+            self.population.alone, kept, steady, reflected, self._undetermined(),
             float(np.hypot(mean, self.population.shift_sigma_m(self.likelihood, whole))),
             self._contradictions(tools, tuple(evidence)),
         )  # fmt: skip
@@ -257,7 +212,7 @@ class SensorSurveyor:
 
         return contradictions([self._corrected(tool) for tool in tools], kinds, sums)
 
-    def _untold(self) -> dict[str, float]:
+    def _undetermined(self) -> dict[str, float]:
         """Kinds that the scan does not determine, those among them that were not even tried."""
         not_tried = set(self.parameters.asked) - set(self.parameters.kinds)
         wide = {kind: PRIOR[kind] for kind in self.parameters.asked if kind in not_tried}
@@ -293,7 +248,7 @@ class SensorSurveyor:
         self.middle = np.zeros((self.modes.size.size, 2 * moments.shape[1]))
         drawn = None
         if self.nominal is not None:
-            drawn = DrawnBoard(self.nominal, measured).moments(sites)
+            drawn = ScaledNominal(self.nominal, measured).moments(sites)
             self.middle = self._amplitudes(measured, drawn)
         self.field = self._amplitudes(measured, moments if drawn is None else drawn)
 
@@ -309,7 +264,8 @@ class SensorSurveyor:
 
     def _corrected(self, tool: _Tool) -> Measurements:
         """A tool's frames by the present estimate; those without a pose lose their weight."""
-        out = self.survey(tool.measured.body).apply(tool.measured)
+        errors = self.parameters.errors_of(tool.measured.body, self.values)
+        out = errors.apply(tool.measured)
         lost: NDArray[np.bool_] = np.asarray(~np.isfinite(out.position).all(axis=1))
         if lost.any():
             tool.weights[lost] = 0.0
@@ -357,9 +313,7 @@ class SensorSurveyor:
         A camera that jitters by 0.3 mm measures poses at which the field differs in its second
         order by as much as the fluxes' noise.
         """
-        terms, share = PoseTerms(at.residual, at.slope), interpolation_share(at.part)
-        prior = 1.0 / (self.optical.jitter**2 * share[:, None])
-        step, _ = self._pose_steps(terms, tool.weights, prior)
+        step, _ = self._pose_steps(at, tool.weights)
         near = linearise(moved(at.part, step), self.modes, self.field)
         back = np.einsum('fsci,fi->fsc', near.slope, step)
         return replace(near, residual=near.residual + back)
@@ -367,9 +321,9 @@ class SensorSurveyor:
     def _learn_field_width(self, variance: Array) -> None:
         """Set the field's prior width to what makes its amplitudes most probable."""
         scale = (self.flux_rms * self.modes.size)[: self.solved, None]
-        power = float((((self.field - self.middle)[: self.solved] / scale) ** 2).sum())
-        freedom = variance.size - float((variance / (self.field_width * scale) ** 2).sum())
-        self.field_width = max(float(np.sqrt(power / max(freedom, 1.0))), LEAST_FIELD_WIDTH)
+        square = ((self.field - self.middle)[: self.solved] / scale) ** 2
+        ratio = variance / (self.field_width * scale) ** 2
+        self.field_width = max(width_by_evidence(square, ratio, 1.0)[0], LEAST_FIELD_WIDTH)
 
     @property
     def flux_rms(self) -> float:
@@ -381,14 +335,10 @@ class SensorSurveyor:
         """Weigh readings and frames, and estimate noise and jitter from what is left."""
         steps, variances, shares, kept, power, count = [], [], [], [], 0.0, 0.0
         for tool, at in zip(tools, linear, strict=True):
-            usable, terms = usable_weights(tool.measured), PoseTerms(at.residual, at.slope)
-            zero = np.zeros((len(usable), 6))
-            step, left = most_probable_step(terms, usable, self.noise_t, FREE_POSE, zero)
-            size = (left**2).mean(axis=2)
-            share = interpolation_share(at.part)
+            usable = usable_weights(tool.measured)
             seen = usable.any(axis=1)
-            scaled = step / np.sqrt(share)[:, None]
-            bad = glitches(scaled, seen & tool.known, self.accuracy.pose_jitter)
+            bad, left = self._wrong_poses(at, usable, seen & tool.known)
+            size = (left**2).mean(axis=2)
             frame_power = (size * usable).sum(axis=1) / np.maximum(usable.sum(axis=1), 1.0)
             good = seen & tool.known & ~bad
             tool.steady = tool.known
@@ -401,22 +351,31 @@ class SensorSurveyor:
             power += float((tool.weights * size).sum()) * left.shape[2]
             spent = min(6.0 / (usable.sum(axis=1).mean() * left.shape[2]), 0.9)
             count += float(tool.weights.sum()) * left.shape[2] * (1.0 - spent)
-            prior = 1.0 / (self.optical.jitter**2 * share[:, None])
-            step, variance = self._pose_steps(terms, tool.weights, prior)
+            step, variance = self._pose_steps(at, tool.weights)
             steps.append(step)
             variances.append(variance)
-            shares.append(share)
+            shares.append(interpolation_share(at.part))
             kept.append(sound & seen)
         free = self.solved * self.field.shape[1]
         self.noise_t = max(np.sqrt(power / max(count - free, 0.2 * count)), SMALLEST_NOISE_T)
         self.optical = estimate_noise(steps, variances, shares, kept, self.optical)
 
-    def _pose_steps(self, terms: PoseTerms, weights: Array, prior: Array) -> tuple[Array, Array]:
+    def _wrong_poses(
+        self, at: Linear, weights: Array, judged: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], Array]:
+        """Frames whose poses are far from where the fluxes put them, and what no pose explains."""
+        zero = np.zeros((len(weights), 6))
+        step, left = most_probable_step(at, weights, self.noise_t, FREE_POSE, zero)
+        scaled = step / np.sqrt(interpolation_share(at.part))[:, None]
+        return glitches(scaled, judged, self.accuracy.pose_jitter), left
+
+    def _pose_steps(self, at: Linear, weights: Array) -> tuple[Array, Array]:
         """Most probable steps (F, 6) of the poses and their variances."""
-        count = len(terms.slope)
+        prior = 1.0 / (self.optical.jitter**2 * interpolation_share(at.part)[:, None])
+        count = len(at.slope)
         root = np.sqrt(weights) / self.noise_t
-        slope = (terms.slope * root[:, :, None, None]).reshape(count, -1, 6)
-        residual = (terms.residual * root[:, :, None]).reshape(count, -1)
+        slope = (at.slope * root[:, :, None, None]).reshape(count, -1, 6)
+        residual = (at.residual * root[:, :, None]).reshape(count, -1)
         precision = slope.transpose(0, 2, 1) @ slope + prior[:, :, None] * np.eye(6)
         inverse = np.linalg.inv(precision)
         step = (inverse @ np.einsum('fri,fr->fi', slope, residual)[:, :, None])[:, :, 0]
@@ -435,12 +394,8 @@ class SensorSurveyor:
                 every = np.ones(len(posed.time), dtype=bool)
                 part = _Tool(posed, every, every, usable_weights(posed))
                 at = linearise(self._corrected(part), self.modes, self.field)
-                zero = np.zeros((len(part.weights), 6))
-                terms = PoseTerms(at.residual, at.slope)
-                step, _ = most_probable_step(terms, part.weights, self.noise_t, FREE_POSE, zero)
-                share = np.sqrt(interpolation_share(at.part))[:, None]
-                wrong = glitches(step / share, every, self.accuracy.pose_jitter)
+                wrong, _ = self._wrong_poses(at, part.weights, every)
                 kept[rows[block][wrong]] = False
-                bad, seen = bad + int(wrong.sum()), seen + len(step)
+                bad, seen = bad + int(wrong.sum()), seen + len(wrong)
             out.append(kept)
         return tuple(out), bad / max(seen, 1)

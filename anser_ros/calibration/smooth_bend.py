@@ -24,21 +24,12 @@ is a plate. A thicker body has no one surface whose lift would move all of its s
 
 @dataclass(frozen=True)
 class SmoothBend:
-    """Holds what each term of a bend does to S sensors, in the body's frame.
+    """Holds what each term of a bend does to S sensors, in the body's frame."""
 
-    Attributes
-    ----------
-    normal : ndarray, shape (3,)
-        Across the plate.
-    lift : ndarray, shape (S, B)
-        Shift of each sensor along the normal, m per m of the term at the plate's rim.
-    turn : ndarray, shape (S, B, 3)
-        Rotation vector of each sensor, rad per m.
-    """
-
-    normal: Array
+    normal: Array  # (3,): across the plate
+    # (S, B): shift of each sensor along the normal, m per m of the term at the plate's rim
     lift: Array
-    turn: Array
+    turn: Array  # (S, B, 3): rotation vector of each sensor, rad per m
 
     @staticmethod
     def of(sensors: SensorTable) -> 'SmoothBend | None':

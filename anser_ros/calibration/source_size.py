@@ -7,25 +7,24 @@ as the jitter is large (`pose_whitening`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import as_real
-from anser_ros.calibration.layout_fit import LayoutFit
-from anser_ros.calibration.layout_score import LayoutCandidate
-from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.pose_correction import pose_precision, pose_terms
 from anser_ros.calibration.pose_whitening import PoseWhitener
 from anser_ros.calibration.readings import frame_blocks
+from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.symmetry import spread_along
+from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.symmetry import size_parameters, spread_along
 from anser_ros.physics.tangent import tilted
-from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -33,35 +32,14 @@ ComplexArray = NDArray[np.complex128]
 POINT, SIZED = COAXIAL[:2]
 """Layouts of emitters without a size, and of those that have no more than a size."""
 LEAST_SIGMAS = 5.0
-"""Standard deviations from zero at which a size is told. They come from five blocks, so that
+"""Standard deviations from zero at which a size is reported. They come from five blocks, so that
 chance alone reaches so many in one of 130 emitters without a size."""
 STEPS = 4
 """Steps of the fit, which starts where the dipoles were fitted: each leaves a small part of the
 error before it."""
 WAYS = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-4, 1e-7])
-"""Steps of the differences by an emitter's centre (m), the tilt of its axis (rad), the real and
-imaginary part of its moment (relative) and its second moment (m^2): small beside the distance of
-any sensor, and far above rounding."""
-
-
-@dataclass(frozen=True)
-class SourceSize:
-    """States how large an emitter was found to be.
-
-    Attributes
-    ----------
-    emitter : int
-    second_moment_m2, sigma_m2 : float
-        Its second moment along its axis, m^2, and the standard deviation of that.
-    point_t, sized_t : float
-        Held-out scores (`LayoutCandidate`) of emitters without and with a size, T.
-    """
-
-    emitter: int
-    second_moment_m2: float
-    sigma_m2: float
-    point_t: float
-    sized_t: float
+"""Steps of the differences by centre (m), tilt of the axis (rad), real and imaginary part of the
+moment (relative) and second moment (m^2): small beside any distance, far above rounding."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +52,13 @@ class _SizedSources:
     sizes_m2: Array
 
     @staticmethod
-    def of(fitted: LayoutFit, count: int) -> '_SizedSources':
+    def of(model: FieldModel, count: int) -> '_SizedSources':
         """Those of ``count`` fitted dipoles each, still without a size."""
-        sites, moments = fitted.dipoles, fitted.fit.moments
+        moments = model.moments
         middle = slice((count - 1) // 2, None, count)
         total = [moments[count * k : count * (k + 1), k].sum() for k in range(moments.shape[1])]
         return _SizedSources(
-            sites.positions[middle], sites.directions[middle], np.array(total),
+            model.positions[middle], model.directions[middle], np.array(total),
             np.zeros(len(total)),
         )  # fmt: skip
 
@@ -99,54 +77,36 @@ class _SizedSources:
         return base
 
 
-def source_sizes(
-    chosen: Layout,
-    candidates: Sequence[LayoutCandidate],
-    fitted: LayoutFit,
-    measurements: Sequence[Measurements],
-    folds: Sequence[NDArray[np.int64]],
-    accuracy: Accuracy,
-) -> tuple[SourceSize, ...]:
-    """Return the sizes that a scan tells, none where emitters without one predict it as well.
+def with_source_sizes(calibration: Calibration) -> Calibration:
+    """Return a calibration that reports the sizes of emitters without a drawing.
 
-    Parameters
-    ----------
-    chosen : Layout
-        The chosen layout; only dipoles on an axis of each emitter have a size.
-    candidates : sequence of LayoutCandidate
-        Every layout that was scored.
-    fitted : LayoutFit
-        The fit of the chosen one.
-    measurements : sequence of Measurements
-        What it was fitted to, at measured poses.
-    folds : sequence of ndarray, shape (F,)
-        Block of space of each frame.
-    accuracy : Accuracy
-        Jitter of the poses.
+    Only dipoles on an axis of each emitter have a size, and none is reported where emitters
+    without one predict the scan as well.
     """
-    scored = {one.layout: one for one in candidates}
-    if chosen.kind != SIZED.kind or not {POINT, SIZED} <= scored.keys():
-        return ()
-    point, sized = scored[POINT], scored[SIZED]
-    if point.score < sized.score * (1.0 + LEAST_GAIN):
-        return ()
-    sources, blocks = (
-        _SizedSources.of(fitted, chosen.count),
-        np.unique(np.concatenate(list(folds))),
-    )
+    scan, layout = calibration.scan, calibration.layout
+    scores = {one.layout: one.score for one in calibration.candidates}
+    if layout.kind != SIZED.kind or not {POINT, SIZED} <= scores.keys():
+        return calibration
+    if scores[POINT] < scores[SIZED] * (1.0 + LEAST_GAIN):
+        return calibration
+    folds = fold_of_frames([m.position for m in scan.measurements])
+    blocks = np.unique(np.concatenate(folds))
+    sources = _SizedSources.of(calibration.model, layout.count)
     for _ in range(STEPS):
-        normal, right = _sums(sources, fitted, measurements, folds, blocks, accuracy)
+        normal, right = _sums(sources, calibration, folds, blocks)
         sources = sources.moved(_solved(normal.sum(axis=0), right.sum(axis=0)))
-    normal, right = _sums(sources, fitted, measurements, folds, blocks, accuracy)
+    normal, right = _sums(sources, calibration, folds, blocks)
     # The jackknife: each block is left out in turn.
     whole, at = normal.sum(axis=0), right.sum(axis=0)
     parts = [_solved(whole - n, at - r)[:, 7] for n, r in zip(normal, right, strict=True)]
     sigma = np.sqrt((blocks.size - 1) * np.var(parts, axis=0))
-    return tuple(
-        SourceSize(k, float(size), float(sigma[k]), point.score, sized.score)
-        for k, size in enumerate(sources.sizes_m2)
-        if abs(size) > LEAST_SIGMAS * sigma[k]
-    )
+    evidence = {'heldout_point_t': scores[POINT], 'heldout_sized_t': scores[SIZED]}
+    records = []
+    for k in np.flatnonzero(np.abs(sources.sizes_m2) > LEAST_SIGMAS * sigma).tolist():
+        figures, sigmas = size_parameters(float(sources.sizes_m2[k]), float(sigma[k]))
+        records.append(EffectRecord('emitter_size', {'coil': k, **figures}, sigmas, evidence))
+    scan = replace(scan, reported_effects=(*scan.reported_effects, *records))
+    return replace(calibration, scan=scan)
 
 
 def _solved(normal: Array, right: Array) -> Array:
@@ -158,24 +118,22 @@ def _solved(normal: Array, right: Array) -> Array:
 
 def _sums(
     sources: _SizedSources,
-    fitted: LayoutFit,
-    measurements: Sequence[Measurements],
+    calibration: Calibration,
     folds: Sequence[NDArray[np.int64]],
     blocks: NDArray[np.int64],
-    accuracy: Accuracy,
 ) -> tuple[Array, Array]:
     """Normal equations of each block, (B, 8K, 8K) and (B, 8K)."""
     ways = np.diag(np.tile(WAYS, len(sources.sizes_m2)))
     here, size = sources.dipoles(), len(ways)
     sites = DipoleSites(here.positions, here.directions)
     normal, right = np.zeros((blocks.size, size, size)), np.zeros((blocks.size, size))
-    for measured, weights, fold in zip(measurements, fitted.fit.weights, folds, strict=True):
+    scan, fit = calibration.scan, calibration.fit
+    precision = pose_precision(scan.accuracy)
+    for measured, weights, fold in zip(scan.measurements, fit.weights, folds, strict=True):
         for some in frame_blocks(*weights.shape):
             part = measured.frames(some)
             terms = pose_terms(part, sites, here.moments)
-            white = PoseWhitener(
-                terms.slope, weights[some], fitted.fit.noise_t, pose_precision(accuracy)
-            )
+            white = PoseWhitener(terms.slope, weights[some], fit.noise_t, precision)
             columns = [_slope(sources, way, part) for way in ways]
             left = np.stack([white.left_over(one) for one in [*columns, terms.residual]], axis=-1)
             left = left.reshape(*white.root.shape, -1) / white.noise_t

@@ -9,7 +9,7 @@ together.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,23 +57,12 @@ HELD_M = 0.02
 
 @dataclass(frozen=True)
 class SourceReadings:
-    """Holds what S sensors read of K sources, from one place.
+    """Holds what S sensors read of K sources, from one place."""
 
-    Attributes
-    ----------
-    points : PlacedPoints
-        Of the sensors.
-    flux : ndarray, shape (S, K, C)
-        The C real parts of each source's flux, T.
-    noise_t : ndarray, shape (S,)
-        Noise of a part, T.
-    used : ndarray of bool, shape (S,)
-    """
-
-    points: PlacedPoints
-    flux: Array
-    noise_t: Array
-    used: Mask
+    points: PlacedPoints  # of the sensors
+    flux: Array  # (S, K, C): the C real parts of each source's flux, T
+    noise_t: Array  # (S,): noise of a part, T
+    used: Mask  # (S,)
 
 
 @dataclass(frozen=True)
@@ -88,33 +77,32 @@ class LocatedSource:
         """Return three dipoles at each place."""
         return DipoleSites.of_any_direction(self.places)
 
+    def basis(self, points: PlacedPoints) -> Array:
+        """Return the readings (S, 3D) of each dipole, T/(A m^2)."""
+        return points.basis(self.sites.positions, self.sites.directions)
+
+    def sigma(self, points: PlacedPoints, noise_t: Array, widths: dict[str, float]) -> Array:
+        """Return how far readings (S, C) may be off by noise and errors of the sensors, T."""
+        sites = self.sites
+        shift, turn = points.slopes(sites.positions, sites.directions, self.moments)
+        flux = self.basis(points) @ self.moments
+        of = {'places': shift, 'axes': turn, 'gains': flux[:, None, :]}
+        variance = np.broadcast_to(noise_t[:, None] ** 2, flux.shape).copy()
+        variance += sum(width**2 * (of[kind] ** 2).sum(axis=1) for kind, width in widths.items())
+        return np.asarray(np.sqrt(variance))
+
 
 @dataclass(frozen=True)
 class SourcesFit:
-    """Holds what a fit found.
+    """Holds what a fit found."""
 
-    Attributes
-    ----------
-    sources : tuple of LocatedSource
-        One an emitter.
-    sign : ndarray, shape (S,)
-        -1 for a sensor the wrong way round.
-    sign_evidence : ndarray, shape (S,)
-        Log likelihood of its being so over its not being so.
-    widths : dict of str to float
-        Of the sensors' errors, of `KINDS`.
-    predicted, sigma : ndarray, shape (S, K, C)
-        Readings of sound sensors, and how far a reading may be off, T.
-    place_sigma_m : ndarray, shape (K,)
-        Standard deviation of each source's place, root of the sum over three axes, m.
-    """
-
-    sources: tuple[LocatedSource, ...]
-    sign: Array
-    sign_evidence: Array
-    widths: dict[str, float]
+    sources: tuple[LocatedSource, ...]  # one an emitter
+    sign_evidence: Array  # (S,): log likelihood of a sensor's being the wrong way round
+    widths: dict[str, float]  # of the sensors' errors, of `KINDS`
+    # predicted, sigma (S, K, C): readings of sound sensors, and how far a reading may be off, T
     predicted: Array
     sigma: Array
+    # (K,): standard deviation of each source's place, root of the sum over three axes, m
     place_sigma_m: Array
 
 
@@ -126,16 +114,99 @@ def student_losses(left: Array, sigma: Array) -> Array:
     return np.asarray(bell + np.log(sigma).sum(axis=-1))
 
 
+@dataclass(frozen=True)
+class _OneEmitter:
+    """Readings of one emitter, of sensors turned the right way round, and what they may be off by.
+
+    Without ``widths``, before there is a field, that is a share of each reading.
+    """
+
+    points: PlacedPoints
+    flux: Array  # (S, C), T
+    noise_t: Array
+    used: Mask
+    widths: dict[str, float] | None
+
+    def left(self, source: LocatedSource) -> Array:
+        """Residuals (S, C), T."""
+        return np.asarray(self.flux - source.basis(self.points) @ source.moments)
+
+    def spread(self, source: LocatedSource) -> Array:
+        """How far readings may be off, (S, C), T."""
+        if self.widths is not None:
+            return source.sigma(self.points, self.noise_t, self.widths)
+        rough = np.hypot(self.noise_t[:, None], FIRST_GAIN * np.abs(self.flux))
+        return np.maximum(rough, 1e-300)
+
+    def root(self, left: Array, sigma: Array) -> Array:
+        """Factors (S, C) that make residuals white, with Student's weights; 0 for the unused."""
+        size = ((left / sigma) ** 2).sum(axis=1)
+        root = np.sqrt(student_weight(size, left.shape[1]))[:, None] / sigma
+        return np.where(self.used[:, None], root, 0.0)
+
+    def loss(self, source: LocatedSource) -> float:
+        """The negative log likelihood of a source, up to a constant."""
+        losses = student_losses(self.left(source), self.spread(source))
+        return float(losses[self.used].sum())
+
+    def refined(self, source: LocatedSource) -> LocatedSource:
+        """The source after steps, unless they made it less likely."""
+        moved = self.stepped(source)
+        return moved if self.loss(moved) < self.loss(source) else source
+
+    def stepped(self, source: LocatedSource) -> LocatedSource:
+        """The source after Gauss-Newton steps of places and moments."""
+        for step in range(SOURCE_STEPS):
+            source, _ = self.step(source, moving=step > 0)
+        return source
+
+    def step(self, source: LocatedSource, *, moving: bool) -> tuple[LocatedSource, Array]:
+        """One step, and the covariance of the places (3D, 3D) that it has."""
+        basis, count, parts = source.basis(self.points), len(source.places), self.flux.shape[1]
+        is_known = bool(source.moments.any())
+        sigma = (self if is_known else replace(self, widths=None)).spread(source)
+        left = self.flux - basis @ source.moments if is_known else np.zeros_like(self.flux)
+        root = self.root(left, sigma)
+        matrix = np.zeros((len(self.flux), parts, 3 * count * (1 + parts)))
+        if moving:
+            matrix[:, :, : 3 * count] = self._by_places(source)
+        for c in range(parts):
+            first = 3 * count * (1 + c)
+            matrix[:, c, first : first + 3 * count] = basis
+        white = (matrix * root[:, :, None]).reshape(-1, matrix.shape[2])
+        target = (self.flux * root).ravel()
+        strength = float(np.linalg.norm(source.moments[:3]))
+        stray = 0.0 if strength == 0.0 else (STRAY * strength) ** -2.0
+        prior = np.concatenate(
+            [
+                np.full(3 * count, HELD_M**-2.0),
+                np.tile(np.repeat([0.0, stray], [3, 3 * count - 3]), parts),
+            ]
+        )
+        normal = white.T @ white + np.diag(prior)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.linalg.pinv(normal * np.outer(scale, scale), hermitian=True)
+        solved = scale * (inverse @ (scale * (white.T @ target)))
+        places = source.places + (solved[: 3 * count].reshape(-1, 3) if moving else 0.0)
+        moments = solved[3 * count :].reshape(parts, -1).T
+        covariance = (inverse * np.outer(scale, scale))[: 3 * count, : 3 * count]
+        return LocatedSource(places, moments), covariance
+
+    def _by_places(self, source: LocatedSource) -> Array:
+        """Derivatives (S, C, 3D), T/m, by the dipoles' places."""
+        sites, (count, parts) = source.sites, (len(source.places), self.flux.shape[1])
+        apart = np.zeros((count, 3, count, parts))
+        apart[np.arange(count), :, np.arange(count)] = source.moments.reshape(count, 3, parts)
+        shift = self.points.shifts(
+            sites.positions, sites.directions, apart.reshape(3 * count, -1)
+        ).reshape(len(self.flux), 3, count, parts)
+        return np.asarray(-shift.transpose(0, 3, 2, 1).reshape(len(self.flux), parts, -1))
+
+
 class SourcesFitter:
     """Fits all sources of the readings.
 
-    Parameters
-    ----------
-    readings : SourceReadings
-    volume : tuple of ndarray, shape (3,)
-        Lowest and highest corner of where sources may be, m, frame fg.
-    kinds : sequence of str
-        What sensors may be off in, of `KINDS`, and ``polarity``.
+    ``volume`` (3,): lowest and highest corner of where sources may be, m, frame fg.
     """
 
     def __init__(
@@ -143,7 +214,9 @@ class SourcesFitter:
     ) -> None:
         self.readings, self.turns = readings, 'polarity' in kinds
         self.used = readings.used
+        self.sign = np.ones(len(readings.flux))
         self.kinds = tuple(kind for kind in KINDS if kind in kinds)
+        self.widths = {kind: START[kind] for kind in self.kinds}
         self.grid = self._grid(volume)
         sites = DipoleSites.of_any_direction(self.grid)
         rows = readings.points.basis(sites.positions, sites.directions)
@@ -163,205 +236,105 @@ class SourcesFitter:
 
     def fit(self) -> SourcesFit:
         """Return the sources, and what is off of the sensors, of the largest likelihood."""
-        count = self.readings.flux.shape[1]
-        sign, widths = np.ones(len(self.readings.flux)), {kind: START[kind] for kind in self.kinds}
-        sources = [self._first(k) for k in range(count)]
+        sources = [self._first(k) for k in range(self.readings.flux.shape[1])]
         for _ in range(SOURCE_ROUNDS):
-            sources = [self._refined(k, one, sign, widths) for k, one in enumerate(sources)]
-            sign = self._signs(sources, widths)
-            widths = self._best_widths(sources, sign, widths)
+            sources = [one.refined(source) for one, source in self._each(sources)]
+            self._learn_signs(sources)
+            self._learn_widths(sources)
             bare = [LocatedSource(one.places[:1], one.moments[:3]) for one in sources]
-            sources = [self._grown(k, one, sign, widths) for k, one in enumerate(bare)]
-        return self._result(sources, widths)
+            sources = [self._grown(one, source) for one, source in self._each(bare)]
+        return self._result(sources)
 
-    def predicted(self, sources: Sequence[LocatedSource]) -> Array:
-        """Return the readings of sound sensors, shape (S, K, C), T."""
-        return np.stack([self._basis(one) @ one.moments for one in sources], axis=1)
+    def _each(
+        self, sources: Sequence[LocatedSource], widths: dict[str, float] | None = None
+    ) -> list[tuple[_OneEmitter, LocatedSource]]:
+        """Each emitter's readings, as the sensors are known now, with its source."""
+        known = self.widths if widths is None else widths
+        return [(self._one(k, known), source) for k, source in enumerate(sources)]
 
-    def sigma(self, sources: Sequence[LocatedSource], widths: dict[str, float]) -> Array:
-        """Return how far readings may be off, shape (S, K, C), T."""
-        return np.stack([self._sigma(one, widths) for one in sources], axis=1)
+    def _one(self, k: int, widths: dict[str, float] | None) -> _OneEmitter:
+        readings = self.readings
+        flux = readings.flux[:, k] * self.sign[:, None]
+        return _OneEmitter(readings.points, flux, readings.noise_t, self.used, widths)
 
-    def _basis(self, source: LocatedSource) -> Array:
-        return self.readings.points.basis(source.sites.positions, source.sites.directions)
-
-    def _sigma(self, source: LocatedSource, widths: dict[str, float]) -> Array:
-        sites = source.sites
-        shift, turn = self.readings.points.slopes(
-            sites.positions, sites.directions, source.moments
-        )
-        flux = self._basis(source) @ source.moments
-        of = {'places': shift, 'axes': turn, 'gains': flux[:, None, :]}
-        variance = np.broadcast_to(self.readings.noise_t[:, None] ** 2, flux.shape).copy()
-        variance += sum(width**2 * (of[kind] ** 2).sum(axis=1) for kind, width in widths.items())
-        return np.asarray(np.sqrt(variance))
+    def _predicted(self, sources: Sequence[LocatedSource]) -> tuple[Array, Array]:
+        """Readings of sound sensors, and how far they may be off, (S, K, C), T."""
+        points, noise_t = self.readings.points, self.readings.noise_t
+        predicted = [one.basis(points) @ one.moments for one in sources]
+        sigma = [one.sigma(points, noise_t, self.widths) for one in sources]
+        return np.stack(predicted, axis=1), np.stack(sigma, axis=1)
 
     def _first(self, k: int) -> LocatedSource:
         """Where on the grid one dipole explains an emitter's readings best, refined."""
-        flux, used = self.readings.flux[:, k], self.used
-        rough = np.hypot(self.readings.noise_t[:, None], FIRST_GAIN * np.abs(flux))
-        rough = np.where(used[:, None], np.maximum(rough, 1e-300), np.inf)
-        rows, weight = self.grid_rows, np.ones((len(self.grid), len(flux)))
-        left = np.zeros(0)
+        one = self._one(k, None)
+        flux, rows = one.flux, self.grid_rows
+        rough = np.hypot(one.noise_t[:, None], FIRST_GAIN * np.abs(flux))
+        rough = np.where(self.used[:, None], np.maximum(rough, 1e-300), np.inf)
+        weight, left = np.ones((len(self.grid), len(flux))), np.zeros(0)
         for _ in range(SOURCE_STEPS):
             sums = [_solved(rows, weight, flux[:, c], rough[:, c]) for c in range(flux.shape[1])]
             left = np.stack(sums, axis=2)
-            size = (left**2).sum(axis=2)
-            weight = student_weight(size, flux.shape[1])
+            weight = student_weight((left**2).sum(axis=2), flux.shape[1])
         losses, found = np.log1p((left**2).sum(axis=2) / FREEDOM).sum(axis=1), []
         for best in np.argsort(losses)[:STARTS]:
             start = LocatedSource(self.grid[best][None], np.zeros((3, flux.shape[1])))
-            source = self._stepped(k, start, np.ones(len(flux)), None)
-            found.append((self._loss(k, source, np.ones(len(flux)), None), source))
+            source = one.stepped(start)
+            found.append((one.loss(source), source))
         return min(found, key=lambda pair: pair[0])[1]
 
-    def _spread(self, k: int, source: LocatedSource, widths: dict[str, float] | None) -> Array:
-        """How far readings of one emitter may be off (S, C); by a share of them at first."""
-        if widths is None:
-            rough = FIRST_GAIN * np.abs(self.readings.flux[:, k])
-            return np.maximum(np.hypot(self.readings.noise_t[:, None], rough), 1e-300)
-        return self._sigma(source, widths)
-
-    def _root(self, left: Array, sigma: Array) -> Array:
-        """Factors (S, C) that make residuals white, with Student's weights; 0 for the unused."""
-        size = ((left / sigma) ** 2).sum(axis=1)
-        root = np.sqrt(student_weight(size, left.shape[1]))[:, None] / sigma
-        return np.where(self.used[:, None], root, 0.0)
-
-    def _loss(
-        self, k: int, source: LocatedSource, sign: Array, widths: dict[str, float] | None
-    ) -> float:
-        left = self.readings.flux[:, k] * sign[:, None] - self._basis(source) @ source.moments
-        sigma = self._spread(k, source, widths)
-        return float(student_losses(left, sigma)[self.used].sum())
-
-    def _stepped(
-        self, k: int, source: LocatedSource, sign: Array, widths: dict[str, float] | None
-    ) -> LocatedSource:
-        """Gauss-Newton steps of places and moments."""
-        for step in range(SOURCE_STEPS):
-            source, _ = self._step(k, source, sign, widths, moving=step > 0)
-        return source
-
-    def _step(
-        self,
-        k: int,
-        source: LocatedSource,
-        sign: Array,
-        widths: dict[str, float] | None,
-        *,
-        moving: bool,
-    ) -> tuple[LocatedSource, Array]:
-        """One step, and the covariance of the places (3D, 3D) that it has."""
-        flux = self.readings.flux[:, k] * sign[:, None]
-        basis, count, parts = self._basis(source), len(source.places), flux.shape[1]
-        known = bool(source.moments.any())
-        sigma = self._spread(k, source, widths if known else None)
-        left = flux - basis @ source.moments if known else np.zeros_like(flux)
-        root = self._root(left, sigma)
-        slopes = np.zeros((len(flux), parts, 3 * count))
-        if moving:
-            sites, apart = source.sites, np.zeros((count, 3, count, parts))
-            apart[np.arange(count), :, np.arange(count)] = source.moments.reshape(count, 3, parts)
-            shift = self.readings.points.shifts(
-                sites.positions, sites.directions, apart.reshape(3 * count, -1)
-            ).reshape(len(flux), 3, count, parts)
-            slopes[:] = -shift.transpose(0, 3, 2, 1).reshape(len(flux), parts, -1)
-        matrix = np.zeros((len(flux), parts, 3 * count * (1 + parts)))
-        matrix[:, :, : 3 * count] = slopes
-        for c in range(parts):
-            first = 3 * count * (1 + c)
-            matrix[:, c, first : first + 3 * count] = basis
-        white = (matrix * root[:, :, None]).reshape(-1, matrix.shape[2])
-        target = (flux * root).ravel()
-        strength = float(np.linalg.norm(source.moments[:3]))
-        stray = 0.0 if strength == 0.0 else (STRAY * strength) ** -2.0
-        prior = np.concatenate(
-            [
-                np.full(3 * count, HELD_M**-2.0),
-                np.tile(np.repeat([0.0, stray], [3, 3 * count - 3]), parts),
-            ]
-        )
-        normal = white.T @ white + np.diag(prior)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        inverse = np.linalg.pinv(normal * np.outer(scale, scale), hermitian=True)
-        solved = scale * (inverse @ (scale * (white.T @ target)))
-        places = source.places + (solved[: 3 * count].reshape(-1, 3) if moving else 0.0)
-        moments = solved[3 * count :].reshape(parts, -1).T
-        covariance = (inverse * np.outer(scale, scale))[: 3 * count, : 3 * count]
-        return LocatedSource(places, moments), covariance
-
-    def _refined(
-        self, k: int, source: LocatedSource, sign: Array, widths: dict[str, float]
-    ) -> LocatedSource:
-        """The source after steps, unless they made it less likely."""
-        moved = self._stepped(k, source, sign, widths)
-        better = self._loss(k, moved, sign, widths) < self._loss(k, source, sign, widths)
-        return moved if better else source
-
-    def _signs(self, sources: Sequence[LocatedSource], widths: dict[str, float]) -> Array:
-        """Which way round each sensor is; those that do not tell clearly take no part."""
+    def _learn_signs(self, sources: Sequence[LocatedSource]) -> None:
+        """Find which way round each sensor is; those that do not tell clearly take no part."""
         if not self.turns:
-            return np.ones(len(self.readings.flux))
-        evidence = self._sign_evidence(self.predicted(sources), self.sigma(sources, widths))
+            return
+        evidence = self._sign_evidence(*self._predicted(sources))
         self.used = self.readings.used & (np.abs(evidence) > CLEAR_SIGN)
-        return np.where(evidence > 0.0, -1.0, 1.0)
+        self.sign = np.where(evidence > 0.0, -1.0, 1.0)
 
     def _sign_evidence(self, predicted: Array, sigma: Array) -> Array:
         flux = self.readings.flux
         losses = [student_losses(sign * flux - predicted, sigma) for sign in (1.0, -1.0)]
         return np.asarray((losses[0] - losses[1]).sum(axis=1))
 
-    def _total(
-        self, sources: Sequence[LocatedSource], sign: Array, widths: dict[str, float]
-    ) -> float:
-        return sum(self._loss(k, one, sign, widths) for k, one in enumerate(sources))
-
-    def _best_widths(
-        self, sources: Sequence[LocatedSource], sign: Array, widths: dict[str, float]
-    ) -> dict[str, float]:
+    def _learn_widths(self, sources: Sequence[LocatedSource]) -> None:
         """Vary one width after the other as long as the readings become more likely."""
-        best = self._total(sources, sign, widths)
-        improved = True
+
+        def loss(widths: dict[str, float]) -> float:
+            return sum(one.loss(source) for one, source in self._each(sources, widths))
+
+        best, improved = loss(self.widths), True
         while improved:
             improved = False
             for kind in self.kinds:
                 for factor in (1.0 / WIDTH_STEP, WIDTH_STEP):
-                    other = {**widths, kind: factor * widths[kind]}
+                    other = {**self.widths, kind: factor * self.widths[kind]}
                     if other[kind] < LEAST_WIDTH * START[kind]:
                         continue
-                    loss = self._total(sources, sign, other)
-                    if loss < best:
-                        best, widths, improved = loss, other, True
+                    if (now := loss(other)) < best:
+                        best, self.widths, improved = now, other, True
                         break
-        return widths
 
-    def _grown(
-        self, k: int, source: LocatedSource, sign: Array, widths: dict[str, float]
-    ) -> LocatedSource:
+    def _grown(self, one: _OneEmitter, source: LocatedSource) -> LocatedSource:
         """The source with as many dipoles of a stray field as pay."""
-        source = self._stepped(k, source, sign, widths)
-        best = (self._loss(k, source, sign, widths), source)
+        source = one.stepped(source)
+        best = (one.loss(source), source)
         for count in range(1, MOST_STRAY + 1):
             if count - len(best[1].places) >= IN_VAIN:
                 break
-            place = self._asked_for(k, source, sign, widths)
+            place = self._asked_for(one, source)
             more = np.zeros((3, source.moments.shape[1]))
             source = LocatedSource(
                 np.vstack([source.places, place]), np.concatenate([source.moments, more])
             )
-            source = self._stepped(k, source, sign, widths)
-            loss = self._loss(k, source, sign, widths) + DIPOLE_PAYS * count
+            source = one.stepped(source)
+            loss = one.loss(source) + DIPOLE_PAYS * count
             if loss < best[0]:
                 best = (loss, source)
         return best[1]
 
-    def _asked_for(
-        self, k: int, source: LocatedSource, sign: Array, widths: dict[str, float]
-    ) -> Array:
+    def _asked_for(self, one: _OneEmitter, source: LocatedSource) -> Array:
         """The place of the grid where one more dipole explains most of what is left."""
-        left = self.readings.flux[:, k] * sign[:, None] - self._basis(source) @ source.moments
-        root = self._root(left, self._spread(k, source, widths))
+        left = one.left(source)
+        root = one.root(left, one.spread(source))
         strength = (STRAY * float(np.linalg.norm(source.moments[:3]))) ** -2.0
         gains = np.zeros(len(self.grid))
         for c in range(left.shape[1]):
@@ -371,18 +344,14 @@ class SourcesFitter:
             gains += (pull * np.linalg.solve(normal, pull[..., None])[..., 0]).sum(axis=1)
         return np.asarray(self.grid[int(np.argmax(gains))])
 
-    def _result(self, sources: Sequence[LocatedSource], widths: dict[str, float]) -> SourcesFit:
-        sign = self._signs(sources, widths)
-        sources = [self._refined(k, one, sign, widths) for k, one in enumerate(sources)]
-        predicted, sigma = self.predicted(sources), self.sigma(sources, widths)
-        evidence = self._sign_evidence(predicted, sigma)
-        spread = [
-            self._step(k, one, sign, widths, moving=True)[1][:3, :3]
-            for k, one in enumerate(sources)
-        ]
+    def _result(self, sources: Sequence[LocatedSource]) -> SourcesFit:
+        self._learn_signs(sources)
+        sources = [one.refined(source) for one, source in self._each(sources)]
+        predicted, sigma = self._predicted(sources)
+        spread = [one.step(source, moving=True)[1][:3, :3] for one, source in self._each(sources)]
         return SourcesFit(
-            tuple(sources), sign, evidence, widths, predicted, sigma,
-            np.sqrt([np.trace(own) for own in spread]),
+            tuple(sources), self._sign_evidence(predicted, sigma), self.widths,
+            predicted, sigma, np.sqrt([np.trace(own) for own in spread]),
         )  # fmt: skip
 
 

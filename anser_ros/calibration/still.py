@@ -9,7 +9,6 @@ looked for and found, each half of the sensors is predicted at the pose that the
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,8 @@ from numpy.typing import NDArray
 from anser_ros.calibration.dipole_sites import basis_rows
 from anser_ros.calibration.factors import as_complex
 from anser_ros.calibration.held_out import HeldOut, HeldOutTally, rms
-from anser_ros.calibration.layout_score import LayoutCandidate
 from anser_ros.calibration.layouts import Generator, Layout
-from anser_ros.calibration.moments import MomentFit, Progress
+from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.optical_noise import OpticalNoise
 from anser_ros.calibration.population import LEAST_EVIDENCE, Posterior
 from anser_ros.calibration.pose_correction import (
@@ -35,13 +33,15 @@ from anser_ros.calibration.requirements import (
     FEWEST_SCAN_FRAMES,
     MANY_SENSORS,
     check_measurements,
+    usable_frames,
 )
-from anser_ros.calibration.result import Calibration, Scan, provenance, residuals
-from anser_ros.calibration.sensor_parameters import SensorParameters, Survey
+from anser_ros.calibration.result import Calibration, Scan, residuals, with_provenance
+from anser_ros.calibration.sensor_parameters import SensorParameters
 from anser_ros.calibration.still_fit import STILL_STEPS, StillFit, StillFitter
 from anser_ros.calibration.still_model import POSE
+from anser_ros.calibration.still_system import figures_of
 from anser_ros.calibration.survey_records import corrections
-from anser_ros.calibration.survey_result import SurveyResult
+from anser_ros.calibration.survey_result import SensorFit
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import clusters_of
@@ -50,63 +50,44 @@ from anser_ros.settings import Accuracy
 Array = NDArray[np.float64]
 
 STILL_KINDS = ('gains', 'axes', 'bend', 'poses')
-"""Kinds of errors that few poses of many sensors tell. The poses' errors are part of every fit;
-looked for, they are told, and what is predicted is predicted where they are."""
+"""Kinds of errors that few poses of many sensors show. The poses' errors are part of every fit;
+looked for, they are reported, and what is predicted is predicted where they are."""
 STILL_ONLY = ('bend', 'poses')
 """Those of them that nothing else determines."""
 BEND, PLACEMENT = 'body_bend', 'body_placement'
 """Names of the effects that the last two of them become."""
 AS_STATED = 'flux_rms_as_stated_t'
 """The evidence of the second that is the held-out error at the poses as they were stated."""
+WORDS = (
+    'three-component dipoles at 7 places about every emitter, place free, and at {} beside them'
+)
+"""The layout in words, with the number of dipoles beside the emitters."""
 POPULATIONS = ('gains', 'axes')
 """Those of them that every sensor has a value of."""
 FEWEST_PLACED = 4
-"""Poses from which on their errors are told. With three, each that is left out leaves two to fit
-to, and what was found on simulated plates was as often further from the truth as nearer."""
+"""Poses from which on their errors are reported. With three, each that is left out leaves two to
+fit to, and what was found on simulated plates was as often further from the truth as nearer."""
 POSE_STEPS = 4
 """Gauss-Newton steps of a held-out pose from where it is stated: errors are millimetres."""
 
 
 def is_still(measurements: Sequence[Measurements]) -> bool:
     """Return whether there are few poses of one body with many sensors, and no more."""
-    frames = sum(int(m.usable.any(axis=1).sum()) for m in measurements)
     many = len(measurements) == 1 and len(measurements[0].sensors) >= MANY_SENSORS
-    return many and FEWEST_FRAMES_OF_MANY <= frames < FEWEST_SCAN_FRAMES
+    return many and FEWEST_FRAMES_OF_MANY <= usable_frames(measurements) < FEWEST_SCAN_FRAMES
 
 
 def calibrate_still(
     measurements: Measurements,
     name: str,
     generator: Generator,
-    emitters: tuple[str, ...],
-    frequencies_hz: tuple[float, ...],
     kinds: Sequence[str],
     accuracy: Accuracy,
     progress: Progress | None = None,
 ) -> Calibration:
     """Fit field, sensors, poses and bends of a body's frames.
 
-    Parameters
-    ----------
-    measurements : Measurements
-        Frames of one body, with poses.
-    name : str
-        Of the session.
-    generator : Generator
-        Rough places of the emitters.
-    emitters, frequencies_hz : tuple, length K
-        Names of the emitters, and their frequencies, Hz.
-    kinds : sequence of str
-        What is looked for, of `STILL_KINDS`; others keep the setup's values.
-    accuracy : Accuracy
-        Noise to begin with, and errors of the poses.
-    progress : callable, optional
-        Called with the name of the stage and its finished fraction.
-
-    Raises
-    ------
-    FitError
-        When the readings lie in one plane, or are all zero.
+    Raises `FitError` when the readings lie in one plane, or are all zero.
     """
     check_measurements([measurements], 1, field_alone=True)
     posed = with_pose(measurements)
@@ -129,36 +110,40 @@ def calibrate_still(
     whole = fitter(posed, kept)
     fit = whole.fit()
     held_out = _held_out(posed, folds, accuracy, _as_stated)
-    told = []
+    misplaced = []
     if 'poses' in looked_for and len(posed.time) >= FEWEST_PLACED:
         gain = whole.evidence_of_poses(fit)
         elsewhere = _held_out(posed, folds, accuracy, _where_the_other_half_finds_it)
         if gain >= LEAST_EVIDENCE and rms(elsewhere.error) < rms(held_out.error):
             evidence = {'log_probability': gain, AS_STATED: rms(held_out.error)}
-            held_out, told = elsewhere, [_misplaced(fit, folds, evidence)]
-    scan = _scan(posed, len(measurements.time), fit, accuracy, (*_bends(fit), *told))
-    moments = _moments(fit)
-    layout = Layout('free', fit.beside, 1.0, 0.0)
+            held_out, misplaced = elsewhere, [_misplaced(fit, folds, evidence)]
+    scan = _scan(posed, len(measurements.time), fit, accuracy, (*_bends(fit), *misplaced))
     model = FieldModel(
         positions=fit.sites.positions,
         directions=fit.sites.directions,
-        moments=moments,
-        emitters=emitters,
-        frequencies_hz=frequencies_hz,
+        moments=_moments(fit),
+        emitters=generator.emitters,
+        frequencies_hz=generator.frequencies_hz,
         flux_error_t=held_out.flux_error_t,
-        shift_sigma_m=0.0 if scan.survey is None else scan.survey.shift_sigma_m,
+        shift_sigma_m=0.0 if scan.sensor_fit is None else scan.sensor_fit.shift_sigma_m,
         effects=scan.corrections,
     )
+    basis = basis_rows(scan.measurements[0], fit.sites)
     calibration = Calibration(
-        model, _moment_fit(scan, fit, moments), held_out, None, (),
-        LayoutCandidate(layout, fit.sites, 0.0, held_out.score_t, ()), layout, 0.0,
-        int(posed.usable.sum()), residuals(scan.measurements, model), scan,
-        undetermined=_not_told(kinds, len(posed.time)),
-    )  # fmt: skip
-    return replace(calibration, model=replace(model, provenance=provenance(calibration, [name])))
+        model=model,
+        fit=figures_of(basis, fit.weights, fit.widths.noise_t, fit.freedom, STILL_STEPS),
+        held_out=held_out,
+        layout=Layout('free', fit.beside, 1.0, 0.0, words=WORDS.format(fit.beside)),
+        damping=0.0,
+        n_measurements=int(posed.usable.sum()),
+        residuals=residuals(scan.measurements, model),
+        scan=scan,
+        undetermined=_not_determined(kinds, len(posed.time)),
+    )
+    return with_provenance(calibration, [name])
 
 
-def _not_told(kinds: Sequence[str], poses: int) -> tuple[str, ...]:
+def _not_determined(kinds: Sequence[str], poses: int) -> tuple[str, ...]:
     """A line for what was asked for and cannot be found in this way."""
     others = ', '.join(kind for kind in kinds if kind not in STILL_KINDS)
     lines = []
@@ -174,26 +159,18 @@ def _moments(fit: StillFit) -> NDArray[np.complex128]:
     return as_complex(found) if fit.model.is_complex else found.astype(complex)
 
 
-def _columns(fit: StillFit) -> tuple[tuple[str, slice], ...]:
-    """Which columns of the sensors' unknowns are gains, and which are tilts of the axes."""
-    gains = fit.model.gains
-    return ('gains', slice(0, gains)), ('axes', slice(gains, None))
-
-
-def _parameters(measured: Measurements, fit: StillFit) -> tuple[SensorParameters, Array, Array]:
-    """The sensors' errors as parameters of a survey: their values and standard deviations."""
-    parameters = SensorParameters([measured], POPULATIONS)
-    values, sigma = np.zeros(len(parameters)), np.zeros(len(parameters))
-    for kind, columns in _columns(fit):
+def _parameters(
+    measured: Measurements, fit: StillFit
+) -> tuple[SensorParameters, Array, Array, Array]:
+    """The sensors' errors as those of a joint fit: values, standard deviations, prior widths."""
+    parameters, gains = SensorParameters([measured], POPULATIONS), fit.model.gains
+    values, sigma, width = np.zeros((3, len(parameters)))
+    for kind, columns in (('gains', slice(0, gains)), ('axes', slice(gains, None))):
         own = fit.unknowns.sensors[:, columns]
         rows = parameters.rows(kind).reshape(len(own), -1)[:, : own.shape[1]]
         values[rows], sigma[rows] = own, fit.sensor_sigma[:, columns]
-    return parameters, values, sigma
-
-
-def _survey(measured: Measurements, fit: StillFit) -> Survey:
-    parameters, values, _ = _parameters(measured, fit)
-    return parameters.survey(measured.body, values)
+        width[rows] = fit.widths.sensors[columns]
+    return parameters, values, sigma, width
 
 
 def _held_out(
@@ -207,7 +184,8 @@ def _held_out(
     tally = HeldOutTally(noise, noise, accuracy, max(len(fit.sites) for fit in folds))
     for frame, fit in enumerate(folds):
         part = posed.frames(np.array([frame]))
-        sound = _survey(part, fit).apply(part)
+        parameters, values, *_ = _parameters(part, fit)
+        sound = parameters.errors_of(part.body, values).apply(part)
         tally.add(predicted(sound, fit, accuracy), usable_weights(sound), sound.position)
     return tally.result()
 
@@ -249,17 +227,12 @@ def _at_best_pose(
 
 def _scan(
     posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy,
-    told: tuple[EffectRecord, ...],
+    reported: tuple[EffectRecord, ...],
 ) -> Scan:  # fmt: skip
     """The frames as ideal sensors on a flat body would have given them, and what was not ideal;
     ``frames`` are those of the session, without a pose too.
     """
-    parameters, values, sigma = _parameters(posed, fit)
-    width = np.zeros(len(parameters))
-    for kind, columns in _columns(fit):
-        found = fit.widths.sensors[columns]
-        rows = parameters.rows(kind).reshape(len(posed.sensors), -1)
-        width[rows[:, : len(found)]] = found
+    parameters, values, sigma, width = _parameters(posed, fit)
     offsets = fit.unknowns.frames[:, :POSE]
     poses = OpticalNoise(
         float(np.sqrt(np.mean(offsets[:, :3] ** 2))),
@@ -268,7 +241,7 @@ def _scan(
     )
     every = np.ones(frames, dtype=bool)
     evidence = {kind: gain for kind, gain in fit.evidence.items() if kind in POPULATIONS}
-    result = SurveyResult(
+    result = SensorFit(
         parameters,
         Posterior(values, width, np.diag(sigma**2), fit.log_evidence),
         tuple(kind for kind in POPULATIONS if kind not in evidence),
@@ -276,12 +249,12 @@ def _scan(
         (every,), (every,), 0.0, {}, float(accuracy.optical_position_m / np.sqrt(len(offsets))),
     )  # fmt: skip
     flat = fit.model.unbent(fit.unknowns, fit.sites)
-    sound = result.survey(posed.body).apply(flat)
-    return Scan((sound,), accuracy, corrections(result), told, result)
+    sound = result.errors_of(posed.body).apply(flat)
+    return Scan((sound,), accuracy, corrections(result), reported, result)
 
 
 def _bends(fit: StillFit) -> tuple[EffectRecord, ...]:
-    """The bend of the body in each frame, as one telling: another session's is another."""
+    """The bend of the body in each frame, as one record: another session's is another."""
     if 'bend' not in fit.evidence:
         return ()
     bend = fit.model.bend
@@ -341,19 +314,3 @@ def _jackknifed(offset: Array, folds: Sequence[StillFit]) -> Array:
         change = fit.unknowns.frames[:, :POSE] - (offset[rest] - offset[rest].mean(axis=0))
         power[rest] += change**2
     return np.asarray(np.sqrt((count - 1) / count * power))
-
-
-def _moment_fit(scan: Scan, fit: StillFit, moments: NDArray[np.complex128]) -> MomentFit:
-    basis = basis_rows(scan.measurements[0], fit.sites)
-    size = np.linalg.svd(basis / np.linalg.norm(basis, axis=0), compute_uv=False)
-    return MomentFit(
-        moments=moments,
-        measurements=scan.measurements,
-        weights=(fit.weights,),
-        noise_t=fit.widths.noise_t,
-        quadrature_noise_t=fit.widths.noise_t,
-        rank=int((size > size[0] * len(basis) * np.finfo(float).eps).sum()),
-        freedom=fit.freedom,
-        condition=float(size[0] / max(size[-1], np.finfo(float).tiny)),
-        alternations=STILL_STEPS,
-    )

@@ -56,59 +56,27 @@ SIZES = (1e-3, 1e-2, 1e-1, 1.0)
 
 @dataclass(frozen=True)
 class StillFit:
-    """Holds what a joint fit found.
+    """Holds what a joint fit found."""
 
-    Attributes
-    ----------
-    model : StillModel
-        Of the frames that were fitted.
-    sites : DipoleSites
-        N dipoles: seven places an emitter, then the free ones, three directions each.
-    beside : int
-        Number of free places.
-    unknowns : StillUnknowns
-        Moments, errors of the frames and of the sensors.
-    sensor_sigma : ndarray, shape (S, G + 2)
-        Standard deviation of the sensors' own.
-    frame_sigma : ndarray, shape (F, 6 + B)
-        Standard deviation of the frames' own, m and rad.
-    widths : StillWidths
-        Noise, and widths as found.
-    weights : ndarray, shape (F, S)
-        Of the readings.
-    freedom : float
-        How many of the moments of each part the readings determine.
-    log_evidence : float
-    evidence : dict of str to float
-        Log evidence that each kind of error added to those before it.
-    """
-
-    model: StillModel
+    model: StillModel  # of the frames that were fitted
+    # N dipoles: seven places an emitter, then the free ones, three directions each
     sites: DipoleSites
-    beside: int
-    unknowns: StillUnknowns
-    sensor_sigma: Array
-    frame_sigma: Array
-    widths: StillWidths
-    weights: Array
-    freedom: float
+    beside: int  # number of free places
+    unknowns: StillUnknowns  # moments, errors of the frames and of the sensors
+    sensor_sigma: Array  # (S, G + 2): standard deviation of the sensors' own
+    frame_sigma: Array  # (F, 6 + B): standard deviation of the frames' own, m and rad
+    widths: StillWidths  # noise, and widths as found
+    weights: Array  # (F, S): of the readings
+    freedom: float  # how many of the moments of each part the readings determine
     log_evidence: float
-    evidence: dict[str, float]
+    evidence: dict[str, float]  # log evidence that each kind of error added to those before it
 
 
 class StillFitter:
     """Fits the frames of one body.
 
-    Parameters
-    ----------
-    measurements : Measurements
-        F frames with poses.
-    centres : ndarray, shape (K, 3)
-        Rough places of the emitters, m, frame fg.
-    kinds : sequence of str
-        What to look for besides errors of the poses: ``gains``, ``axes``, ``bend``.
-    accuracy : Accuracy
-        Noise to begin with, and errors of the poses.
+    ``centres`` (K, 3): rough places of the emitters, m, frame fg. ``kinds``: what to look for
+    besides errors of the poses: ``gains``, ``axes``, ``bend``.
     """
 
     def __init__(

@@ -28,58 +28,34 @@ POSE = 6
 
 @dataclass(frozen=True)
 class StillUnknowns:
-    """Holds what is to be found.
+    """Holds what is to be found."""
 
-    Attributes
-    ----------
-    moments : ndarray, shape (N, C)
-        Of each dipole for each part of the fluxes, A m^2.
-    frames : ndarray, shape (F, 6 + B)
-        Error of each frame's pose (m and rad, frame fg), then the terms of its bend (m).
-    sensors : ndarray, shape (S, G + 2)
-        Gain of each channel less one (its real part, and where fluxes are complex its imaginary
-        part), and its tilt along the two tangents of its axis, rad.
-    """
-
-    moments: Array
+    moments: Array  # (N, C): of each dipole for each part of the fluxes, A m^2
+    # (F, 6 + B): error of each frame's pose (m and rad, frame fg), then the terms of its bend (m)
     frames: Array
+    # (S, G + 2): gain of each channel less one (its real part, and where fluxes are complex its
+    # imaginary part), and its tilt along the two tangents of its axis, rad
     sensors: Array
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Holds the readings about an estimate, sensor by sensor; R = C F rows each.
+    """Holds the readings about an estimate, sensor by sensor; R = C F rows each."""
 
-    Attributes
-    ----------
-    target : ndarray, shape (S, R)
-        Readings that the columns times the unknowns should give, T.
-    basis : ndarray, shape (S, F, N)
-        Flux of each dipole, the same for every part, T/(A m^2).
-    frames : ndarray, shape (S, C, F, 6 + B)
-        Derivatives by the frame's own pose and bend, T/m and T/rad.
-    own : ndarray, shape (S, R, G + 2)
-        Derivatives by the sensor's own gain and tilt, T and T/rad.
-    places : ndarray, shape (S, R, 3 J)
-        Derivatives by the places of the last J dipoles of free direction, T/m.
-    """
-
-    target: Array
-    basis: Array
-    frames: Array
-    own: Array
+    target: Array  # (S, R): readings that the columns times the unknowns should give, T
+    basis: Array  # (S, F, N): flux of each dipole, the same for every part, T/(A m^2)
+    frames: Array  # (S, C, F, 6 + B): derivatives by the frame's own pose and bend, T/m and T/rad
+    own: Array  # (S, R, G + 2): derivatives by the sensor's own gain and tilt, T and T/rad
+    # (S, R, 3 J): derivatives by the places of the last J dipoles of free direction, T/m
     places: Array
 
 
 class StillModel:
     """Predicts the fluxes of a body's frames.
 
-    Parameters
-    ----------
-    measurements : Measurements
-        F frames with a pose; a reading that is not usable counts as zero and needs no weight.
-    is_complex : bool
-        Whether the imaginary parts count: in every part of a measurement alike.
+    ``measurements``: F frames with a pose; a reading that is not usable counts as zero and needs
+    no weight. ``is_complex``: whether the imaginary parts count: in every part of a measurement
+    alike.
     """
 
     def __init__(self, measurements: Measurements, is_complex: bool) -> None:

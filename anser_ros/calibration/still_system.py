@@ -14,6 +14,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites
+from anser_ros.calibration.moments import FitFigures
 from anser_ros.calibration.still_model import Columns, StillModel, StillUnknowns
 
 Array = NDArray[np.float64]
@@ -33,48 +34,37 @@ def student_weight(size: Array, parts: int) -> Array:
     return np.asarray((FREEDOM + parts) / (FREEDOM + size))
 
 
+def figures_of(
+    basis: Array, weights: Array, noise_t: float, freedom: float, alternations: int
+) -> FitFigures:
+    """Return how well a fit to rows of a basis (P, N) went, its condition worked out."""
+    size = np.linalg.svd(basis / np.linalg.norm(basis, axis=0), compute_uv=False)
+    return FitFigures(
+        weights=(weights,),
+        noise_t=noise_t,
+        rank=int((size > size[0] * len(basis) * np.finfo(float).eps).sum()),
+        freedom=freedom,
+        condition=float(size[0] / max(size[-1], np.finfo(float).tiny)),
+        alternations=alternations,
+    )
+
+
 @dataclass(frozen=True)
 class StillWidths:
-    """Holds standard deviations of everything before any data; zero fixes what it belongs to.
+    """Holds standard deviations of everything before any data; zero fixes what it belongs to."""
 
-    Attributes
-    ----------
-    noise_t : float
-        Of a reading's component, T.
-    moments : ndarray, shape (N,)
-        A m^2.
-    frames : ndarray, shape (6 + B,)
-        Of a frame's pose and bend, m and rad.
-    sensors : ndarray, shape (G + 2,)
-        Of gains, and tilts in rad.
-    """
-
-    noise_t: float
-    moments: Array
-    frames: Array
-    sensors: Array
+    noise_t: float  # of a reading's component, T
+    moments: Array  # (N,): A m^2
+    frames: Array  # (6 + B,): of a frame's pose and bend, m and rad
+    sensors: Array  # (G + 2,): of gains, and tilts in rad
 
 
 class StillSystem:
     """One linear system about an estimate, with its solution.
 
-    Parameters
-    ----------
-    model : StillModel
-        The readings.
-    now : StillUnknowns
-        About which it is linear.
-    sites : DipoleSites
-        N dipoles.
-    widths : StillWidths
-        Before any data.
-    weights : ndarray, shape (F, S)
-        Of the readings; 0 takes one out.
-    place_width : ndarray, shape (J,)
-        How far the last J dipoles of free direction may be from where they are, m.
-    moving : bool
-        Whether places and the frames' errors are solved for; at first there is no field to tell
-        them by.
+    ``now``: about which it is linear. ``widths``: before any data. ``place_width`` (J,): how far
+    the last J dipoles of free direction may be from where they are, m. ``moving``: whether places
+    and the frames' errors are solved for; at first there is no field to tell them by.
 
     Attributes
     ----------
@@ -193,16 +183,9 @@ class StillSystem:
     def gains(self, basis: Array, widths: Array) -> Array:
         """Return the log evidence that a dipole of free direction adds at each of P places.
 
-        Parameters
-        ----------
-        basis : ndarray, shape (S, F, 3P)
-            Flux of its three components in each channel, T/(A m^2).
-        widths : ndarray, shape (W, P)
-            Expected sizes of its moment to try, A m^2.
+        ``basis`` (S, F, 3P): flux of its three components in each channel, T/(A m^2). ``widths``
+        (W, P): expected sizes of its moment to try, A m^2.
 
-        Returns
-        -------
-        ndarray, shape (W, P)
         """
         parts, places = self.model.parts, basis.shape[2] // 3
         flat = np.empty((places, parts * 3, self.sensors * self.root.shape[1]))

@@ -1,18 +1,16 @@
-"""Records what a survey found: what a model corrects, and what is only reported."""
+"""Records what a joint fit of sensors found: what a model corrects, and what is only reported."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.disturbances import spans_of
 from anser_ros.calibration.population import FAR
-from anser_ros.calibration.sensor_parameters import SensorParameters
-from anser_ros.calibration.source_size import SourceSize
-from anser_ros.calibration.survey_result import SurveyResult
+from anser_ros.calibration.survey_result import SensorFit
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
-from anser_ros.field.symmetry import size_parameters
 from anser_ros.physics.tangent import tilted
 
 Array = NDArray[np.float64]
@@ -25,18 +23,16 @@ SPREADS = {
 }
 """Names of the populations' effects."""
 FEWEST_REFLECTED = 1e-3
-"""Share of frames with a wrong optical pose from which on they are told."""
-
-
+"""Share of frames with a wrong optical pose from which on they are reported."""
 UNITS = {
     'gains': (100.0, '%'), 'axes': (1e3, 'mrad'), 'places': (1e3, 'mm'),
     'lever_arm': (1e3, 'mm'), 'time_offset': (1e3, 'ms'), 'clock_rate': (1e6, 'ppm'),
     'offsets': (100.0, '% of the fluxes'),
 }  # fmt: skip
-"""Factor and unit in which each kind of parameter is told to people."""
+"""Factor and unit in which each kind of parameter is shown to people."""
 
 
-def undetermined_words(result: SurveyResult) -> tuple[str, ...]:
+def undetermined_words(result: SensorFit) -> tuple[str, ...]:
     """Return a line for every kind of parameter that the scan does not determine."""
     words = []
     for kind, size in result.undetermined.items():
@@ -46,31 +42,6 @@ def undetermined_words(result: SurveyResult) -> tuple[str, ...]:
             f'{kind}: the scan determines it only to {limit}; the value of the setup is kept'
         )
     return tuple(words)
-
-
-def reversed_sensors(
-    channels: NDArray[np.int64], evidence: Array, held_out: Array
-) -> tuple[EffectRecord, ...]:
-    """Return a record of the channels that are the wrong way round, none where there are none.
-
-    ``evidence`` is the log probability of each over its opposite, ``held_out`` the same where the
-    channel took no part.
-    """
-    if not channels.size:
-        return ()
-    found = {
-        'log_probability': float(evidence.min()),
-        'held_out_log_probability': float(held_out.min()),
-    }
-    return (EffectRecord('sensor_polarity', {'channels': channels.tolist()}, {}, found),)
-
-
-def noisy_sensors(channels: NDArray[np.int64], ratios: Array) -> tuple[EffectRecord, ...]:
-    """Return a record of each channel that is noisier than the median one by a ratio."""
-    return tuple(
-        EffectRecord('excess_noise', {'factor': ratio, 'channels': [channel]})
-        for channel, ratio in zip(channels.tolist(), ratios.tolist(), strict=True)
-    )
 
 
 def drift_records(strength: NDArray[np.complex128]) -> tuple[EffectRecord, ...]:
@@ -87,19 +58,7 @@ def drift_records(strength: NDArray[np.complex128]) -> tuple[EffectRecord, ...]:
     return tuple(records)
 
 
-def size_records(sizes: Sequence[SourceSize]) -> tuple[EffectRecord, ...]:
-    """Return a record of each emitter whose size the scan tells."""
-    records = []
-    for found in sizes:
-        figures, sigmas = size_parameters(found.second_moment_m2, found.sigma_m2)
-        evidence = {'heldout_point_t': found.point_t, 'heldout_sized_t': found.sized_t}
-        records.append(
-            EffectRecord('emitter_size', {'coil': found.emitter, **figures}, sigmas, evidence)
-        )
-    return tuple(records)
-
-
-def contradiction_words(result: SurveyResult, names: Sequence[str]) -> tuple[str, ...]:
+def contradiction_words(result: SensorFit, names: Sequence[str]) -> tuple[str, ...]:
     """Return a line for every parameter of which two of the named measurements disagree."""
     words = []
     for found in result.contradictions:
@@ -118,98 +77,82 @@ def _short(value: float) -> str:
     return f'{value:.0f}' if value >= 10.0 else f'{value:.2g}'
 
 
-def corrections(result: SurveyResult) -> tuple[EffectRecord, ...]:
-    """Return what the model knows of: sensors, lever arms and the optical tracker."""
+def corrections(result: SensorFit) -> tuple[EffectRecord, ...]:
+    """Return what the model corrects: sensors, lever arms and the optical tracker."""
     records: list[EffectRecord] = []
     for kind in SPREADS:
         if kind in result.evidence:
             records += _population(result, kind)
     parameters, found = result.parameters, result.posterior
-    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
     for body in parameters.bodies:
         offset = parameters.of('lever_arm', body, found.values)
-        if offset is not None and 'lever_arm' in result.evidence:
-            width = parameters.of('lever_arm', body, sigma)
+        width = parameters.of('lever_arm', body, found.sigma)
+        if offset is not None and width is not None and 'lever_arm' in result.evidence:
             records.append(
                 EffectRecord(
                     'lever_arm',
                     {'offset_m': offset.tolist(), 'body': body},
-                    {'offset_m': [] if width is None else width.tolist()},
+                    {'offset_m': width.tolist()},
                     _evidence(result, 'lever_arm'),
                 )
             )
-    return (*records, *_clock(result, sigma), *_reflected(result))
+    records += _clock(result)
+    # Wrong poses of the optical tracker, which it will have in other sessions as well.
+    if result.reflected > FEWEST_REFLECTED:
+        sigma = float(np.sqrt(result.reflected / max(result.optical.poses, 1.0)))
+        records.append(
+            EffectRecord('outliers', {'fraction': result.reflected}, {'fraction': sigma})
+        )
+    return tuple(records)
 
 
-def _evidence(result: SurveyResult, kind: str) -> dict[str, float]:
+def _evidence(result: SensorFit, kind: str) -> dict[str, float]:
     return {'log_probability': result.evidence[kind]}
 
 
-def _reflected(result: SurveyResult) -> list[EffectRecord]:
-    """Wrong poses of the optical tracker, which it will have in other sessions as well."""
-    if result.reflected <= FEWEST_REFLECTED:
+def _clock(result: SensorFit) -> list[EffectRecord]:
+    """The rate and offset of the optical clock, or its offset alone."""
+    parameters, values, sigma = result.parameters, result.posterior.values, result.posterior.sigma
+    at_offset, at_rate = (parameters.rows(kind) for kind in ('time_offset', 'clock_rate'))
+    if at_rate.size and 'clock_rate' in result.evidence:
+        errors = result.errors_of(parameters.bodies[0])
+        of_rate, of_offset = float(sigma[at_rate][0]), float(sigma[at_offset].sum())
+        stated = {'offset_s': errors.offset_s, 'rate_ppm': 1e6 * errors.rate}
+        sigmas = {
+            'offset_s': float(np.hypot(of_offset, of_rate * parameters.middle_s)),
+            'rate_ppm': 1e6 * of_rate,
+        }
+        return [EffectRecord('clock_rate', stated, sigmas, _evidence(result, 'clock_rate'))]
+    if not at_offset.size or 'time_offset' not in result.evidence:
         return []
-    sigma = float(np.sqrt(result.reflected / max(result.optical.poses, 1.0)))
-    return [EffectRecord('outliers', {'fraction': result.reflected}, {'fraction': sigma})]
+    offset, width = ({'offset_s': float(v[at_offset][0])} for v in (values, sigma))
+    return [EffectRecord('time_offset', offset, width, _evidence(result, 'time_offset'))]
 
 
-def _clock(result: SurveyResult, sigma: Array) -> list[EffectRecord]:
-    parameters = result.parameters
-    offset = parameters.of('time_offset', '', result.posterior.values)
-    rate = parameters.of('clock_rate', '', result.posterior.values)
-    if rate is not None and 'clock_rate' in result.evidence:
-        survey = result.survey(parameters.bodies[0])
-        of_rate = float(sigma[parameters.rows('clock_rate')][0])
-        of_offset = float(sigma[parameters.rows('time_offset')].sum())
-        return [
-            EffectRecord(
-                'clock_rate',
-                {'offset_s': survey.offset_s, 'rate_ppm': 1e6 * survey.rate},
-                {
-                    'offset_s': float(np.hypot(of_offset, of_rate * parameters.middle_s)),
-                    'rate_ppm': 1e6 * of_rate,
-                },
-                _evidence(result, 'clock_rate'),
-            )
-        ]
-    if offset is None or 'time_offset' not in result.evidence:
-        return []
-    return [
-        EffectRecord(
-            'time_offset',
-            {'offset_s': float(offset[0])},
-            {'offset_s': float(sigma[parameters.rows('time_offset')][0])},
-            _evidence(result, 'time_offset'),
-        )
-    ]
-
-
-def _population(result: SurveyResult, kind: str) -> list[EffectRecord]:
+def _population(result: SensorFit, kind: str) -> list[EffectRecord]:
     """The population's record, and one for each channel that stands outside it."""
     parameters, found = result.parameters, result.posterior
     rows = parameters.rows(kind).reshape(-1, parameters.each[kind])
-    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))[rows]
     unit = parameters.unit_t if kind == 'offsets' else 1.0
-    values, sigma = unit * found.values[rows], unit * sigma
+    values, sigma = unit * found.values[rows], unit * found.sigma[rows]
     channels = np.concatenate([table.channel for table in parameters.tables])
+    axes = np.concatenate([table.axis for table in parameters.tables])
     alone = np.isin(rows[:, 0], result.alone[kind])
-    records = [
-        _single(parameters, kind, int(i), values[i], sigma[i]) for i in np.flatnonzero(alone)
+    singles = [
+        _single(kind, int(channels[i]), axes[i], values[i], sigma[i])
+        for i in np.flatnonzero(alone)
     ]
-    members = rows[~alone]
+    members, keep = rows[~alone], ~alone
     width = unit * found.width[members[0]] if members.size else np.zeros(parameters.each[kind])
     # A width is known as well as that many squares of Gaussian numbers tell.
     relative = 1.0 / np.sqrt(2.0 * max(members.size / (2 if kind == 'gains' else 1), 1.0))
-    keep, listed = ~alone, values
-    stated = {'spread': float(width[0])}
+    stated, more, listed = {'spread': float(width[0])}, {}, values
     if kind == 'gains':
         listed = values + [1.0, 0.0]
         stated['phase_spread_rad'] = float(width[1])
         if found.shared > 0.0:
             stated['shared'] = found.shared
-    more = {}
     if kind == 'axes':
-        axes = np.concatenate([table.axis for table in parameters.tables])
         more = {'axes': tilted(axes, values)[keep].tolist()}
     record = EffectRecord(
         SPREADS[kind],
@@ -223,73 +166,46 @@ def _population(result: SurveyResult, kind: str) -> list[EffectRecord]:
         {'spread': float(width[0] * relative), 'values': sigma[keep].tolist()},
         _evidence(result, kind),
     )
-    return [record, *records]
+    return [record, *singles]
 
 
-def _single(
-    parameters: SensorParameters, kind: str, row: int, value: Array, sigma: Array
-) -> EffectRecord:
-    channels = np.concatenate([table.channel for table in parameters.tables])
-    channel, evidence = int(channels[row]), {'widths_of_its_population': FAR}
+def _single(kind: str, channel: int, axis: Array, value: Array, sigma: Array) -> EffectRecord:
+    """The record of a channel with such an error of its own."""
+    name, stated, sigmas = 'sensor_axis', dict[str, Any](channel=channel), dict[str, Any]()
     if kind == 'gains':
         gain = complex(1.0 + value[0], value[1])
-        return EffectRecord(
-            'sensor_gain',
-            {
-                'channel': channel,
-                'gain': abs(gain),
-                'phase_deg': float(np.degrees(np.angle(gain))),
-            },
-            {'gain': float(sigma[0]), 'phase_deg': float(np.degrees(sigma[1] / abs(gain)))},
-            evidence,
-        )
-    if kind == 'offsets':
-        return EffectRecord(
-            'pickup',
-            {'channel': channel, 'phasor_t': value.reshape(-1, 2).tolist()},
-            {'phasor_t': sigma.reshape(-1, 2).tolist()},
-            evidence,
-        )
-    if kind == 'places':
-        return EffectRecord(
-            'sensor_position',
-            {'channels': [channel], 'offset_m': value.tolist()},
-            {'offset_m': sigma.tolist()},
-            evidence,
-        )
-    surveyed = np.concatenate([table.axis for table in parameters.tables])[row]
-    return EffectRecord(
-        'sensor_axis',
-        {
-            'channel': channel,
+        name = 'sensor_gain'
+        stated |= {'gain': abs(gain), 'phase_deg': float(np.degrees(np.angle(gain)))}
+        phase_deg = float(np.degrees(sigma[1] / abs(gain)))
+        sigmas = {'gain': float(sigma[0]), 'phase_deg': phase_deg}
+    elif kind == 'offsets':
+        name = 'pickup'
+        stated['phasor_t'] = value.reshape(-1, 2).tolist()
+        sigmas = {'phasor_t': sigma.reshape(-1, 2).tolist()}
+    elif kind == 'places':
+        name = 'sensor_position'
+        stated = {'channels': [channel], 'offset_m': value.tolist()}
+        sigmas = {'offset_m': sigma.tolist()}
+    else:
+        stated |= {
             'tilt_deg': float(np.degrees(np.arctan(np.linalg.norm(value)))),
-            'axis': tilted(surveyed[None], value[None])[0].tolist(),
-            'surveyed_axis': surveyed.tolist(),
-        },
-        {'tilt_deg': float(np.degrees(np.linalg.norm(sigma)))},
-        evidence,
-    )
+            'axis': tilted(axis[None], value[None])[0].tolist(),
+            'surveyed_axis': axis.tolist(),
+        }
+        sigmas = {'tilt_deg': float(np.degrees(np.linalg.norm(sigma)))}
+    return EffectRecord(name, stated, sigmas, {'widths_of_its_population': FAR})
 
 
 def reported_effects(
-    result: SurveyResult, measurements: Sequence[Measurements]
+    result: SensorFit, measurements: Sequence[Measurements]
 ) -> tuple[EffectRecord, ...]:
-    """Return what the scan alone contained: metal that moved.
-
-    Parameters
-    ----------
-    result : SurveyResult
-        The survey.
-    measurements : sequence of Measurements
-        What was surveyed, one per body and session.
-    """
+    """Return what the scan alone contained: metal that moved."""
     spans = [
         span
         for whole, steady in zip(measurements, result.steady, strict=True)
         for span in spans_of(whole.time, ~steady)
     ]
-    records = [
+    return tuple(
         EffectRecord('moving_metal', {'t_start_s': span.start_s, 't_end_s': span.end_s})
         for span in dict.fromkeys(spans)
-    ]
-    return tuple(records)
+    )

@@ -10,11 +10,12 @@ import numpy as np
 
 from anser_ros.cli.folders import make_folder
 from anser_ros.cli.progress import progress_of
+from anser_ros.settings import Accuracy
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.metal import steel_disc
 from anser_ros.simulation.motion import Approach, Lissajous
-from anser_ros.simulation.recording import STATIC_NOISE_T, Errors, GridScan, record
+from anser_ros.simulation.recording import STATIC_NOISE_T, GridScan, record
 from anser_ros.simulation.world import World
 from anser_ros.wire.bag import bag_file
 from anser_ros.wire.config_folder import read_config
@@ -31,9 +32,7 @@ SECONDS = 8.0
 SCAN_HEIGHTS_M = (0.12, 0.18)
 """Heights of the scan's two layers, m. With them the three clusters of the tool cover 0.09 to 0.21
 m, the heights that the demo's tool reaches."""
-SCAN_ERRORS = Errors(
-    flux_noise_t=STATIC_NOISE_T, optical_jitter_m=0.01e-3, optical_jitter_rad=0.05e-3
-)
+SCAN_ERRORS = Accuracy(STATIC_NOISE_T, 0.01e-3, 0.05e-3)
 """Errors of the scan: means over a second at rest, of 60 optical poses with a jitter of 0.07 mm
 and 0.4 mrad each."""
 
@@ -69,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     path = Lissajous(centre_m=(0.0, 0.0, 0.16), amplitude_m=(0.08, 0.08, 0.02))
     paths = dict.fromkeys(setup.bodies, path)
     visit = steel_disc(Approach(near_m=(0.05, -0.03, -0.06), start_s=2.0, travel_s=3.0))
-    static, live = Errors(flux_noise_t=STATIC_NOISE_T), Errors()
+    static, live = Accuracy(STATIC_NOISE_T), Accuracy()
     sessions = (
         ('factory', scanned, scan.frames, 1.0, None, static),
         ('moving', World(setup, source, paths=paths), frames, RATE_HZ, OPTICAL_RATE_HZ, live),

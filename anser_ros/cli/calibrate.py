@@ -13,8 +13,7 @@ from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration
-from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
-from anser_ros.calibration.still import STILL_ONLY
+from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli.calibration_figure import draw_choice, draw_populations
 from anser_ros.cli.carry_out import carry_out
 from anser_ros.cli.folders import make_folder
@@ -24,12 +23,10 @@ from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.constants import DEGREES
-from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
+from anser_ros.sessions.calibration import NAMED_KINDS, calibrate_sessions, check_same_board
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session
 
-NAMED_KINDS = (*EXTRA_KINDS, *STILL_ONLY)
-"""Kinds of errors that are looked for only when they are named."""
 MOST_LISTED = 40
 """Entries of a list that are shown; of more, their number is."""
 LONG = ('values', 'uncertainty', 'axes')

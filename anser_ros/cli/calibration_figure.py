@@ -1,5 +1,6 @@
 """Draws a calibration: what was tried for the field, and how the sensors differ."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from anser_ros.calibration.result import Calibration
@@ -17,7 +18,8 @@ def draw_choice(calibration: Calibration, path: Path) -> None:
 
     from anser_ros.pictures import save
 
-    picked = calibration.chosen
+    layout = replace(calibration.layout, local=False)
+    picked = next(one for one in calibration.candidates if one.layout == layout)
     factor, unit = flux_unit(picked.score)
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5.4), layout='constrained')
     for mark, name, chosen in (

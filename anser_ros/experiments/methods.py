@@ -14,7 +14,8 @@ from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.result import Calibration
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
-from anser_ros.sessions.calibration import calibrate_sessions, generator_of
+from anser_ros.sessions.calibration import calibrate_sessions
+from anser_ros.sessions.calibration_engine import generator_of
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 

@@ -16,18 +16,19 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.experiments.recordings import HEAD_DISTANCES_CM, MATERIALS, Recordings
 from anser_ros.physics.dipole import field_basis
+from anser_ros.settings import Accuracy
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.metal import MetalBody, steel_disc
 from anser_ros.simulation.motion import Pose
-from anser_ros.simulation.recording import STATIC_NOISE_T, Errors, record
+from anser_ros.simulation.recording import STATIC_NOISE_T, record
 from anser_ros.simulation.world import FieldSource, World
 from anser_ros.wire.config_folder import config_path
 from anser_ros.wire.setup import SensorSpec, Setup, parse_setup
 
 Array = NDArray[np.float64]
 
-STATIC = Errors(flux_noise_t=STATIC_NOISE_T)
+STATIC = Accuracy(flux_noise_t=STATIC_NOISE_T)
 """Errors of a tool at rest; the noise is half of a single window's."""
 PLATE_EDGE_M = 0.25
 """Edge of the square plate, m, about as large as the board."""

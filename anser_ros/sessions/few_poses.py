@@ -97,9 +97,8 @@ def diagnose_few_poses(
     def calibrated(kinds: tuple[str, ...], what: str) -> Calibration:
         return calibrate_sessions(
             [known],
-            Options(estimate=kinds),
+            Options(estimate=kinds, is_joint=True),
             lambda stage, share: say(f'{what}: {stage}, {share:.0%}'),
-            is_joint=True,
         )
 
     before = calibrated((), 'with the sensors as they are')

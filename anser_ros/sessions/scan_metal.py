@@ -64,7 +64,7 @@ def without_resting_metal(
     The calibration has the metal in its field.
     """
     scan = calibration.scan
-    if scan.survey is None:
+    if scan.sensor_fit is None:
         return None
     measurements, start, found = list(scan.measurements), 0, []
     reported_effects = list(scan.reported_effects)
@@ -74,7 +74,7 @@ def without_resting_metal(
         spans = [
             span
             for row, tool in zip(rows, session.tools, strict=True)
-            for span in spans_of(tool.time, ~scan.survey.steady[row])
+            for span in spans_of(tool.time, ~scan.sensor_fit.steady[row])
         ]
         if not spans or session.reference is None:
             continue
@@ -171,7 +171,7 @@ def _problem(
 ) -> Problem | None:
     """The time between two times as a problem of its own, which starts at zero."""
     scan, reference, setup = calibration.scan, session.reference, session.setup
-    assert scan.survey is not None and reference is not None
+    assert scan.sensor_fit is not None and reference is not None
     inside = (reference.time >= begin) & (reference.time <= end)
     if (~inside).sum() < FEWEST_STEADY:
         return None
@@ -181,11 +181,11 @@ def _problem(
     baseline[known] = np.nanmean(steady[:, known], axis=0)
     learnt = cKDTree(np.concatenate([m.placed()[0].reshape(-1, 3) for m in scan.measurements]))
     tools = [
-        _near(learnt, _between(scan.survey.survey(tool.body).apply(tool), begin, end))
+        _near(learnt, _between(scan.sensor_fit.errors_of(tool.body).apply(tool), begin, end))
         for tool in session.tools
     ]
-    accuracy = replace(scan.accuracy, flux_noise_t=scan.survey.noise_t)
-    noise = float(np.hypot(scan.survey.noise_t, calibration.model.flux_error_t))
+    accuracy = replace(scan.accuracy, flux_noise_t=scan.sensor_fit.noise_t)
+    noise = float(np.hypot(scan.sensor_fit.noise_t, calibration.model.flux_error_t))
     try:
         return build_problem(
             tools, _between(reference, begin, end), baseline, calibration.model,

@@ -13,10 +13,7 @@ from anser_ros.wire.setup import Setup
 def board_source(setup: Setup) -> FieldSource:
     """Return the field of a setup's board, without the dipoles that models express it by.
 
-    Raises
-    ------
-    SetupError
-        When the setup's geometry does not describe a board.
+    Raises `SetupError` when the setup's geometry does not describe a board.
     """
     board = board_of(setup)
 

@@ -46,40 +46,20 @@ _COMMANDS = (Identify, Start, Stop, SetFrequencies)
 
 @dataclass(frozen=True)
 class Piece:
-    """Holds the bytes of one record, with what a port needs to know of it.
+    """Holds the bytes of one record, with what a port needs to know of it."""
 
-    Attributes
-    ----------
-    data : bytes
-        The record.
-    is_block : bool
-        Whether it carries samples; such a record may be dropped when the line is full.
-    end_sample : int
-        Number of samples since power-up after which a block is complete; 0 for other records.
-    """
-
-    data: bytes
+    data: bytes  # the record
+    # whether it carries samples; such a record may be dropped when the line is full
     is_block: bool = False
+    # number of samples since power-up after which a block is complete; 0 for other records
     end_sample: int = 0
 
 
 class ControlUnit:
     """Speaks the protocol of `docs/cu_protocol.md` as a control unit does.
 
-    Parameters
-    ----------
-    world : World
-        True fluxes of the sensors that it is connected to.
-    calibration : ChannelCalibration
-        True response of its channels.
-    front_end : FrontEnd, optional
-        Converter and noise.
-    block_samples : int
-        Samples in a block.
-    effects : sequence of RawEffect
-        Changes of the signals.
-    seed : int
-        Seed of the noise.
+    ``world`` has the true fluxes of the sensors that it is connected to, ``calibration`` the true
+    response of its channels.
     """
 
     def __init__(
@@ -153,10 +133,7 @@ class ControlUnit:
     def advance(self, samples: int) -> list[Piece]:
         """Let time pass and return the records of that time, in order.
 
-        Parameters
-        ----------
-        samples : int
-            Time in sampling instants; a block is sent once its last sample is taken.
+        ``samples``: time in sampling instants; a block is sent once its last sample is taken.
         """
         pieces: list[Piece] = []
         if self._sample >= self._next_hello:

@@ -33,27 +33,15 @@ RANDOM = 'random'
 
 @dataclass(frozen=True)
 class Drawn:
-    """Holds a drawn effect with its name and parameters.
+    """Holds a drawn effect with its name and parameters."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the effect.
-    parameters : dict
-        Its parameters as plain data, named as in docs/interfaces.md where the effect is there.
-    effects : tuple of RawEffect
-        What puts the effect into the signals.
-    metal : tuple of MetalBody
-        What puts it into the world.
-    answers : tuple of str
-        Names under which a diagnosis may rightly report the effect; empty where it has no such
-        effect and only ``unexplained`` is right.
-    """
-
-    name: str
+    name: str  # name of the effect
+    # its parameters as plain data, named as in docs/interfaces.md where the effect is there
     parameters: dict[str, Any]
-    effects: tuple[RawEffect, ...] = ()
-    metal: tuple[MetalBody, ...] = field(default=())
+    effects: tuple[RawEffect, ...] = ()  # what puts the effect into the signals
+    metal: tuple[MetalBody, ...] = field(default=())  # what puts it into the world
+    # names under which a diagnosis may rightly report the effect; empty where it has no such
+    # effect and only ``unexplained`` is right
     answers: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
@@ -210,21 +198,7 @@ CATALOGUE: dict[str, Callable[[Unit, np.random.Generator], Drawn]] = {
 def draw(name: str, setup: Setup, channels: ChannelCalibration, rng: np.random.Generator) -> Drawn:
     """Draw the parameters of an effect, and the effect itself when `name` is ``random``.
 
-    Parameters
-    ----------
-    name : str
-        A key of `CATALOGUE`, ``random`` or ``none``.
-    setup : Setup
-        The sensors and coils.
-    channels : ChannelCalibration
-        Response of the channels.
-    rng : numpy.random.Generator
-        Source of the draw.
-
-    Raises
-    ------
-    ParameterError
-        When there is no effect of that name.
+    Raises `ParameterError` when there is no effect of that name.
     """
     if name == NONE:
         return Drawn(NONE, {})

@@ -29,15 +29,6 @@ class FaultInjector:
     `bad_crc`, `gap` and `garbage` affect one block, the others last for some time. The owner of
     the unit and of its port has to act on `unplug`, `overrun` (the unit has no room for its
     blocks) and `saturation` (of its first channel) while they last.
-
-    Parameters
-    ----------
-    kind : str
-        One of `FAULTS`.
-    period_s : float
-        Time from one fault to the next, s.
-    seed : int
-        Seed of the damage.
     """
 
     def __init__(self, kind: str = NONE, period_s: float = 5.0, seed: int = 0) -> None:

@@ -16,23 +16,15 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class MetalBody:
-    """Moves a rigid cloud of equal spheres, which do not drive each other, on a path.
+    """Moves a rigid cloud of equal spheres, which do not drive each other, on a path."""
 
-    Attributes
-    ----------
-    offsets : ndarray, shape (M, 3)
-        Centres of the spheres in the body's frame, m.
-    radius_m, conductivity_s_per_m, relative_permeability : float
-        Radius (m), conductivity (S/m) and relative permeability of each sphere.
-    path : Path
-        Pose of the body over time.
-    """
-
-    offsets: Array
+    offsets: Array  # (M, 3): centres of the spheres in the body's frame, m
+    # radius_m, conductivity_s_per_m, relative_permeability: radius (m), conductivity (S/m) and
+    # relative permeability of each sphere
     radius_m: float
     conductivity_s_per_m: float
     relative_permeability: float
-    path: Path
+    path: Path  # pose of the body over time
 
     def centres(self, time_s: float) -> Array:
         """Return the centres of the spheres at a time, shape (M, 3), m, frame fg."""
@@ -52,14 +44,8 @@ class MetalBody:
 def steel_disc(path: Path | None = None, *, radius_m: float = 0.06, rings: int = 3) -> MetalBody:
     """Return a disc of touching steel balls, like the foot of a stand or the head of a C-arm.
 
-    Parameters
-    ----------
-    path : Path, optional
-        Pose over time; by default it approaches and leaves again.
-    radius_m : float
-        Radius of the disc, m.
-    rings : int
-        Rings of balls around the one in the middle.
+    ``path``: pose over time; by default it approaches and leaves again. ``radius_m``: radius of
+    the disc, m. ``rings``: rings of balls around the one in the middle.
     """
     ball = radius_m / (2 * rings + 1)
     centres = [np.zeros(3)]

@@ -19,24 +19,17 @@ Path = Callable[[float], Pose]
 
 @dataclass(frozen=True)
 class Lissajous:
-    """Describes a path of a sine in each coordinate and each component of the rotation vector.
+    """Describes a path of a sine in each coordinate and each component of the rotation vector."""
 
-    Attributes
-    ----------
-    centre_m, amplitude_m, period_s : tuple of three floats
-        Centre (m), amplitude (m) and period (s) of x, y and z in fg.
-    turn_rad, turn_period_s : tuple of three floats
-        Amplitude (rad) and period (s) of the components of the rotation vector.
-    phase_rad : float
-        Phase at the start, so that two bodies need not move alike.
-    """
-
+    # centre_m, amplitude_m, period_s: centre (m), amplitude (m) and period (s) of x, y and z in fg
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.15)
     amplitude_m: tuple[float, float, float] = (0.08, 0.08, 0.03)
     period_s: tuple[float, float, float] = (9.0, 12.5, 7.0)
+    # turn_rad, turn_period_s: amplitude (rad) and period (s) of the components of the rotation
+    # vector
     turn_rad: tuple[float, float, float] = (0.5, 0.4, 0.8)
     turn_period_s: tuple[float, float, float] = (11.0, 8.0, 17.0)
-    phase_rad: float = 0.0
+    phase_rad: float = 0.0  # phase at the start, so that two bodies need not move alike
 
     def __call__(self, time_s: float) -> Pose:
         """Return the pose at a time, s."""
@@ -61,24 +54,16 @@ def tool_paths(bodies: Sequence[str], phase_rad: float = 0.0) -> Mapping[str, Pa
 
 @dataclass(frozen=True)
 class Approach:
-    """Describes a path that comes near, stays, and leaves again, each way along a smooth ramp.
+    """Describes a path that comes near, stays, and leaves again, each way along a smooth ramp."""
 
-    Attributes
-    ----------
-    far_m, near_m : tuple of three floats
-        Positions between which it moves, m, frame fg.
-    start_s, travel_s, stay_s : float
-        Time of the start, time for one way, and time near, s.
-    period_s : float
-        Time after which the visit repeats, s; 0 for a single visit.
-    """
-
+    # far_m, near_m: positions between which it moves, m, frame fg
     far_m: tuple[float, float, float] = (0.05, -0.03, -0.6)
     near_m: tuple[float, float, float] = (0.05, -0.03, -0.08)
+    # start_s, travel_s, stay_s: time of the start, time for one way, and time near, s
     start_s: float = 8.0
     travel_s: float = 5.0
     stay_s: float = 6.0
-    period_s: float = 0.0
+    period_s: float = 0.0  # time after which the visit repeats, s; 0 for a single visit
 
     def __call__(self, time_s: float) -> Pose:
         """Return the pose at a time, s; the orientation is constant."""

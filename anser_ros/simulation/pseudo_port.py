@@ -20,18 +20,10 @@ loses blocks instead of falling behind more and more."""
 
 
 class PseudoPort:
-    """Holds the device's end of the line, which never blocks.
+    """Holds the device's end of the line, which never blocks; the host opens the link.
 
-    Parameters
-    ----------
-    link : Path
-        Path under which the host opens the port.
-
-    Raises
-    ------
-    PortError
-        When something other than a link has that path, another simulated device has it, or the
-        link cannot be made.
+    Raises `PortError` when something other than a link has that path, another simulated device has
+    it, or the link cannot be made.
     """
 
     def __init__(self, link: Path) -> None:

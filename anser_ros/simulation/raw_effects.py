@@ -8,7 +8,6 @@ clock. An effect does not know which analysis will look at the result.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,84 +45,78 @@ class RawEffect:
 
 @dataclass(frozen=True)
 class RawChannelCrosstalk(RawEffect):
-    """Makes crosstalk between the sensors of one cluster.
+    """Makes crosstalk between the sensors of one cluster."""
 
-    Attributes
-    ----------
-    columns : tuple of int
-        Columns of the cluster's sensors in the order of the setup.
-    matrix : tuple of tuple of float
-        Gain from each sensor (column) to each channel (row), with ones on the diagonal.
-    """
-
-    columns: tuple[int, ...]
+    columns: tuple[int, ...]  # of the cluster's sensors in the order of the setup
+    # gain from each sensor (column) to each channel (row), with ones on the diagonal
     matrix: tuple[tuple[float, ...], ...]
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Return the voltages with those of the cluster mixed."""
         mixed = volts.copy()
         mixed[:, list(self.columns)] = volts[:, list(self.columns)] @ np.array(self.matrix).T
         return mixed
 
 
 @dataclass(frozen=True)
-class CompressingAmplifier(RawEffect):
-    """Saturates one sensor's amplifier: v becomes ``limit * tanh(v / limit)``."""
+class OneSensor(RawEffect):
+    """Changes the voltages of one sensor, at its column in the order of the setup."""
 
     column: int
-    limit_v: float
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Return the voltages with those of the sensor compressed."""
-        compressed = volts.copy()
-        compressed[:, self.column] = self.limit_v * np.tanh(volts[:, self.column] / self.limit_v)
-        return compressed
+        changed = volts.copy()
+        changed[:, self.column] = self.changed(time_s, volts[:, self.column])
+        return changed
+
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        """Return the sensor's voltages (n,), V."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class CrossoverAmplifier(RawEffect):
+class CompressingAmplifier(OneSensor):
+    """Saturates one sensor's amplifier: v becomes ``limit * tanh(v / limit)``."""
+
+    limit_v: float
+
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        return np.asarray(self.limit_v * np.tanh(volts / self.limit_v))
+
+
+@dataclass(frozen=True)
+class CrossoverAmplifier(OneSensor):
     """Distorts one sensor by crossover: v becomes ``v - dead * tanh(v / dead)``.
 
     The diagnosis has no such effect. The weaker all tones are, the larger is the lost fraction.
     """
 
-    column: int
     dead_v: float
 
-    def volts(self, time_s: Array, volts: Array) -> Array:
-        """Return the voltages with the dead zone subtracted from those of the sensor."""
-        crossed = volts.copy()
-        crossed[:, self.column] -= self.dead_v * np.tanh(volts[:, self.column] / self.dead_v)
-        return crossed
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        return np.asarray(volts - self.dead_v * np.tanh(volts / self.dead_v))
 
 
 @dataclass(frozen=True)
-class LooseSensor(RawEffect):
-    """Loosens a sensor's contact: periodically its voltage drops to a small remainder.
+class LooseSensor(OneSensor):
+    """Loosens a sensor's contact: periodically its voltage drops to a small remainder."""
 
-    Attributes
-    ----------
-    column : int
-        Column of the sensor in the order of the setup.
-    share : float
-        Fraction of the time in which the contact is open.
-    rest : float
-        Factor of the voltage at an open contact.
-    period_s : float
-        Time from one opening to the next, s.
-    """
+    share: float = 0.1  # fraction of the time in which the contact is open
+    rest: float = 0.02  # factor of the voltage at an open contact
+    period_s: float = 0.7  # from one opening to the next, s
 
-    column: int
-    share: float = 0.1
-    rest: float = 0.02
-    period_s: float = 0.7
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        is_open = (time_s / self.period_s) % 1.0 < self.share
+        return np.where(is_open, volts * self.rest, volts)
 
-    def volts(self, time_s: Array, volts: Array) -> Array:
-        """Return the voltages with those of the sensor reduced while its contact is open."""
-        open_contact = (time_s / self.period_s) % 1.0 < self.share
-        loose = volts.copy()
-        loose[open_contact, self.column] *= self.rest
-        return loose
+
+@dataclass(frozen=True)
+class ChannelGain(OneSensor):
+    """Makes the gain of one channel wrong."""
+
+    gain: float
+
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        return volts * self.gain
 
 
 @dataclass(frozen=True)
@@ -134,7 +127,6 @@ class OpticalClock(RawEffect):
     fast_ppm: float = 0.0
 
     def optical_time(self, time_s: float) -> float:
-        """Return the time by the wrong clock, s."""
         return time_s * (1.0 + 1e-6 * self.fast_ppm) - self.early_s
 
 
@@ -146,24 +138,9 @@ class TiltedSensor(RawEffect):
     axis: tuple[float, float, float]
 
     def setup(self, setup: Setup) -> Setup:
-        """Return the setup with the true axis of the sensor."""
         sensors = list(setup.sensors)
         sensors[self.column] = replace(sensors[self.column], axis=self.axis)
         return replace(setup, sensors=tuple(sensors))
-
-
-@dataclass(frozen=True)
-class ChannelGain(RawEffect):
-    """Makes the gain of one channel wrong."""
-
-    column: int
-    gain: float
-
-    def volts(self, time_s: Array, volts: Array) -> Array:
-        """Return the voltages with those of the channel scaled."""
-        scaled = volts.copy()
-        scaled[:, self.column] *= self.gain
-        return scaled
 
 
 @dataclass(frozen=True)
@@ -174,7 +151,6 @@ class GainRipple(RawEffect):
     period_s: float
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Return the voltages times the oscillating gain."""
         swing = 1 + self.depth * np.sin(2 * np.pi * time_s / self.period_s)
         return np.asarray(volts * swing[:, None])
 
@@ -188,14 +164,6 @@ class CoilWeakens(RawEffect):
     tau_s: float
 
     def flux(self, time_s: float, flux: ComplexArray) -> ComplexArray:
-        """Return the fluxes with those of the coil at their strength of the time."""
         drifted = flux.copy()
         drifted[:, self.coil] *= 1 + self.amount * (1 - np.exp(-time_s / self.tau_s))
         return drifted
-
-
-def chained_volts(effects: Sequence[RawEffect], time_s: Array, volts: Array) -> Array:
-    """Return the voltages after all effects, applied in their order."""
-    for effect in effects:
-        volts = effect.volts(time_s, volts)
-    return volts

@@ -29,44 +29,14 @@ STATIC_NOISE_T = 30e-12
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Holds standard deviations of the errors of a recording's instruments.
-
-    Attributes
-    ----------
-    flux_noise_t : float
-        Noise of each phasor component, T.
-    optical_jitter_m, optical_jitter_rad : float
-        Jitter of each axis of the optical pose, m and rad.
-    """
-
-    flux_noise_t: float = Accuracy.flux_noise_t
-    optical_jitter_m: float = Accuracy.optical_position_m
-    optical_jitter_rad: float = Accuracy.optical_rotation_rad
-
-
-@dataclass(frozen=True)
 class GridScan:
-    """Moves a body so that it rests at one grid point after another, layer by layer.
+    """Moves a body so that it rests at one grid point after another, layer by layer."""
 
-    Attributes
-    ----------
-    count : int
-        Points along x and along y.
-    span_m : float
-        Edge of the square that they cover, m.
-    heights_m : tuple of float
-        Height z of the body's origin in each layer, m.
-    dwell_s : float
-        Time at each point, s.
-    tilt_rad : float
-        Size of small rotations that differ from point to point, so that no two poses are parallel.
-    """
-
-    count: int = 13
-    span_m: float = 0.30
-    heights_m: tuple[float, ...] = (0.15,)
-    dwell_s: float = 1.0
+    count: int = 13  # points along x and along y
+    span_m: float = 0.30  # edge of the square that they cover, m
+    heights_m: tuple[float, ...] = (0.15,)  # height z of the body's origin in each layer, m
+    dwell_s: float = 1.0  # time at each point, s
+    # size of small rotations that differ from point to point, so that no two poses are parallel
     tilt_rad: float = 0.02
 
     @property
@@ -86,10 +56,10 @@ class GridScan:
         return position, np.asarray(rotation)
 
 
-def _jittered(pose: Pose, errors: Errors, rng: np.random.Generator) -> tuple[Array, Array]:
+def _jittered(pose: Pose, errors: Accuracy, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return a pose as an optical tracker reports it: position (m) and quaternion x y z w."""
-    position = pose[0] + rng.normal(scale=errors.optical_jitter_m, size=3)
-    turn = Rotation.from_rotvec(rng.normal(scale=errors.optical_jitter_rad, size=3))
+    position = pose[0] + rng.normal(scale=errors.optical_position_m, size=3)
+    turn = Rotation.from_rotvec(rng.normal(scale=errors.optical_rotation_rad, size=3))
     return position, np.asarray((turn * Rotation.from_matrix(pose[1])).as_quat())
 
 
@@ -100,33 +70,14 @@ def record(
     frames: int,
     rate_hz: float,
     optical_rate_hz: float | None,
-    errors: Errors,
+    errors: Accuracy,
     rng: np.random.Generator,
 ) -> None:
     """Write a session of a world into a bag.
 
-    Parameters
-    ----------
-    path : str
-        The ``.mcap`` file; it must not exist yet.
-    world : World
-        True fluxes and poses.
-    frames : int
-        Number of flux windows.
-    rate_hz : float
-        Their rate, Hz.
-    optical_rate_hz : float or None
-        Rate of the optical poses, Hz, which begin and end `OPTICAL_MARGIN_S` outside the fluxes;
-        None for one pose at every flux stamp (a static recording).
-    errors : Errors
-        Noise and jitter.
-    rng : numpy.random.Generator
-        Source of the errors.
-
-    Raises
-    ------
-    BagError
-        When the file exists or cannot be written.
+    It has so many flux ``frames``. The optical poses begin and end `OPTICAL_MARGIN_S` outside of
+    them; without a rate of their own (a static recording) there is one at every flux stamp.
+    Raises `BagError` when the file exists or cannot be written.
     """
     stamps = {(START_NS + round(i / rate_hz * SECOND_NS), i / rate_hz) for i in range(frames)}
     with SessionWriter(path) as writer:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.simulation.raw_effects import RawEffect, chained_volts
+from anser_ros.simulation.raw_effects import RawEffect
 from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import ChannelCalibration
 from anser_ros.wire.records import FULL_SCALE_CODE
@@ -23,29 +23,18 @@ OVERLOAD_GAIN = 1e4
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """Describes the analogue side of a control unit with its converter.
+    """Describes the analogue side of a control unit with its converter."""
 
-    Attributes
-    ----------
-    sample_rate_hz : float
-        Samples a second and channel.
-    full_scale_v, full_scale_a : float
-        Voltage and current at code 32768, V and A.
-    noise_codes, current_noise_codes : float
-        White noise before the converter of the sensors and of the currents, codes rms a sample.
-    current_drift : float
-        Fraction by which the currents fall while the coils warm up.
-    warm_up_s : float
-        Time constant of the warming, from the first start on, s.
-    """
-
-    sample_rate_hz: float = 40e3
+    sample_rate_hz: float = 40e3  # samples a second and channel
+    # full_scale_v, full_scale_a: voltage and current at code 32768, V and A
     full_scale_v: float = 5.0
     full_scale_a: float = 2.5
+    # noise_codes, current_noise_codes: white noise before the converter of the sensors and of the
+    # currents, codes rms a sample
     noise_codes: float = 2.4
     current_noise_codes: float = 0.5
-    current_drift: float = 0.02
-    warm_up_s: float = 60.0
+    current_drift: float = 0.02  # fraction by which the currents fall while the coils warm up
+    warm_up_s: float = 60.0  # time constant of the warming, from the first start on, s
 
 
 class Sampler:
@@ -54,20 +43,8 @@ class Sampler:
     Within a stretch the phasors change linearly between the world's at its two ends, so that
     stretches of 5 ms follow a tool at 0.1 m/s to some 10 pT.
 
-    Parameters
-    ----------
-    world : World
-        True fluxes.
-    calibration : ChannelCalibration
-        True response of the channels.
-    front_end : FrontEnd
-        Converter and noise.
-    nominal_current_a : float
-        Peak current that the world's fluxes are given for, A.
-    effects : sequence of RawEffect
-        Changes of the signals, in order.
-    seed : int
-        Seed of the noise.
+    ``calibration`` is the true response of the channels, ``nominal_current_a`` the peak current
+    that the world's fluxes are given for, A.
     """
 
     def __init__(
@@ -113,10 +90,7 @@ class Sampler:
     def codes(self, first_sample: int, count: int) -> NDArray[np.int16]:
         """Return the converter codes of `count` samples from `first_sample` since power-up on.
 
-        Returns
-        -------
-        ndarray, shape (count, S + 1), int16
-            Sensors in the order of the setup, then the sum of currents.
+        Returns sensors in the order of the setup, then the sum of currents.
         """
         rate = self._front_end.sample_rate_hz
         begin_s, end_s = first_sample / rate, (first_sample + count) / rate
@@ -132,8 +106,8 @@ class Sampler:
         change = end - begin
         signals = basis @ np.vstack([begin.T.real, begin.T.imag, change.T.real, change.T.imag])
         volts, current = signals[:, :-1], signals[:, -1]
-        if self._effects:
-            volts = chained_volts(self._effects, time_s - self._start_s, volts)
+        for effect in self._effects:
+            volts = effect.volts(time_s - self._start_s, volts)
         if self.is_overloaded:
             volts = volts * np.where(np.arange(volts.shape[1]) == 0, OVERLOAD_GAIN, 1.0)
         return self._convert(volts, current)

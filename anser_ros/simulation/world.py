@@ -24,16 +24,9 @@ FieldSource = Callable[[Array], ComplexArray]
 class World:
     """Holds the sensors of a setup in the field of a board and of metal.
 
-    Parameters
-    ----------
-    setup : Setup
-        The sensors and the bodies that they are on.
-    source : FieldSource
-        Field of the emitters without metal.
-    paths : mapping of str to Path, optional
-        Pose of each moving body over time; a body without one moves on a default path.
-    metal : sequence of MetalBody
-        Bodies that distort the field.
+    ``setup``: the sensors and the bodies that they are on. ``source``: field of the emitters
+    without metal. ``paths``: pose of each moving body over time; a body without one moves on a
+    default path. ``metal``: bodies that distort the field.
     """
 
     def __init__(

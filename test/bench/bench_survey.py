@@ -17,6 +17,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):  # before numpy is imported
@@ -36,10 +37,10 @@ from calibration_world import (  # noqa: E402
     tool_of,
 )
 
-from anser_ros.calibration.calibrate import Options, fit_scan, survey  # noqa: E402
+from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan  # noqa: E402
 from anser_ros.calibration.layouts import Layout  # noqa: E402
 from anser_ros.calibration.sensor_parameters import KINDS  # noqa: E402
-from anser_ros.calibration.sensor_survey import SensorSurveyor  # noqa: E402
+from anser_ros.calibration.sensor_survey import SensorFitter  # noqa: E402
 from anser_ros.settings import Accuracy  # noqa: E402
 from anser_ros.tracking.estimate import TrackerSettings  # noqa: E402
 from anser_ros.tracking.tracker import Tracker  # noqa: E402
@@ -102,8 +103,9 @@ def _tracked(
     names = tuple(f'coil{k}' for k in range(len(CENTRES)))
     tones = tuple(6000.0 + 170.0 * np.arange(len(CENTRES)))
     options = Options(layout=LAYER, estimate=kinds)
-    scan = survey([told], world.generator, options)
-    model = fit_scan(scan, ['scan'], world.generator, names, tones, options).model
+    generator = replace(world.generator, emitters=names, frequencies_hz=tones)
+    scan = correct_scan([told], generator, options)
+    model = fit_scan(scan, ['scan'], generator, options).model
     at = UNSEEN_S + np.arange(0.0, 20.0, 0.04)
     position, rotation = hand(at, turn)
     points, axes = table.with_geometry(
@@ -123,7 +125,9 @@ def _tracked(
             squares[i, c] = error**2
             over += int(error > 3.0 * one.sigma_position_m)
     rms = 1e3 * np.sqrt(np.nanmean(squares, axis=0))
-    undetermined = '' if scan.survey is None else ', '.join(sorted(scan.survey.undetermined))
+    undetermined = (
+        '' if scan.sensor_fit is None else ', '.join(sorted(scan.sensor_fit.undetermined))
+    )
     ok = np.isfinite(squares).sum()
     return (
         float(np.sqrt(np.mean(rms**2))),
@@ -139,14 +143,14 @@ def row_of(coils: int, seconds: float, turns_deg: float, errors: Errors, seed: i
     world, table = scene(rng, side=4), tool_of(coils)
     told, truth = moved_scan(world, table, rng, seconds, errors, np.radians(turns_deg))
     begin = time.process_time()
-    found = SensorSurveyor([told], KINDS, world.generator, Accuracy()).fit()
+    found = SensorFitter([told], KINDS, world.generator, Accuracy()).fit()
     spent = time.process_time() - begin
-    survey = found.survey('tool')
-    gain = 100.0 * np.sqrt(np.mean(np.abs(survey.gain - truth.gain) ** 2))
-    axis = 1e3 * np.sqrt(np.mean(np.sum((survey.axis - truth.axis) ** 2, axis=1)))
-    place = 1e3 * np.sqrt(np.mean(np.sum((survey.place - truth.place) ** 2, axis=1)))
-    lever = 1e3 * np.linalg.norm(survey.lever_arm - truth.lever)
-    offset = 1e3 * abs(survey.offset_s - errors.offset_s)
+    own = found.errors_of('tool')
+    gain = 100.0 * np.sqrt(np.mean(np.abs(own.gain - truth.gain) ** 2))
+    axis = 1e3 * np.sqrt(np.mean(np.sum((own.axis - truth.axis) ** 2, axis=1)))
+    place = 1e3 * np.sqrt(np.mean(np.sum((own.place - truth.place) ** 2, axis=1)))
+    lever = 1e3 * np.linalg.norm(own.lever_arm - truth.lever)
+    offset = 1e3 * abs(own.offset_s - errors.offset_s)
     undetermined = ', '.join(sorted(found.undetermined)) or 'nothing'
     values = (
         coils, f'{seconds:g}', f'{turns_deg:g}', f'{100 * errors.gain:g}',
