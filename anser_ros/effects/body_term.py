@@ -1,4 +1,5 @@
-"""Defines the term of metal whose body is a sum of modes, and which the search refines.
+"""Defines the terms that the search refines: metal whose body is a sum of modes, and what
+fluctuates.
 
 A simple body has few modes; a real one has more, which are chosen from the data (`with_body`).
 Metal whose response changes with time also has a course, which may be refined as well (`freer`).
@@ -119,3 +120,31 @@ class BodyTerm(Term):
     def restarted(self) -> Self | None:
         """Return the body as it is, where its course started from; None where that isn't known."""
         return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FluctuationTerm(Term):
+    """Holds something constant that fluctuates; theta is empty.
+
+    Attributes
+    ----------
+    constant : Term or None
+        The constant effect at the same site; None for a term from a record.
+    spread : ndarray or None
+        Standard deviation of each of its parameters from frame to frame; None before it is found.
+    frames : int
+        Frames that the spread was found on.
+    """
+
+    constant: Term | None = None
+    spread: Array | None = None
+    frames: int = 1
+
+    def columns(self, view: View) -> ComplexArray | None:
+        """Return columns (F, S, K, q) of unit size along which a frame may move."""
+        return None if self.constant is None else self.constant.effect.columns(self.constant, view)
+
+    @property
+    def expected(self) -> Array:
+        """Return each parameter's standard deviation by the constant effect, shape (q,)."""
+        return np.zeros(0) if self.constant is None else self.constant.effect.prior(self.constant)

@@ -7,12 +7,12 @@ column whatever its course, and explains and hides only what those columns can.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import numpy as np
 
 from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.body_term import FluctuationTerm
 from anser_ros.effects.coil_gain import CoilGain
 from anser_ros.effects.effect import (
     Array,
@@ -38,34 +38,6 @@ OPEN = 40
 has, whose columns it shares, and less than shaped metal (60), whose freedom is what it replaces.
 Larger lets moving metal explain an emitter that steps; smaller lets a fluctuation take over from
 a curve with several parameters."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FluctuationTerm(Term):
-    """Holds something constant that fluctuates; theta is empty.
-
-    Attributes
-    ----------
-    constant : Term or None
-        The constant effect at the same site; None for a term from a record.
-    spread : ndarray or None
-        Standard deviation of each of its parameters from frame to frame; None before it is found.
-    frames : int
-        Frames that the spread was found on.
-    """
-
-    constant: Term | None = None
-    spread: Array | None = None
-    frames: int = 1
-
-    def columns(self, view: View) -> ComplexArray | None:
-        """Return columns (F, S, K, q) of unit size along which a frame may move."""
-        return None if self.constant is None else self.constant.effect.columns(self.constant, view)
-
-    @property
-    def expected(self) -> Array:
-        """Return each parameter's standard deviation by the constant effect, shape (q,)."""
-        return np.zeros(0) if self.constant is None else self.constant.effect.prior(self.constant)
 
 
 class Fluctuation(Effect[FluctuationTerm]):

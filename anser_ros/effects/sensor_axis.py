@@ -14,7 +14,6 @@ from anser_ros.effects.effect import (
     Effect,
     Remedy,
     needed,
-    orthogonal_pair,
     sigmas,
     whole_numbers,
 )
@@ -23,6 +22,7 @@ from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tangent import tangents, tilted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
             if row is None:
                 return None
             surveyed = np.array(term.surveyed)
-            pair, axis = orthogonal_pair(surveyed), self._tilted(term)
+            pair, axis = tangents(surveyed[None])[0], self._tilted(term)
             length = np.linalg.norm(surveyed + term.theta @ pair)
             across = (pair - np.outer(pair @ axis, axis)) / length
             steps = np.einsum('fij,tj->fti', view.rotation, across)
@@ -111,8 +111,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
 
     def _tilted(self, term: SensorAxisTerm) -> Array:
         surveyed = np.array(term.surveyed)
-        axis = surveyed + term.theta @ orthogonal_pair(surveyed)
-        return np.asarray(axis / np.linalg.norm(axis))
+        return tilted(surveyed[None], term.theta[None])[0]
 
     def record(self, term: SensorAxisTerm, covariance: Array) -> EffectRecord:
         """Record tilt and true axis, or the cluster's rotation."""
@@ -148,7 +147,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
         along = float(axis @ surveyed)
         if along <= 0:
             raise ModelFileError('model: sensor_axis turns an axis by a right angle or more')
-        theta = orthogonal_pair(surveyed) @ (axis / along)
+        theta = tangents(surveyed[None])[0] @ (axis / along)
         site: Site = {'channel': int(needed(record, 'channel'))}
         return SensorAxisTerm(self, site, theta, surveyed=tuple(surveyed.tolist()))
 

@@ -263,19 +263,25 @@ def flux_jacobian(
     signs = (1.0, -1.0) if half.any() else (1.0,)
 
     def work(rows: slice) -> None:
-        basis = np.empty((AT_ONCE, 9, q.shape[0]))
-        for here in slices_of(rows, AT_ONCE):
-            few, (n0, n1, n2) = basis[: here.stop - here.start], n[here].T[:, :, None]
-            for sign in signs:
-                away = sign * half[here]
-                fill_fields(r[here] + away * n[here], dipoles, few)
-                f = (few.reshape(-1, len(m)) @ m).reshape(len(few), 9, -1) / len(signs)
-                slope = np.empty((len(few), 3, m.shape[1]))
-                for i, (x, y, z) in enumerate(((3, 4, 5), (4, 6, 7), (5, 7, 8))):
-                    slope[:, i] = n0 * f[:, x] + n1 * f[:, y] + n2 * f[:, z]
-                flux[here] += n0 * f[:, 0] + n1 * f[:, 1] + n2 * f[:, 2]
-                d_r[here] += slope
-                d_n[here] += f[:, :3] + away[:, :, None] * slope
+        f, basis = (
+            np.empty((rows.stop - rows.start, 9, m.shape[1])),
+            np.empty((AT_ONCE, 9, len(m))),
+        )
+        n0, n1, n2 = n[rows].T[:, :, None]
+        for sign in signs:
+            away = sign * half[rows]
+            places = r[rows] + away * n[rows]
+            for here in slices_of(slice(0, len(f)), AT_ONCE):
+                few = basis[: here.stop - here.start]
+                fill_fields(places[here], dipoles, few)
+                np.matmul(few.reshape(-1, len(m)), m, out=f[here].reshape(9 * len(few), -1))
+            f /= len(signs)
+            slope = np.empty((len(f), 3, m.shape[1]))
+            for i, (x, y, z) in enumerate(((3, 4, 5), (4, 6, 7), (5, 7, 8))):
+                slope[:, i] = n0 * f[:, x] + n1 * f[:, y] + n2 * f[:, z]
+            flux[rows] += n0 * f[:, 0] + n1 * f[:, 1] + n2 * f[:, 2]
+            d_r[rows] += slope
+            d_n[rows] += f[:, :3] + away[:, :, None] * slope
 
     in_order(work, slices(len(r), POINTS_A_THREAD))
     return flux.view(np.complex128), d_r.view(np.complex128), d_n.view(np.complex128)

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
+from anser_ros.physics.angles import nearest_rotation
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.tracking.body_descent import descend_body, fill_common
-from anser_ros.tracking.rotations import nearest_rotation
 from anser_ros.tracking.seed import SeedGrid
 from anser_ros.tracking.solve import Array, RealField
 
@@ -246,10 +246,7 @@ def start_from_grid(
     )
     fields = model.view(np.float64).reshape(total, 3, -1)
     measured = coils.axes.T @ flux
-    u, _, vt = np.linalg.svd(np.einsum('gik,jk->gij', fields, measured))
-    sign = np.sign(np.linalg.det(u @ vt))
-    u[:, :, 2] *= sign[:, None]
-    rotations = u @ vt
+    rotations = nearest_rotation(np.einsum('gik,jk->gij', fields, measured))
     predicted = np.einsum('sj,gij,gik->gsk', coils.axes, rotations, fields, optimize=True)
     misfit = ((flux - predicted) ** 2).sum(axis=(1, 2))
     order: Sequence[int] = np.argsort(misfit, kind='stable')[: 8 * GRID_STARTS].tolist()
