@@ -198,7 +198,7 @@ class Effect(Generic[TermT]):
         return int(term.theta.size)
 
     def covers(self, term: TermT, candidate: Term) -> bool:
-        """Return whether a term of this effect in force stands for a candidate already."""
+        """Return whether an active term of this effect stands for a candidate already."""
         return candidate.name_and_site == term.name_and_site
 
     def rivals(self, term: TermT, other: Term) -> bool:
@@ -316,6 +316,11 @@ def needed(record: EffectRecord, key: str) -> Any:
 def whole_numbers(record: EffectRecord, key: str) -> tuple[int, ...]:
     """Return the channels or coils of a record; raises `ModelFileError` when they are missing."""
     return tuple(int(number) for number in needed(record, key))
+
+
+def recorded_site(term: Term) -> dict[str, Any]:
+    """Return a term's site as its record has it, with lists in place of tuples."""
+    return {key: list(v) if isinstance(v, tuple) else v for key, v in term.site.items()}
 
 
 def sigmas(covariance: Array) -> Array:

@@ -21,6 +21,7 @@ from anser_ros.effects.effect import (
     Family,
     Remedy,
     needed,
+    recorded_site,
     whole_numbers,
 )
 from anser_ros.effects.registration import Registration
@@ -98,11 +99,8 @@ class Fluctuation(Effect[FluctuationTerm]):
         """Record where it is, and how much; sigma is that of a spread of so many numbers."""
         spread = np.zeros(1) if term.spread is None else term.spread
         rms = float(np.sqrt(np.sum(spread**2)))
-        where: dict[str, Any] = {**term.site}
-        if 'channels' in where:
-            where['channels'] = list(where['channels'])
         sigma = rms / float(np.sqrt(2 * max(term.frames, 1)))
-        return EffectRecord(self.name, {**where, 'rms': rms}, {'rms': sigma})
+        return EffectRecord(self.name, {**recorded_site(term), 'rms': rms}, {'rms': sigma})
 
     def term(self, record: EffectRecord) -> FluctuationTerm:
         """Return where it is; what it does in a frame only the frame can tell."""

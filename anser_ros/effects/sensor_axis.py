@@ -111,7 +111,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
 
     def _tilted(self, term: SensorAxisTerm) -> Array:
         surveyed = np.array(term.surveyed)
-        return tilted(surveyed[None], term.theta[None])[0]
+        return np.asarray(tilted(surveyed[None], term.theta[None])[0])
 
     def record(self, term: SensorAxisTerm, covariance: Array) -> EffectRecord:
         """Record tilt and true axis, or the cluster's rotation."""

@@ -34,7 +34,7 @@ class Site(TypedDict, total=False):
     z: float  # height of a sheet, m, frame fg
     edge: float  # length of its edge, m
     degree: int  # of a map's polynomial
-    lowest: int  # lowest degree in it, 1 where it is not told
+    lowest: int  # lowest degree in it, 1 where it is not stated
     centre_m: list[float]  # where the polynomial's coordinates are zero, frame of the tracker
     size_m: float  # what they are divided by
     middle_s: float  # time at which a clock's offset is its offset

@@ -14,7 +14,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class View:
-    """Holds predicted readings of a body's S sensors in F frames, with some effects in force.
+    """Holds predicted readings of a body's S sensors in F frames, with some active effects.
 
     Attributes
     ----------

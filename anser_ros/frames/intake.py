@@ -41,7 +41,7 @@ class Frame:
     codes : ndarray of int, shape (S,)
         What is wrong with each reading: places in `frames.faults.FAULTS`, 0 for nothing.
     living : ndarray of bool, shape (K,), or None
-        Emitters that a usable sensor hears; None when all are heard, or none at all.
+        Emitters that a usable sensor receives; None when all are received, or none at all.
     goes_back : bool
         Whether the stamp is before that of the frame before.
     """
@@ -100,7 +100,7 @@ class Intake:
     last_ns : int
         Stamp of the last admitted frame; 0 before.
     dead : tuple of str
-        Emitters that no sensor heard in that frame while others were heard.
+        Emitters that no sensor received in that frame while others were received.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Intake:
 
         Raises
         ------
-        LayoutError or what the intake was told
+        LayoutError, or the intake's own error
             As `judge`, and when the emitters are not as many as there ought to be.
         """
         frame = self.judge(stamp_ns, channels, flux, flags, None if emitters is None else
@@ -199,7 +199,7 @@ class Intake:
 
         Raises
         ------
-        LayoutError or what the intake was told
+        LayoutError, or the intake's own error
             When the stamp is not positive, shapes don't fit, a channel appears twice, or the
             emitters are not as many as there ought to be.
         """

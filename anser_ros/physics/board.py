@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import SetupError
-from anser_ros.physics.tracks import loop_moment, paths_field
+from anser_ros.physics.tracks import loop_field, loop_moment
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class Board:
         ndarray, shape (P, K, 3)
             Flux density, T, frame fg.
         """
-        return paths_field(self.paths, points, np.full(len(self.names), self.current_a))
+        return np.stack([loop_field(path, points, self.current_a) for path in self.paths], axis=1)
 
     def moments(self) -> Array:
         """Return the magnetic moment of every coil, shape (K, 3), A m^2, frame fg."""

@@ -107,7 +107,8 @@ def fill_fields(points, dipoles, out):  # type: ignore[no-untyped-def]
                 place += 1
 
 
-def _rows(values: NDArray[np.generic], width: int, what: str) -> Array:
+def rows_of(values: NDArray[np.generic], width: int, what: str) -> Array:
+    """Return values as contiguous rows (n, width); raises `ValueError` for any other shape."""
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != width:
         raise ValueError(f'{what} must have shape (n, {width}), got {array.shape}')
@@ -117,7 +118,7 @@ def _rows(values: NDArray[np.generic], width: int, what: str) -> Array:
 def _sensors(
     points: NDArray[np.generic], axes: NDArray[np.generic], lengths: NDArray[np.generic] | None
 ) -> tuple[Array, Array, Array]:
-    r, n = _rows(points, 3, 'points'), _rows(axes, 3, 'axes')
+    r, n = rows_of(points, 3, 'points'), rows_of(axes, 3, 'axes')
     if r.shape != n.shape:
         raise ValueError(f'points and axes must match, got {r.shape} and {n.shape}')
     if lengths is None:
@@ -159,7 +160,7 @@ def flux_basis(
         When the shapes do not fit together.
     """
     r, n, spans = _sensors(points, axes, lengths)
-    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
     out = np.empty((r.shape[0], q.shape[0]))
     fill_flux_basis(r, n, spans, dipole_rows(q, u), out)
     return out
@@ -182,8 +183,8 @@ def field_basis(
     ndarray, shape (P, N, 3)
         Field vectors, frame fg, T / (A m^2).
     """
-    r = _rows(points, 3, 'points')
-    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    r = rows_of(points, 3, 'points')
+    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
     out = np.empty((r.shape[0], 3, q.shape[0]))
     fill_fields(r, dipole_rows(q, u), out)
     return np.moveaxis(out, 1, 2)
@@ -204,8 +205,8 @@ def dipole_field(
     moments : ndarray, shape (N, K), complex
         Dipole magnitudes for each of the K emitters, A m^2.
     """
-    r = _rows(points, 3, 'points')
-    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    r = rows_of(points, 3, 'points')
+    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
     m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)
     out, dipoles = np.empty((r.shape[0], 3, m.shape[1])), dipole_rows(q, u)
 
@@ -255,7 +256,7 @@ def flux_jacobian(
         When the shapes do not fit together.
     """
     r, n, spans = _sensors(points, axes, lengths)
-    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
     m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)
     flux = np.zeros((r.shape[0], m.shape[1]))
     d_r = np.zeros((r.shape[0], 3, m.shape[1]))

@@ -160,10 +160,6 @@ def solve_body(
     low, high : ndarray, shape (3,)
         Box that the body's origin must not leave, m.
 
-    Returns
-    -------
-    BodySolution
-
     Raises
     ------
     TrackingError
@@ -233,10 +229,6 @@ def start_from_grid(
     coils : BodyCoils
     flux : ndarray, shape (S, 2K)
         T.
-
-    Returns
-    -------
-    list of (position, rotation)
     """
     total = len(grid.points)
     complex_moments = field.moments.view(np.complex128)

@@ -149,10 +149,6 @@ def build_grid(
     spacing_m : float
         See `grid_points`.
 
-    Returns
-    -------
-    SeedGrid
-
     Raises
     ------
     TrackingError

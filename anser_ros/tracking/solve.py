@@ -161,10 +161,6 @@ def solve_coil(
     length_m : float
         Coil length; 0 for a point sensor.
 
-    Returns
-    -------
-    CoilSolution
-
     Raises
     ------
     TrackingError

@@ -120,7 +120,7 @@ class ErrorModes:
         positions : ndarray, shape (N, 3)
             Of the dipoles, m.
         floor_m : float
-            Height over which dipoles are in the room where tools may be, m.
+            Height over which dipoles are where tools may be, m.
         """
         if given is None:
             return None

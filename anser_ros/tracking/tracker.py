@@ -72,10 +72,13 @@ class Past:
 
     def forget(self) -> None:
         """Forget all warm starts, and what was seen of the sensors and bodies."""
-        for one in (
-            self.judgement, *self.coils.values(), *self.bodies.values(), *self.followers,
-        ):  # fmt: skip
-            one.forget()
+        self.judgement.forget()
+        for coil in self.coils.values():
+            coil.forget()
+        for body in self.bodies.values():
+            body.forget()
+        for follower in self.followers:
+            follower.forget()
 
 
 @dataclass

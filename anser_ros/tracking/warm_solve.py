@@ -42,9 +42,10 @@ def _expected(tracks: list[CoilTrack], stamp_ns: int) -> tuple[Array, Array]:
     good = [track.good for track in tracks if track.good is not None]
     old = [g if t.before is None else t.before[1] for t, g in zip(tracks, good, strict=True)]
     steps = np.array([track.steps(stamp_ns) for track in tracks])[:, None]
-    now, then = (np.array([(s.position, s.axis) for s in some]) for some in (good, old))
-    positions = now[:, 0] + steps * (now[:, 0] - then[:, 0])
-    axes = now[:, 1] + steps * (now[:, 1] - then[:, 1])
+    place, last_place = (np.concatenate([s.position for s in some]) for some in (good, old))
+    axis, last_axis = (np.concatenate([s.axis for s in some]) for some in (good, old))
+    positions = place.reshape(-1, 3) + steps * (place - last_place).reshape(-1, 3)
+    axes = axis.reshape(-1, 3) + steps * (axis - last_axis).reshape(-1, 3)
     axes /= np.where(steps > 0.0, np.sqrt((axes * axes).sum(axis=1, keepdims=True)), 1.0)
     return positions, axes
 
