@@ -28,43 +28,24 @@ that the data do not determine from growing without bound."""
 
 @dataclass(frozen=True)
 class Richness:
-    """States how finely metal is shaped.
+    """States how finely metal is shaped."""
 
-    Attributes
-    ----------
-    modes : int
-        Most modes of a body.
-    knots : tuple of int
-        Numbers of knots that a free course may have, tried in this order.
-    left : float
-        Misfit over the noise's from which a freer course is tried.
-    """
-
-    modes: int
-    knots: tuple[int, ...]
-    left: float
+    modes: int  # Most modes of a body
+    knots: tuple[int, ...]  # Numbers of knots that a free course may have, tried in this order
+    left: float  # Misfit over the noise's from which a freer course is tried
 
 
 @dataclass(frozen=True, kw_only=True)
 class BodyTerm(Term):
     """Holds metal of modes: theta is its course, then real and imaginary parts of their
     amplitudes.
-
-    Attributes
-    ----------
-    kind : str
-        Of body (`anser_ros.metal.body.BODIES`).
-    modes : ndarray, shape (c, m)
-        Each a combination of the c couplings of the body's shapes.
-    spread : ndarray, shape (m,)
-        Prior standard deviation of each mode's amplitude, in phase and in quadrature.
-    richness : Richness or None
-        How finely the body was shaped; None for a simple body as it starts.
     """
 
-    kind: str
-    modes: Array
+    kind: str  # Of body (`anser_ros.metal.body.BODIES`)
+    modes: Array  # (c, m), each a combination of the c couplings of the body's shapes
+    # (m,), prior standard deviation of each mode's amplitude, in phase and in quadrature
     spread: Array
+    # How finely the body was shaped; None for a simple body as it starts
     richness: Richness | None = None
 
     @property
@@ -124,21 +105,13 @@ class BodyTerm(Term):
 
 @dataclass(frozen=True, kw_only=True)
 class FluctuationTerm(Term):
-    """Holds something constant that fluctuates; theta is empty.
+    """Holds something constant that fluctuates; theta is empty."""
 
-    Attributes
-    ----------
-    constant : Term or None
-        The constant effect at the same site; None for a term from a record.
-    spread : ndarray or None
-        Standard deviation of each of its parameters from frame to frame; None before it is found.
-    frames : int
-        Frames that the spread was found on.
-    """
-
+    # The constant effect at the same site; None for a term from a record
     constant: Term | None = None
+    # Standard deviation of each of its parameters from frame to frame; None before it is found
     spread: Array | None = None
-    frames: int = 1
+    frames: int = 1  # Frames that the spread was found on
 
     def columns(self, view: View) -> ComplexArray | None:
         """Return columns (F, S, K, q) of unit size along which a frame may move."""

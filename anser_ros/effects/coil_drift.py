@@ -33,15 +33,9 @@ def _shape(time: Array, tau: float) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class CoilDriftTerm(Term):
-    """Holds the drift of one emitter.
+    """Holds the drift of one emitter."""
 
-    Attributes
-    ----------
-    duration : float
-        Of the session, s; only the search needs it.
-    """
-
-    duration: float = 1.0
+    duration: float = 1.0  # Of the session, s; only the search needs it
 
 
 class CoilDrift(Effect[CoilDriftTerm]):

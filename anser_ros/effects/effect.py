@@ -77,22 +77,14 @@ class Family(Enum):
 
 @dataclass(frozen=True)
 class Resting:
-    """States where metal at rest is, and what it may be besides its few parameters.
+    """States where metal at rest is, and what it may be besides its few parameters."""
 
-    Attributes
-    ----------
-    centre : ndarray, shape (3,)
-        m, frame fg.
-    near : sequence of (Shapes, sizes)
-        Shapes about the centre whose couplings tell the place; the one that predicts best is
-        fitted together with the metal.
-    extended : sequence of (Shapes, sizes)
-        Shapes of a body as large as its distance, tried where much is left; none where the metal
-        has no such shapes.
-    """
-
-    centre: Array
+    centre: Array  # (3,), m, frame fg
+    # Shapes about the centre whose couplings tell the place; the one that predicts best is fitted
+    # together with the metal
     near: Sequence[SizedShapes]
+    # Shapes of a body as large as its distance, tried where much is left; none where the metal has
+    # no such shapes
     extended: Sequence[SizedShapes] = ()
 
 

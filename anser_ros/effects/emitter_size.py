@@ -20,18 +20,10 @@ UNIT = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class EmitterSizeTerm(Term):
-    """Holds an emitter that is the same all around an axis.
+    """Holds an emitter that is the same all around an axis."""
 
-    Attributes
-    ----------
-    axis : ndarray, shape (3,)
-        Unit vector, frame fg.
-    modelled_m2 : float
-        Second moment of the model's own dipoles of this emitter, m^2.
-    """
-
-    axis: Array
-    modelled_m2: float
+    axis: Array  # (3,), unit vector, frame fg
+    modelled_m2: float  # Second moment of the model's own dipoles of this emitter, m^2
 
     @property
     def second_moment_m2(self) -> float:

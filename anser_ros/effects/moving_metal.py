@@ -55,19 +55,11 @@ KNOTS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class MovingTerm(BodyTerm):
-    """Holds metal on a path; theta is the path's parameters, then the modes' amplitudes.
-
-    Attributes
-    ----------
-    path : MetalPath
-    duration : float
-        Of the session, s.
-    first : ndarray or None
-        Parameters of the path as the search started with; None for a term from a record.
-    """
+    """Holds metal on a path; theta is the path's parameters, then the modes' amplitudes."""
 
     path: MetalPath
-    duration: float
+    duration: float  # Of the session, s
+    # Parameters of the path as the search started with; None for a term from a record
     first: Array | None = None
 
     @property

@@ -74,15 +74,9 @@ class OpticalScale(Effect[Term]):
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationDriftTerm(Term):
-    """Holds the drift of the optical tracker.
+    """Holds the drift of the optical tracker."""
 
-    Attributes
-    ----------
-    duration : float
-        Time over which the growth in theta is made, s.
-    """
-
-    duration: float
+    duration: float  # Time over which the growth in theta is made, s
 
 
 class RegistrationDrift(Effect[RegistrationDriftTerm]):

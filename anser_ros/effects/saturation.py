@@ -61,15 +61,9 @@ def compressed(flux: ComplexArray, per_full_scale_squared: float, shape: str) ->
 
 @dataclass(frozen=True, kw_only=True)
 class SaturationTerm(Term):
-    """Holds the saturation of one channel.
+    """Holds the saturation of one channel."""
 
-    Attributes
-    ----------
-    weights : ndarray, shape (K,) or ()
-        What each emitter's tone counts in what the amplifier sees.
-    """
-
-    weights: Array
+    weights: Array  # (K,), what each emitter's tone counts in what the amplifier sees
 
 
 class Saturation(Effect[SaturationTerm]):

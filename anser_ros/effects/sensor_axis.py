@@ -27,14 +27,9 @@ from anser_ros.physics.tangent import tangents, tilted
 
 @dataclass(frozen=True, kw_only=True)
 class SensorAxisTerm(Term):
-    """Holds one sensor's tilt, or one cluster's turn.
+    """Holds one sensor's tilt, or one cluster's turn."""
 
-    Attributes
-    ----------
-    surveyed : tuple of float
-        The sensor's surveyed axis in the body's frame; empty for a cluster.
-    """
-
+    # The sensor's surveyed axis in the body's frame; empty for a cluster
     surveyed: tuple[float, ...] = ()
 
 

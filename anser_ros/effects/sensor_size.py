@@ -19,15 +19,9 @@ UNIT = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSizeTerm(Term):
-    """Holds the coils of one body.
+    """Holds the coils of one body."""
 
-    Attributes
-    ----------
-    surveyed : mapping of int to float
-        Surveyed length (m) of the coil on each channel.
-    """
-
-    surveyed: Mapping[int, float]
+    surveyed: Mapping[int, float]  # Surveyed length (m) of the coil on each channel
 
 
 class SensorSize(Effect[SensorSizeTerm]):

@@ -32,24 +32,14 @@ coils that are wound one by one have next to none, the axes of a chip nearly all
 
 @dataclass(frozen=True, kw_only=True)
 class SpreadTerm(Term):
-    """Holds a population: theta is the values of its channels, one channel after the other.
+    """Holds a population: theta is the values of its channels, one channel after the other."""
 
-    Attributes
-    ----------
-    groups : tuple of int
-        Which value each channel has, where several have one: row of the values by member. Empty
-        where each has its own.
-    members : tuple of int
-        Their channels.
-    spread : float
-        Standard deviation of the population, in the values' unit.
-    shared : float
-        Share of the population's variance that the channels at one place have in common.
-    """
-
-    members: tuple[int, ...]
-    spread: float
+    members: tuple[int, ...]  # Their channels
+    spread: float  # Standard deviation of the population, in the values' unit
+    # Share of the population's variance that the channels at one place have in common
     shared: float = 0.0
+    # Which value each channel has, where several have one: row of the values by member. Empty
+    # where each has its own.
     groups: tuple[int, ...] = ()
 
     @property

@@ -14,18 +14,12 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Dipoles:
-    """Holds a set of N dipoles with one moment for each of K emitters.
+    """Holds a set of N dipoles with one moment for each of K emitters."""
 
-    Attributes
-    ----------
-    positions, directions : ndarray, shape (N, 3)
-        Positions (m) and unit directions, frame fg.
-    moments : ndarray, shape (N, K), complex
-        Moments along the directions at each emitter's nominal current, A m^2.
-    """
-
+    # positions, directions: (N, 3), positions (m) and unit directions, frame fg
     positions: Array
     directions: Array
+    # (N, K), moments along the directions at each emitter's nominal current, A m^2
     moments: ComplexArray
 
     @staticmethod

@@ -15,21 +15,11 @@ from anser_ros.wire import points
 
 
 class Fault(NamedTuple):
-    """Describes one kind of fault by its name, state and reason.
+    """Describes one kind of fault by its name, state and reason."""
 
-    Attributes
-    ----------
-    kind : str
-        Its name in the counters: ``readings_<kind>``.
-    state : str
-        The state of a pose that the reading was for.
-    reason : str
-        What `/diagnostics` says of it.
-    """
-
-    kind: str
-    state: str
-    reason: str
+    kind: str  # Its name in the counters: ``readings_<kind>``
+    state: str  # The state of a pose that the reading was for
+    reason: str  # What `/diagnostics` says of it
 
 
 GOOD = 0

@@ -28,30 +28,17 @@ Count = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class Frame:
-    """Holds one frame of fluxes as a table of sensors has them.
+    """Holds one frame of fluxes as a table of sensors has them."""
 
-    Attributes
-    ----------
-    stamp_ns : int
-        Middle of the demodulation window.
-    channels : ndarray of int, shape (S,)
-        Channels in the table's order.
-    flux : ndarray, shape (S, K), complex
-        T; NaN where a channel is missing and in place of components that are not finite.
-    codes : ndarray of int, shape (S,)
-        What is wrong with each reading: places in `frames.faults.FAULTS`, 0 for nothing.
-    living : ndarray of bool, shape (K,), or None
-        Emitters that a usable sensor receives; None when all are received, or none at all.
-    goes_back : bool
-        Whether the stamp is before that of the frame before.
-    """
-
-    stamp_ns: int
-    channels: Integers
+    stamp_ns: int  # Middle of the demodulation window
+    channels: Integers  # (S,), channels in the table's order
+    # (S, K), T; NaN where a channel is missing and in place of components that are not finite
     flux: ComplexArray
+    # (S,), what is wrong with each reading: places in `frames.faults.FAULTS`, 0 for nothing
     codes: Integers
+    # (K,), emitters that a usable sensor receives; None when all are received, or none at all
     living: NDArray[np.bool_] | None = None
-    goes_back: bool = False
+    goes_back: bool = False  # Whether the stamp is before that of the frame before
 
     @property
     def usable(self) -> NDArray[np.bool_]:

@@ -30,31 +30,16 @@ _DIRECTIONS = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))
 
 @dataclass(frozen=True)
 class Board:
-    """Describes a board of K emitter coils that all have the same shape.
+    """Describes a board of K emitter coils that all have the same shape."""
 
-    Attributes
-    ----------
-    names : tuple of str, length K
-        Names of the coils.
-    frequencies_hz : tuple of float, length K
-        Drive frequencies, Hz.
-    shape : ndarray, shape (M, 3)
-        Corners of one coil's closed path around its own centre, m; the last corner is joined to
-        the first.
-    current_a : float
-        Nominal current times the number of turns that the path stands for, A.
-    centres : ndarray, shape (K, 3)
-        Coil centres, m, frame fg.
-    rotations : ndarray, shape (K, 3, 3)
-        Rotation matrices from each coil's own frame to fg.
-    """
-
-    names: tuple[str, ...]
-    frequencies_hz: tuple[float, ...]
+    names: tuple[str, ...]  # length K, names of the coils
+    frequencies_hz: tuple[float, ...]  # length K, drive frequencies, Hz
+    # (M, 3), corners of one coil's closed path around its own centre, m; the last corner is joined
+    # to the first
     shape: Array
-    current_a: float
-    centres: Array
-    rotations: Array
+    current_a: float  # Nominal current times the number of turns that the path stands for, A
+    centres: Array  # (K, 3), coil centres, m, frame fg
+    rotations: Array  # (K, 3, 3), rotation matrices from each coil's own frame to fg
 
     @property
     def paths(self) -> tuple[Array, ...]:

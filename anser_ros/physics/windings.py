@@ -18,26 +18,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlacedPoints:
-    """Holds the P points of S sensors of a body at one pose, sensor by sensor.
+    """Holds the P points of S sensors of a body at one pose, sensor by sensor."""
 
-    Attributes
-    ----------
-    points, axes : ndarray, shape (P, 3)
-        m, and unit vectors, frame fg.
-    lengths, weights : ndarray, shape (P,)
-        m; factor of each point's flux density.
-    arms : ndarray, shape (P, 3)
-        From the sensor's place to the point, m, frame fg.
-    first : ndarray of int, shape (S,)
-        The first point of each sensor.
-    """
-
+    # points, axes: (P, 3), m, and unit vectors, frame fg
     points: Array
     axes: Array
+    # lengths, weights: (P,), m; factor of each point's flux density
     lengths: Array
     weights: Array
-    arms: Array
-    first: NDArray[np.int64]
+    arms: Array  # (P, 3), from the sensor's place to the point, m, frame fg
+    first: NDArray[np.int64]  # (S,), the first point of each sensor
 
     @staticmethod
     def of(sensors: SensorTable, position: Array, rotation: Array) -> 'PlacedPoints':

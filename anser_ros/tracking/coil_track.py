@@ -39,29 +39,17 @@ up to which the model's error at a pose is reused."""
 
 
 class PoseErrors(NamedTuple):
-    """Says what the model's uncertainty does to a sensor at a pose.
-
-    Attributes
-    ----------
-    context : SolveContext
-    position, axis : ndarray, shape (3,)
-    errors : ndarray, shape (R, 2K)
-        Flux errors of one standard deviation each, T.
-    whitening : ndarray, shape (1, 2K) or (2K, 2K)
-        1/T; see `whitening_of`.
-    reach_m : float
-        Move up to which this is still good.
-    among : float
-        Above 1, the sensor is among dipoles that stand for metal and are no description of the
-        field so near to them.
-    """
+    """Says what the model's uncertainty does to a sensor at a pose."""
 
     context: SolveContext
+    # position, axis: (3,)
     position: Array
     axis: Array
-    errors: Array
-    whitening: Array
-    reach_m: float
+    errors: Array  # (R, 2K), flux errors of one standard deviation each, T
+    whitening: Array  # (1, 2K), 1/T; see `whitening_of`
+    reach_m: float  # Move up to which this is still good
+    # Above 1, the sensor is among dipoles that stand for metal and are no description of the field
+    # so near to them
     among: float
 
     @property

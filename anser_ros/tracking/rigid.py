@@ -77,32 +77,14 @@ class BodyCoils:
 
 @dataclass(frozen=True)
 class BodySolution:
-    """States where a rigid tool's solve ended.
+    """States where a rigid tool's solve ended."""
 
-    Attributes
-    ----------
-    position : ndarray, shape (3,)
-        Body origin, m, frame fg.
-    rotation : ndarray, shape (3, 3)
-        Takes body vectors to fg.
-    chi2 : float
-        Squared residual in units of its covariance.
-    information : ndarray, shape (6, 6)
-        Inverse covariance of (position, rotation vector), both in fg.
-    residual : ndarray, shape (S, 2K)
-        Measured minus modelled flux, T.
-    coil_chi2 : ndarray, shape (S,)
-        Each coil's squared residual in units of its own noise.
-    evaluations : int
-    converged : bool
-    """
-
-    position: Array
-    rotation: Array
-    chi2: float
-    information: Array
-    residual: Array
-    coil_chi2: Array
+    position: Array  # (3,), body origin, m, frame fg
+    rotation: Array  # (3, 3), takes body vectors to fg
+    chi2: float  # Squared residual in units of its covariance
+    information: Array  # (6, 6), inverse covariance of (position, rotation vector), both in fg
+    residual: Array  # (S, 2K), measured minus modelled flux, T
+    coil_chi2: Array  # (S,), each coil's squared residual in units of its own noise
     evaluations: int
     converged: bool
 

@@ -41,27 +41,13 @@ LAST_RESORT = 5
 
 @dataclass(frozen=True)
 class SeedGrid:
-    """Holds positions (G, 3) of the grid and, for each, what turns fluxes into an axis.
+    """Holds positions (G, 3) of the grid and, for each, what turns fluxes into an axis."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (G, 3)
-        m, frame fg.
-    projectors : ndarray, shape (G, 3, 2K)
-        ``L^-1 B``, whitened.
-    triangles : ndarray, shape (G, 3, 3)
-        ``L^-1``.
-    sigma : ndarray, shape (2K,)
-        Standard deviations that the grid was whitened with, T.
-    spacing_m : float
-        Distance between neighbours in the board's plane at the volume's floor.
-    """
-
-    points: Array
-    projectors: Array
-    triangles: Array
-    sigma: Array
-    spacing_m: float
+    points: Array  # (G, 3), m, frame fg
+    projectors: Array  # (G, 3, 2K), ``L^-1 B``, whitened
+    triangles: Array  # (G, 3, 3), ``L^-1``
+    sigma: Array  # (2K,), standard deviations that the grid was whitened with, T
+    spacing_m: float  # Distance between neighbours in the board's plane at the volume's floor
 
 
 @numba.njit(cache=True, error_model='numpy')

@@ -28,19 +28,12 @@ need a few; the bound keeps the time of a frame limited when the fluxes fit no p
 
 @dataclass(frozen=True)
 class RealField:
-    """Holds a field model laid out for the kernels.
+    """Holds a field model laid out for the kernels."""
 
-    Attributes
-    ----------
-    positions, directions : ndarray, shape (N, 3)
-        Dipole positions (m, frame fg) and unit directions.
-    moments : ndarray, shape (N, 2K)
-        A m^2; for every emitter its real part, then its imaginary part.
-    """
-
+    # positions, directions: (N, 3), dipole positions (m, frame fg) and unit directions
     positions: Array
     directions: Array
-    moments: Array
+    moments: Array  # (N, 2K), A m^2; for every emitter its real part, then its imaginary part
 
     @classmethod
     def of(
@@ -82,33 +75,16 @@ class RealField:
 
 
 class CoilSolution(NamedTuple):
-    """States where a coil's solve ended.
+    """States where a coil's solve ended."""
 
-    Attributes
-    ----------
-    position : ndarray, shape (3,)
-        m, frame fg.
-    axis : ndarray, shape (3,)
-        Unit sensitive axis.
-    chi2 : float
-        Sum of squared whitened residuals.
-    normal : ndarray, shape (6, 6)
-        ``J^T J`` of the whitened residuals by position (per m) and free axis vector.
-    residual : ndarray, shape (2K,)
-        Measured minus modelled flux, T; real and imaginary part by turns.
-    evaluations : int
-        Field evaluations used.
-    converged : bool
-        Whether the last step was negligible.
-    """
-
-    position: Array
-    axis: Array
-    chi2: float
+    position: Array  # (3,), m, frame fg
+    axis: Array  # (3,), unit sensitive axis
+    chi2: float  # Sum of squared whitened residuals
+    # (6, 6), ``J^T J`` of the whitened residuals by position (per m) and free axis vector
     normal: Array
-    residual: Array
-    evaluations: int
-    converged: bool
+    residual: Array  # (2K,), measured minus modelled flux, T; real and imaginary part by turns
+    evaluations: int  # Field evaluations used
+    converged: bool  # Whether the last step was negligible
 
 
 def whitening_of(sigma: Array) -> Array:

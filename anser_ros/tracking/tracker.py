@@ -83,31 +83,16 @@ class Past:
 
 @dataclass
 class Scene:
-    """Holds what frames are solved with: a model made ready, and the tools as it knows them.
+    """Holds what frames are solved with: a model made ready, and the tools as it knows them."""
 
-    Attributes
-    ----------
-    sensors : SensorTable
-        As surveyed.
-    model : FieldModel or None
-    context : SolveContext or None
-        Of the model.
-    correction : Correction or None
-        Of the model's effects.
-    table : SensorTable
-        The sensors as the model's effects have them.
-    bodies : dict of str to (ndarray of int, BodyCoils)
-        Rows and coils of the bodies whose six degrees of freedom their coils see.
-    reduced : ReducedScene or None
-        The context of the last frame in which emitters were dead.
-    """
-
-    sensors: SensorTable
+    sensors: SensorTable  # As surveyed
     model: FieldModel | None = None
-    context: SolveContext | None = None
-    correction: Correction | None = None
-    table: SensorTable = field(init=False)
+    context: SolveContext | None = None  # Of the model
+    correction: Correction | None = None  # Of the model's effects
+    table: SensorTable = field(init=False)  # The sensors as the model's effects have them
+    # Rows and coils of the bodies whose six degrees of freedom their coils see
     bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = field(init=False)
+    # The context of the last frame in which emitters were dead
     reduced: ReducedScene | None = None
 
     def __post_init__(self) -> None:
