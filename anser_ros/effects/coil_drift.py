@@ -1,8 +1,7 @@
 """An emitter's strength changes with time, as its copper or its driver warms up."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +42,8 @@ class CoilDrift(Effect[CoilDriftTerm]):
 
     name = 'coil_drift'
     summary = "an emitter's strength changes with time"
-    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'amount': '1', 'tau_s': 's'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+    units = {'coil': '1', 'amount': '1', 'tau_s': 's'}
+    plausible = {
         'amount': (-0.5, 0.5),
         'tau_s': (0.5, 1000.0),
     }

@@ -1,7 +1,6 @@
 """An emitter is stronger or weaker than the model has it, all the time."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,7 +17,7 @@ class CoilGain(ComplexGain):
 
     name = 'coil_gain'
     summary = "an emitter's strength is not the calibrated one"
-    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
+    units = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a candidate for every emitter."""

@@ -1,7 +1,6 @@
 """Holds what complex gains share that are off, of a channel, a tool or an emitter."""
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from anser_ros.field.model import EffectRecord
 class ComplexGain(Effect[Term]):
     """Theta is the real and imaginary part of (gain - 1) of what the site names."""
 
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+    plausible = {
         'gain': (0.2, 3.0),
         'phase_deg': (-60.0, 60.0),
     }

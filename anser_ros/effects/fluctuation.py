@@ -6,7 +6,7 @@ corresponding constant effect, as that of the optical jitter is. A fluctuation c
 column whatever its course, and explains and hides only what those columns can.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -52,7 +52,7 @@ class Fluctuation(Effect[FluctuationTerm]):
 
     of: ClassVar[Effect[Any]]
     family = Family.FLUCTUATION
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rms': (0.0, 1.0)}
+    plausible = {'rms': (0.0, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
         """Try every site of the constant effect on emitters and tools."""
@@ -116,7 +116,7 @@ class CoilFluctuation(Fluctuation):
 
     name = 'coil_fluctuation'
     summary = "an emitter's strength steps, swings or fails, not as a warming coil's does"
-    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'rms': '1'}
+    units = {'coil': '1', 'rms': '1'}
     remedy = Remedy.FLUX
     drifts = True
     followed = True
@@ -128,7 +128,7 @@ class SensorGainDrift(Fluctuation):
 
     name = 'sensor_gain_drift'
     summary = "a sensor's gain changes with time"
-    units: ClassVar[Mapping[str, str]] = {'channel': '1', 'rms': '1'}
+    units = {'channel': '1', 'rms': '1'}
     of = SensorGain()
 
 
@@ -137,7 +137,7 @@ class ToolGainDrift(Fluctuation):
 
     name = 'tool_gain_drift'
     summary = "the gain that all of a tool's sensors share changes with time"
-    units: ClassVar[Mapping[str, str]] = {'body': '1', 'rms': '1'}
+    units = {'body': '1', 'rms': '1'}
     of = ToolGain()
 
 
@@ -146,7 +146,7 @@ class LooseSensorAxis(Fluctuation):
 
     name = 'loose_sensor_axis'
     summary = "a sensor's axis changes with time"
-    units: ClassVar[Mapping[str, str]] = {'channel': '1', 'channels': '1', 'rms': 'rad'}
+    units = {'channel': '1', 'channels': '1', 'rms': 'rad'}
     of = SensorAxis()
 
 
@@ -155,7 +155,7 @@ class LooseSensorPosition(Fluctuation):
 
     name = 'loose_sensor_position'
     summary = "a cluster's place in its body changes with time"
-    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'rms': 'm'}
+    units = {'channels': '1', 'rms': 'm'}
     of = SensorPosition()
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
@@ -168,7 +168,7 @@ class StampJitter(Fluctuation):
 
     name = 'stamp_jitter'
     summary = 'the optical stamps are early or late by a different time in every frame'
-    units: ClassVar[Mapping[str, str]] = {'rms': 's'}
+    units = {'rms': 's'}
     of = TimeOffset()
 
 
@@ -177,7 +177,7 @@ class OpticalJitter(Fluctuation):
 
     name = 'optical_jitter'
     summary = 'the optical poses have larger errors than stated'
-    units: ClassVar[Mapping[str, str]] = {'rms': 'm and rad'}
+    units = {'rms': 'm and rad'}
     of = Registration()
 
 

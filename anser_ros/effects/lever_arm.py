@@ -1,7 +1,6 @@
 """The sensors sit elsewhere in the body's frame than the setup says."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ class LeverArm(PlacedElsewhere):
 
     name = 'lever_arm'
     summary = "the sensors sit elsewhere in the body's frame"
-    units: ClassVar[Mapping[str, str]] = {'offset_m': 'm', 'body': '1'}
+    units = {'offset_m': 'm', 'body': '1'}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a candidate for every body that has sensors."""

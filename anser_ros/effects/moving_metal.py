@@ -1,8 +1,8 @@
 """A metal object moves during the session."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +122,7 @@ class MovingMetal(Effect[MovingTerm]):
 
     name = 'moving_metal'
     summary = 'a metal object moves during the session'
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'start_m': 'm', 'end_m': 'm', 't_start_s': 's', 't_end_s': 's',
         'path': 's and m', 'polarizability': 'm^3 (3x3, [re, im])',
     }  # fmt: skip

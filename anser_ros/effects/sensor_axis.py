@@ -1,8 +1,7 @@
 """A sensor's axis, or a whole triaxial cluster's frame, is not the surveyed one."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -38,13 +37,13 @@ class SensorAxis(Effect[SensorAxisTerm]):
 
     name = 'sensor_axis'
     summary = "a sensor's axis is not the surveyed one"
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'channel': '1',
         'tilt_deg': 'deg',
         'axis': '1',
         'rotation_deg': 'deg',
     }
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'tilt_deg': (0.0, 30.0)}
+    plausible = {'tilt_deg': (0.0, 30.0)}
     remedy = Remedy.SENSORS
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:

@@ -1,7 +1,6 @@
 """One sensor's complex gain is off."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,7 +16,7 @@ class SensorGain(ChannelGain):
 
     name = 'sensor_gain'
     summary = "one sensor's gain is off"
-    units: ClassVar[Mapping[str, str]] = {'channel': '1', 'gain': '1', 'phase_deg': 'deg'}
+    units = {'channel': '1', 'gain': '1', 'phase_deg': 'deg'}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a term for every channel, references too."""

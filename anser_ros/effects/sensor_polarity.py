@@ -1,8 +1,5 @@
 """Some sensors are wired the other way round."""
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +13,7 @@ class SensorPolarity(Wiring):
 
     name = 'sensor_polarity'
     summary = 'a sensor is wired the other way round'
-    units: ClassVar[Mapping[str, str]] = {'channels': '1'}
+    units = {'channels': '1'}
     remedy = Remedy.FLUX
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:

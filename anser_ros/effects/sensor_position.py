@@ -1,7 +1,6 @@
 """One sensor, or one cluster, sits elsewhere in the body than the others say."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,7 @@ from anser_ros.physics.sensor import SensorTable
 class PlacedElsewhere(Effect[Term]):
     """Theta is the offset of some of a body's sensors in the body's frame, m."""
 
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_m': (-0.03, 0.03)}
+    plausible = {'offset_m': (-0.03, 0.03)}
     remedy = Remedy.SENSORS
 
     def rows(self, term: Term, sensors: SensorTable) -> NDArray[np.bool_]:
@@ -65,7 +64,7 @@ class SensorPosition(PlacedElsewhere):
 
     name = 'sensor_position'
     summary = 'one sensor of a body sits elsewhere than surveyed'
-    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'offset_m': 'm'}
+    units = {'channels': '1', 'offset_m': 'm'}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Try single sensors and clusters of bodies that carry more than those."""

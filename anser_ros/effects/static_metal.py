@@ -1,8 +1,7 @@
 """A metal object rests near the volume."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,11 +84,11 @@ class StaticMetal(Effect[Term]):
 
     name = 'static_metal'
     summary = 'a metal object stands near the volume'
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'position_m': 'm',
         'polarizability': 'm^3 (3x3, [re, im])',
     }
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'position_m': (-1.0, 1.0)}
+    plausible = {'position_m': (-1.0, 1.0)}
     remedy = Remedy.FIELD
     family = Family.METAL_AT_REST
     inexact = np.inf

@@ -1,7 +1,6 @@
 """All sensors of a tool share a gain that is off, as behind one amplifier; references don't."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,7 +16,7 @@ class ToolGain(ChannelGain):
 
     name = 'tool_gain'
     summary = "the gain that all of a tool's sensors share is off"
-    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'gain': '1', 'phase_deg': 'deg'}
+    units = {'channels': '1', 'gain': '1', 'phase_deg': 'deg'}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a candidate for every body with two sensors or more."""

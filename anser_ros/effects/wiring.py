@@ -3,8 +3,7 @@
 None has a parameter to fit; they are found before the search (`anser_ros.diagnosis.wiring`).
 """
 
-from collections.abc import Mapping
-from typing import ClassVar, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +42,7 @@ class SwappedChannels(Wiring):
 
     name = 'swapped_channels'
     summary = 'sensors are plugged into each other'
-    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'read_as': '1'}
+    units = {'channels': '1', 'read_as': '1'}
     remedy = Remedy.FLUX
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
@@ -63,7 +62,7 @@ class SwappedCoils(Wiring):
 
     name = 'swapped_coils'
     summary = 'emitters are plugged into each other'
-    units: ClassVar[Mapping[str, str]] = {'coils': '1', 'read_as': '1'}
+    units = {'coils': '1', 'read_as': '1'}
     remedy = Remedy.FLUX
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
@@ -80,7 +79,7 @@ class DeadChannel(Wiring):
 
     name = 'dead_channel'
     summary = 'a channel receives nothing'
-    units: ClassVar[Mapping[str, str]] = {'channels': '1'}
+    units = {'channels': '1'}
 
     def silenced(self, term: Term) -> tuple[int, ...]:
         """Return all channels that the term names."""

@@ -88,27 +88,12 @@ def _whole(geometry: Mapping[str, Any], key: str, default: int) -> int:
 def spiral_path(
     side_x_m: float, side_y_m: float, pitch_m: float, turns: float, layers: int, thickness_m: float
 ) -> Array:
-    """Return the corners of a rectangular spiral that winds inwards and outwards by turns.
+    """Return the corners (M, 3), m, of a rectangular spiral around the coil's centre.
 
-    The first layer winds inwards, the second outwards, and so on.
-
-    Parameters
-    ----------
-    side_x_m, side_y_m : float
-        Outer sides between the centres of the tracks, m.
-    pitch_m : float
-        Distance between neighbouring turns, m.
-    turns : float
-        Number of turns of all layers together; each layer gets the same number of quarter turns.
-    layers : int
-        Number of copper layers, evenly spaced from z = 0 down to z = -thickness.
-    thickness_m : float
-        Distance from the top copper layer to the bottom one, m.
-
-    Returns
-    -------
-    ndarray, shape (M, 3)
-        Corners around the coil's centre, m.
+    The first layer winds inwards, the second outwards, and so on; each has the same number of
+    quarter turns. ``side_x_m``, ``side_y_m`` are the outer sides between the centres of the
+    tracks, ``pitch_m`` lies between neighbouring turns; the layers are evenly spaced from z = 0
+    down to -``thickness_m``.
 
     Raises
     ------

@@ -169,19 +169,10 @@ def flux_basis(
 def field_basis(
     points: NDArray[np.generic], positions: NDArray[np.generic], directions: NDArray[np.generic]
 ) -> Array:
-    """Return the field of dipoles of unit moment.
+    """Return the field (P, N, 3), T / (A m^2), of dipoles of unit moment.
 
-    Parameters
-    ----------
-    points : ndarray, shape (P, 3)
-        Where the field is wanted, m, frame fg.
-    positions, directions : ndarray, shape (N, 3)
-        Dipole positions (m) and unit directions, frame fg.
-
-    Returns
-    -------
-    ndarray, shape (P, N, 3)
-        Field vectors, frame fg, T / (A m^2).
+    ``points`` (P, 3) are in m; ``positions`` (m) and unit ``directions`` (N, 3) are the dipoles',
+    all in the frame fg.
     """
     r = rows_of(points, 3, 'points')
     q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
@@ -196,14 +187,9 @@ def dipole_field(
     directions: NDArray[np.generic],
     moments: NDArray[np.generic],
 ) -> ComplexArray:
-    """Return the field of dipoles, shape (P, 3, K), T.
+    """Return the field of dipoles, shape (P, 3, K), T; arguments as for `field_basis`.
 
-    Parameters
-    ----------
-    points, positions, directions
-        As for `field_basis`.
-    moments : ndarray, shape (N, K), complex
-        Dipole magnitudes for each of the K emitters, A m^2.
+    ``moments`` (N, K), complex, are the dipoles' magnitudes for each of the K emitters, A m^2.
     """
     r = rows_of(points, 3, 'points')
     q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')

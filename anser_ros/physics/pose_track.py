@@ -137,16 +137,8 @@ class _Bend:
 
     Over an interval h, at the fraction u of the way, that is ``-u (1 - u) h^2 / 2`` times the
     acceleration, which follows from the difference between the velocities after and before the
-    interval.
-
-    Parameters
-    ----------
-    time : ndarray, shape (M,)
-        Of the samples, s.
-    left, right : ndarray of int, shape (F,)
-        Samples before and after each time.
-    at : ndarray, shape (F,)
-        The times, s.
+    interval. The samples have times (M,), s; ``left`` and ``right`` (F,) are those before and
+    after each of the times ``at``.
     """
 
     def __init__(

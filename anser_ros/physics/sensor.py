@@ -135,19 +135,11 @@ class SensorTable:
         )
 
     def placed(self, position: Array, rotation: Array) -> tuple[Array, Array]:
-        """Return the sensors' centres and axes in fg for given poses of their body.
+        """Return the sensors' centres (m) and unit axes (..., S, 3) in fg for given poses of their
+        body.
 
-        Parameters
-        ----------
-        position : ndarray, shape (..., 3)
-            Origin of the body, m, frame fg.
-        rotation : ndarray, shape (..., 3, 3)
-            Rotation matrix from the body's frame to fg.
-
-        Returns
-        -------
-        centres, axes : ndarray, shape (..., S, 3)
-            Centres (m) and unit axes, frame fg.
+        ``position`` (..., 3) is its origin, m, ``rotation`` (..., 3, 3) turns from its frame to
+        fg.
         """
         turned = np.einsum('...ij,sj->...si', rotation, self.position)
         return turned + position[..., None, :], np.einsum('...ij,sj->...si', rotation, self.axis)

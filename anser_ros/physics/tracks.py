@@ -51,21 +51,10 @@ def segment_field(
     points: NDArray[np.generic],
     current_a: float = 1.0,
 ) -> Array:
-    """Return the field of straight segments that all carry the same current.
+    """Return the field (P, 3), T, of straight segments that all carry the same current.
 
-    Parameters
-    ----------
-    starts, ends : ndarray, shape (M, 3)
-        Ends of the segments, m; the current flows from start to end.
-    points : ndarray, shape (P, 3)
-        Where the field is wanted, m; none may lie on a segment.
-    current_a : float
-        Current, A.
-
-    Returns
-    -------
-    ndarray, shape (P, 3)
-        Flux density, T, in the frame of the points.
+    It flows from ``starts`` to ``ends`` (M, 3), m; none of the ``points`` (P, 3), m, may lie on a
+    segment.
 
     Raises
     ------
@@ -86,21 +75,10 @@ def segment_field(
 def loop_field(
     corners: NDArray[np.generic], points: NDArray[np.generic], current_a: float = 1.0
 ) -> Array:
-    """Return the field of a closed path of straight segments.
+    """Return the field (P, 3), T, of a closed path of straight segments.
 
-    Parameters
-    ----------
-    corners : ndarray, shape (M, 3)
-        The current flows from each corner (m) to the next, and from the last to the first.
-    points : ndarray, shape (P, 3)
-        Where the field is wanted, m; none may lie on the path.
-    current_a : float
-        Current, A.
-
-    Returns
-    -------
-    ndarray, shape (P, 3)
-        Flux density, T, in the frame of the points.
+    The current flows from each of the ``corners`` (M, 3), m, to the next, and from the last to the
+    first; none of the ``points`` (P, 3), m, may lie on the path.
 
     Raises
     ------
@@ -112,18 +90,7 @@ def loop_field(
 
 
 def loop_moment(corners: NDArray[np.generic], current_a: float = 1.0) -> Array:
-    """Return the magnetic moment of a closed path, ``I/2`` times the sum of ``r x dr``.
-
-    Parameters
-    ----------
-    corners, current_a
-        As for `loop_field`.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        Moment, A m^2.
-    """
+    """Return the magnetic moment (3,), A m^2, of a closed path: ``I/2`` times all ``r x dr``."""
     path = rows_of(corners, 3, 'corners')
     cross = np.cross(path, np.roll(path, -1, axis=0))
     return np.asarray(0.5 * current_a * cross.sum(axis=0))

@@ -62,17 +62,9 @@ class PlacedPoints:
     def slopes(self, positions: Array, directions: Array, moments: Array) -> tuple[Array, Array]:
         """Return the derivatives by a shift and a turn of each sensor about its own place.
 
-        Parameters
-        ----------
-        positions, directions : ndarray, shape (N, 3)
-            Of dipoles, m and unit vectors, frame fg.
-        moments : ndarray, shape (N, C)
-            Of each of C parts of the fluxes, A m^2.
-
-        Returns
-        -------
-        by_shift, by_turn : ndarray, shape (S, 3, C)
-            T/m and T/rad, along and about the axes of fg.
+        Each is of the shape (S, 3, C), T/m and T/rad, along and about the axes of fg, for each of
+        C parts of the ``moments`` (N, C), A m^2, of dipoles at ``positions`` (m) with unit
+        ``directions`` (N, 3).
         """
         by_place, by_axis = self._by_point(positions, directions, moments)
         turn = np.cross(self.arms[:, :, None], by_place, axis=1)

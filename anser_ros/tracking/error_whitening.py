@@ -103,20 +103,10 @@ def error_whitening(
 ) -> tuple[Array, Array, Array, Array]:
     """Return the model's error at coils, and the factors that make their residuals white.
 
-    Parameters
-    ----------
-    points, axes : ndarray, shape (S, 3)
-        Coil centres (m) and unit axes, frame fg.
-    lengths : ndarray, shape (S,)
-        Coil lengths, m.
-    dipoles : ndarray, shape (6, N)
-        The dipoles whose moments are uncertain: rows of `RealField.columns`.
-    spacing : ndarray, shape (N,)
-        Their `source_spacing`, m.
-    modes : ndarray, shape (N, R 2K)
-        Moments' errors of one standard deviation each, A m^2.
-    sigma : ndarray, shape (2K,)
-        Standard deviation of each flux component, T.
+    The S coils have centres ``points`` (m), unit ``axes`` (S, 3), frame fg, and ``lengths``, m.
+    The N ``dipoles``, rows of `RealField.columns`, have uncertain moments: ``modes`` (N, R 2K) are
+    errors of one standard deviation each, A m^2, ``spacing`` is `source_spacing`, m. ``sigma``
+    (2K,) is each flux component's standard deviation, T.
 
     Returns
     -------

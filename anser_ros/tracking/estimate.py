@@ -204,11 +204,10 @@ class NoiseScale:
         ratio : float
             Residual power of the frame per degree of freedom, in units of the expected one.
         usual : float
-            The ratio that noise of the expected size seldom exceeds. A residual above what is
-            usual for this sensor comes from a bent field.
+            What noise of the expected size seldom exceeds; more comes from a bent field.
         share : float
             Degrees of freedom for each dimension of the pose: what stays in the former of a bent
-            field tells, as a power, what goes into the latter.
+            field shows, as a power, what goes into the latter.
         model_share : float
             Part of the expected residual that is the model's own error. It bends the field as
             metal does, and as much of it goes into the pose, however many readings there are.

@@ -90,18 +90,10 @@ class BodySolution:
 
 
 def common_factor(modes: Array, inverse_sigma: Array) -> Array:
-    """Return the factor E with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
+    """Return E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
 
-    Parameters
-    ----------
-    modes : ndarray, shape (S, R, 2K)
-        Flux errors of one standard deviation each that several coils share, T.
-    inverse_sigma : ndarray, shape (S, 2K)
-        1/T.
-
-    Returns
-    -------
-    ndarray, shape (R, S 2K)
+    ``modes`` (S, R, 2K) are flux errors of one standard deviation each that several coils share,
+    T; ``inverse_sigma`` (S, 2K) is in 1/T.
 
     Raises
     ------
@@ -127,20 +119,9 @@ def solve_body(
 ) -> BodySolution:
     """Fit a rigid tool's pose from a start near it.
 
-    Parameters
-    ----------
-    field : RealField
-    coils : BodyCoils
-    flux : ndarray, shape (S, 2K)
-        T; real and imaginary part by turns.
-    inverse_sigma : ndarray, shape (S, 2K)
-        1/T.
-    common : ndarray, shape (R, S 2K)
-        From `common_factor`; R = 0 for a model without uncertainty.
-    position, rotation : ndarray, shapes (3,), (3, 3)
-        Start.
-    low, high : ndarray, shape (3,)
-        Box that the body's origin must not leave, m.
+    ``flux`` (S, 2K) in T has real and imaginary part by turns, ``inverse_sigma`` (S, 2K) is in
+    1/T; ``common`` is from `common_factor`, without a row for a model without uncertainty. The
+    body's origin does not leave the box from ``low`` to ``high``, m.
 
     Raises
     ------
@@ -168,19 +149,8 @@ def start_from_coils(
 ) -> tuple[Array, Array] | None:
     """Return the pose of a body from its coils' own 5-DoF poses (Wahba's problem).
 
-    Parameters
-    ----------
-    coils : BodyCoils
-        The coils that have a pose.
-    positions, axes : ndarray, shape (S, 3)
-        Their poses, m and unit vectors, frame fg.
-    weights : ndarray, shape (S,)
-        How much each is trusted.
-
-    Returns
-    -------
-    position, rotation : ndarrays, shapes (3,), (3, 3), or None
-        None when these coils don't fix the rotation.
+    ``coils`` are those that have a pose: ``positions`` (m) and unit ``axes`` (S, 3) in fg,
+    ``weights`` (S,) by how much each is trusted. None when these coils don't fix the rotation.
     """
     if len(axes) == 0:
         return None
@@ -200,17 +170,8 @@ def start_from_grid(
 ) -> list[tuple[Array, Array]]:
     """Return starts for a body whose single coils have no poses (few emitters, many axes).
 
-    At every grid point the emitters' fields are turned to fit all coils at once, the lever arms
-    neglected; the poses with the least misfit come first.
-
-    Parameters
-    ----------
-    grid : SeedGrid
-        Gives the positions.
-    field : RealField
-    coils : BodyCoils
-    flux : ndarray, shape (S, 2K)
-        T.
+    At every grid point the emitters' fields are turned to fit the fluxes (S, 2K), T, of all coils
+    at once, the lever arms neglected; the poses with the least misfit come first.
     """
     total = len(grid.points)
     complex_moments = field.moments.view(np.complex128)

@@ -124,21 +124,12 @@ def grid_points(volume: TrackedVolume, spacing_m: float) -> Array:
 def build_grid(
     field: RealField, sigma: Array, volume: TrackedVolume, spacing_m: float = 0.025
 ) -> SeedGrid:
-    """Precompute the scan of a volume.
-
-    Parameters
-    ----------
-    field : RealField
-    sigma : ndarray, shape (2K,)
-        Standard deviation of each flux component, T.
-    volume : TrackedVolume
-    spacing_m : float
-        See `grid_points`.
+    """Precompute the scan of a volume; ``sigma`` (2K,) is each flux component's, T.
 
     Raises
     ------
     TrackingError
-        When the spacing doesn't suit the volume.
+        When the spacing doesn't suit the volume, see `grid_points`.
     """
     points = grid_points(volume, spacing_m)
     moments = field.moments.view(np.complex128)
@@ -151,15 +142,7 @@ def build_grid(
 
 
 def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return the cheapest distinct grid points.
-
-    Parameters
-    ----------
-    grid : SeedGrid
-    flux : ndarray, shape (2K,)
-        T; real and imaginary part by turns.
-    count : int
-        Most candidates wanted.
+    """Return the cheapest distinct grid points for fluxes (2K,), T, ``count`` of them at most.
 
     Returns
     -------
@@ -234,22 +217,9 @@ def solve_cold(
 ) -> list[CoilSolution]:
     """Return every distinct pose that the best grid points lead to, least chi-square first.
 
-    Parameters
-    ----------
-    field : RealField
-    grid : SeedGrid
-    flux, whitening, low, high, length_m
-        As for `solve_coil`.
-    gate : float
-        Chi-square that an acceptable pose stays below; when none of the first starts leads there,
-        more are tried.
-    thorough : bool
-        Whether more are tried when those lead to nothing acceptable.
-
-    Returns
-    -------
-    list of CoilSolution
-        At least one.
+    There is at least one. ``gate`` is the chi-square that an acceptable pose stays below; when
+    none of the first starts leads there, a ``thorough`` search tries more. The other arguments are
+    those of `solve_coil`.
     """
     found: list[CoilSolution] = []
     tried = 0

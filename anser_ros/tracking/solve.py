@@ -88,17 +88,10 @@ class CoilSolution(NamedTuple):
 
 
 def whitening_of(sigma: Array) -> Array:
-    """Return the matrix that turns a flux residual into one of unit covariance.
+    """Return the matrix, 1/T, that turns a flux residual into one of unit covariance.
 
-    Parameters
-    ----------
-    sigma : ndarray, shape (2K,)
-        Standard deviation of each flux component, T.
-
-    Returns
-    -------
-    ndarray, shape (1, 2K)
-        1/T: the diagonal alone.
+    It is the diagonal alone, shape (1, 2K), from the standard deviation ``sigma`` (2K,) of each
+    flux component, T.
 
     Raises
     ------
@@ -123,19 +116,10 @@ def solve_coil(
 ) -> CoilSolution:
     """Fit a coil's pose from a start near it.
 
-    Parameters
-    ----------
-    field : RealField
-    flux : ndarray, shape (2K,)
-        Measured flux, T; real and imaginary part by turns.
-    whitening : ndarray, shape (1, 2K) or (2K, 2K)
-        From `whitening_of`.
-    position, axis : ndarray, shape (3,)
-        Start: m, frame fg, and unit axis.
-    low, high : ndarray, shape (3,)
-        Box that the position must not leave, m.
-    length_m : float
-        Coil length; 0 for a point sensor.
+    ``flux`` (2K,) in T has real and imaginary part by turns; ``whitening`` is from `whitening_of`,
+    or a whole matrix (2K, 2K), 1/T. The start is a ``position`` (m, frame fg) and a unit ``axis``;
+    the position does not leave the box from ``low`` to ``high``, m. A ``length_m`` of 0 is a point
+    sensor.
 
     Raises
     ------

@@ -100,16 +100,10 @@ class ErrorModes:
     def of(
         cls, given: ComplexArray | None, positions: Array, floor_m: float
     ) -> 'ErrorModes | None':
-        """Lay out modes; None where there is no uncertainty.
+        """Lay out modes (R, N, K), A m^2; None where there is no uncertainty.
 
-        Parameters
-        ----------
-        given : ndarray, shape (R, N, K), complex
-            A m^2.
-        positions : ndarray, shape (N, 3)
-            Of the dipoles, m.
-        floor_m : float
-            Height over which dipoles are where tools may be, m.
+        ``positions`` (N, 3) are the dipoles', m; those over the height ``floor_m`` are where tools
+        may be.
         """
         if given is None:
             return None

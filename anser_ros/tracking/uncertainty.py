@@ -81,21 +81,11 @@ def bounded_inverse(information):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model='numpy')
 def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def]
-    """Return the covariance of a single coil's pose.
+    """Return the covariance (6, 6) of a coil's position and rotation vector, both in fg, m and
+    rad.
 
-    Parameters
-    ----------
-    normal : ndarray, shape (6, 6)
-        ``J^T J`` of the whitened residuals by position (per m) and free axis vector.
-    axis : ndarray, shape (3,)
-        Unit sensitive axis, frame fg.
-    roll_variance : float
-        rad^2, given to the rotation about the axis.
-
-    Returns
-    -------
-    ndarray, shape (6, 6)
-        m^2, m rad, rad^2: position, then rotation vector, both in fg.
+    ``normal`` (6, 6) is ``J^T J`` of the whitened residuals by position (per m) and free axis
+    vector; ``roll_variance``, rad^2, is given to the rotation about the axis.
     """
     t = np.empty((2, 3))
     fill_tangent(axis, t)
@@ -134,21 +124,9 @@ def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def
 def add_motion(covariance, position, next_position, axes, next_axes, share):  # type: ignore[no-untyped-def]
     """Add to a pose's covariance (6, 6), in place, a part of its last motion as an error.
 
-    Parameters
-    ----------
-    covariance : ndarray, shape (6, 6)
-        Of position and rotation vector, fg.
-    position, next_position : ndarray, shape (3,)
-        m.
-    axes, next_axes : ndarray, shape (3, 3) or (3, 1)
-        All axes of a body, or that of a coil, in columns.
-    share : float
-        Standard deviation of the error in units of the motion.
-
-    Returns
-    -------
-    float
-        Square root of the trace of the position's covariance, m.
+    ``axes`` and ``next_axes`` hold all axes of a body, or that of a coil, in columns: (3, 3) or
+    (3, 1). ``share`` is the error's standard deviation in units of the motion. Returns the square
+    root of the trace of the position's covariance, m.
     """
     move = np.zeros(6)
     # Each axis n turns by w x n; the sum of n x (w x n) over three axes is 2 w, over one it is w.
