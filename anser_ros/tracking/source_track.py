@@ -105,7 +105,7 @@ class SourceTrack(Track[BodySolution]):
 
 
 class Sources:
-    """Follows the source that each body sees, as a follower of the tracker.
+    """Follows the source that each body sees, as an observer of the tracker.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class Sources:
         for track in self._tracks.values():
             track.forget()
 
-    def follow(self, bodies: Sequence[BodyFrame]) -> None:
+    def observe(self, bodies: Sequence[BodyFrame]) -> None:
         """Find the source in the frame of each body, if the field is that of one."""
         self.found = {
             body.name: track_source(

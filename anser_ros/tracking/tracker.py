@@ -44,24 +44,24 @@ def _add(counters: Counter[str], name: str, by: int) -> None:
     counters[name] += by
 
 
-class Follower(Protocol):
+class Observer(Protocol):
     """What an application follows through time besides the poses of coils and bodies."""
 
     def forget(self) -> None:
         """Drop the last poses, so that the next solves start cold."""
 
-    def follow(self, bodies: Sequence[BodyFrame]) -> None:
+    def observe(self, bodies: Sequence[BodyFrame]) -> None:
         """Take in one frame of all bodies, after their coils were solved each by itself."""
 
 
 class Past:
     """Holds what a tracker has seen so far of its sensors and bodies."""
 
-    def __init__(self, sensors: SensorTable, followers: Sequence[Follower]) -> None:
+    def __init__(self, sensors: SensorTable, observers: Sequence[Observer]) -> None:
         self.counters: Counter[str] = Counter()
         self.coils = {name: CoilTrack() for name in sensors.name}
         self.bodies = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
-        self.followers = followers
+        self.observers = observers
         # It holds the counters and not the tracker: in a cycle, a tracker that was replaced would
         # keep its tables until a collection of garbage, of which a running node makes few.
         count = partial(_add, self.counters)
@@ -77,8 +77,8 @@ class Past:
             coil.forget()
         for body in self.bodies.values():
             body.forget()
-        for follower in self.followers:
-            follower.forget()
+        for observer in self.observers:
+            observer.forget()
 
 
 @dataclass
@@ -133,7 +133,7 @@ class Tracker:
         The tool sensors, positions and axes in their body's frame. Those that are sums of
         windings are left out.
     settings : TrackerSettings, optional
-    followers : sequence of Follower
+    observers : sequence of Observer
         What else is followed.
     past : Past, optional
         Of another tracker of these sensors, from which this one goes on.
@@ -162,7 +162,7 @@ class Tracker:
         model: FieldModel | None,
         sensors: SensorTable,
         settings: TrackerSettings | None = None,
-        followers: Sequence[Follower] = (),
+        observers: Sequence[Observer] = (),
         *,
         past: Past | None = None,
         scene: Scene | None = None,
@@ -170,7 +170,7 @@ class Tracker:
         self.settings = settings or TrackerSettings()
         if past is None:
             sensors = _checked(sensors)
-            past = Past(sensors, followers)
+            past = Past(sensors, observers)
         self.sensors, self._past = sensors, past
         if scene is None:
             scene = Scene(sensors)
@@ -383,8 +383,8 @@ class Tracker:
             else:
                 result = track_body(self._past.bodies[name], frame)
             bodies.append(RigidBody(rows, table, result))
-        for follower in self._past.followers:
-            follower.follow(frames)
+        for observer in self._past.observers:
+            observer.observe(frames)
         judged = self._past.judgement.judged(stamp_ns, coils, bodies, self.settings)
         if context.shift_sigma_m == 0.0:
             yield from judged
