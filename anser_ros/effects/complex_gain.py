@@ -30,7 +30,7 @@ class ComplexGain(Effect[Term]):
         return EffectRecord(self.name, {**recorded_site(term), **figures}, sigmas)
 
 
-class ChannelGain(ComplexGain):
+class GainOfChannels(ComplexGain):
     """Is a complex gain of the channels that a term's site names."""
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.complex_gain import ChannelGain, theta_of
+from anser_ros.effects.complex_gain import GainOfChannels, theta_of
 from anser_ros.effects.effect import needed
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 
 
-class SensorGain(ChannelGain):
+class SensorGain(GainOfChannels):
     """Is the complex gain of one channel."""
 
     name = 'sensor_gain'

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.complex_gain import ChannelGain, theta_of
+from anser_ros.effects.complex_gain import GainOfChannels, theta_of
 from anser_ros.effects.effect import whole_numbers
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 
 
-class ToolGain(ChannelGain):
+class ToolGain(GainOfChannels):
     """Is the complex gain of all of a tool's channels."""
 
     name = 'tool_gain'

@@ -30,7 +30,7 @@ MOST_STEPS = 2.5
 
 
 class Solution(Protocol):
-    """What the solve of any tracked thing ends with."""
+    """States where the solve of any tracked thing ended."""
 
     @property
     def position(self) -> Array:

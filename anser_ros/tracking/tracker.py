@@ -45,7 +45,7 @@ def _add(counters: Counter[str], name: str, by: int) -> None:
 
 
 class Observer(Protocol):
-    """What an application follows through time besides the poses of coils and bodies."""
+    """Works out what an application needs besides the poses of coils and bodies."""
 
     def forget(self) -> None:
         """Drop the last poses, so that the next solves start cold."""
@@ -82,7 +82,7 @@ class Past:
 
 
 @dataclass
-class Scene:
+class TrackedScene:
     """Holds what frames are solved with: a model made ready, and the tools as it knows them."""
 
     sensors: SensorTable  # As surveyed
@@ -111,12 +111,12 @@ class Scene:
 
     def with_model(
         self, model: FieldModel, settings: TrackerSettings, model_id: str | None = None
-    ) -> 'Scene':
+    ) -> 'TrackedScene':
         """Return the scene of another model; what has not changed is kept."""
         context = build_context(model, settings, self.context, model_id)
         if self.model is None or model.effects is not self.model.effects:
             correction = Correction.of(model.effects, self.sensors, model.frequencies_hz)
-            return Scene(self.sensors, model, context, correction, self.reduced)
+            return TrackedScene(self.sensors, model, context, correction, self.reduced)
         scene = copy(self)
         scene.model, scene.context = model, context
         return scene
@@ -137,7 +137,7 @@ class Tracker:
         What else is followed.
     past : Past, optional
         Of another tracker of these sensors, from which this one goes on.
-    scene : Scene, optional
+    scene : TrackedScene, optional
         Made of the model, if that was done before.
 
     Attributes
@@ -165,7 +165,7 @@ class Tracker:
         observers: Sequence[Observer] = (),
         *,
         past: Past | None = None,
-        scene: Scene | None = None,
+        scene: TrackedScene | None = None,
     ) -> None:
         self.settings = settings or TrackerSettings()
         if past is None:
@@ -173,7 +173,7 @@ class Tracker:
             past = Past(sensors, observers)
         self.sensors, self._past = sensors, past
         if scene is None:
-            scene = Scene(sensors)
+            scene = TrackedScene(sensors)
             if model is not None:
                 scene = scene.with_model(model, self.settings)
         self._scene = scene
@@ -250,7 +250,7 @@ class Tracker:
             self.model, self.sensors, self.settings, past=other._past, scene=copy(self._scene)
         )
 
-    def _copy(self, scene: Scene) -> 'Tracker':
+    def _copy(self, scene: TrackedScene) -> 'Tracker':
         return Tracker(scene.model, self.sensors, self.settings, past=self._past, scene=scene)
 
     def reset(self) -> None:
