@@ -3,7 +3,7 @@
 import numpy as np
 
 from anser_ros.physics.constants import DIPOLE_CONSTANT
-from anser_ros.physics.dipole import field_basis, fill_field_and_gradient
+from anser_ros.physics.dipole import dipole_rows, field_basis, fill_fields
 
 
 def dipole_field(points, positions, moments):
@@ -13,13 +13,10 @@ def dipole_field(points, positions, moments):
 
 def dipole_gradient(points, positions, moments):
     """Return ``dB_j / dx_i``, shape (P, 3, 3), of the same, T/m."""
-    basis = np.empty((9, len(positions)))
-    out = np.empty((len(points), 3, 3))
-    for p, point in enumerate(points):
-        fill_field_and_gradient(point, positions, moments, basis)
-        xx, xy, xz, yy, yz, zz = basis[3:].sum(axis=1)
-        out[p] = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
-    return out
+    basis = np.empty((len(points), 9, len(positions)))
+    fill_fields(points, dipole_rows(positions, moments), basis)
+    xx, xy, xz, yy, yz, zz = basis[:, 3:].sum(axis=2).T
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
 
 
 def dipole_tensor(points, sources):

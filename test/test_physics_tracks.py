@@ -22,7 +22,7 @@ from anser_ros.field.nominal import Tolerances, nominal_model
 from anser_ros.physics import board as boards
 from anser_ros.physics.board import Board, build_board, spiral_path
 from anser_ros.physics.constants import MU_0
-from anser_ros.physics.tracks import loop_field, loop_moment, paths_field, segment_field
+from anser_ros.physics.tracks import loop_field, loop_moment, segment_field
 
 
 @pytest.fixture
@@ -265,9 +265,9 @@ def test_a_coil_too_big_for_the_nodes_is_refused():
         nominal_model(board)
 
 
-def test_paths_field_is_each_loop_on_its_own():
+def test_a_board_s_field_is_each_loop_on_its_own():
     board = anser_board()
     points = np.array([[0.0, 0.02, 0.1]])
-    fields = paths_field(board.paths, points, np.arange(1.0, 9.0))
+    fields = board.field(points)
     assert fields.shape == (1, 8, 3)
-    np.testing.assert_allclose(fields[:, 3], loop_field(board.paths[3], points, 4.0))
+    np.testing.assert_allclose(fields[:, 3], loop_field(board.paths[3], points, board.current_a))

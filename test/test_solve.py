@@ -5,6 +5,7 @@ import pytest
 from tracking_world import NOISE_T, certain_model
 
 from anser_ros.errors import TrackingError
+from anser_ros.physics.angles import nearest_rotation
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.tangent import fill_tangent
 from anser_ros.physics.volume import TrackedVolume
@@ -154,8 +155,8 @@ def test_projected_descent_reaches_further(rng):
         first = axis + 0.5 * rng.normal(size=3)
         first /= np.linalg.norm(first)
         descend_projected(
-            start, first, flux, np.full(WIDTH, 1 / NOISE_T), FIELD.positions, FIELD.directions,
-            FIELD.moments, LOW, HIGH, 25,
+            start, first, flux, np.full(WIDTH, 1 / NOISE_T), FIELD.columns, FIELD.moments,
+            LOW, HIGH, 25,
         )  # fmt: skip
         near += np.linalg.norm(start - position) < 3e-3
     assert near >= 90
@@ -278,4 +279,4 @@ def test_half_turns(i):
 
 def test_nearest_rotation_is_proper(rng):
     mirror = np.diag([1.0, 1.0, -1.0]) + 0.01 * rng.normal(size=(3, 3))
-    assert np.linalg.det(rotations.nearest_rotation(mirror)) == pytest.approx(1.0)
+    assert np.linalg.det(nearest_rotation(mirror)) == pytest.approx(1.0)

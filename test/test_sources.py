@@ -34,7 +34,7 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OK
 from anser_ros.sessions.starting_model import with_new_survey
 from anser_ros.settings import Accuracy
-from anser_ros.tracking.source_track import seen_from
+from anser_ros.tracking.source_track import Sources, seen_from
 from anser_ros.tracking.tracker import Tracker, TrackerSettings
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup
@@ -246,12 +246,13 @@ class TestSeenFromABody:
 
     def found(self, model, measured):
         """Places, axes and sigmas (F, ...) from a cold start in every frame, and the truth."""
-        tracker = Tracker(model, measured.sensors, self.SETTINGS)
+        sources = Sources()
+        tracker = Tracker(model, measured.sensors, self.SETTINGS, [sources])
         out = []
         for k, flux in enumerate(measured.flux):
             poses = tracker.update(10**10 * (k + 1), measured.sensors.channel, flux)
             assert all(pose.state != OK for pose in poses), 'no pose of six numbers is known'
-            out.append(tracker.sources['array'])
+            out.append(sources.found['array'])
         axis = symmetry_axis(model.positions, model.directions, model.moments)
         true = seen_from(axis, measured.position, measured.rotation)
         return out, true
@@ -282,13 +283,14 @@ class TestSeenFromABody:
         errors, sigmas = [], []
         settings = replace(self.SETTINGS, gate=1e3, adaptive=False)
         for effects in ((), (told,)):
-            tracker = Tracker(replace(model, effects=effects), table, settings)
+            sources = Sources()
+            tracker = Tracker(replace(model, effects=effects), table, settings, [sources])
             axis = symmetry_axis(model.positions, model.directions, model.moments)
             true, _ = seen_from(axis, measured.position, measured.rotation)
             for k, flux in enumerate(measured.flux):
                 tracker.update(10**10 * (k + 1), table.channel, flux)
-                errors.append(np.linalg.norm(tracker.sources['array'].position - true[k]))
-                sigmas.append(tracker.sources['array'].sigma_position_m)
+                errors.append(np.linalg.norm(sources.found['array'].position - true[k]))
+                sigmas.append(sources.found['array'].sigma_position_m)
         before, after = np.sqrt(np.mean(np.square(np.reshape(errors, (2, -1))), axis=1))
         assert after < 0.8 * before
         assert before > 3.0 * np.mean(sigmas[:30]) and after < 2.0 * np.mean(sigmas[30:])
@@ -308,9 +310,10 @@ class TestSeenFromABody:
         settings = replace(
             self.SETTINGS, volume=TrackedVolume((-0.05, -0.05, 0.2), (0.05, 0.05, 0.3))
         )
-        tracker = Tracker(model, measured.sensors, settings)
+        sources = Sources()
+        tracker = Tracker(model, measured.sensors, settings, [sources])
         tracker.update(10**10, measured.sensors.channel, measured.flux[0])
-        assert tracker.sources['array'].state != OK
+        assert sources.found['array'].state != OK
 
 
 class TestGainsInADiagnosis:

@@ -82,8 +82,10 @@ def test_swapping_models_keeps_the_warm_starts(rng):
     assert swapped.model is other
     assert tracker.model is MODEL
     far = tracker.with_model(replace(MODEL, moments=0.5 * MODEL.moments))
-    assert far._context.grid is not tracker._context.grid, 'another field needs another grid'
-    assert swapped._context.grid is tracker._context.grid
+    assert far._scene.context.grid is not tracker._scene.context.grid, (
+        'another field needs another grid'
+    )
+    assert swapped._scene.context.grid is tracker._scene.context.grid
 
 
 def test_settings_may_change_on_the_way(rng):

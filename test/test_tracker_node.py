@@ -205,7 +205,7 @@ def test_what_acquisition_measures_meanwhile_changes_settings_only(tracker):
     ready(tracker)
     say_flux()
     wait_frame(tracker, 1)
-    topics, context = dict(node._topics), node._tracker._context
+    topics, context = dict(node._topics), node._tracker._scene.context
     noise = node._tracker.settings.flux_noise_t
     plain = setup_of(SENSORS, reference_specs())
 
@@ -218,12 +218,12 @@ def test_what_acquisition_measures_meanwhile_changes_settings_only(tracker):
     measured(stamp_sigma_s=3e-4)
     wait_frame(tracker, 2)
     assert node._tracker.settings.stamp_sigma_s == 3e-4
-    assert node._tracker._context is context, 'which takes a tenth of a second to make'
+    assert node._tracker._scene.context is context, 'which takes a tenth of a second to make'
     assert node._tracker.counters['cold_starts'] == len(SENSORS.name)
     measured(stamp_sigma_s=3e-4, flux_noise_t=2.0 * noise)
     wait_frame(tracker, 3)
     assert node._tracker.settings.flux_noise_t == 2.0 * noise
-    assert np.all(node._tracker._context.sigma > context.sigma)
+    assert np.all(node._tracker._scene.context.sigma > context.sigma)
     assert node._topics == topics
     assert {topic.estimate.state for topic in topics.values()} == {'ok'}
 

@@ -223,12 +223,12 @@ def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, li
         for _ in range(100):
             time.sleep(0.02)
             tracker.say_flux(fluxes(certain_model(), SENSORS, *place, rng))
-            late_s.append(1e-9 * (tracker.stamp_ns - node._tracker._intake.last_ns))
+            late_s.append(1e-9 * (tracker.stamp_ns - node._tracker._past.intake.last_ns))
 
     sender = threading.Thread(target=send)
     sender.start()
     tracker.spin_until(lambda: not sender.is_alive())
-    tracker.spin_until(lambda: node._tracker._intake.last_ns == tracker.stamp_ns)
+    tracker.spin_until(lambda: node._tracker._past.intake.last_ns == tracker.stamp_ns)
     assert (node.counters['frames_skipped'] > 20) if live else not node.counters['frames_skipped']
     assert node.counters['frames_skipped'] + node.counters['frames'] == 120
     node.publish_diagnostics()

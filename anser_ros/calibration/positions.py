@@ -16,8 +16,7 @@ from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import ComplexArray, as_real
 from anser_ros.calibration.readings import BLOCK_ROWS, frame_blocks, weighted_readings
 from anser_ros.field.measurements import Measurements
-from anser_ros.kernel_cache import kernel
-from anser_ros.physics.dipole import GAUSS_OFFSET, fill_field_and_gradient, flux_basis
+from anser_ros.physics.dipole import GAUSS_OFFSET, dipole_rows, fill_fields, flux_basis
 
 Array = NDArray[np.float64]
 
@@ -32,26 +31,6 @@ CONVERGED = 1e-3
 """Relative fall of the sum of squares below which another step is not worth its time."""
 
 
-@kernel(nogil=True)
-def _fill_slopes(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
-    basis = np.empty((9, positions.shape[0]))
-    point = np.empty(3)
-    out[:] = 0.0
-    for p in range(points.shape[0]):
-        half = lengths[p] * GAUSS_OFFSET
-        count = 1 if half == 0.0 else 2
-        n0, n1, n2 = axes[p, 0], axes[p, 1], axes[p, 2]
-        for s in range(count):
-            for i in range(3):
-                point[i] = points[p, i] + half * (1 - 2 * s) * axes[p, i]
-            fill_field_and_gradient(point, positions, directions, basis)
-            for j in range(positions.shape[0]):
-                # The field depends on the difference of places: moving the dipole is the negative.
-                out[p, j, 0] -= (n0 * basis[3, j] + n1 * basis[4, j] + n2 * basis[5, j]) / count
-                out[p, j, 1] -= (n0 * basis[4, j] + n1 * basis[6, j] + n2 * basis[7, j]) / count
-                out[p, j, 2] -= (n0 * basis[5, j] + n1 * basis[7, j] + n2 * basis[8, j]) / count
-
-
 def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleSites) -> Array:
     """Return the derivative of the flux basis by the dipoles' positions.
 
@@ -59,11 +38,17 @@ def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleS
     lengths, m.
     Returns (P, N, 3): derivatives, T / (A m^3).
     """
-    out = np.empty((points.shape[0], len(dipoles), 3))
-    _fill_slopes(
-        np.ascontiguousarray(points), np.ascontiguousarray(axes), np.ascontiguousarray(lengths),
-        np.ascontiguousarray(dipoles.positions), np.ascontiguousarray(dipoles.directions), out,
-    )  # fmt: skip
+    out = np.zeros((points.shape[0], len(dipoles), 3))
+    fields = np.empty((points.shape[0], 9, len(dipoles)))
+    rows, (n0, n1, n2) = dipole_rows(dipoles.positions, dipoles.directions), axes.T[:, :, None]
+    half = GAUSS_OFFSET * lengths[:, None]
+    signs = (1.0, -1.0) if half.any() else (1.0,)
+    for sign in signs:
+        fill_fields(points + sign * half * axes, rows, fields)
+        for i, (x, y, z) in enumerate(((3, 4, 5), (4, 6, 7), (5, 7, 8))):
+            # The field depends on the difference of places: moving the dipole is the negative.
+            slope = n0 * fields[:, x] + n1 * fields[:, y] + n2 * fields[:, z]
+            out[:, :, i] -= slope / len(signs)
     return out
 
 

@@ -13,38 +13,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Apparatus:
-    """Holds tools, references, emitters and the space that they take up.
+    """Holds tools, references, emitters and the space that they take up."""
 
-    Attributes
-    ----------
-    tools : tuple of SensorTable
-        One table for each tool body.
-    references : SensorTable or None
-        The sensors that are fixed in fg.
-    emitters : int
-        Number of emitters, K.
-    omega : ndarray, shape (K,)
-        Angular drive frequencies, rad/s.
-    duration : float
-        Length of the session, s.
-    illumination : Dipoles
-        The emitters' own field, good also beside and below the board.
-    visited_box : ndarray, shape (2, 3)
-        Lower and upper corner of the box in which tool sensors were during this session, m, frame
-        fg: what the data can tell about, not where tools may be (that is
-        `physics.volume.TrackedVolume`).
-    board : ndarray, shape (2, 3)
-        Lower and upper corner of the field generator, m, frame fg.
-    """
-
-    tools: tuple[SensorTable, ...]
-    references: SensorTable | None
-    emitters: int
-    omega: Array
-    duration: float
-    illumination: Dipoles
+    tools: tuple[SensorTable, ...]  # One table for each tool body
+    references: SensorTable | None  # The sensors that are fixed in fg
+    emitters: int  # Number of emitters, K
+    omega: Array  # (K,), angular drive frequencies, rad/s
+    duration: float  # Length of the session, s
+    illumination: Dipoles  # The emitters' own field, good also beside and below the board
+    # (2, 3), lower and upper corner of the box in which tool sensors were during this session, m,
+    # frame fg: what the data can tell about, not where tools may be (that is
+    # `physics.volume.TrackedVolume`)
     visited_box: Array
-    board: Array
+    board: Array  # (2, 3), lower and upper corner of the field generator, m, frame fg
 
     @property
     def tool_channels(self) -> tuple[int, ...]:

@@ -1,4 +1,5 @@
-"""Defines the term of metal whose body is a sum of modes, and which the search refines.
+"""Defines the terms that the search refines: metal whose body is a sum of modes, and what
+fluctuates.
 
 A simple body has few modes; a real one has more, which are chosen from the data (`with_body`).
 Metal whose response changes with time also has a course, which may be refined as well (`freer`).
@@ -27,43 +28,24 @@ that the data do not determine from growing without bound."""
 
 @dataclass(frozen=True)
 class Richness:
-    """States how finely metal is shaped.
+    """States how finely metal is shaped."""
 
-    Attributes
-    ----------
-    modes : int
-        Most modes of a body.
-    knots : tuple of int
-        Numbers of knots that a free course may have, tried in this order.
-    left : float
-        Misfit over the noise's from which a freer course is tried.
-    """
-
-    modes: int
-    knots: tuple[int, ...]
-    left: float
+    modes: int  # Most modes of a body
+    knots: tuple[int, ...]  # Numbers of knots that a free course may have, tried in this order
+    left: float  # Misfit over the noise's from which a freer course is tried
 
 
 @dataclass(frozen=True, kw_only=True)
 class BodyTerm(Term):
     """Holds metal of modes: theta is its course, then real and imaginary parts of their
     amplitudes.
-
-    Attributes
-    ----------
-    kind : str
-        Of body (`anser_ros.metal.body.BODIES`).
-    modes : ndarray, shape (c, m)
-        Each a combination of the c couplings of the body's shapes.
-    spread : ndarray, shape (m,)
-        Prior standard deviation of each mode's amplitude, in phase and in quadrature.
-    richness : Richness or None
-        How finely the body was shaped; None for a simple body as it starts.
     """
 
-    kind: str
-    modes: Array
+    kind: str  # Of body (`anser_ros.metal.body.BODIES`)
+    modes: Array  # (c, m), each a combination of the c couplings of the body's shapes
+    # (m,), prior standard deviation of each mode's amplitude, in phase and in quadrature
     spread: Array
+    # How finely the body was shaped; None for a simple body as it starts
     richness: Richness | None = None
 
     @property
@@ -119,3 +101,23 @@ class BodyTerm(Term):
     def restarted(self) -> Self | None:
         """Return the body as it is, where its course started from; None where that isn't known."""
         return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FluctuationTerm(Term):
+    """Holds something constant that fluctuates; theta is empty."""
+
+    # The constant effect at the same site; None for a term from a record
+    constant: Term | None = None
+    # Standard deviation of each of its parameters from frame to frame; None before it is found
+    spread: Array | None = None
+    frames: int = 1  # Frames that the spread was found on
+
+    def columns(self, view: View) -> ComplexArray | None:
+        """Return columns (F, S, K, q) of unit size along which a frame may move."""
+        return None if self.constant is None else self.constant.effect.columns(self.constant, view)
+
+    @property
+    def expected(self) -> Array:
+        """Return each parameter's standard deviation by the constant effect, shape (q,)."""
+        return np.zeros(0) if self.constant is None else self.constant.effect.prior(self.constant)

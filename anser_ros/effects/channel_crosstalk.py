@@ -1,9 +1,8 @@
 """Channels leak into each other, inside a cluster or between two of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +38,8 @@ class ChannelCrosstalk(Effect[Term]):
 
     name = 'channel_crosstalk'
     summary = 'channels leak into each other'
-    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'matrix': '1'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'matrix': (-0.5, 0.5)}
+    units = {'channels': '1', 'matrix': '1'}
+    plausible = {'matrix': (-0.5, 0.5)}
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:

@@ -1,8 +1,7 @@
 """The optical tracker's clock runs at another rate than the fluxes'."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -20,8 +19,8 @@ class ClockRate(Effect[Term]):
 
     name = 'clock_rate'
     summary = "one of the two clocks runs slow, so that the stamps' offset grows"
-    units: ClassVar[Mapping[str, str]] = {'offset_s': 's', 'rate_ppm': '1e-6'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+    units = {'offset_s': 's', 'rate_ppm': '1e-6'}
+    plausible = {
         'offset_s': (-0.5, 0.5),
         'rate_ppm': (-2e4, 2e4),
     }

@@ -1,8 +1,7 @@
 """One emitter's tone leaks into another's."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations, permutations
-from typing import ClassVar
 
 import numpy as np
 
@@ -30,13 +29,13 @@ class CoilCrosstalk(Effect[Term]):
 
     name = 'coil_crosstalk'
     summary = "one emitter's tone leaks into another's"
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'coils': '1',
         'eps': '1',
         'eps_quadrature': '1',
         'mutual': '1',
     }
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'eps': (-0.5, 0.5)}
+    plausible = {'eps': (-0.5, 0.5)}
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:

@@ -1,8 +1,7 @@
 """An emitter's strength changes with time, as its copper or its driver warms up."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,15 +32,9 @@ def _shape(time: Array, tau: float) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class CoilDriftTerm(Term):
-    """Holds the drift of one emitter.
+    """Holds the drift of one emitter."""
 
-    Attributes
-    ----------
-    duration : float
-        Of the session, s; only the search needs it.
-    """
-
-    duration: float = 1.0
+    duration: float = 1.0  # Of the session, s; only the search needs it
 
 
 class CoilDrift(Effect[CoilDriftTerm]):
@@ -49,8 +42,8 @@ class CoilDrift(Effect[CoilDriftTerm]):
 
     name = 'coil_drift'
     summary = "an emitter's strength changes with time"
-    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'amount': '1', 'tau_s': 's'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+    units = {'coil': '1', 'amount': '1', 'tau_s': 's'}
+    plausible = {
         'amount': (-0.5, 0.5),
         'tau_s': (0.5, 1000.0),
     }

@@ -1,37 +1,27 @@
 """An emitter is stronger or weaker than the model has it, all the time."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 
 from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.complex_gain import figures_of, theta_of
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, unit_matrix
+from anser_ros.effects.complex_gain import ComplexGain, theta_of
+from anser_ros.effects.effect import Array, ComplexArray, needed, unit_matrix
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
 
-class CoilGain(Effect[Term]):
-    """Theta is the real and imaginary part of (gain - 1)."""
+class CoilGain(ComplexGain):
+    """Is the complex gain of one emitter."""
 
     name = 'coil_gain'
     summary = "an emitter's strength is not the calibrated one"
-    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
-        'gain': (0.2, 3.0),
-        'phase_deg': (-60.0, 60.0),
-    }
-    remedy = Remedy.FLUX
+    units = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a candidate for every emitter."""
         return [Term(self, {'coil': k}, np.zeros(2)) for k in range(apparatus.emitters)]
-
-    def prior(self, term: Term) -> Array:
-        """Expect a strength that is off by some ten percent."""
-        return np.full(2, 0.3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return the emitter's own flux, for the real and the imaginary part of its gain."""
@@ -45,11 +35,6 @@ class CoilGain(Effect[Term]):
         matrix = unit_matrix(omega.size)
         matrix[term.site['coil'], term.site['coil']] = 1 + complex(*term.theta)
         return matrix[None]
-
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the gain's size and phase."""
-        figures, sigmas = figures_of(term.theta, covariance)
-        return EffectRecord(self.name, {'coil': term.site['coil'], **figures}, sigmas)
 
     def term(self, record: EffectRecord) -> Term:
         """Return the term of a gain and a phase."""

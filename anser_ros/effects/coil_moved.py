@@ -1,7 +1,6 @@
 """An emitter is not where the model has it."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -23,8 +22,8 @@ class CoilMoved(Effect[Term]):
 
     name = 'coil_moved'
     summary = 'an emitter is not where the model has it'
-    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'shift_m': 'm'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'shift_m': (-0.03, 0.03)}
+    units = {'coil': '1', 'shift_m': 'm'}
+    plausible = {'shift_m': (-0.03, 0.03)}
     remedy = Remedy.FIELD
     gradient_error = GRADIENT_ERROR
 

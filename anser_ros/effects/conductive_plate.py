@@ -1,7 +1,6 @@
 """A metal sheet parallel to the board distorts the field by its eddy currents."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,13 +43,13 @@ class ConductivePlate(Effect[Term]):
 
     name = 'conductive_plate'
     summary = 'a metal sheet lies parallel to the board'
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'z_m': 'm',
         'edge_m': 'm',
         'centre_m': 'm',
         'sheet_ohm': 'ohm',
     }
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+    plausible = {
         'z_m': (-1.0, 1.0),
         'edge_m': (0.02, 2.0),
         'sheet_ohm': (1e-7, 1.0),

@@ -71,19 +71,11 @@ def _term(effect: Effect[Any], record: EffectRecord) -> Term:
 
 @dataclass(frozen=True)
 class Correction:
-    """Makes the corrections that a model's effect records ask for.
-
-    Attributes
-    ----------
-    terms : tuple of Term
-    surveyed : SensorTable
-        Sensors as the setup has them.
-    omega : ndarray, shape (K,)
-    """
+    """Makes the corrections that a model's effect records ask for."""
 
     terms: tuple[Term, ...]
-    surveyed: SensorTable
-    omega: Array
+    surveyed: SensorTable  # Sensors as the setup has them
+    omega: Array  # (K,)
 
     @staticmethod
     def of(

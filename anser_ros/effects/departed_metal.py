@@ -53,15 +53,9 @@ class DepartedTerm(MovingTerm):
 
 @dataclass(frozen=True)
 class DepartedMetal(MovingMetal):
-    """Takes metal on a free path from its rest and back; a model has none of it to correct.
+    """Takes metal on a free path from its rest and back; a model has none of it to correct."""
 
-    Attributes
-    ----------
-    rest_s : float
-        When it rests, s since the session's start.
-    """
-
-    rest_s: float
+    rest_s: float  # When it rests, s since the session's start
 
     def starting(
         self, path: MetalPath, course: Array, duration: float, alpha: Array

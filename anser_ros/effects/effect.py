@@ -17,12 +17,13 @@ themselves, and code that speaks of effects without these classes.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.body_term import BodyTerm, FluctuationTerm
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
@@ -31,10 +32,6 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.metal.scattering import Shapes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
-
-if TYPE_CHECKING:
-    from anser_ros.effects.body_term import BodyTerm
-    from anser_ros.effects.fluctuation import FluctuationTerm
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -80,22 +77,14 @@ class Family(Enum):
 
 @dataclass(frozen=True)
 class Resting:
-    """States where metal at rest is, and what it may be besides its few parameters.
+    """States where metal at rest is, and what it may be besides its few parameters."""
 
-    Attributes
-    ----------
-    centre : ndarray, shape (3,)
-        m, frame fg.
-    near : sequence of (Shapes, sizes)
-        Shapes about the centre whose couplings tell the place; the one that predicts best is
-        fitted together with the metal.
-    extended : sequence of (Shapes, sizes)
-        Shapes of a body as large as its distance, tried where much is left; none where the metal
-        has no such shapes.
-    """
-
-    centre: Array
+    centre: Array  # (3,), m, frame fg
+    # Shapes about the centre whose couplings tell the place; the one that predicts best is fitted
+    # together with the metal
     near: Sequence[SizedShapes]
+    # Shapes of a body as large as its distance, tried where much is left; none where the metal has
+    # no such shapes
     extended: Sequence[SizedShapes] = ()
 
 
@@ -201,7 +190,7 @@ class Effect(Generic[TermT]):
         return int(term.theta.size)
 
     def covers(self, term: TermT, candidate: Term) -> bool:
-        """Return whether a term of this effect in force stands for a candidate already."""
+        """Return whether an active term of this effect stands for a candidate already."""
         return candidate.name_and_site == term.name_and_site
 
     def rivals(self, term: TermT, other: Term) -> bool:
@@ -225,11 +214,11 @@ class Effect(Generic[TermT]):
         """Return where metal at rest is and what it may be besides; None for any other effect."""
         return None
 
-    def body(self, term: TermT) -> 'BodyTerm | None':
+    def body(self, term: TermT) -> BodyTerm | None:
         """Return the term of metal whose body and course are refined; None for other effects."""
         return None
 
-    def opened(self, term: TermT) -> 'FluctuationTerm | None':
+    def opened(self, term: TermT) -> FluctuationTerm | None:
         """Return the term of an effect whose spread is found; None for any other effect."""
         return None
 
@@ -321,6 +310,11 @@ def whole_numbers(record: EffectRecord, key: str) -> tuple[int, ...]:
     return tuple(int(number) for number in needed(record, key))
 
 
+def recorded_site(term: Term) -> dict[str, Any]:
+    """Return a term's site as its record has it, with lists in place of tuples."""
+    return {key: list(v) if isinstance(v, tuple) else v for key, v in term.site.items()}
+
+
 def sigmas(covariance: Array) -> Array:
     """Return the standard deviations that a covariance matrix holds."""
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
@@ -329,11 +323,3 @@ def sigmas(covariance: Array) -> Array:
 def unit_matrix(size: int) -> ComplexArray:
     """Return the identity of this size as a complex matrix."""
     return np.eye(size, dtype=complex)
-
-
-def orthogonal_pair(axis: Array) -> Array:
-    """Return two unit vectors, shape (2, 3), that make a right-handed frame with a unit axis."""
-    start = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    first = np.cross(axis, start)
-    first /= np.linalg.norm(first)
-    return np.stack([np.cross(first, axis), first])

@@ -1,8 +1,7 @@
 """An emitter without a drawing is larger, or flatter, than its model's dipoles are."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -20,18 +19,10 @@ UNIT = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class EmitterSizeTerm(Term):
-    """Holds an emitter that is the same all around an axis.
+    """Holds an emitter that is the same all around an axis."""
 
-    Attributes
-    ----------
-    axis : ndarray, shape (3,)
-        Unit vector, frame fg.
-    modelled_m2 : float
-        Second moment of the model's own dipoles of this emitter, m^2.
-    """
-
-    axis: Array
-    modelled_m2: float
+    axis: Array  # (3,), unit vector, frame fg
+    modelled_m2: float  # Second moment of the model's own dipoles of this emitter, m^2
 
     @property
     def second_moment_m2(self) -> float:
@@ -54,10 +45,10 @@ class EmitterSize(Effect[EmitterSizeTerm]):
 
     name = 'emitter_size'
     summary = 'an emitter is longer or flatter than its model'
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'coil': '1', 'second_moment_m2': 'm^2', 'length_m': 'm', 'diameter_m': 'm',
     }  # fmt: skip
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+    plausible = {
         'length_m': (0.0, 1.0),
         'diameter_m': (0.0, 1.0),
     }

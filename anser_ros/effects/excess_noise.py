@@ -1,8 +1,5 @@
 """Only the noise has grown."""
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 from anser_ros.effects.seen import SeenEffect
 
 
@@ -11,8 +8,8 @@ class ExcessNoise(SeenEffect):
 
     name = 'excess_noise'
     summary = 'the noise is larger than it should be, and nothing else'
-    units: ClassVar[Mapping[str, str]] = {'factor': '1', 'channels': '1'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'factor': (1.0, 1000.0)}
+    units = {'factor': '1', 'channels': '1'}
+    plausible = {'factor': (1.0, 1000.0)}
 
 
 EXCESS_NOISE = ExcessNoise()

@@ -6,13 +6,13 @@ corresponding constant effect, as that of the optical jitter is. A fluctuation c
 column whatever its course, and explains and hides only what those columns can.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any, ClassVar, cast
 
 import numpy as np
 
 from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.body_term import FluctuationTerm
 from anser_ros.effects.coil_gain import CoilGain
 from anser_ros.effects.effect import (
     Array,
@@ -21,6 +21,7 @@ from anser_ros.effects.effect import (
     Family,
     Remedy,
     needed,
+    recorded_site,
     whole_numbers,
 )
 from anser_ros.effects.registration import Registration
@@ -40,34 +41,6 @@ Larger lets moving metal explain an emitter that steps; smaller lets a fluctuati
 a curve with several parameters."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FluctuationTerm(Term):
-    """Holds something constant that fluctuates; theta is empty.
-
-    Attributes
-    ----------
-    constant : Term or None
-        The constant effect at the same site; None for a term from a record.
-    spread : ndarray or None
-        Standard deviation of each of its parameters from frame to frame; None before it is found.
-    frames : int
-        Frames that the spread was found on.
-    """
-
-    constant: Term | None = None
-    spread: Array | None = None
-    frames: int = 1
-
-    def columns(self, view: View) -> ComplexArray | None:
-        """Return columns (F, S, K, q) of unit size along which a frame may move."""
-        return None if self.constant is None else self.constant.effect.columns(self.constant, view)
-
-    @property
-    def expected(self) -> Array:
-        """Return each parameter's standard deviation by the constant effect, shape (q,)."""
-        return np.zeros(0) if self.constant is None else self.constant.effect.prior(self.constant)
-
-
 class Fluctuation(Effect[FluctuationTerm]):
     """Lets one constant effect fluctuate; it is the base of all that do so.
 
@@ -79,7 +52,7 @@ class Fluctuation(Effect[FluctuationTerm]):
 
     of: ClassVar[Effect[Any]]
     family = Family.FLUCTUATION
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rms': (0.0, 1.0)}
+    plausible = {'rms': (0.0, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
         """Try every site of the constant effect on emitters and tools."""
@@ -126,11 +99,8 @@ class Fluctuation(Effect[FluctuationTerm]):
         """Record where it is, and how much; sigma is that of a spread of so many numbers."""
         spread = np.zeros(1) if term.spread is None else term.spread
         rms = float(np.sqrt(np.sum(spread**2)))
-        where: dict[str, Any] = {**term.site}
-        if 'channels' in where:
-            where['channels'] = list(where['channels'])
         sigma = rms / float(np.sqrt(2 * max(term.frames, 1)))
-        return EffectRecord(self.name, {**where, 'rms': rms}, {'rms': sigma})
+        return EffectRecord(self.name, {**recorded_site(term), 'rms': rms}, {'rms': sigma})
 
     def term(self, record: EffectRecord) -> FluctuationTerm:
         """Return where it is; what it does in a frame only the frame can tell."""
@@ -146,7 +116,7 @@ class CoilFluctuation(Fluctuation):
 
     name = 'coil_fluctuation'
     summary = "an emitter's strength steps, swings or fails, not as a warming coil's does"
-    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'rms': '1'}
+    units = {'coil': '1', 'rms': '1'}
     remedy = Remedy.FLUX
     drifts = True
     followed = True
@@ -158,7 +128,7 @@ class SensorGainDrift(Fluctuation):
 
     name = 'sensor_gain_drift'
     summary = "a sensor's gain changes with time"
-    units: ClassVar[Mapping[str, str]] = {'channel': '1', 'rms': '1'}
+    units = {'channel': '1', 'rms': '1'}
     of = SensorGain()
 
 
@@ -167,7 +137,7 @@ class ToolGainDrift(Fluctuation):
 
     name = 'tool_gain_drift'
     summary = "the gain that all of a tool's sensors share changes with time"
-    units: ClassVar[Mapping[str, str]] = {'body': '1', 'rms': '1'}
+    units = {'body': '1', 'rms': '1'}
     of = ToolGain()
 
 
@@ -176,7 +146,7 @@ class LooseSensorAxis(Fluctuation):
 
     name = 'loose_sensor_axis'
     summary = "a sensor's axis changes with time"
-    units: ClassVar[Mapping[str, str]] = {'channel': '1', 'channels': '1', 'rms': 'rad'}
+    units = {'channel': '1', 'channels': '1', 'rms': 'rad'}
     of = SensorAxis()
 
 
@@ -185,7 +155,7 @@ class LooseSensorPosition(Fluctuation):
 
     name = 'loose_sensor_position'
     summary = "a cluster's place in its body changes with time"
-    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'rms': 'm'}
+    units = {'channels': '1', 'rms': 'm'}
     of = SensorPosition()
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
@@ -198,7 +168,7 @@ class StampJitter(Fluctuation):
 
     name = 'stamp_jitter'
     summary = 'the optical stamps are early or late by a different time in every frame'
-    units: ClassVar[Mapping[str, str]] = {'rms': 's'}
+    units = {'rms': 's'}
     of = TimeOffset()
 
 
@@ -207,7 +177,7 @@ class OpticalJitter(Fluctuation):
 
     name = 'optical_jitter'
     summary = 'the optical poses have larger errors than stated'
-    units: ClassVar[Mapping[str, str]] = {'rms': 'm and rad'}
+    units = {'rms': 'm and rad'}
     of = Registration()
 
 

@@ -109,15 +109,9 @@ class StraightPath:
 
 @dataclass(frozen=True)
 class FreePath:
-    """Leads along a natural spline; its parameters are the centre (m) at each knot.
+    """Leads along a natural spline; its parameters are the centre (m) at each knot."""
 
-    Attributes
-    ----------
-    knots : tuple of float
-        s, ascending, at least three.
-    """
-
-    knots: tuple[float, ...]
+    knots: tuple[float, ...]  # s, ascending, at least three
 
     @property
     def count(self) -> int:

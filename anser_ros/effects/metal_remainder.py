@@ -41,20 +41,11 @@ class RemainderPart(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Couplings:
-    """Combines couplings into fixed modes, each with a complex amplitude.
-
-    Attributes
-    ----------
-    shapes : Shapes
-    centre : ndarray, shape (3,)
-        m.
-    modes : ndarray, shape (shapes.size, m)
-        Of the size that each is expected to have.
-    """
+    """Combines couplings into fixed modes, each with a complex amplitude."""
 
     shapes: Shapes
-    centre: Array
-    modes: Array
+    centre: Array  # (3,), m
+    modes: Array  # (shapes.size, m), of the size that each is expected to have
 
     @property
     def count(self) -> int:
@@ -82,16 +73,9 @@ class Couplings:
 
 @dataclass(frozen=True, eq=False)
 class IlluminationChange:
-    """Changes each emitter's strength and place (x, y, z) as they act on metal.
+    """Changes each emitter's strength and place (x, y, z) as they act on metal."""
 
-    Attributes
-    ----------
-    metal : sequence of Term
-        At rest; what answers to the emitters.
-    emitters : int
-    """
-
-    metal: Sequence[Term]
+    metal: Sequence[Term]  # At rest; what answers to the emitters
     emitters: int
 
     @property
@@ -137,16 +121,9 @@ class IlluminationChange:
 
 @dataclass(frozen=True, kw_only=True)
 class RemainderTerm(Term):
-    """Holds a leftover of one metal; theta is the leftover's parameters.
+    """Holds a leftover of one metal; theta is the leftover's parameters."""
 
-    Attributes
-    ----------
-    parent : tuple of str
-        `Term.name_and_site` of the metal.
-    leftover : RemainderPart
-    """
-
-    parent: tuple[str, str]
+    parent: tuple[str, str]  # `Term.name_and_site` of the metal
     leftover: RemainderPart
 
 

@@ -1,8 +1,8 @@
 """A metal object moves during the session."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,19 +55,11 @@ KNOTS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class MovingTerm(BodyTerm):
-    """Holds metal on a path; theta is the path's parameters, then the modes' amplitudes.
-
-    Attributes
-    ----------
-    path : MetalPath
-    duration : float
-        Of the session, s.
-    first : ndarray or None
-        Parameters of the path as the search started with; None for a term from a record.
-    """
+    """Holds metal on a path; theta is the path's parameters, then the modes' amplitudes."""
 
     path: MetalPath
-    duration: float
+    duration: float  # Of the session, s
+    # Parameters of the path as the search started with; None for a term from a record
     first: Array | None = None
 
     @property
@@ -130,7 +122,7 @@ class MovingMetal(Effect[MovingTerm]):
 
     name = 'moving_metal'
     summary = 'a metal object moves during the session'
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'start_m': 'm', 'end_m': 'm', 't_start_s': 's', 't_end_s': 's',
         'path': 's and m', 'polarizability': 'm^3 (3x3, [re, im])',
     }  # fmt: skip

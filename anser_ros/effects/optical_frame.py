@@ -1,8 +1,7 @@
 """An optical frame may be more than turned and shifted: it may be too large, or on the move."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +23,8 @@ class OpticalScale(Effect[Term]):
 
     name = 'optical_scale'
     summary = "the optical tracker's millimetre is too long or too short"
-    units: ClassVar[Mapping[str, str]] = {'scale': '1', 'shift_m': 'm'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+    units = {'scale': '1', 'shift_m': 'm'}
+    plausible = {
         'scale': (0.9, 1.1),
         'shift_m': (-0.1, 0.1),
     }
@@ -74,15 +73,9 @@ class OpticalScale(Effect[Term]):
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationDriftTerm(Term):
-    """Holds the drift of the optical tracker.
+    """Holds the drift of the optical tracker."""
 
-    Attributes
-    ----------
-    duration : float
-        Time over which the growth in theta is made, s.
-    """
-
-    duration: float
+    duration: float  # Time over which the growth in theta is made, s
 
 
 class RegistrationDrift(Effect[RegistrationDriftTerm]):
@@ -90,12 +83,12 @@ class RegistrationDrift(Effect[RegistrationDriftTerm]):
 
     name = 'registration_drift'
     summary = 'the optical tracker moves steadily'
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'translation_m': 'm',
         'velocity_m_per_s': 'm/s',
         'duration_s': 's',
     }
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+    plausible = {
         'translation_m': (-0.05, 0.05),
         'velocity_m_per_s': (-0.01, 0.01),
     }

@@ -1,7 +1,6 @@
 """Some frames are outliers, which no model of the field explains."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 from anser_ros.effects.seen import SeenEffect, SeenTerm
 from anser_ros.field.model import EffectRecord
@@ -12,8 +11,8 @@ class Outliers(SeenEffect):
 
     name = 'outliers'
     summary = 'some frames fit no model'
-    units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'channels': '1'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'fraction': (0.0, 0.5)}
+    units = {'fraction': '1', 'channels': '1'}
+    plausible = {'fraction': (0.0, 0.5)}
 
 
 class LooseContact(Outliers):

@@ -1,7 +1,6 @@
 """A common acquisition delay turns all phasors, the faster the higher their frequency."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,8 +19,8 @@ class PhaseDelay(Effect[Term]):
 
     name = 'phase_delay'
     summary = 'a common acquisition delay turns all phasors'
-    units: ClassVar[Mapping[str, str]] = {'delay_s': 's'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'delay_s': (-5e-5, 5e-5)}
+    units = {'delay_s': 's'}
+    plausible = {'delay_s': (-5e-5, 5e-5)}
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:

@@ -1,7 +1,6 @@
 """A constant phasor is added to a channel: cables, or drive that couples into sense."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +20,12 @@ class Pickup(Effect[Term]):
 
     name = 'pickup'
     summary = 'a constant phasor is added to a channel'
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'channel': '1',
         'phasor_t': 'T (re, im of every emitter)',
         'rms_t': 'T',
     }
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rms_t': (0.0, 1e-6)}
+    plausible = {'rms_t': (0.0, 1e-6)}
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:

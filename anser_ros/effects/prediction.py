@@ -19,21 +19,11 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Fields:
-    """Holds the fields that a prediction starts from.
+    """Holds the fields that a prediction starts from."""
 
-    Attributes
-    ----------
-    model : Dipoles
-        Good where tool sensors were calibrated.
-    illumination : Dipoles
-        Good beside and below the board: what metal and reference sensors see.
-    omega : ndarray, shape (K,)
-        rad/s.
-    """
-
-    model: Dipoles
-    illumination: Dipoles
-    omega: Array
+    model: Dipoles  # Good where tool sensors were calibrated
+    illumination: Dipoles  # Good beside and below the board: what metal and reference sensors see
+    omega: Array  # (K,), rad/s
 
 
 def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View:

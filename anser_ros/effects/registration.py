@@ -1,7 +1,6 @@
 """The optical tracker's frame is not the field generator's."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,8 +18,8 @@ class Registration(Effect[Term]):
 
     name = 'registration'
     summary = "the optical frame is not aligned with the field generator's"
-    units: ClassVar[Mapping[str, str]] = {'rotation_deg': 'deg', 'translation_m': 'm'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+    units = {'rotation_deg': 'deg', 'translation_m': 'm'}
+    plausible = {
         'rotation_deg': (-10.0, 10.0),
         'translation_m': (-0.05, 0.05),
     }

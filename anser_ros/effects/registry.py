@@ -9,7 +9,7 @@ from functools import cache
 from types import ModuleType
 from typing import Any
 
-import anser_ros.effects as package
+import anser_ros.effects
 from anser_ros.effects.effect import Effect
 from anser_ros.errors import ModelFileError
 
@@ -17,14 +17,14 @@ from anser_ros.errors import ModelFileError
 @cache
 def all_effects() -> dict[str, Effect[Any]]:
     """Return every effect by its name, in alphabetical order."""
-    return effects_in(package)
+    return effects_in(anser_ros.effects)
 
 
-def effects_in(room: ModuleType) -> dict[str, Any]:
+def effects_in(package: ModuleType) -> dict[str, Any]:
     """Return the effects that the modules of a package define, by name in alphabetical order."""
     found: dict[str, Any] = {}
-    for info in pkgutil.iter_modules(room.__path__):
-        module = importlib.import_module(f'{room.__name__}.{info.name}')
+    for info in pkgutil.iter_modules(package.__path__):
+        module = importlib.import_module(f'{package.__name__}.{info.name}')
         for effect in getattr(module, 'EFFECTS', ()):
             if effect.name in found:
                 raise ValueError(f'two effects are called {effect.name!r}')

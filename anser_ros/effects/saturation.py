@@ -8,9 +8,8 @@ What the amplifier sees is either the flux, as behind an integrator, or the volt
 induces, in which a tone counts in proportion to its frequency.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,15 +60,9 @@ def compressed(flux: ComplexArray, per_full_scale_squared: float, shape: str) ->
 
 @dataclass(frozen=True, kw_only=True)
 class SaturationTerm(Term):
-    """Holds the saturation of one channel.
+    """Holds the saturation of one channel."""
 
-    Attributes
-    ----------
-    weights : ndarray, shape (K,) or ()
-        What each emitter's tone counts in what the amplifier sees.
-    """
-
-    weights: Array
+    weights: Array  # (K,), what each emitter's tone counts in what the amplifier sees
 
 
 class Saturation(Effect[SaturationTerm]):
@@ -77,14 +70,14 @@ class Saturation(Effect[SaturationTerm]):
 
     name = 'saturation'
     summary = 'a channel compresses large signals'
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'channel': '1',
         'full_scale_t': 'T',
         'shape': 'name of the curve',
         'sees': 'flux or voltage',
         'tone_weights': '1',
     }
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'full_scale_t': (1e-8, 1e-3)}
+    plausible = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
     inexact = CURVE
 

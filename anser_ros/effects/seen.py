@@ -10,14 +10,9 @@ from anser_ros.field.model import EffectRecord
 
 @dataclass(frozen=True, kw_only=True)
 class SeenTerm(Term):
-    """States how much of an effect there is, on the channels of its site, or on all.
+    """States how much of an effect there is, on the channels of its site, or on all."""
 
-    Attributes
-    ----------
-    amount, sigma : float
-        What the effect's first parameter is, and its standard deviation.
-    """
-
+    # amount, sigma: What the effect's first parameter is, and its standard deviation
     amount: float
     sigma: float = 0.0
 

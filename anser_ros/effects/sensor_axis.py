@@ -1,8 +1,7 @@
 """A sensor's axis, or a whole triaxial cluster's frame, is not the surveyed one."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,7 +13,6 @@ from anser_ros.effects.effect import (
     Effect,
     Remedy,
     needed,
-    orthogonal_pair,
     sigmas,
     whole_numbers,
 )
@@ -23,18 +21,14 @@ from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tangent import tangents, tilted
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorAxisTerm(Term):
-    """Holds one sensor's tilt, or one cluster's turn.
+    """Holds one sensor's tilt, or one cluster's turn."""
 
-    Attributes
-    ----------
-    surveyed : tuple of float
-        The sensor's surveyed axis in the body's frame; empty for a cluster.
-    """
-
+    # The sensor's surveyed axis in the body's frame; empty for a cluster
     surveyed: tuple[float, ...] = ()
 
 
@@ -43,13 +37,13 @@ class SensorAxis(Effect[SensorAxisTerm]):
 
     name = 'sensor_axis'
     summary = "a sensor's axis is not the surveyed one"
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'channel': '1',
         'tilt_deg': 'deg',
         'axis': '1',
         'rotation_deg': 'deg',
     }
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'tilt_deg': (0.0, 30.0)}
+    plausible = {'tilt_deg': (0.0, 30.0)}
     remedy = Remedy.SENSORS
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
@@ -82,7 +76,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
             if row is None:
                 return None
             surveyed = np.array(term.surveyed)
-            pair, axis = orthogonal_pair(surveyed), self._tilted(term)
+            pair, axis = tangents(surveyed[None])[0], self._tilted(term)
             length = np.linalg.norm(surveyed + term.theta @ pair)
             across = (pair - np.outer(pair @ axis, axis)) / length
             steps = np.einsum('fij,tj->fti', view.rotation, across)
@@ -111,8 +105,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
 
     def _tilted(self, term: SensorAxisTerm) -> Array:
         surveyed = np.array(term.surveyed)
-        axis = surveyed + term.theta @ orthogonal_pair(surveyed)
-        return np.asarray(axis / np.linalg.norm(axis))
+        return np.asarray(tilted(surveyed[None], term.theta[None])[0])
 
     def record(self, term: SensorAxisTerm, covariance: Array) -> EffectRecord:
         """Record tilt and true axis, or the cluster's rotation."""
@@ -148,7 +141,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
         along = float(axis @ surveyed)
         if along <= 0:
             raise ModelFileError('model: sensor_axis turns an axis by a right angle or more')
-        theta = orthogonal_pair(surveyed) @ (axis / along)
+        theta = tangents(surveyed[None])[0] @ (axis / along)
         site: Site = {'channel': int(needed(record, 'channel'))}
         return SensorAxisTerm(self, site, theta, surveyed=tuple(surveyed.tolist()))
 

@@ -1,9 +1,9 @@
 """One sensor, or one cluster, sits elsewhere in the body than the others say."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
@@ -12,6 +12,7 @@ from anser_ros.effects.effect import (
     Effect,
     Remedy,
     needed,
+    recorded_site,
     sigmas,
     whole_numbers,
 )
@@ -21,14 +22,49 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
 
-class SensorPosition(Effect[Term]):
+class PlacedElsewhere(Effect[Term]):
     """Theta is the offset of some of a body's sensors in the body's frame, m."""
+
+    plausible = {'offset_m': (-0.03, 0.03)}
+    remedy = Remedy.SENSORS
+
+    def rows(self, term: Term, sensors: SensorTable) -> NDArray[np.bool_]:
+        """Return which sensors (S,) are shifted."""
+        raise NotImplementedError
+
+    def prior(self, term: Term) -> Array:
+        """Return a prior spread of 5 mm: offsets are some millimetres."""
+        return np.full(3, 5e-3)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Return the derivative by the centres of those sensors, along the body's axes."""
+        rows = self.rows(term, view.sensors)
+        if view.is_reference or not rows.any():
+            return None
+        out = view.columns(3)
+        out[:, rows] = np.einsum('fsik,fij->fskj', view.d_position[:, rows], view.rotation)
+        return out
+
+    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
+        """Return the table with those sensors shifted by the offset, m."""
+        rows = self.rows(term, sensors)[:, None]
+        return sensors.with_geometry(position=sensors.position + rows * term.theta)
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Record the site and the offset."""
+        return EffectRecord(
+            self.name,
+            {**recorded_site(term), 'offset_m': term.theta.tolist()},
+            {'offset_m': sigmas(covariance).tolist()},
+        )
+
+
+class SensorPosition(PlacedElsewhere):
+    """Shifts one sensor, or one cluster."""
 
     name = 'sensor_position'
     summary = 'one sensor of a body sits elsewhere than surveyed'
-    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'offset_m': 'm'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_m': (-0.03, 0.03)}
-    remedy = Remedy.SENSORS
+    units = {'channels': '1', 'offset_m': 'm'}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Try single sensors and clusters of bodies that carry more than those."""
@@ -40,33 +76,9 @@ class SensorPosition(Effect[Term]):
                 groups += [g for g in apparatus.clusters() if own > set(g)]
         return [Term(self, {'channels': group}, np.zeros(3)) for group in groups]
 
-    def prior(self, term: Term) -> Array:
-        """Return a prior spread of 5 mm: offsets are some millimetres."""
-        return np.full(3, 5e-3)
-
-    def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Return the derivative by the centres of those sensors, along the body's axes."""
-        rows = np.isin(view.sensors.channel, term.site['channels'])
-        if view.is_reference or not rows.any():
-            return None
-        out = view.columns(3)
-        out[:, rows] = np.einsum('fsik,fij->fskj', view.d_position[:, rows], view.rotation)
-        return out
-
-    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
-        """Return the table with those sensors shifted by the offset, m."""
-        rows = np.isin(sensors.channel, term.site['channels'])
-        return sensors.with_geometry(
-            position=sensors.position + rows[:, None] * term.theta[None, :]
-        )
-
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the channels and the offset."""
-        return EffectRecord(
-            self.name,
-            {'channels': list(term.site['channels']), 'offset_m': term.theta.tolist()},
-            {'offset_m': sigmas(covariance).tolist()},
-        )
+    def rows(self, term: Term, sensors: SensorTable) -> NDArray[np.bool_]:
+        """Return the sensors of the site's channels."""
+        return np.isin(sensors.channel, term.site['channels'])
 
     def term(self, record: EffectRecord) -> Term:
         """Read the channels and their offset, m, from a record."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,15 +18,9 @@ UNIT = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSizeTerm(Term):
-    """Holds the coils of one body.
+    """Holds the coils of one body."""
 
-    Attributes
-    ----------
-    surveyed : mapping of int to float
-        Surveyed length (m) of the coil on each channel.
-    """
-
-    surveyed: Mapping[int, float]
+    surveyed: Mapping[int, float]  # Surveyed length (m) of the coil on each channel
 
 
 class SensorSize(Effect[SensorSizeTerm]):
@@ -39,8 +32,8 @@ class SensorSize(Effect[SensorSizeTerm]):
 
     name = 'sensor_size'
     summary = 'the coils are too long to be points'
-    units: ClassVar[Mapping[str, str]] = {'length_m': 'm', 'channels': '1'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'length_m': (0.0, 0.08)}
+    units = {'length_m': 'm', 'channels': '1'}
+    plausible = {'length_m': (0.0, 0.08)}
     remedy = Remedy.SENSORS
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorSizeTerm]:

@@ -1,6 +1,6 @@
 """All sensors have errors, each its own: populations of gains, axes and places."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -32,24 +32,14 @@ coils that are wound one by one have next to none, the axes of a chip nearly all
 
 @dataclass(frozen=True, kw_only=True)
 class SpreadTerm(Term):
-    """Holds a population: theta is the values of its channels, one channel after the other.
+    """Holds a population: theta is the values of its channels, one channel after the other."""
 
-    Attributes
-    ----------
-    groups : tuple of int
-        Which value each channel has, where several have one: row of the values by member. Empty
-        where each has its own.
-    members : tuple of int
-        Their channels.
-    spread : float
-        Standard deviation of the population, in the values' unit.
-    shared : float
-        Share of the population's variance that the channels at one place have in common.
-    """
-
-    members: tuple[int, ...]
-    spread: float
+    members: tuple[int, ...]  # Their channels
+    spread: float  # Standard deviation of the population, in the values' unit
+    # Share of the population's variance that the channels at one place have in common
     shared: float = 0.0
+    # Which value each channel has, where several have one: row of the values by member. Empty
+    # where each has its own.
     groups: tuple[int, ...] = ()
 
     @property
@@ -81,7 +71,7 @@ class SensorSpread(Effect[SpreadTerm]):
     """
 
     family = Family.SEEN
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'spread': (0.0, 0.3)}
+    plausible = {'spread': (0.0, 0.3)}
     width: ClassVar[int] = 0
     offset_of_values: ClassVar[tuple[float, ...]] = ()
 
@@ -125,7 +115,7 @@ class SensorGainSpread(SensorSpread):
     name = 'sensor_gain_spread'
     summary = 'every channel has a gain of its own'
     family = Family.STEADY
-    units: ClassVar[Mapping[str, str]] = {'spread': '1', 'channels': '1', 'values': '1'}
+    units = {'spread': '1', 'channels': '1', 'values': '1'}
     remedy = Remedy.FLUX
     width = 2
     parts: ClassVar[tuple[str, ...]] = ('in phase', 'quadrature')
@@ -201,7 +191,7 @@ class SensorAxisSpread(SensorSpread):
 
     name = 'sensor_axis_spread'
     summary = "every sensor's axis is a little off"
-    units: ClassVar[Mapping[str, str]] = {'spread': 'rad', 'channels': '1', 'values': 'rad'}
+    units = {'spread': 'rad', 'channels': '1', 'values': 'rad'}
     remedy = Remedy.SENSORS
     width = 2
     parts: ClassVar[tuple[str, ...]] = ('first tangent', 'second tangent')
@@ -217,7 +207,7 @@ class SensorPlaceSpread(SensorSpread):
 
     name = 'sensor_place_spread'
     summary = 'every sensor sits a little off its surveyed place'
-    units: ClassVar[Mapping[str, str]] = {'spread': 'm', 'channels': '1', 'values': 'm'}
+    units = {'spread': 'm', 'channels': '1', 'values': 'm'}
     remedy = Remedy.SENSORS
     width = 3
     parts: ClassVar[tuple[str, ...]] = ('x', 'y', 'z')
@@ -233,8 +223,8 @@ class SensorPickupSpread(SensorSpread):
 
     name = 'sensor_pickup_spread'
     summary = 'a constant phasor of its own is added to every channel'
-    units: ClassVar[Mapping[str, str]] = {'spread': 'T', 'channels': '1', 'values': 'T'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'spread': (0.0, 1.0)}
+    units = {'spread': 'T', 'channels': '1', 'values': 'T'}
+    plausible = {'spread': (0.0, 1.0)}
     remedy = Remedy.FLUX
 
     def offset(

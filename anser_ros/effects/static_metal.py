@@ -1,8 +1,7 @@
 """A metal object rests near the volume."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +41,7 @@ CLOSEST = 0.02
 """Metal that is searched keeps this distance (m) from where sensors were: a point-like answer is
 no model of a body that is nearer than its own size."""
 SAME_BODY_M = 0.12
-"""Distance (m) from metal in force within which further metal is taken for the same body: about
+"""Distance (m) from active metal within which further metal is taken for the same body: about
 the step of the grid of places. Nearer candidates only stand in for the body's shape."""
 
 
@@ -85,11 +84,11 @@ class StaticMetal(Effect[Term]):
 
     name = 'static_metal'
     summary = 'a metal object stands near the volume'
-    units: ClassVar[Mapping[str, str]] = {
+    units = {
         'position_m': 'm',
         'polarizability': 'm^3 (3x3, [re, im])',
     }
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'position_m': (-1.0, 1.0)}
+    plausible = {'position_m': (-1.0, 1.0)}
     remedy = Remedy.FIELD
     family = Family.METAL_AT_REST
     inexact = np.inf
@@ -155,7 +154,7 @@ class StaticMetal(Effect[Term]):
         return (term.with_theta(np.concatenate([term.theta[:3], alpha.ravel()])),)
 
     def covers(self, term: Term, candidate: Term) -> bool:
-        """Take metal that is near to metal in force for the same body."""
+        """Count nearby candidates as covered: they are the same body."""
         if candidate.effect is not self:
             return False
         return bool(np.linalg.norm(candidate.theta[:3] - term.theta[:3]) < SAME_BODY_M)

@@ -34,7 +34,7 @@ class Site(TypedDict, total=False):
     z: float  # height of a sheet, m, frame fg
     edge: float  # length of its edge, m
     degree: int  # of a map's polynomial
-    lowest: int  # lowest degree in it, 1 where it is not told
+    lowest: int  # lowest degree in it, 1 where it is not stated
     centre_m: list[float]  # where the polynomial's coordinates are zero, frame of the tracker
     size_m: float  # what they are divided by
     middle_s: float  # time at which a clock's offset is its offset
@@ -43,14 +43,9 @@ class Site(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Held:
-    """Marks a term whose parameters that are not linear stay where they are in a fit.
+    """Marks a term whose parameters that are not linear stay where they are in a fit."""
 
-    Attributes
-    ----------
-    covariance : ndarray, shape (q, q), or None
-        Of all its parameters, from when they were last free; None where they never were.
-    """
-
+    # (q, q), of all its parameters, from when they were last free; None where they never were
     covariance: Array | None = None
 
 
@@ -59,22 +54,14 @@ class Term:
     """Holds an effect at one site (a channel, a coil, a body, ...) with values of its parameters.
 
     An effect that needs more data than a site defines a subclass with more fields.
-
-    Attributes
-    ----------
-    effect : Effect
-    site : Site
-        What tells this candidate from others of the same effect, as reports and records show it.
-    theta : ndarray, shape (q,)
-        Parameters in the units that the effect works in; zero is no effect.
-    held : Held or None
-        None where all parameters are free.
     """
 
     effect: 'Effect[Any]'
+    # What tells this candidate from others of the same effect, as reports and records show it
     site: Site = field(default_factory=lambda: Site())
+    # (q,), parameters in the units that the effect works in; zero is no effect
     theta: Array = field(default_factory=lambda: np.zeros(0))
-    held: Held | None = None
+    held: Held | None = None  # None where all parameters are free
 
     def with_theta(self, theta: Array) -> Self:
         """Return the same term with other parameters."""

@@ -1,8 +1,7 @@
 """The optical tracker's clock is ahead of the fluxes', or behind."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -30,8 +29,8 @@ class TimeOffset(Effect[Term]):
 
     name = 'time_offset'
     summary = 'the optical stamps are early or late'
-    units: ClassVar[Mapping[str, str]] = {'offset_s': 's'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_s': (-0.5, 0.5)}
+    units = {'offset_s': 's'}
+    plausible = {'offset_s': (-0.5, 0.5)}
     remedy = Remedy.OPTICAL
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:

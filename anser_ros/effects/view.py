@@ -14,54 +14,30 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class View:
-    """Holds predicted readings of a body's S sensors in F frames, with some effects in force.
+    """Holds predicted readings of a body's S sensors in F frames, with some active effects."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (F,)
-        s since the session's start.
-    sensors : SensorTable
-        The sensors as the effects say that they are.
-    position, rotation : ndarray, shapes (F, 3) and (F, 3, 3)
-        Pose of the body, m, frame fg.
-    velocity : ndarray, shape (F, 6)
-        m/s and rad/s along the axes of fg, of the body's origin.
-    centres, axes : ndarray, shape (F, S, 3)
-        Places (m) and unit axes of the sensors, frame fg.
-    linear : ndarray, shape (F, S, K), complex
-        Flux before offsets and compression, T.
-    flux : ndarray, shape (F, S, K), complex
-        Flux as it is read, T.
-    d_position, d_axis : ndarray, shape (F, S, 3, K), complex
-        Derivatives of the flux by the sensor's centre (T/m) and by its axis vector (T).
-    d_turn : ndarray, shape (F, S, 3, K), complex
-        Derivative of the flux by a turn of the body about its origin, along fg's axes, T/rad.
-    dipoles : Dipoles
-        The field that the sensors see, without what moves.
-    illumination : Dipoles
-        The emitters' own field, as metal sees it.
-    omega : ndarray, shape (K,)
-        Angular drive frequencies, rad/s.
-    is_reference : bool
-        Whether the sensors are the references, which are fixed in fg.
-    """
-
-    time: Array
-    sensors: SensorTable
+    time: Array  # (F,), s since the session's start
+    sensors: SensorTable  # The sensors as the effects say that they are
+    # position, rotation: (F, 3) and (F, 3, 3), pose of the body, m, frame fg
     position: Array
     rotation: Array
-    velocity: Array
+    velocity: Array  # (F, 6), m/s and rad/s along the axes of fg, of the body's origin
+    # centres, axes: (F, S, 3), places (m) and unit axes of the sensors, frame fg
     centres: Array
     axes: Array
-    linear: ComplexArray
-    flux: ComplexArray
+    linear: ComplexArray  # (F, S, K), flux before offsets and compression, T
+    flux: ComplexArray  # (F, S, K), flux as it is read, T
+    # d_position, d_axis: (F, S, 3, K), derivatives of the flux by the sensor's centre (T/m) and by
+    # its axis vector (T)
     d_position: ComplexArray
     d_axis: ComplexArray
+    # (F, S, 3, K), derivative of the flux by a turn of the body about its origin, along fg's axes,
+    # T/rad
     d_turn: ComplexArray
-    dipoles: Dipoles
-    illumination: Dipoles
-    omega: Array
-    is_reference: bool
+    dipoles: Dipoles  # The field that the sensors see, without what moves
+    illumination: Dipoles  # The emitters' own field, as metal sees it
+    omega: Array  # (K,), angular drive frequencies, rad/s
+    is_reference: bool  # Whether the sensors are the references, which are fixed in fg
 
     def row(self, channel: int) -> int | None:
         """Return the row of a channel, or None where the body doesn't carry it."""

@@ -3,8 +3,7 @@
 None has a parameter to fit; they are found before the search (`anser_ros.diagnosis.wiring`).
 """
 
-from collections.abc import Mapping
-from typing import ClassVar
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,21 +14,36 @@ from anser_ros.effects.effect import (
     Effect,
     Family,
     Remedy,
+    recorded_site,
     unit_matrix,
     whole_numbers,
 )
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.field.model import EffectRecord
 
 
-class SwappedChannels(Effect[Term]):
+class Wiring(Effect[Term]):
+    """Has no parameter: its site, which is all lists of numbers, says what is wired how."""
+
+    family = Family.SEEN
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Record the channels or emitters, and those that they are read as."""
+        return EffectRecord(self.name, recorded_site(term))
+
+    def term(self, record: EffectRecord) -> Term:
+        """Read the channels or emitters, and those that they are read as, from a record."""
+        site = {key: whole_numbers(record, key) for key in self.units}
+        return Term(self, cast(Site, site))
+
+
+class SwappedChannels(Wiring):
     """Reads each of ``channels`` at the place of the one in ``read_as``."""
 
     name = 'swapped_channels'
     summary = 'sensors are plugged into each other'
-    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'read_as': '1'}
+    units = {'channels': '1', 'read_as': '1'}
     remedy = Remedy.FLUX
-    family = Family.SEEN
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
         """Return a permutation; channels of which one is missing stay as they are."""
@@ -42,27 +56,14 @@ class SwappedChannels(Effect[Term]):
             matrix[row[shown], row[true]] = 1.0
         return matrix
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the true channels, and those that they are read as."""
-        site = term.site
-        return EffectRecord(
-            self.name, {'channels': list(site['channels']), 'read_as': list(site['read_as'])}
-        )
 
-    def term(self, record: EffectRecord) -> Term:
-        """Read from a record which channels are swapped, and with which."""
-        true, shown = whole_numbers(record, 'channels'), whole_numbers(record, 'read_as')
-        return Term(self, {'channels': true, 'read_as': shown})
-
-
-class SwappedCoils(Effect[Term]):
+class SwappedCoils(Wiring):
     """Shows each emitter of ``coils`` in the place of the one in ``read_as``."""
 
     name = 'swapped_coils'
     summary = 'emitters are plugged into each other'
-    units: ClassVar[Mapping[str, str]] = {'coils': '1', 'read_as': '1'}
+    units = {'coils': '1', 'read_as': '1'}
     remedy = Remedy.FLUX
-    family = Family.SEEN
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
         """Return the emitters' permutation as a matrix."""
@@ -72,39 +73,17 @@ class SwappedCoils(Effect[Term]):
             matrix[shown, true] = 1.0
         return matrix[None]
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the true emitters, and those that they are read as."""
-        site = term.site
-        return EffectRecord(
-            self.name, {'coils': list(site['coils']), 'read_as': list(site['read_as'])}
-        )
 
-    def term(self, record: EffectRecord) -> Term:
-        """Read the swapped emitters from a record, and as which they are read."""
-        true, shown = whole_numbers(record, 'coils'), whole_numbers(record, 'read_as')
-        return Term(self, {'coils': true, 'read_as': shown})
-
-
-class DeadChannel(Effect[Term]):
+class DeadChannel(Wiring):
     """Silences channels whose readings are noise; they take no part in anything."""
 
     name = 'dead_channel'
     summary = 'a channel receives nothing'
-    units: ClassVar[Mapping[str, str]] = {'channels': '1'}
-    remedy = Remedy.NONE
-    family = Family.SEEN
+    units = {'channels': '1'}
 
     def silenced(self, term: Term) -> tuple[int, ...]:
         """Return all channels that the term names."""
         return term.channels
-
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the channels that are dead."""
-        return EffectRecord(self.name, {'channels': list(term.site['channels'])})
-
-    def term(self, record: EffectRecord) -> Term:
-        """Read the channels that are dead from a record."""
-        return Term(self, {'channels': whole_numbers(record, 'channels')})
 
 
 SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()

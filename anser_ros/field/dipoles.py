@@ -14,18 +14,12 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Dipoles:
-    """Holds a set of N dipoles with one moment for each of K emitters.
+    """Holds a set of N dipoles with one moment for each of K emitters."""
 
-    Attributes
-    ----------
-    positions, directions : ndarray, shape (N, 3)
-        Positions (m) and unit directions, frame fg.
-    moments : ndarray, shape (N, K), complex
-        Moments along the directions at each emitter's nominal current, A m^2.
-    """
-
+    # positions, directions: (N, 3), positions (m) and unit directions, frame fg
     positions: Array
     directions: Array
+    # (N, K), moments along the directions at each emitter's nominal current, A m^2
     moments: ComplexArray
 
     @staticmethod
@@ -36,15 +30,7 @@ class Dipoles:
 
     @staticmethod
     def vectors(points: Array, moments: ComplexArray) -> 'Dipoles':
-        """Return dipoles with vector moments, as three rows (x, y, z) a point.
-
-        Parameters
-        ----------
-        points : ndarray, shape (M, 3)
-            Positions, m, frame fg.
-        moments : ndarray, shape (M, 3, K), complex
-            Moment vectors, A m^2, frame fg.
-        """
+        """Return dipoles with vector moments (M, 3, K), A m^2: rows x, y, z of each point (m)."""
         flat = np.ascontiguousarray(moments.reshape(3 * len(points), -1))
         return Dipoles(*along_each_axis(points), flat)
 
@@ -61,19 +47,10 @@ class Dipoles:
         return dipole_field(points, self.positions, self.directions, self.moments)
 
     def flux(self, points: Array, axes: Array, lengths: Array | None) -> ComplexArray:
-        """Return each emitter's flux density along sensors' axes.
+        """Return each emitter's flux density (P, K), T, along sensors' axes.
 
-        Parameters
-        ----------
-        points, axes : ndarray, shape (P, 3)
-            Sensor centres (m) and unit axes, frame fg.
-        lengths : ndarray, shape (P,), or None
-            Coil lengths, m; None for point sensors.
-
-        Returns
-        -------
-        ndarray, shape (P, K), complex
-            Flux density, T.
+        Sensor centres (m) and unit axes (P, 3) are in the frame fg; no ``lengths`` are those of
+        points.
         """
         basis = flux_basis(points, axes, lengths, self.positions, self.directions)
         return np.asarray(basis @ self.moments)

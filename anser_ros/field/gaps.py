@@ -14,19 +14,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ScanGaps:
-    """Holds what a scan leaves open of the field, alike for all emitters.
+    """Holds what a scan leaves open of the field, alike for all emitters."""
 
-    Attributes
-    ----------
-    positions, directions : ndarray, shape (N, 3)
-        Dipoles, m and unit vectors, frame fg.
-    moments : ndarray, shape (R, N)
-        A m^2. The variance of a phasor component of any emitter's flux is the sum of the squares
-        of the fluxes of these R combinations of the dipoles.
-    """
-
+    # positions, directions: (N, 3), dipoles, m and unit vectors, frame fg
     positions: Array
     directions: Array
+    # (R, N), A m^2. The variance of a phasor component of any emitter's flux is the sum of the
+    # squares of the fluxes of these R combinations of the dipoles.
     moments: Array
 
     def sigma_t(self, points: Array, axes: Array, lengths: Array) -> Array:

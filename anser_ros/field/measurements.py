@@ -58,7 +58,7 @@ class Measurements:
 
     @property
     def is_followed(self) -> bool:
-        """Return whether the optical tracker followed the body, so that clocks can be told.
+        """Return whether the optical tracker followed the body, so that clocks can be compared.
 
         A recording with one pose for each point of rest contains no information about clocks, and
         each place once.

@@ -133,19 +133,10 @@ class FieldModel:
         )  # fmt: skip
 
     def flux(self, points: Array, axes: Array, lengths: Array | None = None) -> ComplexArray:
-        """Return the flux that each sensor has of each emitter.
+        """Return the flux (..., K), T, that each sensor has of each emitter, along its axis.
 
-        Parameters
-        ----------
-        points, axes : ndarray, shape (..., 3)
-            Sensor centres (m) and unit axes, frame fg.
-        lengths : ndarray, shape broadcast to (...), or None
-            Coil lengths, m; None for point sensors.
-
-        Returns
-        -------
-        ndarray, shape (..., K), complex
-            Flux density along the axes, T.
+        Sensor centres (m) and unit axes (..., 3) are in the frame fg; no ``lengths`` are those of
+        points.
         """
         flat = points.reshape(-1, 3)
         spans = None if lengths is None else np.broadcast_to(lengths, points.shape[:-1]).ravel()

@@ -47,20 +47,11 @@ class Tolerances:
 
     The defaults are assumptions, not measurements. Larger ones make reported uncertainties larger
     and let references change the model more.
-
-    Attributes
-    ----------
-    gain : float
-        Relative error of each coil's moment (turns, shape, scale of the current).
-    shift_m : float
-        Error of each coil's position along x, y and z, m.
-    tilt_rad : float
-        Tilt of each coil about its own x and y axes, rad.
     """
 
-    gain: float = 0.02
-    shift_m: float = 5e-4
-    tilt_rad: float = 5e-3
+    gain: float = 0.02  # Relative error of each coil's moment (turns, shape, scale of the current)
+    shift_m: float = 5e-4  # Error of each coil's position along x, y and z, m
+    tilt_rad: float = 5e-3  # Tilt of each coil about its own x and y axes, rad
 
 
 @dataclass(frozen=True)

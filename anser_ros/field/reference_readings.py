@@ -14,26 +14,14 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class ReferenceReadings:
-    """Holds mean readings of the reference sensors while nothing distorted the field.
+    """Holds mean readings of the reference sensors while nothing distorted the field."""
 
-    Attributes
-    ----------
-    name : tuple of str, length R
-    position : ndarray, shape (R, 3)
-        Surveyed places, m, frame fg: a sensor that is elsewhere now reads something else.
-    axis : ndarray, shape (R, 3)
-        Surveyed unit axes.
-    flux : ndarray, shape (R, K), complex
-        T.
-    sigma_t : float
-        Noise of a component of these means, T.
-    """
-
-    name: tuple[str, ...]
+    name: tuple[str, ...]  # length R
+    # (R, 3), surveyed places, m, frame fg: a sensor that is elsewhere now reads something else
     position: Array
-    axis: Array
-    flux: ComplexArray
-    sigma_t: float
+    axis: Array  # (R, 3), surveyed unit axes
+    flux: ComplexArray  # (R, K), T
+    sigma_t: float  # Noise of a component of these means, T
 
 
 def readings_document(readings: ReferenceReadings) -> dict[str, Any]:

@@ -25,22 +25,13 @@ moments so large that rounding is seen."""
 
 @dataclass(frozen=True)
 class SymmetryAxis:
-    """Describes an axis of rotation that leaves a field as it is.
+    """Describes an axis of rotation that leaves a field as it is."""
 
-    Attributes
-    ----------
-    point : ndarray, shape (3,)
-        The middle of the sources on it, m, frame fg: that of their moments, about which their
-        field has no quadrupole.
-    direction : ndarray, shape (3,)
-        Unit vector; the first emitter's moment points along it.
-    second_moment_m2 : float
-        Of the sources about the middle, along the axis, m^2.
-    """
-
+    # (3,), the middle of the sources on it, m, frame fg: that of their moments, about which their
+    # field has no quadrupole
     point: Array
-    direction: Array
-    second_moment_m2: float
+    direction: Array  # (3,), unit vector; the first emitter's moment points along it
+    second_moment_m2: float  # Of the sources about the middle, along the axis, m^2
 
 
 def symmetry_axis(

@@ -15,21 +15,11 @@ from anser_ros.wire import points
 
 
 class Fault(NamedTuple):
-    """Describes one kind of fault by its name, state and reason.
+    """Describes one kind of fault by its name, state and reason."""
 
-    Attributes
-    ----------
-    kind : str
-        Its name in the counters: ``readings_<kind>``.
-    state : str
-        The state of a pose that the reading was for.
-    reason : str
-        What `/diagnostics` says of it.
-    """
-
-    kind: str
-    state: str
-    reason: str
+    kind: str  # Its name in the counters: ``readings_<kind>``
+    state: str  # The state of a pose that the reading was for
+    reason: str  # What `/diagnostics` says of it
 
 
 GOOD = 0
@@ -62,17 +52,9 @@ FAULTS: tuple[Fault | None, ...] = (
 
 
 def value_codes(flux: NDArray[np.complex128]) -> NDArray[np.int64]:
-    """Return what the values of readings say about them.
+    """Return what the values of readings (..., K), T, say about them.
 
-    Parameters
-    ----------
-    flux : ndarray, shape (..., K), complex
-        T.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        `GOOD`, `NOT_FINITE_CODE` or `ABSURD_CODE`.
+    Each is `GOOD`, `NOT_FINITE_CODE` or `ABSURD_CODE`.
     """
     with np.errstate(invalid='ignore'):
         largest = np.maximum(np.abs(flux.real), np.abs(flux.imag)).max(axis=-1, initial=0.0)
@@ -85,17 +67,8 @@ def reading_codes(
 ) -> NDArray[np.int64]:
     """Return what is wrong with recorded readings, as `frames.intake` says it of live ones.
 
-    Parameters
-    ----------
-    flux : ndarray, shape (..., K), complex
-        T.
-    flags : ndarray, shape (...), int
-        Flag bits of `wire.points`; a channel that is not in its frame has `STALE` and NaN.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Places in `FAULTS`; `GOOD` for readings that can be used.
+    ``flux`` (..., K) in T and ``flags`` (...) of `wire.points`, where a channel that is not in its
+    frame has `STALE` and NaN, make places in `FAULTS`; `GOOD` for readings that can be used.
     """
     codes = np.where(flags == 0, value_codes(flux), FLAGGED_CODE)
     for bit, code in reversed(FLAG_CODES):

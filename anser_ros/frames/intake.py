@@ -28,30 +28,17 @@ Count = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class Frame:
-    """Holds one frame of fluxes as a table of sensors has them.
+    """Holds one frame of fluxes as a table of sensors has them."""
 
-    Attributes
-    ----------
-    stamp_ns : int
-        Middle of the demodulation window.
-    channels : ndarray of int, shape (S,)
-        Channels in the table's order.
-    flux : ndarray, shape (S, K), complex
-        T; NaN where a channel is missing and in place of components that are not finite.
-    codes : ndarray of int, shape (S,)
-        What is wrong with each reading: places in `frames.faults.FAULTS`, 0 for nothing.
-    living : ndarray of bool, shape (K,), or None
-        Emitters that a usable sensor hears; None when all are heard, or none at all.
-    goes_back : bool
-        Whether the stamp is before that of the frame before.
-    """
-
-    stamp_ns: int
-    channels: Integers
+    stamp_ns: int  # Middle of the demodulation window
+    channels: Integers  # (S,), channels in the table's order
+    # (S, K), T; NaN where a channel is missing and in place of components that are not finite
     flux: ComplexArray
+    # (S,), what is wrong with each reading: places in `frames.faults.FAULTS`, 0 for nothing
     codes: Integers
+    # (K,), emitters that a usable sensor receives; None when all are received, or none at all
     living: NDArray[np.bool_] | None = None
-    goes_back: bool = False
+    goes_back: bool = False  # Whether the stamp is before that of the frame before
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -100,7 +87,7 @@ class Intake:
     last_ns : int
         Stamp of the last admitted frame; 0 before.
     dead : tuple of str
-        Emitters that no sensor heard in that frame while others were heard.
+        Emitters that no sensor received in that frame while others were received.
     """
 
     def __init__(
@@ -144,7 +131,7 @@ class Intake:
 
         Raises
         ------
-        LayoutError or what the intake was told
+        LayoutError, or the intake's own error
             As `judge`, and when the emitters are not as many as there ought to be.
         """
         frame = self.judge(stamp_ns, channels, flux, flags, None if emitters is None else
@@ -199,7 +186,7 @@ class Intake:
 
         Raises
         ------
-        LayoutError or what the intake was told
+        LayoutError, or the intake's own error
             When the stamp is not positive, shapes don't fit, a channel appears twice, or the
             emitters are not as many as there ought to be.
         """

@@ -33,24 +33,15 @@ UNIT = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """Holds shapes of a field about a centre, and the pairs of them that metal couples.
+    """Holds shapes of a field about a centre, and the pairs of them that metal couples."""
 
-    Attributes
-    ----------
-    offsets : ndarray, shape (n, 3)
-        From the centre, m.
-    functionals : ndarray, shape (M, n, 3)
-        Amplitude i is the sum of ``functionals[i]`` times the field at the offsets.
-    first, second : ndarray of int, shape (P,)
-        Shapes of each pair, first <= second.
-    sloped : ndarray of int
-        The pairs, by index, whose coupling may have a part that grows as log f.
-    """
-
-    offsets: Array
+    offsets: Array  # (n, 3), from the centre, m
+    # (M, n, 3), amplitude i is the sum of ``functionals[i]`` times the field at the offsets
     functionals: Array
+    # first, second: (P,), shapes of each pair, first <= second
     first: NDArray[np.int64]
     second: NDArray[np.int64]
+    # The pairs, by index, whose coupling may have a part that grows as log f
     sloped: NDArray[np.int64]
 
     @property

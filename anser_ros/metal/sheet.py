@@ -81,19 +81,9 @@ def sheet_sources(
 ) -> Dipoles:
     """Return loops of a sheet parallel to the board, as dipoles along z.
 
-    Parameters
-    ----------
-    centre : ndarray, shape (3,)
-        m.
-    edges : ndarray, shape (2,)
-        Along x and y, m; the mesh is scaled with their geometric mean.
-    sheet_ohm : float
-        Resistance of a square.
-    count : int
-        Loops along an edge.
-    illumination : Dipoles
-    omega : ndarray, shape (K,)
-        rad/s.
+    The ``centre`` (3,) and the ``edges`` (2,) along x and y are in m; the mesh of ``count`` loops
+    along an edge is scaled with their geometric mean. ``sheet_ohm`` is the resistance of a square,
+    ``omega`` (K,) in rad/s.
     """
     values, vectors = _modes(count)
     steps = (np.arange(count) + 0.5) / count - 0.5

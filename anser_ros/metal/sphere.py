@@ -26,23 +26,8 @@ def sphere_polarisability(
     with ``x = a sqrt(j w mu sigma)``; matched at the surface it gives the moment
     ``2 pi a^3 / mu_0 (2 mu_r - q) / (mu_r + q)`` with ``q = x^2 / (x coth x - 1) - 1``
     (J. R. Wait, Geophysics 16, 1951, p. 666). The limits are -2 pi a^3 / mu_0 for a perfect
-    conductor and ``4 pi a^3 / mu_0 (mu_r - 1) / (mu_r + 2)`` for a permeable insulator.
-
-    Parameters
-    ----------
-    radius_m : float
-        Radius a, m.
-    conductivity_s_per_m : float
-        Conductivity, S/m; 0 for an insulator.
-    relative_permeability : float
-        Relative permeability mu_r.
-    omega : ndarray, shape (K,)
-        Angular frequencies, rad/s.
-
-    Returns
-    -------
-    ndarray, shape (K,), complex
-        Moment per flux density, A m^2 / T.
+    conductor and ``4 pi a^3 / mu_0 (mu_r - 1) / (mu_r + 2)`` for a permeable insulator, whose
+    conductivity is 0. ``omega`` (K,) is in rad/s, the moments (K,) per flux density in A m^2 / T.
 
     Raises
     ------

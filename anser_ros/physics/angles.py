@@ -1,4 +1,7 @@
-"""Computes angles between axes and of rotations, rad, by arctangent: small ones are exact too."""
+"""Computes angles between axes and of rotations, and rotations nearest to matrices.
+
+Angles are in rad, by arctangent: small ones are exact too.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,3 +34,13 @@ def rotation_angles(matrices: Array) -> Array:
     sine = np.linalg.norm(matrices - transposed, axis=(-2, -1)) / np.sqrt(8.0)
     cosine = 0.5 * (np.trace(matrices, axis1=-2, axis2=-1) - 1.0)
     return np.asarray(np.arctan2(sine, cosine))
+
+
+def nearest_rotation(matrices: Array) -> Array:
+    """Return the proper rotations (..., n, n) nearest to matrices (Kabsch).
+
+    They are ``U diag(1, ..., 1, det) V^T`` of the singular value decomposition.
+    """
+    u, _, vt = np.linalg.svd(matrices)
+    u[..., -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import SetupError
-from anser_ros.physics.tracks import loop_moment, paths_field
+from anser_ros.physics.tracks import loop_field, loop_moment
 
 Array = NDArray[np.float64]
 
@@ -30,31 +30,16 @@ _DIRECTIONS = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))
 
 @dataclass(frozen=True)
 class Board:
-    """Describes a board of K emitter coils that all have the same shape.
+    """Describes a board of K emitter coils that all have the same shape."""
 
-    Attributes
-    ----------
-    names : tuple of str, length K
-        Names of the coils.
-    frequencies_hz : tuple of float, length K
-        Drive frequencies, Hz.
-    shape : ndarray, shape (M, 3)
-        Corners of one coil's closed path around its own centre, m; the last corner is joined to
-        the first.
-    current_a : float
-        Nominal current times the number of turns that the path stands for, A.
-    centres : ndarray, shape (K, 3)
-        Coil centres, m, frame fg.
-    rotations : ndarray, shape (K, 3, 3)
-        Rotation matrices from each coil's own frame to fg.
-    """
-
-    names: tuple[str, ...]
-    frequencies_hz: tuple[float, ...]
+    names: tuple[str, ...]  # length K, names of the coils
+    frequencies_hz: tuple[float, ...]  # length K, drive frequencies, Hz
+    # (M, 3), corners of one coil's closed path around its own centre, m; the last corner is joined
+    # to the first
     shape: Array
-    current_a: float
-    centres: Array
-    rotations: Array
+    current_a: float  # Nominal current times the number of turns that the path stands for, A
+    centres: Array  # (K, 3), coil centres, m, frame fg
+    rotations: Array  # (K, 3, 3), rotation matrices from each coil's own frame to fg
 
     @property
     def paths(self) -> tuple[Array, ...]:
@@ -75,7 +60,7 @@ class Board:
         ndarray, shape (P, K, 3)
             Flux density, T, frame fg.
         """
-        return paths_field(self.paths, points, np.full(len(self.names), self.current_a))
+        return np.stack([loop_field(path, points, self.current_a) for path in self.paths], axis=1)
 
     def moments(self) -> Array:
         """Return the magnetic moment of every coil, shape (K, 3), A m^2, frame fg."""
@@ -103,27 +88,12 @@ def _whole(geometry: Mapping[str, Any], key: str, default: int) -> int:
 def spiral_path(
     side_x_m: float, side_y_m: float, pitch_m: float, turns: float, layers: int, thickness_m: float
 ) -> Array:
-    """Return the corners of a rectangular spiral that winds inwards and outwards by turns.
+    """Return the corners (M, 3), m, of a rectangular spiral around the coil's centre.
 
-    The first layer winds inwards, the second outwards, and so on.
-
-    Parameters
-    ----------
-    side_x_m, side_y_m : float
-        Outer sides between the centres of the tracks, m.
-    pitch_m : float
-        Distance between neighbouring turns, m.
-    turns : float
-        Number of turns of all layers together; each layer gets the same number of quarter turns.
-    layers : int
-        Number of copper layers, evenly spaced from z = 0 down to z = -thickness.
-    thickness_m : float
-        Distance from the top copper layer to the bottom one, m.
-
-    Returns
-    -------
-    ndarray, shape (M, 3)
-        Corners around the coil's centre, m.
+    The first layer winds inwards, the second outwards, and so on; each has the same number of
+    quarter turns. ``side_x_m``, ``side_y_m`` are the outer sides between the centres of the
+    tracks, ``pitch_m`` lies between neighbouring turns; the layers are evenly spaced from z = 0
+    down to -``thickness_m``.
 
     Raises
     ------

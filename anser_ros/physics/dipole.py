@@ -29,23 +29,18 @@ POINTS_A_THREAD = 512
 """Points that one thread works out, a millisecond's work."""
 
 
-@kernel(nogil=True)
-def _in_rows(positions, directions):  # type: ignore[no-untyped-def]
+def dipole_rows(positions: Array, directions: Array) -> Array:
     """Return x, y, z, u_x, u_y, u_z of dipoles as rows (6, N), which vector registers can load."""
-    out = np.empty((6, positions.shape[0]))
-    for j in range(positions.shape[0]):
-        for i in range(3):
-            out[i, j], out[3 + i, j] = positions[j, i], directions[j, i]
-    return out
+    return np.ascontiguousarray(np.concatenate([positions, directions], axis=1).T)
 
 
 @kernel(nogil=True)
-def fill_flux_basis(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
+def fill_flux_basis(points, axes, lengths, dipoles, out):  # type: ignore[no-untyped-def]
     """Write each unit dipole's flux density along each coil's axis into ``out``, shape (P, N).
 
-    The arguments are those of `flux_basis` as contiguous arrays; nothing is checked.
+    The arguments are those of `flux_basis` as contiguous arrays, dipoles as `dipole_rows`; nothing
+    is checked.
     """
-    dipoles = _in_rows(positions, directions)
     x, y, z = dipoles[0], dipoles[1], dipoles[2]
     u, v, w = dipoles[3], dipoles[4], dipoles[5]
     for p in range(points.shape[0]):
@@ -67,130 +62,53 @@ def fill_flux_basis(points, axes, lengths, positions, directions, out):  # type:
                 row[j] = value if s == 0 else row[j] + value
 
 
-@kernel
-def fill_field_and_gradient(point, positions, directions, basis):  # type: ignore[no-untyped-def]
-    """Write each unit dipole's field and gradient at one point (m) into ``basis``, shape (9, N).
-
-    Rows 0 to 2 hold B_x, B_y, B_z (T); rows 3 to 8 the gradient's xx, xy, xz, yy, yz, zz (T/m).
-    """
-    for j in range(positions.shape[0]):
-        dx = point[0] - positions[j, 0]
-        dy = point[1] - positions[j, 1]
-        dz = point[2] - positions[j, 2]
-        ux, uy, uz = directions[j, 0], directions[j, 1], directions[j, 2]
-        inv2 = 1.0 / (dx * dx + dy * dy + dz * dz)
-        k3 = DIPOLE_CONSTANT * inv2 * math.sqrt(inv2)
-        k5 = 3.0 * k3 * inv2
-        du = dx * ux + dy * uy + dz * uz
-        basis[0, j] = k5 * du * dx - k3 * ux
-        basis[1, j] = k5 * du * dy - k3 * uy
-        basis[2, j] = k5 * du * dz - k3 * uz
-        q = 5.0 * du * inv2
-        basis[3, j] = k5 * (2.0 * ux * dx + du - q * dx * dx)
-        basis[4, j] = k5 * (ux * dy + uy * dx - q * dx * dy)
-        basis[5, j] = k5 * (ux * dz + uz * dx - q * dx * dz)
-        basis[6, j] = k5 * (2.0 * uy * dy + du - q * dy * dy)
-        basis[7, j] = k5 * (uy * dz + uz * dy - q * dy * dz)
-        basis[8, j] = k5 * (2.0 * uz * dz + du - q * dz * dz)
-
-
 @kernel(nogil=True)
-def _fill_near(px, py, pz, dipoles, offset, inverse, near, along):  # type: ignore[no-untyped-def]
-    """Write offsets d (3, N), ``1/d^2``, ``k/d^3`` and ``d . u`` of dipoles, from `_in_rows`.
+def fill_fields(points, dipoles, out):  # type: ignore[no-untyped-def]
+    """Write each unit dipole's field at points into ``out``, shape (P, 3 or 9, N).
 
-    One row at a time: a loop that writes to several is not turned to vector registers.
+    Rows 0 to 2 hold B_x, B_y, B_z (T); where there are more, rows 3 to 8 hold the gradient's xx,
+    xy, xz, yy, yz, zz (T/m). ``dipoles`` is from `dipole_rows`. One row at a time: a loop that
+    writes to several is not turned to vector registers.
     """
-    for i in range(3):
-        row, place, at = offset[i], dipoles[i], px if i == 0 else py if i == 1 else pz
-        for j in range(row.shape[0]):
-            row[j] = at - place[j]
+    count = dipoles.shape[1]
+    offset, work = np.empty((3, count)), np.empty((5, count))
+    inverse, near, along, k5, k7 = work[0], work[1], work[2], work[3], work[4]
     dx, dy, dz = offset[0], offset[1], offset[2]
     u, v, w = dipoles[3], dipoles[4], dipoles[5]
-    for j in range(near.shape[0]):
-        inverse[j] = 1.0 / (dx[j] * dx[j] + dy[j] * dy[j] + dz[j] * dz[j])
-    for j in range(near.shape[0]):
-        near[j] = DIPOLE_CONSTANT * inverse[j] * math.sqrt(inverse[j])
-    for j in range(along.shape[0]):
-        along[j] = dx[j] * u[j] + dy[j] * v[j] + dz[j] * w[j]
-
-
-@kernel(nogil=True)
-def _fill_field_basis(points, dipoles, out):  # type: ignore[no-untyped-def]
-    """Write the fields of unit dipoles, from `_in_rows`, at points into ``out``, (P, 3, N)."""
-    count = dipoles.shape[1]
-    offset, inverse = np.empty((3, count)), np.empty(count)
-    near, along = np.empty(count), np.empty(count)
     for p in range(points.shape[0]):
-        px, py, pz = points[p, 0], points[p, 1], points[p, 2]
-        _fill_near(px, py, pz, dipoles, offset, inverse, near, along)
+        for i in range(3):
+            way, origin, at = offset[i], dipoles[i], points[p, i]
+            for j in range(count):
+                way[j] = at - origin[j]
+        for j in range(count):
+            inverse[j] = 1.0 / (dx[j] * dx[j] + dy[j] * dy[j] + dz[j] * dz[j])
+        for j in range(count):
+            near[j] = DIPOLE_CONSTANT * inverse[j] * math.sqrt(inverse[j])
+        for j in range(count):
+            along[j] = dx[j] * u[j] + dy[j] * v[j] + dz[j] * w[j]
+        for j in range(count):
+            k5[j] = 3.0 * near[j] * inverse[j]
         for i in range(3):
             row, way, direction = out[p, i], offset[i], dipoles[3 + i]
             for j in range(count):
-                turned = 3.0 * along[j] * inverse[j] * way[j] - direction[j]
-                row[j] = near[j] * turned
+                row[j] = k5[j] * along[j] * way[j] - near[j] * direction[j]
+        if out.shape[1] == 3:
+            continue
+        for j in range(count):
+            k7[j] = 5.0 * along[j] * inverse[j]
+        place = 3
+        for a in range(3):
+            for b in range(a, 3):
+                row, first, second = out[p, place], offset[a], offset[b]
+                ua, ub, same = dipoles[3 + a], dipoles[3 + b], 1.0 if a == b else 0.0
+                for j in range(count):
+                    mixed = ua[j] * second[j] + ub[j] * first[j] - k7[j] * first[j] * second[j]
+                    row[j] = k5[j] * (mixed + same * along[j])
+                place += 1
 
 
-@kernel(nogil=True)
-def _fill_slopes(px, py, pz, dipoles, work, basis):  # type: ignore[no-untyped-def]
-    """Do what `fill_field_and_gradient` does, for one of many points and dipoles in rows.
-
-    ``work`` (8, N) is written over.
-    """
-    offset, inverse, near, along = work[:3], work[3], work[4], work[5]
-    k5, k7 = work[6], work[7]
-    _fill_near(px, py, pz, dipoles, offset, inverse, near, along)
-    for j in range(near.shape[0]):
-        k5[j] = 3.0 * near[j] * inverse[j]
-    for j in range(near.shape[0]):
-        k7[j] = 5.0 * along[j] * inverse[j]
-    for i in range(3):
-        row, way, direction = basis[i], offset[i], dipoles[3 + i]
-        for j in range(near.shape[0]):
-            row[j] = k5[j] * along[j] * way[j] - near[j] * direction[j]
-    place = 3
-    for a in range(3):
-        for b in range(a, 3):
-            row, first, second = basis[place], offset[a], offset[b]
-            u, v, same = dipoles[3 + a], dipoles[3 + b], 1.0 if a == b else 0.0
-            for j in range(near.shape[0]):
-                mixed = u[j] * second[j] + v[j] * first[j] - k7[j] * first[j] * second[j]
-                row[j] = k5[j] * (mixed + same * along[j])
-            place += 1
-
-
-@kernel(nogil=True)
-def _fill_flux_jacobian(points, axes, lengths, dipoles, moments, flux, d_r, d_n):  # type: ignore[no-untyped-def]
-    """Add fluxes and derivatives to ``flux``, ``d_r`` and ``d_n``, as `flux_jacobian` has them.
-
-    These three and ``moments`` are real; their last axis holds the 2K parts (re, im by turns).
-    ``dipoles`` is from `_in_rows`.
-    """
-    basis, work = np.empty((9, dipoles.shape[1])), np.empty((8, dipoles.shape[1]))
-    for p in range(points.shape[0]):
-        n0, n1, n2 = axes[p, 0], axes[p, 1], axes[p, 2]
-        half = lengths[p] * GAUSS_OFFSET
-        count = 1 if half == 0.0 else 2
-        for s in range(count):
-            h = half * (1 - 2 * s)
-            _fill_slopes(
-                points[p, 0] + h * n0, points[p, 1] + h * n1, points[p, 2] + h * n2, dipoles, work,
-                basis,
-            )  # fmt: skip
-            f = np.dot(basis, moments)
-            for k in range(moments.shape[1]):
-                gx = n0 * f[3, k] + n1 * f[4, k] + n2 * f[5, k]
-                gy = n0 * f[4, k] + n1 * f[6, k] + n2 * f[7, k]
-                gz = n0 * f[5, k] + n1 * f[7, k] + n2 * f[8, k]
-                flux[p, k] += (n0 * f[0, k] + n1 * f[1, k] + n2 * f[2, k]) / count
-                d_r[p, 0, k] += gx / count
-                d_r[p, 1, k] += gy / count
-                d_r[p, 2, k] += gz / count
-                d_n[p, 0, k] += (f[0, k] + h * gx) / count
-                d_n[p, 1, k] += (f[1, k] + h * gy) / count
-                d_n[p, 2, k] += (f[2, k] + h * gz) / count
-
-
-def _rows(values: NDArray[np.generic], width: int, what: str) -> Array:
+def rows_of(values: NDArray[np.generic], width: int, what: str) -> Array:
+    """Return values as contiguous rows (n, width); raises `ValueError` for any other shape."""
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != width:
         raise ValueError(f'{what} must have shape (n, {width}), got {array.shape}')
@@ -200,7 +118,7 @@ def _rows(values: NDArray[np.generic], width: int, what: str) -> Array:
 def _sensors(
     points: NDArray[np.generic], axes: NDArray[np.generic], lengths: NDArray[np.generic] | None
 ) -> tuple[Array, Array, Array]:
-    r, n = _rows(points, 3, 'points'), _rows(axes, 3, 'axes')
+    r, n = rows_of(points, 3, 'points'), rows_of(axes, 3, 'axes')
     if r.shape != n.shape:
         raise ValueError(f'points and axes must match, got {r.shape} and {n.shape}')
     if lengths is None:
@@ -242,33 +160,24 @@ def flux_basis(
         When the shapes do not fit together.
     """
     r, n, spans = _sensors(points, axes, lengths)
-    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
     out = np.empty((r.shape[0], q.shape[0]))
-    fill_flux_basis(r, n, spans, q, u, out)
+    fill_flux_basis(r, n, spans, dipole_rows(q, u), out)
     return out
 
 
 def field_basis(
     points: NDArray[np.generic], positions: NDArray[np.generic], directions: NDArray[np.generic]
 ) -> Array:
-    """Return the field of dipoles of unit moment.
+    """Return the field (P, N, 3), T / (A m^2), of dipoles of unit moment.
 
-    Parameters
-    ----------
-    points : ndarray, shape (P, 3)
-        Where the field is wanted, m, frame fg.
-    positions, directions : ndarray, shape (N, 3)
-        Dipole positions (m) and unit directions, frame fg.
-
-    Returns
-    -------
-    ndarray, shape (P, N, 3)
-        Field vectors, frame fg, T / (A m^2).
+    ``points`` (P, 3) are in m; ``positions`` (m) and unit ``directions`` (N, 3) are the dipoles',
+    all in the frame fg.
     """
-    r = _rows(points, 3, 'points')
-    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    r = rows_of(points, 3, 'points')
+    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
     out = np.empty((r.shape[0], 3, q.shape[0]))
-    _fill_field_basis(r, _in_rows(q, u), out)
+    fill_fields(r, dipole_rows(q, u), out)
     return np.moveaxis(out, 1, 2)
 
 
@@ -278,25 +187,20 @@ def dipole_field(
     directions: NDArray[np.generic],
     moments: NDArray[np.generic],
 ) -> ComplexArray:
-    """Return the field of dipoles, shape (P, 3, K), T.
+    """Return the field of dipoles, shape (P, 3, K), T; arguments as for `field_basis`.
 
-    Parameters
-    ----------
-    points, positions, directions
-        As for `field_basis`.
-    moments : ndarray, shape (N, K), complex
-        Dipole magnitudes for each of the K emitters, A m^2.
+    ``moments`` (N, K), complex, are the dipoles' magnitudes for each of the K emitters, A m^2.
     """
-    r = _rows(points, 3, 'points')
-    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    r = rows_of(points, 3, 'points')
+    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
     m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)
-    out, dipoles = np.empty((r.shape[0], 3, m.shape[1])), _in_rows(q, u)
+    out, dipoles = np.empty((r.shape[0], 3, m.shape[1])), dipole_rows(q, u)
 
     def work(rows: slice) -> None:
         basis = np.empty((AT_ONCE, 3, q.shape[0]))
         for here in slices_of(rows, AT_ONCE):
             few = basis[: here.stop - here.start]
-            _fill_field_basis(r[here], dipoles, few)
+            fill_fields(r[here], dipoles, few)
             np.matmul(
                 few.reshape(3 * len(few), len(m)), m, out=out[here].reshape(3 * len(few), -1)
             )
@@ -338,14 +242,33 @@ def flux_jacobian(
         When the shapes do not fit together.
     """
     r, n, spans = _sensors(points, axes, lengths)
-    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
     m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)
     flux = np.zeros((r.shape[0], m.shape[1]))
     d_r = np.zeros((r.shape[0], 3, m.shape[1]))
-    d_n, dipoles = np.zeros_like(d_r), _in_rows(q, u)
+    d_n, dipoles, half = np.zeros_like(d_r), dipole_rows(q, u), GAUSS_OFFSET * spans[:, None]
+    signs = (1.0, -1.0) if half.any() else (1.0,)
 
-    def work(at: slice) -> None:
-        _fill_flux_jacobian(r[at], n[at], spans[at], dipoles, m, flux[at], d_r[at], d_n[at])
+    def work(rows: slice) -> None:
+        f, basis = (
+            np.empty((rows.stop - rows.start, 9, m.shape[1])),
+            np.empty((AT_ONCE, 9, len(m))),
+        )
+        n0, n1, n2 = n[rows].T[:, :, None]
+        for sign in signs:
+            away = sign * half[rows]
+            places = r[rows] + away * n[rows]
+            for here in slices_of(slice(0, len(f)), AT_ONCE):
+                few = basis[: here.stop - here.start]
+                fill_fields(places[here], dipoles, few)
+                np.matmul(few.reshape(-1, len(m)), m, out=f[here].reshape(9 * len(few), -1))
+            f /= len(signs)
+            slope = np.empty((len(f), 3, m.shape[1]))
+            for i, (x, y, z) in enumerate(((3, 4, 5), (4, 6, 7), (5, 7, 8))):
+                slope[:, i] = n0 * f[:, x] + n1 * f[:, y] + n2 * f[:, z]
+            flux[rows] += n0 * f[:, 0] + n1 * f[:, 1] + n2 * f[:, 2]
+            d_r[rows] += slope
+            d_n[rows] += f[:, :3] + away[:, :, None] * slope
 
     in_order(work, slices(len(r), POINTS_A_THREAD))
     return flux.view(np.complex128), d_r.view(np.complex128), d_n.view(np.complex128)

@@ -33,21 +33,11 @@ percent."""
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """Holds a sequence of M poses of one body in ascending order of time.
+    """Holds a sequence of M poses of one body in ascending order of time."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (M,)
-        Stamps of the poses on the clock that gave them, s, ascending.
-    position : ndarray, shape (M, 3)
-        Origin of the body, m, frame fg.
-    quaternion : ndarray, shape (M, 4)
-        Rotation from the body's frame to fg, in the order x y z w.
-    """
-
-    time: Array
-    position: Array
-    quaternion: Array
+    time: Array  # (M,), stamps of the poses on the clock that gave them, s, ascending
+    position: Array  # (M, 3), origin of the body, m, frame fg
+    quaternion: Array  # (M, 4), rotation from the body's frame to fg, in the order x y z w
 
     @cached_property
     def _aligned(self) -> Array:
@@ -147,16 +137,8 @@ class _Bend:
 
     Over an interval h, at the fraction u of the way, that is ``-u (1 - u) h^2 / 2`` times the
     acceleration, which follows from the difference between the velocities after and before the
-    interval.
-
-    Parameters
-    ----------
-    time : ndarray, shape (M,)
-        Of the samples, s.
-    left, right : ndarray of int, shape (F,)
-        Samples before and after each time.
-    at : ndarray, shape (F,)
-        The times, s.
+    interval. The samples have times (M,), s; ``left`` and ``right`` (F,) are those before and
+    after each of the times ``at``.
     """
 
     def __init__(

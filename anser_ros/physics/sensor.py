@@ -24,17 +24,10 @@ class Windings:
     A reading is the sum of each point's weight times the flux density there along the sensor's
     axis. Weights of a loop have the sum one, those of two coils wound against each other zero. A
     sensor with fewer points has further ones of weight zero.
-
-    Attributes
-    ----------
-    offset : ndarray, shape (S, Q, 3)
-        From the sensor's position, m, in the frame of its body.
-    weight : ndarray, shape (S, Q)
-        Zero in all of a row for a sensor that is a single coil.
     """
 
-    offset: Array
-    weight: Array
+    offset: Array  # (S, Q, 3), from the sensor's position, m, in the frame of its body
+    weight: Array  # (S, Q), zero in all of a row for a sensor that is a single coil
 
     @staticmethod
     def of(rows: Sequence[Sequence[Sequence[float]]]) -> 'Windings | None':
@@ -74,28 +67,18 @@ def joined_windings(tables: Sequence['SensorTable']) -> Windings | None:
 
 @dataclass(frozen=True)
 class SensorTable:
-    """Holds a table of S pick-up coils with one row each.
+    """Holds a table of S pick-up coils with one row each."""
 
-    Attributes
-    ----------
-    channel : ndarray of int, shape (S,)
-        Channel of the control unit that each coil is connected to.
-    name, body : tuple of str, length S
-        Name of each sensor and of the body that it is fixed to (``fg`` for reference sensors).
-    position, axis : ndarray, shape (S, 3)
-        Centre (m) and unit sensitive axis in the frame of the sensor's body.
-    length : ndarray, shape (S,)
-        Length of the coil along its axis, m; 0 for a point sensor.
-    windings : Windings or None
-        Points of the sensors that are sums of several; None where all are single coils.
-    """
-
-    channel: NDArray[np.int64]
+    channel: NDArray[np.int64]  # (S,), channel of the control unit that each coil is connected to
+    # name, body: length S, name of each sensor and of the body that it is fixed to (``fg`` for
+    # reference sensors)
     name: tuple[str, ...]
     body: tuple[str, ...]
+    # position, axis: (S, 3), centre (m) and unit sensitive axis in the frame of the sensor's body
     position: Array
     axis: Array
-    length: Array
+    length: Array  # (S,), length of the coil along its axis, m; 0 for a point sensor
+    # Points of the sensors that are sums of several; None where all are single coils
     windings: Windings | None = None
 
     @property
@@ -152,19 +135,11 @@ class SensorTable:
         )
 
     def placed(self, position: Array, rotation: Array) -> tuple[Array, Array]:
-        """Return the sensors' centres and axes in fg for given poses of their body.
+        """Return the sensors' centres (m) and unit axes (..., S, 3) in fg for given poses of their
+        body.
 
-        Parameters
-        ----------
-        position : ndarray, shape (..., 3)
-            Origin of the body, m, frame fg.
-        rotation : ndarray, shape (..., 3, 3)
-            Rotation matrix from the body's frame to fg.
-
-        Returns
-        -------
-        centres, axes : ndarray, shape (..., S, 3)
-            Centres (m) and unit axes, frame fg.
+        ``position`` (..., 3) is its origin, m, ``rotation`` (..., 3, 3) turns from its frame to
+        fg.
         """
         turned = np.einsum('...ij,sj->...si', rotation, self.position)
         return turned + position[..., None, :], np.einsum('...ij,sj->...si', rotation, self.axis)

@@ -1,5 +1,7 @@
 """Spans the plane across a direction by two unit vectors."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,21 +12,27 @@ from anser_ros.kernel_cache import kernel
 def fill_tangent(n, t):  # type: ignore[no-untyped-def]
     """Write two unit vectors that complete the unit vector ``n`` to a right-handed frame.
 
-    Duff et al., Building an orthonormal basis, revisited, JCGT 2017: no direction is singular.
+    The first is across ``n`` and the axis of the frame that is most across it. Tilts in model
+    files are along these two.
     """
-    sign = 1.0 if n[2] >= 0.0 else -1.0
-    a = -1.0 / (sign + n[2])
-    b = n[0] * n[1] * a
-    t[0, 0], t[0, 1], t[0, 2] = 1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]
-    t[1, 0], t[1, 1], t[1, 2] = b, sign + n[1] * n[1] * a, -n[1]
+    k = 0
+    for i in range(1, 3):
+        if abs(n[i]) < abs(n[k]):
+            k = i
+    i, j = (k + 1) % 3, (k + 2) % 3
+    norm = math.sqrt(n[i] * n[i] + n[j] * n[j])
+    t[0, k], t[0, i], t[0, j] = 0.0, n[j] / norm, -n[i] / norm
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        t[1, k] = n[i] * t[0, j] - n[j] * t[0, i]
 
 
 def tangents(axes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return two unit vectors across each unit axis, shape (S, 2, 3), for axes of shape (S, 3)."""
-    least = np.eye(3)[np.argmin(np.abs(axes), axis=1)]
-    first = np.cross(axes, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(axes, first)], axis=1)
+    out = np.empty((len(axes), 2, 3))
+    for axis, pair in zip(np.ascontiguousarray(axes), out, strict=True):
+        fill_tangent(axis, pair)
+    return out
 
 
 def tilted(axes: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,13 +8,12 @@ digits cancel at points near the line that extends the segment. Only closed path
 that is curl-free outside the copper, and only such a field can be fitted by dipoles.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT
+from anser_ros.physics.dipole import rows_of
 
 Array = NDArray[np.float64]
 
@@ -46,41 +45,24 @@ def _add_segments(starts, ends, points, factor, out):  # type: ignore[no-untyped
         out[p, 2] += factor * bz
 
 
-def _points(values: NDArray[np.generic], what: str) -> Array:
-    array = np.ascontiguousarray(values, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f'{what} must have shape (n, 3), got {array.shape}')
-    return array
-
-
 def segment_field(
     starts: NDArray[np.generic],
     ends: NDArray[np.generic],
     points: NDArray[np.generic],
     current_a: float = 1.0,
 ) -> Array:
-    """Return the field of straight segments that all carry the same current.
+    """Return the field (P, 3), T, of straight segments that all carry the same current.
 
-    Parameters
-    ----------
-    starts, ends : ndarray, shape (M, 3)
-        Ends of the segments, m; the current flows from start to end.
-    points : ndarray, shape (P, 3)
-        Where the field is wanted, m; none may lie on a segment.
-    current_a : float
-        Current, A.
-
-    Returns
-    -------
-    ndarray, shape (P, 3)
-        Flux density, T, in the frame of the points.
+    It flows from ``starts`` to ``ends`` (M, 3), m; none of the ``points`` (P, 3), m, may lie on a
+    segment.
 
     Raises
     ------
     ValueError
         When the shapes do not fit together.
     """
-    first, last, at = _points(starts, 'starts'), _points(ends, 'ends'), _points(points, 'points')
+    first, last = rows_of(starts, 3, 'starts'), rows_of(ends, 3, 'ends')
+    at = rows_of(points, 3, 'points')
     if first.shape != last.shape:
         raise ValueError(f'starts and ends must match, got {first.shape} and {last.shape}')
     lengths = np.linalg.norm(last - first, axis=1)
@@ -93,69 +75,22 @@ def segment_field(
 def loop_field(
     corners: NDArray[np.generic], points: NDArray[np.generic], current_a: float = 1.0
 ) -> Array:
-    """Return the field of a closed path of straight segments.
+    """Return the field (P, 3), T, of a closed path of straight segments.
 
-    Parameters
-    ----------
-    corners : ndarray, shape (M, 3)
-        The current flows from each corner (m) to the next, and from the last to the first.
-    points : ndarray, shape (P, 3)
-        Where the field is wanted, m; none may lie on the path.
-    current_a : float
-        Current, A.
-
-    Returns
-    -------
-    ndarray, shape (P, 3)
-        Flux density, T, in the frame of the points.
+    The current flows from each of the ``corners`` (M, 3), m, to the next, and from the last to the
+    first; none of the ``points`` (P, 3), m, may lie on the path.
 
     Raises
     ------
     ValueError
         When an array is not of shape (n, 3).
     """
-    path = _points(corners, 'corners')
+    path = rows_of(corners, 3, 'corners')
     return segment_field(path, np.roll(path, -1, axis=0), points, current_a)
 
 
 def loop_moment(corners: NDArray[np.generic], current_a: float = 1.0) -> Array:
-    """Return the magnetic moment of a closed path, ``I/2`` times the sum of ``r x dr``.
-
-    Parameters
-    ----------
-    corners, current_a
-        As for `loop_field`.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        Moment, A m^2.
-    """
-    path = _points(corners, 'corners')
+    """Return the magnetic moment (3,), A m^2, of a closed path: ``I/2`` times all ``r x dr``."""
+    path = rows_of(corners, 3, 'corners')
     cross = np.cross(path, np.roll(path, -1, axis=0))
     return np.asarray(0.5 * current_a * cross.sum(axis=0))
-
-
-def paths_field(
-    paths: Sequence[NDArray[np.generic]], points: NDArray[np.generic], currents_a: Array
-) -> Array:
-    """Return the fields of K closed paths with different currents.
-
-    Parameters
-    ----------
-    paths : sequence of ndarray, shape (M, 3)
-        Corners of each path, m.
-    points : ndarray, shape (P, 3)
-        Where the fields are wanted, m.
-    currents_a : ndarray, shape (K,)
-        Current of each path, A.
-
-    Returns
-    -------
-    ndarray, shape (P, K, 3)
-        Flux density of each path, T.
-    """
-    fields = [
-        loop_field(path, points, float(i)) for path, i in zip(paths, currents_a, strict=True)
-    ]
-    return np.stack(fields, axis=1)

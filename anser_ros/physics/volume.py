@@ -31,17 +31,13 @@ class TrackedVolume:
     It is what `over_board` makes of the demo's board (`test/test_setup.py`), for setups whose
     board cannot be drawn.
 
-    Attributes
-    ----------
-    low, high : tuple of three float
-        Corners, low < high in x, y and z.
-
     Raises
     ------
     TrackingError
         When the corners make no box.
     """
 
+    # low, high: Corners, low < high in x, y and z
     low: tuple[float, float, float] = (-0.2, -0.2, 0.05)
     high: tuple[float, float, float] = (0.2, 0.2, 0.35)
 

@@ -18,26 +18,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlacedPoints:
-    """Holds the P points of S sensors of a body at one pose, sensor by sensor.
+    """Holds the P points of S sensors of a body at one pose, sensor by sensor."""
 
-    Attributes
-    ----------
-    points, axes : ndarray, shape (P, 3)
-        m, and unit vectors, frame fg.
-    lengths, weights : ndarray, shape (P,)
-        m; factor of each point's flux density.
-    arms : ndarray, shape (P, 3)
-        From the sensor's place to the point, m, frame fg.
-    first : ndarray of int, shape (S,)
-        The first point of each sensor.
-    """
-
+    # points, axes: (P, 3), m, and unit vectors, frame fg
     points: Array
     axes: Array
+    # lengths, weights: (P,), m; factor of each point's flux density
     lengths: Array
     weights: Array
-    arms: Array
-    first: NDArray[np.int64]
+    arms: Array  # (P, 3), from the sensor's place to the point, m, frame fg
+    first: NDArray[np.int64]  # (S,), the first point of each sensor
 
     @staticmethod
     def of(sensors: SensorTable, position: Array, rotation: Array) -> 'PlacedPoints':
@@ -72,17 +62,9 @@ class PlacedPoints:
     def slopes(self, positions: Array, directions: Array, moments: Array) -> tuple[Array, Array]:
         """Return the derivatives by a shift and a turn of each sensor about its own place.
 
-        Parameters
-        ----------
-        positions, directions : ndarray, shape (N, 3)
-            Of dipoles, m and unit vectors, frame fg.
-        moments : ndarray, shape (N, C)
-            Of each of C parts of the fluxes, A m^2.
-
-        Returns
-        -------
-        by_shift, by_turn : ndarray, shape (S, 3, C)
-            T/m and T/rad, along and about the axes of fg.
+        Each is of the shape (S, 3, C), T/m and T/rad, along and about the axes of fg, for each of
+        C parts of the ``moments`` (N, C), A m^2, of dipoles at ``positions`` (m) with unit
+        ``directions`` (N, 3).
         """
         by_place, by_axis = self._by_point(positions, directions, moments)
         turn = np.cross(self.arms[:, :, None], by_place, axis=1)

@@ -10,6 +10,7 @@ from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.diagnosis.prepare import BLOCKS, TEST_EVERY
 from anser_ros.effects.term import Site, Term
 from anser_ros.errors import DiagnosisError, FitError
+from anser_ros.physics.angles import nearest_rotation
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.poses.effect import PoseSetting, Role
 from anser_ros.poses.fit import PoseFit, robust_fit
@@ -248,8 +249,7 @@ def _misfit(path: OpticalPath, sensors: Sequence[PoseSequence], offset: float) -
 def frames_from_places(tracked: Array, optical: Array) -> Array:
     """Return the rotation (3, 3) that takes optical places (n, 3) to tracked ones, by Kabsch."""
     left, right = tracked - np.median(tracked, axis=0), optical - np.median(optical, axis=0)
-    u, _, vt = np.linalg.svd(left.T @ right)
-    return np.asarray(u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt)
+    return nearest_rotation(left.T @ right)
 
 
 def frames_from_turns(tracked: Array, optical: Array) -> Array:
@@ -284,8 +284,7 @@ def _turn_of_turns(tracked: Array, optical: Array) -> Array:
     jumps *= np.sign(np.einsum('ij,ij->i', optical[1:], optical[:-1]))
     sign[1:] = np.cumprod(np.where(jumps < 0, -1.0, 1.0))
     for _ in range(10):
-        u, _, vt = np.linalg.svd((tracked * sign[:, None]).T @ optical)
-        solution = u @ np.diag([1, 1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+        solution = nearest_rotation((tracked * sign[:, None]).T @ optical)
         agreement = np.sign(np.einsum('ij,ij->i', tracked, optical @ solution.T))
         if np.array_equal(agreement, sign):
             break

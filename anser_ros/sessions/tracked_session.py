@@ -13,6 +13,7 @@ from anser_ros.sessions.known_metal import KnownMetalModels
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
+from anser_ros.tracking.source_track import Sources
 from anser_ros.tracking.tracker import Tracker
 
 Progress = Callable[[float], None]
@@ -64,8 +65,9 @@ def track(
             f'{prepared.session.path}: the session has no tool fluxes to track, on a topic that '
             f'ends with /tool/flux'
         )
+    seen = Sources()
     tracker = _tracker(
-        prepared, settings or TrackerSettings(), follows=isinstance(follower, ModelFollower)
+        prepared, settings or TrackerSettings(), seen, follows=isinstance(follower, ModelFollower)
     )
     estimates: dict[str, list[PoseEstimate]] = {}
     sources: dict[str, list[PoseEstimate]] = {}
@@ -76,15 +78,15 @@ def track(
         if standing.model is not None and standing.model is not tracker.model:
             tracker = tracker.with_model(standing.model)
         if frame.tools is not None:
-            seen = frame.tools.in_phase() if in_phase else frame.tools
+            tools = frame.tools.in_phase() if in_phase else frame.tools
             found = tracker.update(
-                frame.stamp_ns, seen.channels, seen.flux, seen.flags, standing.withheld
+                frame.stamp_ns, tools.channels, tools.flux, tools.flags, standing.withheld
             )
             if follower is not None:
-                follower.witnessed(seen, found)
+                follower.witnessed(tools, found)
             for estimate in found:
                 estimates.setdefault(estimate.name, []).append(estimate)
-            for body, source in tracker.sources.items():
+            for body, source in seen.found.items():
                 sources.setdefault(body, []).append(source)
         if progress is not None:
             progress(count / len(frames))
@@ -95,7 +97,9 @@ def track(
     return TrackedSession(by_name, seconds, summary, further if sources else {})
 
 
-def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: bool) -> Tracker:
+def _tracker(
+    prepared: PreparedSession, settings: TrackerSettings, seen: Sources, *, follows: bool
+) -> Tracker:
     """A tracker that knows the session's noise, and a drift's course if nothing else does."""
     return Tracker(
         prepared.model,
@@ -105,4 +109,5 @@ def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: b
             recorded_drift=prepared.recorded_drift and not follows,
             volume=settings.volume or prepared.volume,
         ),
+        [seen],
     )

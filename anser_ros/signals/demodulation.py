@@ -43,27 +43,15 @@ much noise and save the error of a moving tool."""
 
 @dataclass(frozen=True)
 class ToneFit:
-    """Holds fitted phasors of one window, in the unit of the samples.
+    """Holds fitted phasors of one window, in the unit of the samples."""
 
-    Attributes
-    ----------
-    phasors : ndarray, shape (C, K), complex
-        Peak amplitude and phase in the middle of the window.
-    sigma : ndarray, shape (C, K)
-        Standard deviation of the real and of the imaginary part.
-    noise : ndarray, shape (C,)
-        Root mean square of the residual of a sample.
-    rates : ndarray, shape (C, K), complex
-        Change of the phasors per second; zero where it is not fitted.
-    motion_bias : ndarray, shape (2K, 2K), or None
-        Bias of the phasors [Re, Im] by rates [Re, Im] that the fit leaves out, s; None where the
-        rates are fitted.
-    """
-
-    phasors: NDArray[np.complex128]
-    sigma: NDArray[np.float64]
-    noise: NDArray[np.float64]
+    phasors: NDArray[np.complex128]  # (C, K), peak amplitude and phase in the middle of the window
+    sigma: NDArray[np.float64]  # (C, K), standard deviation of the real and of the imaginary part
+    noise: NDArray[np.float64]  # (C,), root mean square of the residual of a sample
+    # (C, K), change of the phasors per second; zero where it is not fitted
     rates: NDArray[np.complex128]
+    # (2K, 2K), bias of the phasors [Re, Im] by rates [Re, Im] that the fit leaves out, s; None
+    # where the rates are fitted
     motion_bias: NDArray[np.float64] | None = None
 
 

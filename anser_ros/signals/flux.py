@@ -31,27 +31,17 @@ one is taken for dead."""
 
 @dataclass(frozen=True)
 class FluxWindow:
-    """Holds fluxes and currents of one window.
+    """Holds fluxes and currents of one window."""
 
-    Attributes
-    ----------
-    flux : ndarray, shape (S, K), complex
-        Flux density at nominal current, T; NaN for an emitter without current.
-    sigma : ndarray, shape (S, K)
-        Standard deviation of each component from the residual noise, T.
-    current : ndarray, shape (K,), complex
-        Measured currents, A, with their phase in the middle of the window.
-    current_sigma : ndarray, shape (K,)
-        Standard deviation of each component of the currents, A.
-    driven : ndarray of bool, shape (K,)
-        Whether the emitter carries current.
-    """
-
+    # (S, K), flux density at nominal current, T; NaN for an emitter without current
     flux: NDArray[np.complex128]
+    # (S, K), standard deviation of each component from the residual noise, T
     sigma: NDArray[np.float64]
+    # (K,), measured currents, A, with their phase in the middle of the window
     current: NDArray[np.complex128]
+    # (K,), standard deviation of each component of the currents, A
     current_sigma: NDArray[np.float64]
-    driven: NDArray[np.bool_]
+    driven: NDArray[np.bool_]  # (K,), whether the emitter carries current
 
 
 class FluxConverter:

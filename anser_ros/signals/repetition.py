@@ -20,7 +20,6 @@ from anser_ros.signals.repetition_kernels import (
     MOST_ROWS,
     PROBE_SAMPLES,
     SLOTS,
-    count_coincidences,
     search,
 )
 
@@ -47,6 +46,11 @@ less than `MEMORY_S`. More often only costs time."""
 SHORTEST_LAG_S = 1e-3
 """Shortest lag, s, at which fresh samples are compared: over a shorter one a tone at 1 kHz or less
 is no other than it was."""
+SAMPLED_ROWS = 64
+"""Length, samples, of the stretches on which the column is compared with itself at the worst lag;
+long enough for what follows on what."""
+SAMPLED_SHARE = 16
+"""One such stretch in so many is compared. All of them would cost as much as the search."""
 MEMORY_S = 1.0
 """Time constant, s, with which coincidences are forgotten. A longer one keeps a tool's movement,
 which makes coincidences rarer, in mind when it rests; a shorter one counts few."""
@@ -107,8 +111,7 @@ class RepetitionWatch:
         self._probes = np.zeros((len(PROBE_SAMPLES), columns), np.uint32)
         self._probed_at = np.zeros(len(PROBE_SAMPLES), np.int64)
         self._lag, self._run, self._until, self._age = np.zeros((4, columns), np.int64)
-        self._equal = np.zeros(columns, np.int64)
-        self._tried, self._same, self._continued = np.zeros((3, columns))
+        self._equal, self._tally = np.zeros(columns, np.bool_), np.zeros((3, columns))
         self._judge()
 
     @property
@@ -189,25 +192,40 @@ class RepetitionWatch:
                 self._age,
             )  # fmt: skip
             if contiguous > self._worst_lag:
-                is_new = (self._run < self._needed).astype(np.int64)
-                count_coincidences(
-                    self._history, first, count, at, self._worst_lag, RAILS, is_new,
-                    self._equal, self._tried, self._same, self._continued,
-                )  # fmt: skip
+                self._compare(first, count, at)
             self._searched = at + count
             if count == until_judged:
                 self._judge()
 
+    def _compare(self, first: int, count: int, at: int) -> None:
+        """Compare samples, those of a few stretches, with the samples of the worst lag before.
+
+        Samples at an end of the converter's range tell nothing of the noise, and neither do
+        columns that repeat themselves.
+        """
+        history, is_new = self._history, self._run < self._needed
+        stretch = SAMPLED_ROWS * SAMPLED_SHARE
+        for start in range(at - at % stretch, at + count, stretch):
+            begin, end = max(start, at), min(start + SAMPLED_ROWS, at + count)
+            if begin >= end:
+                continue
+            rows = first + np.arange(begin - at, end - at)
+            now = history[rows]
+            counts = (now > RAILS[0]) & (now < RAILS[1]) & is_new
+            same = counts & (now == history[(rows - self._worst_lag) % len(history)])
+            continued = same & np.concatenate([self._equal[None], same[:-1]])
+            self._tally += [part.sum(axis=0) for part in (counts, same, continued)]
+            self._equal = same[-1] & (end < start + SAMPLED_ROWS)
+
     def _judge(self) -> None:
         """Work out how long a run must be, from the coincidences of samples that are fresh."""
-        same = (self._same + 0.5 * _PRIOR) / (self._tried + _PRIOR)
-        followed = self._continued + _PRIOR_RUNS * np.sqrt(same)
-        surprise = -np.log2(np.maximum(same, followed / (self._same + _PRIOR_RUNS)))
+        tried, coincided, continued = self._tally
+        same = (coincided + 0.5 * _PRIOR) / (tried + _PRIOR)
+        followed = continued + _PRIOR_RUNS * np.sqrt(same)
+        surprise = -np.log2(np.maximum(same, followed / (coincided + _PRIOR_RUNS)))
         samples = np.ceil(EVIDENCE_BITS / np.maximum(surprise, 1e-6))
         self._needed = np.maximum(samples, FINGERPRINT_SAMPLES).astype(np.int64)
-        kept = math.exp(-_JUDGED_SAMPLES / (MEMORY_S * self._rate_hz))
-        for counted in (self._tried, self._same, self._continued):
-            counted *= kept
+        self._tally *= math.exp(-_JUDGED_SAMPLES / (MEMORY_S * self._rate_hz))
 
 
 def _worst_lag(rows: int, sample_rate_hz: float, tones_hz: NDArray[np.float64] | None) -> int:

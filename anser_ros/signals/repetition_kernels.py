@@ -37,11 +37,6 @@ PROBE_SAMPLES = (128, 512, 2048)
 """Samples after which each of the fingerprints that all others are compared with is taken anew. In
 a ring that is shorter than one of these numbers such a probe comes again for certain, at the
 latest after twice the number; that a longer one has no anchor has a probability of 1e-14."""
-SAMPLED_ROWS = 64
-"""Length, samples, of the stretches on which the column is compared with itself at the worst lag;
-long enough for what follows on what."""
-SAMPLED_SHARE = 16
-"""One such stretch in so many is compared. All of them would cost as much as the search."""
 
 
 @kernel
@@ -58,27 +53,6 @@ def _run_length(history, row, column, lag, longest):  # type: ignore[no-untyped-
         if history[one, column] != history[other, column]:
             return back
     return longest
-
-
-@kernel
-def _begin(  # type: ignore[no-untyped-def]
-    history, row, at, found, known, needed, lag, run, until, age
-):
-    """Begin to follow, at a lag that one column has, all that have it; how many these are.
-
-    What a buffer repeats it repeats in all columns, of which most meet no anchor yet.
-    """
-    begun = 0
-    for c in range(history.shape[1]):
-        if lag[c] > 0:
-            continue
-        same = _run_length(history, row, c, found, min(needed[c], known))
-        if same >= FINGERPRINT_SAMPLES:
-            lag[c], run[c] = found, same
-            begun += 1
-            if same >= needed[c]:
-                until[c], age[c] = at + 1, found
-    return begun
 
 
 @kernel
@@ -103,8 +77,19 @@ def search(  # type: ignore[no-untyped-def]
         followed += lag[c] > 0
     for i in range(count):
         row, at = first + i, position + i
-        if followed:
-            followed = _follow(history, row, at, needed, lag, run, until, age)
+        for c in range(columns if followed else 0):
+            if lag[c] == 0:
+                continue
+            other = row - lag[c]
+            if other < 0:
+                other += rows
+            if history[other, c] != history[row, c]:
+                lag[c], run[c] = 0, 0
+                followed -= 1
+                continue
+            run[c] += 1
+            if run[c] >= needed[c]:
+                until[c], age[c] = at + 1, lag[c]
         # Apart from the search, this takes several columns per step.
         for c in range(columns):
             fingerprint[c] = np.uint32(fingerprint[c] * FACTOR + np.uint32(history[row, c]))
@@ -132,62 +117,19 @@ def search(  # type: ignore[no-untyped-def]
                 found = at - probed_at[0 if mark == short[c] else 1 if mark == middle[c] else 2]
             if found <= 0 or lag[c] > 0 or found >= rows - needed[c]:
                 continue
-            if _run_length(history, row, c, found, FINGERPRINT_SAMPLES) == FINGERPRINT_SAMPLES:
-                known = contiguous + i + 1
-                followed += _begin(history, row, at, found, known, needed, lag, run, until, age)
+            if _run_length(history, row, c, found, FINGERPRINT_SAMPLES) < FINGERPRINT_SAMPLES:
+                continue
+            # What a buffer repeats it repeats in all columns, of which most meet no anchor yet.
+            for b in range(columns):
+                if lag[b] > 0:
+                    continue
+                same = _run_length(history, row, b, found, min(needed[b], contiguous + i + 1))
+                if same >= FINGERPRINT_SAMPLES:
+                    lag[b], run[b] = found, same
+                    followed += 1
+                    if same >= needed[b]:
+                        until[b], age[b] = at + 1, found
         for k in range(probed_at.size):
             if (at + 1) % PROBE_SAMPLES[k] == 0:
                 probes[k] = fingerprint
                 probed_at[k] = at
-
-
-@kernel
-def _follow(history, row, at, needed, lag, run, until, age):  # type: ignore[no-untyped-def]
-    """Compare a sample with the one that each followed column's lag foretells; how many go on."""
-    rows, columns = history.shape
-    followed = 0
-    for c in range(columns):
-        if lag[c] == 0:
-            continue
-        other = row - lag[c]
-        if other < 0:
-            other += rows
-        if history[other, c] != history[row, c]:
-            lag[c], run[c] = 0, 0
-            continue
-        followed += 1
-        run[c] += 1
-        if run[c] >= needed[c]:
-            until[c], age[c] = at + 1, lag[c]
-    return followed
-
-
-@kernel
-def count_coincidences(  # type: ignore[no-untyped-def]
-    history, first, count, position, lag, rails, is_new, equal, tried, same, continued
-):  # fmt: skip
-    """Compare samples with those of one lag before, and count how often they coincide.
-
-    ``tried``, ``same`` (C,) count samples and those that equal the one `lag` before; ``continued``
-    (C,) those of them whose predecessor does too, which ``equal`` (C,) carries from call to call.
-    Samples at an end of the converter's range, ``rails``, tell nothing of the noise, and neither
-    do columns that repeat themselves, 0 in ``is_new`` (C,); both are left out.
-    """
-    rows, columns = history.shape
-    for i in range(count):
-        if ((position + i) // SAMPLED_ROWS) % SAMPLED_SHARE:
-            continue
-        row = first + i
-        other = row - lag
-        if other < 0:
-            other += rows
-        for c in range(columns):
-            sample = history[row, c]
-            counts = np.int64(rails[0] < sample) & np.int64(sample < rails[1]) & is_new[c]
-            now = counts & np.int64(sample == history[other, c])
-            tried[c] += counts
-            same[c] += now
-            continued[c] += now & equal[c]
-            equal[c] = now
-        if (position + i) % SAMPLED_ROWS == SAMPLED_ROWS - 1:
-            equal[:] = 0

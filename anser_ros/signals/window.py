@@ -17,37 +17,20 @@ _SEQUENCES = 2**32
 
 @dataclass(frozen=True)
 class Window:
-    """Holds one window of samples of all channels.
+    """Holds one window of samples of all channels."""
 
-    Attributes
-    ----------
-    codes : ndarray of int16, shape (N, C)
-        Converter codes.
-    present : ndarray of bool, shape (N,)
-        False where a sample was lost.
-    middle_sample : float
-        Number of the sample in the middle of the window, since the stream began.
-    saturated : ndarray of bool, shape (C,)
-        Whether a sample lies at an end of the converter's range.
-    stuck : ndarray of bool, shape (C,)
-        Whether all samples are the same.
-    ages : ndarray of int, shape (C,)
-        How long before, samples, a column said what it says in the window, or a part of it; 0
-        where all of it is new.
-    noiseless : ndarray of bool, shape (C,)
-        Whether a column holds too little noise to distinguish new samples from old ones.
-    repeats : bool
-        Whether no column says anything new.
-    """
-
-    codes: NDArray[np.int16]
-    present: NDArray[np.bool_]
+    codes: NDArray[np.int16]  # (N, C), converter codes
+    present: NDArray[np.bool_]  # (N,), false where a sample was lost
+    # Number of the sample in the middle of the window, since the stream began
     middle_sample: float
-    saturated: NDArray[np.bool_]
-    stuck: NDArray[np.bool_]
+    saturated: NDArray[np.bool_]  # (C,), whether a sample lies at an end of the converter's range
+    stuck: NDArray[np.bool_]  # (C,), whether all samples are the same
+    # (C,), how long before, samples, a column said what it says in the window, or a part of it; 0
+    # where all of it is new
     ages: NDArray[np.int64]
+    # (C,), whether a column holds too little noise to distinguish new samples from old ones
     noiseless: NDArray[np.bool_]
-    repeats: bool
+    repeats: bool  # Whether no column says anything new
 
     @property
     def dropped(self) -> bool:

@@ -60,7 +60,7 @@ def fill_body(  # type: ignore[no-untyped-def]
     """Write a pose's residual (S, 2K) and ``white`` (7, S 2K).
 
     Row 0 of ``white``: the whitened residual; rows 1 to 6: the whitened flux's derivatives by the
-    translation and the turn, both in fg. ``basis`` (7 S, N) is room to work in.
+    translation and the turn, both in fg. ``basis`` (7 S, N) is written over.
     """
     coils, width = flux.shape
     arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)

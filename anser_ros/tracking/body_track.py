@@ -1,7 +1,6 @@
 """Follows a rigid tool through time by all of its usable coils, without those that disagree."""
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,14 +9,8 @@ from numpy.typing import NDArray
 from anser_ros import pose_states as states
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_descent import step_to_coils
-from anser_ros.tracking.coil_track import (
-    MOST_STEPS,
-    SUSPICIOUS_JUMP_M,
-    CoilResult,
-    distance,
-    take_errors,
-)
-from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
+from anser_ros.tracking.coil_track import CoilResult, take_errors
+from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.tracking.rigid import (
     BodyCoils,
     BodySolution,
@@ -28,12 +21,11 @@ from anser_ros.tracking.rigid import (
 )
 from anser_ros.tracking.rotations import rotation_between, rotation_of_vector
 from anser_ros.tracking.seed import SAME_PLACE_M
-from anser_ros.tracking.solve_context import SolveContext
-from anser_ros.tracking.solve_verdict import RARE, variance_scale, verdict
+from anser_ros.tracking.solve_verdict import RARE
+from anser_ros.tracking.track import Freedom, SolveFrame, Start, Track
 from anser_ros.tracking.uncertainty import bounded_inverse
 
 Array = NDArray[np.float64]
-Start = tuple[Array, Array]
 
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""
@@ -52,36 +44,27 @@ LEFT_OUT_S = 1.0
 
 
 @dataclass
-class BodyTrack:
-    """Remembers one body: its last good pose, its noise scale, the coils that disagreed."""
+class BodyTrack(Track[BodySolution]):
+    """Remembers one body: its last good poses, its noise scale, the coils that disagreed."""
 
-    good: BodySolution | None = None
-    good_ns: int = 0
-    before: tuple[int, BodySolution] | None = None
     left_out: frozenset[int] = frozenset()
     again_ns: int = 0
-    noise: NoiseScale = field(default_factory=NoiseScale)
 
     def forget(self) -> None:
         """Drop the last poses, so that the next solve starts cold."""
-        self.good = self.before = None
+        super().forget()
         self.left_out = frozenset()
 
-    def expected(self, stamp_ns: int) -> Start | None:
+    def expected(self, good: BodySolution, stamp_ns: int) -> Start:
         """Return where the body is if it moves on as it did between its last two good poses."""
-        if self.good is None:
-            return None
-        position, rotation = self.good.position, self.good.rotation
-        if self.before is None:
-            return position, rotation
-        before_ns, old = self.before
-        steps = (stamp_ns - self.good_ns) / max(self.good_ns - before_ns, 1)
-        if not 0.0 < steps <= MOST_STEPS:
-            return position, rotation
-        turn = rotation_between(old.rotation, rotation)
+        steps = self.steps(stamp_ns)
+        if self.before is None or steps == 0.0:
+            return good.position, good.rotation
+        old = self.before[1]
+        turn = rotation_between(old.rotation, good.rotation)
         return (
-            position + steps * (position - old.position),
-            rotation_of_vector(steps * turn) @ rotation,
+            good.position + steps * (good.position - old.position),
+            rotation_of_vector(steps * turn) @ good.rotation,
         )
 
 
@@ -111,14 +94,17 @@ class BodyResult:
     fit: BodyFit | None = None
 
 
-@dataclass(frozen=True)
-class _BodyFrame:
-    """A body's fluxes (S, 2K) in one frame, and what its coils found by themselves."""
+@dataclass
+class BodyFrame(SolveFrame):
+    """Holds a body's fluxes (S, 2K), its coils, and what each of these found by itself."""
 
     coils: BodyCoils
-    flux: Array
     single: list[CoilResult]
-    context: SolveContext
+
+    @property
+    def usable(self) -> NDArray[np.int64]:
+        """Return the indices of the coils that the body may use."""
+        return np.flatnonzero([coil.usable for coil in self.single])
 
     @cached_property
     def inverse_sigma(self) -> Array:
@@ -164,7 +150,7 @@ class _BodyFrame:
         return position, rotation
 
 
-def _solve(frame: _BodyFrame, used: NDArray[np.int64], start: Start) -> BodyFit:
+def _solve(frame: BodyFrame, used: NDArray[np.int64], start: Start) -> BodyFit:
     part, context = frame.coils.subset(used), frame.context
     weights = np.tile(frame.inverse_sigma, (len(used), 1))
     solution = solve_body(
@@ -174,7 +160,7 @@ def _solve(frame: _BodyFrame, used: NDArray[np.int64], start: Start) -> BodyFit:
     return BodyFit(solution, used, max(weights.size - UNKNOWNS, 1))
 
 
-def _without_disagreeing(fit: BodyFit, frame: _BodyFrame, gate: float) -> BodyFit:
+def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit:
     """Leave out, one by one, up to a third of the coils while one of them spoils the fit."""
     for _ in range(len(fit.used) // 3):
         if fit.ratio <= gate**2:
@@ -191,7 +177,7 @@ def _without_disagreeing(fit: BodyFit, frame: _BodyFrame, gate: float) -> BodyFi
     return fit
 
 
-def _cold_starts(frame: _BodyFrame, used: NDArray[np.int64]) -> list[Start]:
+def _cold_starts(frame: BodyFrame, used: NDArray[np.int64]) -> list[Start]:
     context, coils, single = frame.context, frame.coils, frame.single
     for wanted in (states.OK, states.RESIDUAL):
         rows = [i for i in used if single[i].estimate.state == wanted]
@@ -211,107 +197,72 @@ def _cold_starts(frame: _BodyFrame, used: NDArray[np.int64]) -> list[Start]:
     return start_from_grid(context.grid, context.field, coils.subset(used), frame.flux[used])
 
 
-def track_body(
-    track: BodyTrack,
-    name: str,
-    coils: BodyCoils,
-    stamp_ns: int,
-    flux: Array,
-    usable: NDArray[np.bool_],
-    single: list[CoilResult],
-    context: SolveContext,
-    settings: TrackerSettings,
-) -> BodyResult:
-    """Estimate a body's pose from the fluxes, shape (S, 2K), of its usable coils."""
-    used = np.flatnonzero(usable)
+def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
+    """Estimate a body's pose from the fluxes of its usable coils."""
+    used, coils, gate = frame.usable, frame.coils, frame.settings.gate
     if len(used) < 2 or not coils.subset(used).observable:
-        reason = f'{len(used)} of {len(usable)} coils usable; two that are not parallel are needed'
-        worst = next(
-            (s.estimate.state for i, s in enumerate(single) if not usable[i]), states.STALE
-        )
-        return BodyResult(no_pose(name, stamp_ns, worst, context.model_id, reason))
-    frame = _BodyFrame(coils, flux, single, context)
-    fits = _from_good(track, stamp_ns, frame, used, settings)
+        count = f'{len(used)} of {len(frame.single)} coils usable'
+        reason = f'{count}; two that are not parallel are needed'
+        worst = next((c.estimate.state for c in frame.single if not c.usable), states.STALE)
+        return BodyResult(frame.no_pose(worst, reason))
+    fits = _from_good(track, frame, used)
     if not fits:
         fits = [_solve(frame, used, start) for start in _cold_starts(frame, used)]
         fits.sort(key=lambda candidate: candidate.ratio)
-        fits[:1] = [_without_disagreeing(f, frame, settings.gate) for f in fits[:1]]
+        fits[:1] = [_without_disagreeing(f, frame, gate) for f in fits[:1]]
     if not fits:
         reason = 'no coil of this body has a pose to start from'
-        return BodyResult(no_pose(name, stamp_ns, states.RESIDUAL, context.model_id, reason))
+        return BodyResult(frame.no_pose(states.RESIDUAL, reason))
     fit = fits[0]
-    result = _judge(track, name, stamp_ns, fit, fits[1:], coils, context, settings)
+    result = _judge(track, frame, fit, fits[1:])
     if result.state == states.OK:
-        last, track.before = track.good, None
-        moved = math.inf if last is None else distance(last.position, fit.solution.position)
-        if last is not None and moved < SUSPICIOUS_JUMP_M:
-            track.before = (track.good_ns, last)
-        track.good, track.good_ns = fit.solution, stamp_ns
+        track.remember(fit.solution, frame.stamp_ns)
         track.noise.add(fit.ratio)
         left_out = frozenset(used.tolist()) - frozenset(fit.used.tolist())
         if left_out != track.left_out:
-            track.left_out, track.again_ns = left_out, stamp_ns + round(LEFT_OUT_S / NANO)
+            track.left_out, track.again_ns = left_out, frame.stamp_ns + round(LEFT_OUT_S / NANO)
     return BodyResult(result, fit)
 
 
-def _from_good(
-    track: BodyTrack,
-    stamp_ns: int,
-    frame: _BodyFrame,
-    used: NDArray[np.int64],
-    settings: TrackerSettings,
-) -> list[BodyFit]:
+def _from_good(track: BodyTrack, frame: BodyFrame, used: NDArray[np.int64]) -> list[BodyFit]:
     """The fit near the last good pose, when there is one that passes the gate."""
-    if track.good is None or (stamp_ns - track.good_ns) * NANO > settings.warm_age_s:
+    stamp_ns, gate = frame.stamp_ns, frame.settings.gate
+    good = track.fresh(stamp_ns, frame.settings)
+    if good is None:
         return []
-    start = track.expected(stamp_ns)
-    assert start is not None
-    start = frame.nearer(start, used)
+    start = frame.nearer(track.expected(good, stamp_ns), used)
     if track.left_out and stamp_ns < track.again_ns:
         kept = np.array([i for i in used if int(i) not in track.left_out], dtype=np.int64)
         if len(kept) > 1 and frame.coils.subset(kept).observable:
             fit = _solve(frame, kept, start)
-            if fit.good(settings.gate):
+            if fit.good(gate):
                 return [fit]
     track.again_ns = stamp_ns + round(LEFT_OUT_S / NANO)
-    fit = _without_disagreeing(_solve(frame, used, start), frame, settings.gate)
-    return [fit] if fit.good(settings.gate) else []
+    fit = _without_disagreeing(_solve(frame, used, start), frame, gate)
+    return [fit] if fit.good(gate) else []
 
 
 def _judge(
-    track: BodyTrack,
-    name: str,
-    stamp_ns: int,
-    fit: BodyFit,
-    rivals: list[BodyFit],
-    coils: BodyCoils,
-    context: SolveContext,
-    settings: TrackerSettings,
+    track: BodyTrack, frame: BodyFrame, fit: BodyFit, rivals: list[BodyFit]
 ) -> PoseEstimate:
     solution = fit.solution
-    scale = variance_scale(
-        track.noise, solution.chi2, fit.freedom, UNKNOWNS, RARE, context, settings
-    )
-    covariance = scale * bounded_inverse(solution.information)
-    sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
-    residual = float(np.sqrt(np.mean(solution.residual**2)))
+    position, rotation = solution.position, solution.rotation
     others = (
         (rival.solution.chi2, 'another pose')
         for rival in rivals
         if rival.solution.converged and _apart(rival.solution, solution)
     )
-    state, reason = verdict(
-        settings, solution.chi2, fit.freedom, residual,
-        solution.position + solution.rotation @ coils.subset(fit.used).offsets.mean(axis=0),
-        solution.converged, sigma, scale, rivals=others,
+    estimate = frame.estimate(
+        track.noise, solution, Freedom(fit.freedom, UNKNOWNS, RARE),
+        (position, rotation[:, 2].copy(), rotation),
+        lambda _: bounded_inverse(solution.information), others,
+        position + rotation @ frame.coils.subset(fit.used).offsets.mean(axis=0),
     )  # fmt: skip
-    left_out = len(coils.offsets) - len(fit.used)
-    if state == states.OK and left_out:
-        reason = f'{left_out} of {len(coils.offsets)} coils left out'
-    return PoseEstimate(
-        name, stamp_ns, state, solution.position, solution.rotation[:, 2].copy(),
-        solution.rotation, covariance, sigma, residual, fit.ratio, context.model_id, reason,
-    )  # fmt: skip
+    left_out = len(frame.single) - len(fit.used)
+    if estimate.state == states.OK and left_out:
+        reason = f'{left_out} of {len(frame.single)} coils left out'
+        estimate = replace(estimate, reason=reason)
+    return estimate
 
 
 def _apart(one: BodySolution, other: BodySolution) -> bool:

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import kernel
-from anser_ros.physics.constants import DIPOLE_CONSTANT
-from anser_ros.physics.dipole import GAUSS_OFFSET
+from anser_ros.physics.dipole import fill_flux_basis
 
 Array = NDArray[np.float64]
 
@@ -21,12 +20,15 @@ less, and no layout has neighbours within a millimetre."""
 def _fill_whitening(errors, sigma, factor, out):  # type: ignore[no-untyped-def]
     """Write the inverse Cholesky factor of ``diag(sigma)^2 + E^T E``; False if there is none."""
     width = sigma.shape[0]
-    scaled = errors / sigma
-    factor[:] = np.dot(scaled.T, scaled)
+    scaled = np.empty(errors.shape)
+    for r in range(errors.shape[0]):
+        for i in range(width):
+            scaled[r, i] = errors[r, i] / sigma[i]
+    gram = np.dot(scaled.T, scaled)
     for i in range(width):
-        factor[i, i] += 1.0
+        gram[i, i] += 1.0
         for j in range(i + 1):
-            total = factor[i, j]
+            total = gram[i, j]
             for k in range(j):
                 total -= factor[i, k] * factor[j, k]
             if i > j:
@@ -50,73 +52,43 @@ def _fill_whitening(errors, sigma, factor, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
-def _fill_spacing(positions, spacing):  # type: ignore[no-untyped-def]
-    for i in range(positions.shape[0]):
-        nearest = np.inf
-        for j in range(positions.shape[0]):
-            dx, dy = positions[i, 0] - positions[j, 0], positions[i, 1] - positions[j, 1]
-            dz = positions[i, 2] - positions[j, 2]
-            square = dx * dx + dy * dy + dz * dz
-            if square > SAME_PLACE_M**2:
-                nearest = min(nearest, square)
-        spacing[i] = math.sqrt(nearest) if nearest < np.inf else 0.0
-
-
 def source_spacing(positions: Array, floor_m: float) -> Array:
     """Return how far dipoles where tools may be are from their neighbours, m, shape (N,).
 
     Dipoles that stand for metal do not determine the field between themselves and others of their
     kind. Those lower than ``floor_m`` are below all tools and get 0.
     """
-    spacing = np.empty(len(positions))
-    _fill_spacing(np.ascontiguousarray(positions), spacing)
-    spacing[positions[:, 2] < floor_m] = 0.0
-    return spacing
-
-
-@kernel
-def _fill_couplings(points, axes, lengths, dipoles, spacing, basis, away, among):  # type: ignore[no-untyped-def]
-    """Write each unit dipole's flux in each coil, and how near each coil is to them."""
-    px, py, pz = dipoles[0], dipoles[1], dipoles[2]
-    ux, uy, uz = dipoles[3], dipoles[4], dipoles[5]
-    for p in range(points.shape[0]):
-        nx, ny, nz = axes[p, 0], axes[p, 1], axes[p, 2]
-        half = lengths[p] * GAUSS_OFFSET
-        count = 1 if half == 0.0 else 2
-        scale, row, nearest, deepest = DIPOLE_CONSTANT / count, basis[p], np.inf, 0.0
-        for s in range(count):
-            h = half * (1 - 2 * s)
-            x, y, z = points[p, 0] + h * nx, points[p, 1] + h * ny, points[p, 2] + h * nz
-            for j in range(px.shape[0]):
-                dx, dy, dz = x - px[j], y - py[j], z - pz[j]
-                square = dx * dx + dy * dy + dz * dz
-                inv2 = 1.0 / square
-                inv3 = scale * inv2 * math.sqrt(inv2)
-                du = dx * ux[j] + dy * uy[j] + dz * uz[j]
-                dn = dx * nx + dy * ny + dz * nz
-                nu = nx * ux[j] + ny * uy[j] + nz * uz[j]
-                value = inv3 * (3.0 * du * dn * inv2 - nu)
-                row[j] = value if s == 0 else row[j] + value
-        for j in range(px.shape[0]):
-            dx, dy, dz = points[p, 0] - px[j], points[p, 1] - py[j], points[p, 2] - pz[j]
-            square = dx * dx + dy * dy + dz * dz
-            nearest = min(nearest, square)
-            deepest = max(deepest, spacing[j] * spacing[j] / square)
-        away[p], among[p] = math.sqrt(nearest), math.sqrt(deepest)
+    square = np.zeros((len(positions), len(positions)))
+    for column in positions.T:
+        square += (column[:, None] - column) ** 2
+    square[square <= SAME_PLACE_M**2] = np.inf
+    nearest = np.sqrt(square.min(axis=1, initial=np.inf))
+    return np.where((nearest < np.inf) & (positions[:, 2] >= floor_m), nearest, 0.0)
 
 
 @kernel
 def _fill_all(  # type: ignore[no-untyped-def]
     points, axes, lengths, dipoles, spacing, modes, sigma, errors, out, away, among
 ):  # fmt: skip
+    """Write what `error_whitening` returns; False where a covariance has no factor."""
     width = sigma.shape[0]
     basis, factor = np.empty((points.shape[0], dipoles.shape[1])), np.empty((width, width))
-    _fill_couplings(points, axes, lengths, dipoles, spacing, basis, away, among)
-    errors[:] = np.dot(basis, modes).reshape(errors.shape)
+    fill_flux_basis(points, axes, lengths, dipoles, basis)
+    flat = np.dot(basis, modes)
     good = True
     for s in range(points.shape[0]):
+        for r in range(errors.shape[1]):
+            for k in range(width):
+                errors[s, r, k] = flat[s, r * width + k]
         good &= _fill_whitening(errors[s], sigma, factor, out[s])
+        nearest, deepest = np.inf, 0.0
+        for j in range(dipoles.shape[1]):
+            square = 0.0
+            for i in range(3):
+                square += (points[s, i] - dipoles[i, j]) ** 2
+            nearest = min(nearest, square)
+            deepest = max(deepest, spacing[j] * spacing[j] / square)
+        away[s], among[s] = math.sqrt(nearest), math.sqrt(deepest)
     return good
 
 
@@ -131,20 +103,10 @@ def error_whitening(
 ) -> tuple[Array, Array, Array, Array]:
     """Return the model's error at coils, and the factors that make their residuals white.
 
-    Parameters
-    ----------
-    points, axes : ndarray, shape (S, 3)
-        Coil centres (m) and unit axes, frame fg.
-    lengths : ndarray, shape (S,)
-        Coil lengths, m.
-    dipoles : ndarray, shape (6, N)
-        The dipoles whose moments are uncertain: rows of `RealField.columns`.
-    spacing : ndarray, shape (N,)
-        Their `source_spacing`, m.
-    modes : ndarray, shape (N, R 2K)
-        Moments' errors of one standard deviation each, A m^2.
-    sigma : ndarray, shape (2K,)
-        Standard deviation of each flux component, T.
+    The S coils have centres ``points`` (m), unit ``axes`` (S, 3), frame fg, and ``lengths``, m.
+    The N ``dipoles``, rows of `RealField.columns`, have uncertain moments: ``modes`` (N, R 2K) are
+    errors of one standard deviation each, A m^2, ``spacing`` is `source_spacing`, m. ``sigma``
+    (2K,) is each flux component's standard deviation, T.
 
     Returns
     -------

@@ -42,53 +42,30 @@ poses; larger, and a coil that is a little wrong all the time counts as one with
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """States what the tracker may assume.
+    """States what the tracker may assume."""
 
-    Attributes
-    ----------
-    flux_noise_t : float
-        Standard deviation of each phasor component, T, before anything has been tracked.
-    adaptive : bool
-        Whether each sensor's noise scale follows the residuals of its recent good frames.
-    volume : TrackedVolume or None
-        Where tools may be; a pose outside is refused. None: the tracker's box over an Anser board.
-    grid_spacing_m : float
-        Spacing of the cold start's grid at 0.1 m height.
-    gate : float
-        A pose whose residual is more than so many times the expected one is refused; from
-        `NO_GATE` on no pose is refused for what it contradicts (to measure what that costs, never
-        for use).
-    odds : float
-        A second pose that is more likely than one to so many makes the first ambiguous.
-    max_sigma_m : float
-        Poses less certain than this are refused as ambiguous, m.
-    min_signal : float
-        Fluxes whose rms is below so many noise sigmas are no signal.
-    warm_age_s : float
-        How old a good pose may be to start from.
-    roll_variance : float
-        Variance given to the roll about a single coil's axis, rad^2.
-    recorded_drift : bool
-        Whether an emitter's drift takes the course that the model's effects recorded: only on the
-        session that they were found on, and with a model that doesn't follow the references.
-    stamp_sigma_s : float
-        Error of a flux stamp, s.
-    tools : ToolSettings
-        How well tools are known, and how fast they may be.
-    """
-
+    # Standard deviation of each phasor component, T, before anything has been tracked
     flux_noise_t: float = Accuracy.flux_noise_t
+    # Whether each sensor's noise scale follows the residuals of its recent good frames
     adaptive: bool = True
+    # Where tools may be; a pose outside is refused. None: the tracker's box over an Anser board.
     volume: TrackedVolume | None = None
-    grid_spacing_m: float = 0.035
+    grid_spacing_m: float = 0.035  # Spacing of the cold start's grid at 0.1 m height
+    # A pose whose residual is more than so many times the expected one is refused; from `NO_GATE`
+    # on no pose is refused for what it contradicts (to measure what that costs, never for use)
     gate: float = USUAL_GATE
+    # A second pose that is more likely than one to so many makes the first ambiguous
     odds: float = 1000.0
-    max_sigma_m: float = 0.01
-    min_signal: float = 4.0
-    warm_age_s: float = 1.0
+    max_sigma_m: float = 0.01  # Poses less certain than this are refused as ambiguous, m
+    min_signal: float = 4.0  # Fluxes whose rms is below so many noise sigmas are no signal
+    warm_age_s: float = 1.0  # How old a good pose may be to start from
+    # Variance given to the roll about a single coil's axis, rad^2
     roll_variance: float = ROLL_VARIANCE
+    # Whether an emitter's drift takes the course that the model's effects recorded: only on the
+    # session that they were found on, and with a model that doesn't follow the references
     recorded_drift: bool = False
-    stamp_sigma_s: float = Accuracy.stamp_sigma_s
+    stamp_sigma_s: float = Accuracy.stamp_sigma_s  # Error of a flux stamp, s
+    # How well tools are known, and how fast they may be
     tools: ToolSettings = field(default_factory=ToolSettings)
 
     def __post_init__(self) -> None:
@@ -133,52 +110,28 @@ class TrackerSettings:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """Holds one sensor's or body's pose in one frame, or why there is none.
+    """Holds one sensor's or body's pose in one frame, or why there is none."""
 
-    Attributes
-    ----------
-    name : str
-        Of the sensor or body.
-    stamp_ns : int
-        The flux message's stamp.
-    state : str
-        One of `anser_ros.pose_states.STATES`; the pose may only be used when it is ``ok``.
-    position : ndarray, shape (3,)
-        m, frame fg; NaN where nothing was solved.
-    axis : ndarray, shape (3,)
-        Sensitive axis of a sensor, +z of a body; unit vector, frame fg.
-    rotation : ndarray, shape (3, 3), or None
-        Body axes in fg (columns); None for a single coil, whose roll is not observable.
-    covariance : ndarray, shape (6, 6)
-        Position (m^2) and rotation vector (rad^2), both in fg; the model's uncertainty included.
-    sigma_position_m : float
-        Square root of the trace of the position covariance.
-    residual_t : float
-        Root mean square of measured minus modelled flux components, T.
-    chi2 : float
-        Residual power per degree of freedom in units of the expected one.
-    model_id : str
-        Which field model made it.
-    reason : str
-        Why the state is not ``ok``, in words with figures.
-    """
-
-    name: str
-    stamp_ns: int
+    name: str  # Of the sensor or body
+    stamp_ns: int  # The flux message's stamp
+    # One of `anser_ros.pose_states.STATES`; the pose may only be used when it is ``ok``
     state: str
-    position: Array
-    axis: Array
+    position: Array  # (3,), m, frame fg; NaN where nothing was solved
+    axis: Array  # (3,), sensitive axis of a sensor, +z of a body; unit vector, frame fg
+    # (3, 3), body axes in fg (columns); None for a single coil, whose roll is not observable
     rotation: Array | None
+    # (6, 6), position (m^2) and rotation vector (rad^2), both in fg; the model's uncertainty
+    # included
     covariance: Array
-    sigma_position_m: float
-    residual_t: float
-    chi2: float
-    model_id: str
-    reason: str = ''
+    sigma_position_m: float  # Square root of the trace of the position covariance
+    residual_t: float  # Root mean square of measured minus modelled flux components, T
+    chi2: float  # Residual power per degree of freedom in units of the expected one
+    model_id: str  # Which field model made it
+    reason: str = ''  # Why the state is not ``ok``, in words with figures
 
     def with_sigma(self, sigma_position_m: float) -> 'PoseEstimate':
         """Return the same estimate with another sigma of the position."""
-        other = PoseEstimate.__new__(PoseEstimate)
+        other = PoseEstimate.__new__(PoseEstimate)  # in a sixth of the time of `replace`
         other.__dict__.update(self.__dict__, sigma_position_m=sigma_position_m)
         return other
 
@@ -251,11 +204,10 @@ class NoiseScale:
         ratio : float
             Residual power of the frame per degree of freedom, in units of the expected one.
         usual : float
-            The ratio that noise of the expected size seldom exceeds. A residual above what is
-            usual for this sensor comes from a bent field.
+            What noise of the expected size seldom exceeds; more comes from a bent field.
         share : float
             Degrees of freedom for each dimension of the pose: what stays in the former of a bent
-            field tells, as a power, what goes into the latter.
+            field shows, as a power, what goes into the latter.
         model_share : float
             Part of the expected residual that is the model's own error. It bends the field as
             metal does, and as much of it goes into the pose, however many readings there are.

@@ -11,8 +11,9 @@ import math
 import numpy as np
 
 from anser_ros.kernel_cache import kernel
-from anser_ros.physics.dipole import fill_field_and_gradient
+from anser_ros.physics.dipole import fill_fields
 from anser_ros.physics.tangent import fill_tangent
+from anser_ros.tracking.descent import damped_step
 
 LARGEST_MOVE_M = 0.05
 """Longest step of the position, m; beyond it the linearised field is no guide any more."""
@@ -86,24 +87,30 @@ def _turn(field, flux, axis, tangent, plane, residual):  # type: ignore[no-untyp
 
 @kernel
 def _look(  # type: ignore[no-untyped-def]
-    position, axis, flux, inverse_sigma, positions, directions, moments, basis, field, tangent,
-    plane, residual, slopes,
+    position, axis, flux, inverse_sigma, dipoles, moments, basis, tangent, plane, residual, normal,
+    gradient,
 ):  # fmt: skip
-    """Best axis at a position, chi-square with it, and its slopes (3, 2K) by the position."""
+    """Best axis at a position; returns chi-square with it.
+
+    ``normal`` (3, 3) and ``gradient`` (3,) are left for a step of the position.
+    """
     width = flux.shape[0]
-    fill_field_and_gradient(position, positions, directions, basis)
-    f = np.dot(basis, moments)
+    place = np.empty((1, 3))
+    for i in range(3):
+        place[0, i] = position[i]
+    fill_fields(place, dipoles, basis)
+    f = np.dot(basis[0], moments)
     for k in range(width):
         for i in range(9):
             f[i, k] *= inverse_sigma[k]
-        for i in range(3):
-            field[i, k] = f[i, k]
-    chi2 = _turn(field, flux, axis, tangent, plane, residual)
+    chi2 = _turn(f[:3], flux, axis, tangent, plane, residual)
     n0, n1, n2 = axis[0], axis[1], axis[2]
+    slopes = f[3:6]
     for k in range(width):
-        slopes[0, k] = n0 * f[3, k] + n1 * f[4, k] + n2 * f[5, k]
-        slopes[1, k] = n0 * f[4, k] + n1 * f[6, k] + n2 * f[7, k]
-        slopes[2, k] = n0 * f[5, k] + n1 * f[7, k] + n2 * f[8, k]
+        xx, xy, xz, yy, yz, zz = f[3, k], f[4, k], f[5, k], f[6, k], f[7, k], f[8, k]
+        slopes[0, k] = n0 * xx + n1 * xy + n2 * xz
+        slopes[1, k] = n0 * xy + n1 * yy + n2 * yz
+        slopes[2, k] = n0 * xz + n1 * yz + n2 * zz
     for i in range(3):
         for p in range(2):
             dot = 0.0
@@ -111,81 +118,59 @@ def _look(  # type: ignore[no-untyped-def]
                 dot += plane[p, k] * slopes[i, k]
             for k in range(width):
                 slopes[i, k] -= dot * plane[p, k]
+    for i in range(3):
+        gradient[i] = 0.0
+        for k in range(width):
+            gradient[i] += slopes[i, k] * residual[k]
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(width):
+                total += slopes[i, k] * slopes[j, k]
+            normal[i, j] = normal[j, i] = total
     return chi2
 
 
 @kernel
-def _step(slopes, residual, damping, step):  # type: ignore[no-untyped-def]
-    """Damped step (3) by Cramer's rule, shortened to the largest move."""
-    a, g = np.empty((3, 3)), np.empty(3)
-    for i in range(3):
-        for j in range(i, 3):
-            a[i, j] = 0.0
-            for k in range(residual.shape[0]):
-                a[i, j] += slopes[i, k] * slopes[j, k]
-            a[j, i] = a[i, j]
-        g[i] = 0.0
-        for k in range(residual.shape[0]):
-            g[i] += slopes[i, k] * residual[k]
-    for i in range(3):
-        a[i, i] *= 1.0 + damping
-    c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
-    c01 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
-    c02 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
-    c11 = a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]
-    c12 = a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]
-    c22 = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
-    determinant = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
-    scale = 1.0 / (determinant + 1e-300)
-    step[0] = scale * (c00 * g[0] + c01 * g[1] + c02 * g[2])
-    step[1] = scale * (c01 * g[0] + c11 * g[1] + c12 * g[2])
-    step[2] = scale * (c02 * g[0] + c12 * g[1] + c22 * g[2])
-    size = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-    if size > LARGEST_MOVE_M:
-        for i in range(3):
-            step[i] *= LARGEST_MOVE_M / size
-
-
-@kernel
 def descend_projected(  # type: ignore[no-untyped-def]
-    position, axis, flux, inverse_sigma, positions, directions, moments, low, high, budget,
+    position, axis, flux, inverse_sigma, dipoles, moments, low, high, budget,
 ):  # fmt: skip
     """Move ``position`` and ``axis`` (in place) towards a minimum.
 
-    ``flux`` is in tesla. Returns chi-square (of a point coil) and the evaluations used.
+    ``flux`` is in tesla, ``dipoles`` (6, N) are `solve.RealField.columns`. Returns chi-square (of
+    a point coil) and the evaluations used.
     """
     width = flux.shape[0]
-    white = flux * inverse_sigma
-    basis, field = np.empty((9, positions.shape[0])), np.empty((3, width))
-    tangent, plane, step = np.empty((2, 3)), np.empty((2, width)), np.empty(3)
-    residual, slopes = np.empty(width), np.empty((3, width))
-    new_residual, new_slopes = np.empty(width), np.empty((3, width))
-    new_position, new_axis = np.empty(3), np.empty(3)
+    white, basis = flux * inverse_sigma, np.empty((1, 9, dipoles.shape[1]))
+    tangent, plane, residual = np.empty((2, 3)), np.empty((2, width)), np.empty(width)
+    normal, gradient, new_normal, new_gradient = (
+        np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    )  # fmt: skip
+    step, factor, new_position, new_axis = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
     chi2 = _look(
-        position, axis, white, inverse_sigma, positions, directions, moments, basis, field,
-        tangent, plane, residual, slopes,
+        position, axis, white, inverse_sigma, dipoles, moments, basis, tangent, plane, residual,
+        normal, gradient,
     )  # fmt: skip
     used, damping = 1, 1e-3
-    while used < budget:
-        _step(slopes, residual, damping, step)
-        moved = 0.0
+    while used < budget and damped_step(normal, gradient, damping, factor, step):
+        size = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+        part, moved = min(1.0, LARGEST_MOVE_M / max(size, 1e-300)), 0.0
         for i in range(3):
-            new_position[i] = min(max(position[i] + step[i], low[i]), high[i])
+            new_position[i] = min(max(position[i] + part * step[i], low[i]), high[i])
             moved = max(moved, abs(new_position[i] - position[i]))
             new_axis[i] = axis[i]
         if moved < 1e-6:
             break
         trial = _look(
-            new_position, new_axis, white, inverse_sigma, positions, directions, moments, basis,
-            field, tangent, plane, new_residual, new_slopes,
+            new_position, new_axis, white, inverse_sigma, dipoles, moments, basis, tangent, plane,
+            residual, new_normal, new_gradient,
         )  # fmt: skip
         used += 1
         if trial < chi2:
             done = chi2 - trial < NEAR * chi2
             chi2 = trial
             position[:], axis[:] = new_position, new_axis
-            residual, new_residual = new_residual, residual
-            slopes, new_slopes = new_slopes, slopes
+            normal, new_normal = new_normal, normal
+            gradient, new_gradient = new_gradient, gradient
             damping *= 0.2
             if done:
                 break

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
+from anser_ros.physics.angles import nearest_rotation
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.tracking.body_descent import descend_body, fill_common
-from anser_ros.tracking.rotations import nearest_rotation
 from anser_ros.tracking.seed import SeedGrid
 from anser_ros.tracking.solve import Array, RealField
 
@@ -77,49 +77,23 @@ class BodyCoils:
 
 @dataclass(frozen=True)
 class BodySolution:
-    """States where a rigid tool's solve ended.
+    """States where a rigid tool's solve ended."""
 
-    Attributes
-    ----------
-    position : ndarray, shape (3,)
-        Body origin, m, frame fg.
-    rotation : ndarray, shape (3, 3)
-        Takes body vectors to fg.
-    chi2 : float
-        Squared residual in units of its covariance.
-    information : ndarray, shape (6, 6)
-        Inverse covariance of (position, rotation vector), both in fg.
-    residual : ndarray, shape (S, 2K)
-        Measured minus modelled flux, T.
-    coil_chi2 : ndarray, shape (S,)
-        Each coil's squared residual in units of its own noise.
-    evaluations : int
-    converged : bool
-    """
-
-    position: Array
-    rotation: Array
-    chi2: float
-    information: Array
-    residual: Array
-    coil_chi2: Array
+    position: Array  # (3,), body origin, m, frame fg
+    rotation: Array  # (3, 3), takes body vectors to fg
+    chi2: float  # Squared residual in units of its covariance
+    information: Array  # (6, 6), inverse covariance of (position, rotation vector), both in fg
+    residual: Array  # (S, 2K), measured minus modelled flux, T
+    coil_chi2: Array  # (S,), each coil's squared residual in units of its own noise
     evaluations: int
     converged: bool
 
 
 def common_factor(modes: Array, inverse_sigma: Array) -> Array:
-    """Return the factor E with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
+    """Return E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
 
-    Parameters
-    ----------
-    modes : ndarray, shape (S, R, 2K)
-        Flux errors of one standard deviation each that several coils share, T.
-    inverse_sigma : ndarray, shape (S, 2K)
-        1/T.
-
-    Returns
-    -------
-    ndarray, shape (R, S 2K)
+    ``modes`` (S, R, 2K) are flux errors of one standard deviation each that several coils share,
+    T; ``inverse_sigma`` (S, 2K) is in 1/T.
 
     Raises
     ------
@@ -145,24 +119,9 @@ def solve_body(
 ) -> BodySolution:
     """Fit a rigid tool's pose from a start near it.
 
-    Parameters
-    ----------
-    field : RealField
-    coils : BodyCoils
-    flux : ndarray, shape (S, 2K)
-        T; real and imaginary part by turns.
-    inverse_sigma : ndarray, shape (S, 2K)
-        1/T.
-    common : ndarray, shape (R, S 2K)
-        From `common_factor`; R = 0 for a model without uncertainty.
-    position, rotation : ndarray, shapes (3,), (3, 3)
-        Start.
-    low, high : ndarray, shape (3,)
-        Box that the body's origin must not leave, m.
-
-    Returns
-    -------
-    BodySolution
+    ``flux`` (S, 2K) in T has real and imaginary part by turns, ``inverse_sigma`` (S, 2K) is in
+    1/T; ``common`` is from `common_factor`, without a row for a model without uncertainty. The
+    body's origin does not leave the box from ``low`` to ``high``, m.
 
     Raises
     ------
@@ -190,19 +149,8 @@ def start_from_coils(
 ) -> tuple[Array, Array] | None:
     """Return the pose of a body from its coils' own 5-DoF poses (Wahba's problem).
 
-    Parameters
-    ----------
-    coils : BodyCoils
-        The coils that have a pose.
-    positions, axes : ndarray, shape (S, 3)
-        Their poses, m and unit vectors, frame fg.
-    weights : ndarray, shape (S,)
-        How much each is trusted.
-
-    Returns
-    -------
-    position, rotation : ndarrays, shapes (3,), (3, 3), or None
-        None when these coils don't fix the rotation.
+    ``coils`` are those that have a pose: ``positions`` (m) and unit ``axes`` (S, 3) in fg,
+    ``weights`` (S,) by how much each is trusted. None when these coils don't fix the rotation.
     """
     if len(axes) == 0:
         return None
@@ -222,21 +170,8 @@ def start_from_grid(
 ) -> list[tuple[Array, Array]]:
     """Return starts for a body whose single coils have no poses (few emitters, many axes).
 
-    At every grid point the emitters' fields are turned to fit all coils at once, the lever arms
-    neglected; the poses with the least misfit come first.
-
-    Parameters
-    ----------
-    grid : SeedGrid
-        Gives the positions.
-    field : RealField
-    coils : BodyCoils
-    flux : ndarray, shape (S, 2K)
-        T.
-
-    Returns
-    -------
-    list of (position, rotation)
+    At every grid point the emitters' fields are turned to fit the fluxes (S, 2K), T, of all coils
+    at once, the lever arms neglected; the poses with the least misfit come first.
     """
     total = len(grid.points)
     complex_moments = field.moments.view(np.complex128)
@@ -246,10 +181,7 @@ def start_from_grid(
     )
     fields = model.view(np.float64).reshape(total, 3, -1)
     measured = coils.axes.T @ flux
-    u, _, vt = np.linalg.svd(np.einsum('gik,jk->gij', fields, measured))
-    sign = np.sign(np.linalg.det(u @ vt))
-    u[:, :, 2] *= sign[:, None]
-    rotations = u @ vt
+    rotations = nearest_rotation(np.einsum('gik,jk->gij', fields, measured))
     predicted = np.einsum('sj,gij,gik->gsk', coils.axes, rotations, fields, optimize=True)
     misfit = ((flux - predicted) ** 2).sum(axis=(1, 2))
     order: Sequence[int] = np.argsort(misfit, kind='stable')[: 8 * GRID_STARTS].tolist()

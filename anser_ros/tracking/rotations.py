@@ -97,12 +97,3 @@ def rotation_of_quaternion(quaternion: NDArray[np.generic]) -> Array:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def nearest_rotation(matrix: NDArray[np.generic]) -> Array:
-    """Return the proper rotation nearest to a matrix (Kabsch): ``U diag(1, 1, det) V^T`` of its
-    SVD.
-    """
-    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
-    sign = 1.0 if np.linalg.det(u @ vt) > 0 else -1.0
-    return np.asarray(u @ np.diag([1.0, 1.0, sign]) @ vt)

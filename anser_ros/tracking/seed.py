@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import kernel
-from anser_ros.physics.dipole import fill_field_and_gradient
+from anser_ros.physics.dipole import dipole_field
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.projection import descend_projected
 from anser_ros.tracking.solve import Array, CoilSolution, RealField, solve_coil
@@ -41,67 +41,22 @@ LAST_RESORT = 5
 
 @dataclass(frozen=True)
 class SeedGrid:
-    """Holds positions (G, 3) of the grid and, for each, what turns fluxes into an axis.
+    """Holds positions (G, 3) of the grid and, for each, what turns fluxes into an axis."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (G, 3)
-        m, frame fg.
-    projectors : ndarray, shape (G, 3, 2K)
-        ``L^-1 B``, whitened.
-    triangles : ndarray, shape (G, 3, 3)
-        ``L^-1``.
-    sigma : ndarray, shape (2K,)
-        Standard deviations that the grid was whitened with, T.
-    spacing_m : float
-        Distance between neighbours in the board's plane at the volume's floor.
+    points: Array  # (G, 3), m, frame fg
+    projectors: Array  # (G, 3, 2K), ``L^-1 B``, whitened
+    triangles: Array  # (G, 3, 3), ``L^-1``
+    sigma: Array  # (2K,), standard deviations that the grid was whitened with, T
+    spacing_m: float  # Distance between neighbours in the board's plane at the volume's floor
+
+
+@kernel
+def _pick(points, linear, triangles, power, apart, chosen, cost, axes):  # type: ignore[no-untyped-def]
+    """Cost of a unit axis at every grid point, and that axis; returns how many are ``chosen``.
+
+    These are the cheapest points that are apart from each other in place or axis.
     """
-
-    points: Array
-    projectors: Array
-    triangles: Array
-    sigma: Array
-    spacing_m: float
-
-
-@kernel
-def _fill_grid(points, positions, directions, moments, inverse_sigma, projectors, triangles):  # type: ignore[no-untyped-def]
-    basis = np.empty((9, positions.shape[0]))
-    width = moments.shape[1]
-    for g in range(points.shape[0]):
-        fill_field_and_gradient(points[g], positions, directions, basis)
-        field = np.dot(basis[:3], moments)
-        for i in range(3):
-            for k in range(width):
-                field[i, k] *= inverse_sigma[k]
-        gram = np.zeros((3, 3))
-        for i in range(3):
-            for j in range(3):
-                for k in range(width):
-                    gram[i, j] += field[i, k] * field[j, k]
-        ridge = 1e-12 * (gram[0, 0] + gram[1, 1] + gram[2, 2]) + 1e-300
-        l00 = math.sqrt(gram[0, 0] + ridge)
-        l10, l20 = gram[1, 0] / l00, gram[2, 0] / l00
-        l11 = math.sqrt(max(gram[1, 1] - l10 * l10, 0.0) + ridge)
-        l21 = (gram[2, 1] - l20 * l10) / l11
-        l22 = math.sqrt(max(gram[2, 2] - l20 * l20 - l21 * l21, 0.0) + ridge)
-        t = triangles[g]
-        t[:] = 0.0
-        t[0, 0], t[1, 1], t[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
-        t[1, 0] = -l10 * t[0, 0] / l11
-        t[2, 1] = -l21 * t[1, 1] / l22
-        t[2, 0] = -(l20 * t[0, 0] + l21 * t[1, 0]) / l22
-        for i in range(3):
-            for k in range(width):
-                total = 0.0
-                for j in range(i + 1):
-                    total += t[i, j] * field[j, k]
-                projectors[g, i, k] = total
-
-
-@kernel
-def _score(linear, triangles, power, cost, axes):  # type: ignore[no-untyped-def]
-    """Cost of a unit axis at every grid point, and that axis."""
+    alive = np.ones(points.shape[0], np.bool_)
     for g in range(linear.shape[0]):
         c0, c1, c2 = linear[g, 0], linear[g, 1], linear[g, 2]
         t = triangles[g]
@@ -117,35 +72,22 @@ def _score(linear, triangles, power, cost, axes):  # type: ignore[no-untyped-def
         v2 = t[2, 0] * n0 + t[2, 1] * n1 + t[2, 2] * n2
         variance = v0 * v0 + v1 * v1 + v2 * v2
         cost[g] = power - (c0 * c0 + c1 * c1 + c2 * c2) + (length - 1.0) ** 2 / variance
-
-
-@kernel
-def _pick(points, cost, axes, apart, count):  # type: ignore[no-untyped-def]
-    """Indices of the cheapest points that are apart from each other in place or axis."""
-    chosen = np.empty(count, np.int64)
-    found = 0
-    alive = np.ones(points.shape[0], np.bool_)
-    while found < count:
+    for found in range(chosen.shape[0]):
         best = -1
         for g in range(points.shape[0]):
             if alive[g] and (best < 0 or cost[g] < cost[best]):
                 best = g
         if best < 0:
-            break
+            return found
         chosen[found] = best
-        found += 1
         for g in range(points.shape[0]):
-            dx = points[g, 0] - points[best, 0]
-            dy = points[g, 1] - points[best, 1]
-            dz = points[g, 2] - points[best, 2]
-            dot = (
-                axes[g, 0] * axes[best, 0]
-                + axes[g, 1] * axes[best, 1]
-                + axes[g, 2] * axes[best, 2]
-            )
-            if dx * dx + dy * dy + dz * dz < apart * apart and dot > 0.5:
+            square, dot = 0.0, 0.0
+            for i in range(3):
+                square += (points[g, i] - points[best, i]) ** 2
+                dot += axes[g, i] * axes[best, i]
+            if square < apart * apart and dot > 0.5:
                 alive[g] = False
-    return chosen[:found]
+    return chosen.shape[0]
 
 
 def grid_points(volume: TrackedVolume, spacing_m: float) -> Array:
@@ -182,51 +124,25 @@ def grid_points(volume: TrackedVolume, spacing_m: float) -> Array:
 def build_grid(
     field: RealField, sigma: Array, volume: TrackedVolume, spacing_m: float = 0.025
 ) -> SeedGrid:
-    """Precompute the scan of a volume.
-
-    Parameters
-    ----------
-    field : RealField
-    sigma : ndarray, shape (2K,)
-        Standard deviation of each flux component, T.
-    volume : TrackedVolume
-    spacing_m : float
-        See `grid_points`.
-
-    Returns
-    -------
-    SeedGrid
+    """Precompute the scan of a volume; ``sigma`` (2K,) is each flux component's, T.
 
     Raises
     ------
     TrackingError
-        When the spacing doesn't suit the volume.
+        When the spacing doesn't suit the volume, see `grid_points`.
     """
     points = grid_points(volume, spacing_m)
-    projectors = np.empty((len(points), 3, field.moments.shape[1]))
-    triangles = np.empty((len(points), 3, 3))
-    _fill_grid(
-        points,
-        field.positions,
-        field.directions,
-        field.moments,
-        1.0 / sigma,
-        projectors,
-        triangles,
-    )
-    return SeedGrid(points, projectors, triangles, np.array(sigma), spacing_m)
+    moments = field.moments.view(np.complex128)
+    fields = dipole_field(points, field.positions, field.directions, moments)
+    white = np.ascontiguousarray(fields).view(np.float64) / sigma
+    gram = white @ white.swapaxes(1, 2)
+    ridge = 1e-12 * np.trace(gram, axis1=1, axis2=2) + 1e-300
+    triangles = np.linalg.inv(np.linalg.cholesky(gram + ridge[:, None, None] * np.eye(3)))
+    return SeedGrid(points, triangles @ white, triangles, np.array(sigma), spacing_m)
 
 
 def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return the cheapest distinct grid points.
-
-    Parameters
-    ----------
-    grid : SeedGrid
-    flux : ndarray, shape (2K,)
-        T; real and imaginary part by turns.
-    count : int
-        Most candidates wanted.
+    """Return the cheapest distinct grid points for fluxes (2K,), T, ``count`` of them at most.
 
     Returns
     -------
@@ -240,10 +156,12 @@ def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[NDArray[np.int64], Ar
     white = flux / grid.sigma
     total = len(grid.points)
     linear = (grid.projectors.reshape(3 * total, -1) @ white).reshape(total, 3)
-    cost, axes = np.empty(total), np.empty((total, 3))
-    _score(linear, grid.triangles, float(white @ white), cost, axes)
-    chosen = _pick(grid.points, cost, axes, 1.5 * grid.spacing_m, count)
-    return chosen, axes, cost
+    cost, axes, chosen = np.empty(total), np.empty((total, 3)), np.empty(count, np.int64)
+    apart = 1.5 * grid.spacing_m
+    found = _pick(
+        grid.points, linear, grid.triangles, float(white @ white), apart, chosen, cost, axes
+    )
+    return chosen[:found], axes, cost
 
 
 def _same(a: CoilSolution, b: CoilSolution) -> bool:
@@ -271,8 +189,8 @@ def _polish(
     for index in starts:
         position, axis = grid.points[index].copy(), axes[index].copy()
         chi2, _ = descend_projected(
-            position, axis, flux, inverse_sigma, field.positions, field.directions,
-            field.moments, low, high, PROJECTED_BUDGET,
+            position, axis, flux, inverse_sigma, field.columns, field.moments, low, high,
+            PROJECTED_BUDGET,
         )  # fmt: skip
         reached.append((chi2, position, axis))
     reached.sort(key=lambda item: item[0])
@@ -299,22 +217,9 @@ def solve_cold(
 ) -> list[CoilSolution]:
     """Return every distinct pose that the best grid points lead to, least chi-square first.
 
-    Parameters
-    ----------
-    field : RealField
-    grid : SeedGrid
-    flux, whitening, low, high, length_m
-        As for `solve_coil`.
-    gate : float
-        Chi-square that an acceptable pose stays below; when none of the first starts leads there,
-        more are tried.
-    thorough : bool
-        Whether more are tried when those lead to nothing acceptable.
-
-    Returns
-    -------
-    list of CoilSolution
-        At least one.
+    There is at least one. ``gate`` is the chi-square that an acceptable pose stays below; when
+    none of the first starts leads there, a ``thorough`` search tries more. The other arguments are
+    those of `solve_coil`.
     """
     found: list[CoilSolution] = []
     tried = 0

@@ -28,19 +28,12 @@ need a few; the bound keeps the time of a frame limited when the fluxes fit no p
 
 @dataclass(frozen=True)
 class RealField:
-    """Holds a field model laid out for the kernels.
+    """Holds a field model laid out for the kernels."""
 
-    Attributes
-    ----------
-    positions, directions : ndarray, shape (N, 3)
-        Dipole positions (m, frame fg) and unit directions.
-    moments : ndarray, shape (N, 2K)
-        A m^2; for every emitter its real part, then its imaginary part.
-    """
-
+    # positions, directions: (N, 3), dipole positions (m, frame fg) and unit directions
     positions: Array
     directions: Array
-    moments: Array
+    moments: Array  # (N, 2K), A m^2; for every emitter its real part, then its imaginary part
 
     @classmethod
     def of(
@@ -82,47 +75,23 @@ class RealField:
 
 
 class CoilSolution(NamedTuple):
-    """States where a coil's solve ended.
+    """States where a coil's solve ended."""
 
-    Attributes
-    ----------
-    position : ndarray, shape (3,)
-        m, frame fg.
-    axis : ndarray, shape (3,)
-        Unit sensitive axis.
-    chi2 : float
-        Sum of squared whitened residuals.
-    normal : ndarray, shape (6, 6)
-        ``J^T J`` of the whitened residuals by position (per m) and free axis vector.
-    residual : ndarray, shape (2K,)
-        Measured minus modelled flux, T; real and imaginary part by turns.
-    evaluations : int
-        Field evaluations used.
-    converged : bool
-        Whether the last step was negligible.
-    """
-
-    position: Array
-    axis: Array
-    chi2: float
+    position: Array  # (3,), m, frame fg
+    axis: Array  # (3,), unit sensitive axis
+    chi2: float  # Sum of squared whitened residuals
+    # (6, 6), ``J^T J`` of the whitened residuals by position (per m) and free axis vector
     normal: Array
-    residual: Array
-    evaluations: int
-    converged: bool
+    residual: Array  # (2K,), measured minus modelled flux, T; real and imaginary part by turns
+    evaluations: int  # Field evaluations used
+    converged: bool  # Whether the last step was negligible
 
 
 def whitening_of(sigma: Array) -> Array:
-    """Return the matrix that turns a flux residual into one of unit covariance.
+    """Return the matrix, 1/T, that turns a flux residual into one of unit covariance.
 
-    Parameters
-    ----------
-    sigma : ndarray, shape (2K,)
-        Standard deviation of each flux component, T.
-
-    Returns
-    -------
-    ndarray, shape (1, 2K)
-        1/T: the diagonal alone.
+    It is the diagonal alone, shape (1, 2K), from the standard deviation ``sigma`` (2K,) of each
+    flux component, T.
 
     Raises
     ------
@@ -147,23 +116,10 @@ def solve_coil(
 ) -> CoilSolution:
     """Fit a coil's pose from a start near it.
 
-    Parameters
-    ----------
-    field : RealField
-    flux : ndarray, shape (2K,)
-        Measured flux, T; real and imaginary part by turns.
-    whitening : ndarray, shape (1, 2K) or (2K, 2K)
-        From `whitening_of`.
-    position, axis : ndarray, shape (3,)
-        Start: m, frame fg, and unit axis.
-    low, high : ndarray, shape (3,)
-        Box that the position must not leave, m.
-    length_m : float
-        Coil length; 0 for a point sensor.
-
-    Returns
-    -------
-    CoilSolution
+    ``flux`` (2K,) in T has real and imaginary part by turns; ``whitening`` is from `whitening_of`,
+    or a whole matrix (2K, 2K), 1/T. The start is a ``position`` (m, frame fg) and a unit ``axis``;
+    the position does not leave the box from ``low`` to ``high``, m. A ``length_m`` of 0 is a point
+    sensor.
 
     Raises
     ------

@@ -87,40 +87,23 @@ class Starts:
 
 @dataclass(frozen=True)
 class ErrorModes:
-    """Lays a model's uncertainty out for one product with sensors' coupling to its dipoles.
+    """Lays a model's uncertainty out for one product with sensors' coupling to its dipoles."""
 
-    Attributes
-    ----------
-    given : ndarray, shape (R, N, K), complex
-        The model's own array that the rest was made from: a model that has the same array has the
-        same modes, and all that sensors derived from them stays good.
-    rows : ndarray of int, shape (M,)
-        The dipoles whose moments are uncertain.
-    moments : ndarray, shape (M, R' 2K)
-        Of the modes that are not zero, A m^2.
-    spacing : ndarray, shape (M,)
-        See `source_spacing`, m.
-    """
-
+    # (R, N, K), the model's own array that the rest was made from: a model that has the same array
+    # has the same modes, and all that sensors derived from them stays good
     given: ComplexArray
-    rows: NDArray[np.int64]
-    moments: Array
-    spacing: Array
+    rows: NDArray[np.int64]  # (M,), the dipoles whose moments are uncertain
+    moments: Array  # (M, R' 2K), of the modes that are not zero, A m^2
+    spacing: Array  # (M,), see `source_spacing`, m
 
     @classmethod
     def of(
         cls, given: ComplexArray | None, positions: Array, floor_m: float
     ) -> 'ErrorModes | None':
-        """Lay out modes; None where there is no uncertainty.
+        """Lay out modes (R, N, K), A m^2; None where there is no uncertainty.
 
-        Parameters
-        ----------
-        given : ndarray, shape (R, N, K), complex
-            A m^2.
-        positions : ndarray, shape (N, 3)
-            Of the dipoles, m.
-        floor_m : float
-            Height over which dipoles are in the room where tools may be, m.
+        ``positions`` (N, 3) are the dipoles', m; those over the height ``floor_m`` are where tools
+        may be.
         """
         if given is None:
             return None
@@ -141,33 +124,19 @@ class ErrorModes:
 
 @dataclass(frozen=True)
 class SolveContext:
-    """Holds what every solve of a frame shares.
-
-    Attributes
-    ----------
-    field : RealField
-    sigma : ndarray, shape (2K,)
-        Noise and the model's own unexplained part, T.
-    modes : ErrorModes or None
-    starts : Starts
-    low, high : ndarray, shape (3,)
-        Box of the solver, m.
-    model_id : str
-    model_share : float
-        Part of the expected residual's power that is the model's own error, the modes aside.
-    shift_sigma_m : float
-        The model's.
-    """
+    """Holds what every solve of a frame shares."""
 
     field: RealField
-    sigma: Array
+    sigma: Array  # (2K,), noise and the model's own unexplained part, T
     modes: ErrorModes | None
     starts: Starts
+    # low, high: (3,), box of the solver, m
     low: Array
     high: Array
     model_id: str
+    # Part of the expected residual's power that is the model's own error, the modes aside
     model_share: float
-    shift_sigma_m: float = 0.0
+    shift_sigma_m: float = 0.0  # The model's
 
     @property
     def grid(self) -> SeedGrid:

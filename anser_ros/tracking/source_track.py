@@ -7,7 +7,8 @@ magnet in front of an array of magnetometers is tracked in this way.
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,20 +16,20 @@ from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
 from anser_ros.field.symmetry import SymmetryAxis
+from anser_ros.physics.angles import nearest_rotation
 from anser_ros.physics.dipole import field_basis
-from anser_ros.stamps import NANO
+from anser_ros.tracking.body_track import BodyFrame
 from anser_ros.tracking.coil_track import UNKNOWNS
-from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
+from anser_ros.tracking.estimate import NoiseScale, PoseEstimate
 from anser_ros.tracking.rigid import BodyCoils, BodySolution, common_factor, solve_body
-from anser_ros.tracking.rotations import nearest_rotation, rotation_of_vector
+from anser_ros.tracking.rotations import rotation_of_vector
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import RealField
-from anser_ros.tracking.solve_context import SolveContext
-from anser_ros.tracking.solve_verdict import RARE, variance_scale, verdict
+from anser_ros.tracking.solve_verdict import RARE
+from anser_ros.tracking.track import Freedom, SolveFrame, Start, Track
 from anser_ros.tracking.uncertainty import ROLL_VARIANCE, bounded_inverse
 
 Array = NDArray[np.float64]
-Start = tuple[Array, Array]
 
 DIRECTIONS, RATIO = 400, 1.15
 """Directions of the scan's places, and the ratio of neighbouring distances: both leave about a
@@ -96,37 +97,53 @@ def _vector_basis(coils: BodyCoils, places: Array, axis: Array) -> Array:
 
 
 @dataclass
-class SourceTrack:
+class SourceTrack(Track[BodySolution]):
     """Remembers one body: its scan, the last good pose, the noise scale."""
 
     scan: SourceScan | None = None
     coils: BodyCoils | None = None
-    good: BodySolution | None = None
-    good_ns: int = 0
-    noise: NoiseScale | None = None
+
+
+class Sources:
+    """Follows the source that each body sees, as an observer of the tracker.
+
+    Attributes
+    ----------
+    found : dict of str to PoseEstimate
+        Of each body in the last frame, where the field is the same all around an axis: place (m)
+        and axis of the source in the body's frame.
+    """
+
+    def __init__(self) -> None:
+        self._tracks: dict[str, SourceTrack] = {}
+        self.found: dict[str, PoseEstimate] = {}
 
     def forget(self) -> None:
-        """Drop the last pose, so that the next solve starts cold."""
-        self.good = None
+        """Drop the last poses, so that the next solves start cold."""
+        for track in self._tracks.values():
+            track.forget()
+
+    def observe(self, bodies: Sequence[BodyFrame]) -> None:
+        """Find the source in the frame of each body, if the field is that of one."""
+        self.found = {
+            body.name: track_source(
+                self._tracks.setdefault(body.name, SourceTrack()), _SourceFrame(body, axis)
+            )
+            for body in bodies
+            if (axis := body.context.symmetry) is not None
+        }
 
 
-@dataclass(frozen=True)
-class SourceFrame:
-    """Holds one frame's fluxes (S, 2K) of a body in the field of an axisymmetric source."""
+class _SourceFrame(SolveFrame):
+    """One frame's fluxes (S, 2K) of a body in the field of an axisymmetric source."""
 
-    name: str
-    stamp_ns: int
-    coils: BodyCoils
-    flux: Array
-    axis: SymmetryAxis
-    context: SolveContext
-    settings: TrackerSettings
+    def __init__(self, body: BodyFrame, axis: SymmetryAxis) -> None:
+        super().__init__(body.name, body.stamp_ns, body.flux, body.context, body.settings)
+        self.coils, self.used, self.axis = body.coils, body.usable, axis
 
     @cached_property
     def live(self) -> NDArray[np.bool_]:
-        """Return which flux components (2K,) carry anything: constant fields
-        have no quadrature.
-        """
+        """Return which flux components (2K,) carry anything: a constant one has no quadrature."""
         return np.asarray((self.flux != 0.0).any(axis=0))
 
     @cached_property
@@ -137,18 +154,18 @@ class SourceFrame:
             whole.positions, whole.directions, np.ascontiguousarray(whole.moments[:, self.live])
         )
 
-    def solved(self, used: NDArray[np.int64], start: Start) -> BodySolution:
+    def solved(self, start: Start) -> BodySolution:
         """Descend to the pose near a start."""
-        part, context = self.coils.subset(used), self.context
+        part, context, used = self.coils.subset(self.used), self.context, self.used
         flux = np.ascontiguousarray(self.flux[np.ix_(used, self.live)])
         weights = np.tile(1.0 / context.sigma[self.live], (len(used), 1))
         common = common_factor(part.gain_errors(flux), weights)
         low, high = context.low - part.reach, context.high + part.reach
         return solve_body(self.field, part, flux, weights, common, *start, low, high)
 
-    def starts(self, scan: SourceScan, used: NDArray[np.int64]) -> list[Start]:
+    def starts(self, scan: SourceScan) -> list[Start]:
         """Return poses of the body for the scan's best places."""
-        column = int(np.argmax((self.flux[used] ** 2).sum(axis=0)))
+        column = int(np.argmax((self.flux[self.used] ** 2).sum(axis=0)))
         whole = self.context.field
         moment = whole.moments[:, column] @ whole.directions
         out = []
@@ -172,38 +189,35 @@ class SourceFrame:
         return self.axis.point + turn @ (position - self.axis.point), turn @ rotation
 
 
-def track_source(
-    track: SourceTrack, frame: SourceFrame, usable: NDArray[np.bool_]
-) -> PoseEstimate:
+def track_source(track: SourceTrack, frame: _SourceFrame) -> PoseEstimate:
     """Estimate where the source is in the body's frame, from all usable sensors.
 
     The estimate's position (m), axis and covariance are in the body's frame.
     """
-    used, settings, context = np.flatnonzero(usable), frame.settings, frame.context
+    used, settings = frame.used, frame.settings
     if len(used) < FEWEST_SENSORS:
         reason = (
             f'{len(used)} sensors usable, {FEWEST_SENSORS} are needed to find and judge the source'
         )
-        return no_pose(frame.name, frame.stamp_ns, states.STALE, context.model_id, reason)
+        return frame.no_pose(states.STALE, reason)
     if track.scan is None or track.coils is not frame.coils:
         near, far = _distances(frame)
         track.scan, track.coils = SourceScan(frame.coils, near, far), frame.coils
         track.noise = NoiseScale()
-    found: list[BodySolution] = []
-    age = (frame.stamp_ns - track.good_ns) * NANO
-    if track.good is not None and age <= settings.warm_age_s:
-        found = [frame.solved(used, frame.rolled(track.good.position, track.good.rotation))]
+    good, found = track.fresh(frame.stamp_ns, settings), []
+    if good is not None:
+        found = [frame.solved(frame.rolled(good.position, good.rotation))]
     freedom = len(used) * int(frame.live.sum()) - UNKNOWNS
     if not found or not found[0].chi2 <= settings.gate**2 * freedom:
-        found = [frame.solved(used, start) for start in frame.starts(track.scan, used)]
+        found = [frame.solved(start) for start in frame.starts(track.scan)]
         found.sort(key=lambda solution: solution.chi2)
     estimate = _judged(track, frame, found, freedom)
     if estimate.state == states.OK:
-        track.good, track.good_ns = found[0], frame.stamp_ns
+        track.remember(found[0], frame.stamp_ns)
     return estimate
 
 
-def _distances(frame: SourceFrame) -> tuple[float, float]:
+def _distances(frame: _SourceFrame) -> tuple[float, float]:
     """Least and largest distance of the source from the middle of a body in the volume, m."""
     low, high = np.array(frame.settings.box.low), np.array(frame.settings.box.high)
     point = frame.axis.point
@@ -218,7 +232,7 @@ def seen_from(axis: SymmetryAxis, position: Array, rotation: Array) -> tuple[Arr
     return place, np.einsum('...ji,j->...i', rotation, axis.direction)
 
 
-def _covariance(frame: SourceFrame, solution: BodySolution) -> Array:
+def _covariance(frame: _SourceFrame, solution: BodySolution) -> Array:
     """Covariance (6, 6) of place and turn of the source, body's frame; its roll is unknown."""
     away, axis = frame.axis.point - solution.position, frame.axis.direction
     # A turn w of the body moves the place seen by (away x w), and turns the axis seen by -w.
@@ -242,15 +256,9 @@ def _covariance(frame: SourceFrame, solution: BodySolution) -> Array:
 
 
 def _judged(
-    track: SourceTrack, frame: SourceFrame, found: list[BodySolution], freedom: int
+    track: SourceTrack, frame: _SourceFrame, found: list[BodySolution], freedom: int
 ) -> PoseEstimate:
-    solution, settings, context = found[0], frame.settings, frame.context
-    assert track.noise is not None
-    ratio = solution.chi2 / freedom
-    scale = variance_scale(track.noise, solution.chi2, freedom, UNKNOWNS, RARE, context, settings)
-    covariance = scale * _covariance(frame, solution)
-    sigma = float(np.sqrt(np.trace(covariance[:3, :3])))
-    residual = float(np.sqrt(np.mean(solution.residual**2)))
+    solution = found[0]
     place, axis = seen_from(frame.axis, solution.position, solution.rotation)
     others = (
         (rival.chi2, 'another place')
@@ -259,15 +267,11 @@ def _judged(
         and math.dist(seen_from(frame.axis, rival.position, rival.rotation)[0], place)
         > SAME_PLACE_M
     )
-    state, reason = verdict(
-        settings, solution.chi2, freedom, residual,
-        solution.position + solution.rotation @ frame.coils.offsets.mean(axis=0),
-        solution.converged, sigma, scale, 'place', rivals=others,
+    estimate = frame.estimate(
+        track.noise, solution, Freedom(freedom, UNKNOWNS, RARE), (place, axis, None),
+        lambda _: _covariance(frame, solution), others,
+        solution.position + solution.rotation @ frame.coils.offsets.mean(axis=0), 'place',
     )  # fmt: skip
-    if state == states.OK:
-        track.noise.add(ratio)
-    blank = no_pose(frame.name, frame.stamp_ns, state, context.model_id, reason)
-    return replace(
-        blank, position=place, axis=axis, covariance=covariance, sigma_position_m=sigma,
-        residual_t=residual, chi2=ratio,
-    )  # fmt: skip
+    if estimate.state == states.OK:
+        track.noise.add(estimate.chi2)
+    return estimate

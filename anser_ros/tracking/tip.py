@@ -13,21 +13,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Tip:
-    """States where a tip is on its body.
+    """States where a tip is on its body."""
 
-    Attributes
-    ----------
-    name : str
-        Of the tip, in topics and in ``/diagnostics``.
-    position : ndarray, shape (3,)
-        m, body's frame.
-    covariance : ndarray, shape (3, 3)
-        m^2, body's frame: what its calibration leaves unknown.
-    """
-
-    name: str
-    position: Array
-    covariance: Array
+    name: str  # Of the tip, in topics and in ``/diagnostics``
+    position: Array  # (3,), m, body's frame
+    covariance: Array  # (3, 3), m^2, body's frame: what its calibration leaves unknown
 
     def of_body(self, body: PoseEstimate) -> PoseEstimate:
         """Return the tip's pose with its body's state; none where the body has none.

@@ -6,9 +6,11 @@ frame's solve, and a warm solve that misses the gate is repeated without any gue
 """
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +18,20 @@ from numpy.typing import NDArray
 from anser_ros import pose_states as states
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
-from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE, value_codes
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.integrity.freshness import Freshness
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.pose_states import Withheld
 from anser_ros.stamps import NANO
-from anser_ros.tracking.body_track import BodyResult, BodyTrack, track_body
-from anser_ros.tracking.coil_track import CoilResult, CoilTrack, track_coil
+from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, track_body
+from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTrack, track_coil
 from anser_ros.tracking.emitters import FEWEST_EMITTERS, ReducedScene, without_dead
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
 from anser_ros.tracking.rigid import BodyCoils
 from anser_ros.tracking.solve_context import SolveContext, build_context, depends_on
-from anser_ros.tracking.source_track import SourceFrame, SourceTrack, track_source
 from anser_ros.tracking.warm_solve import solve_warm
 
 Array = NDArray[np.float64]
@@ -38,15 +39,87 @@ ComplexArray = NDArray[np.complex128]
 
 __all__ = ['PoseEstimate', 'Tracker', 'TrackerSettings']
 
-PAST = (
-    'counters', '_coil_tracks', '_body_tracks', '_source_tracks', 'sources', '_intake',
-    '_freshness', '_judgement', '_first_ns',
-)  # fmt: skip
-"""Attributes of a tracker that hold what it has seen so far."""
-
 
 def _add(counters: Counter[str], name: str, by: int) -> None:
     counters[name] += by
+
+
+class Observer(Protocol):
+    """Works out what an application needs besides the poses of coils and bodies."""
+
+    def forget(self) -> None:
+        """Drop the last poses, so that the next solves start cold."""
+
+    def observe(self, bodies: Sequence[BodyFrame]) -> None:
+        """Take in one frame of all bodies, after their coils were solved each by itself."""
+
+
+class Past:
+    """Holds what a tracker has seen so far of its sensors and bodies."""
+
+    def __init__(self, sensors: SensorTable, observers: Sequence[Observer]) -> None:
+        self.counters: Counter[str] = Counter()
+        self.coils = {name: CoilTrack() for name in sensors.name}
+        self.bodies = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
+        self.observers = observers
+        # It holds the counters and not the tracker: in a cycle, a tracker that was replaced would
+        # keep its tables until a collection of garbage, of which a running node makes few.
+        count = partial(_add, self.counters)
+        self.intake = Intake(sensors.channel, count, spares_dead=True, error=TrackingError)
+        self.freshness = Freshness()
+        self.judgement = Judgement()
+        self.first_ns = 0
+
+    def forget(self) -> None:
+        """Forget all warm starts, and what was seen of the sensors and bodies."""
+        self.judgement.forget()
+        for coil in self.coils.values():
+            coil.forget()
+        for body in self.bodies.values():
+            body.forget()
+        for observer in self.observers:
+            observer.forget()
+
+
+@dataclass
+class TrackedScene:
+    """Holds what frames are solved with: a model made ready, and the tools as it knows them."""
+
+    sensors: SensorTable  # As surveyed
+    model: FieldModel | None = None
+    context: SolveContext | None = None  # Of the model
+    correction: Correction | None = None  # Of the model's effects
+    table: SensorTable = field(init=False)  # The sensors as the model's effects have them
+    # Rows and coils of the bodies whose six degrees of freedom their coils see
+    bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = field(init=False)
+    # The context of the last frame in which emitters were dead
+    reduced: ReducedScene | None = None
+
+    def __post_init__(self) -> None:
+        corrected = self.correction
+        self.table = table = self.sensors if corrected is None else corrected.sensors()
+        changes = None if corrected is None else corrected.gain_changes()
+        self.bodies = {}
+        for body in dict.fromkeys(table.body):
+            rows = np.array([i for i, name in enumerate(table.body) if name == body])
+            coils = BodyCoils(
+                table.position[rows], table.axis[rows], table.length[rows],
+                None if changes is None else changes[:, rows],
+            )  # fmt: skip
+            if coils.observable:
+                self.bodies[body] = (rows, coils)
+
+    def with_model(
+        self, model: FieldModel, settings: TrackerSettings, model_id: str | None = None
+    ) -> 'TrackedScene':
+        """Return the scene of another model; what has not changed is kept."""
+        context = build_context(model, settings, self.context, model_id)
+        if self.model is None or model.effects is not self.model.effects:
+            correction = Correction.of(model.effects, self.sensors, model.frequencies_hz)
+            return TrackedScene(self.sensors, model, context, correction, self.reduced)
+        scene = copy(self)
+        scene.model, scene.context = model, context
+        return scene
 
 
 class Tracker:
@@ -60,6 +133,12 @@ class Tracker:
         The tool sensors, positions and axes in their body's frame. Those that are sums of
         windings are left out.
     settings : TrackerSettings, optional
+    observers : sequence of Observer
+        What else is followed.
+    past : Past, optional
+        Of another tracker of these sensors, from which this one goes on.
+    scene : TrackedScene, optional
+        Made of the model, if that was done before.
 
     Attributes
     ----------
@@ -69,9 +148,6 @@ class Tracker:
         readings that were not used: ``readings_missing``, ``readings_saturated``,
         ``readings_stale``, ``readings_dropped``, ``readings_not_finite``, ``readings_absurd``,
         ``readings_stuck``.
-    sources : dict of str to PoseEstimate
-        Of each body in the last frame, where the field is the same all around an axis: place (m)
-        and axis of the source in the body's frame. A body has no pose of its own there.
 
     Raises
     ------
@@ -86,86 +162,53 @@ class Tracker:
         model: FieldModel | None,
         sensors: SensorTable,
         settings: TrackerSettings | None = None,
+        observers: Sequence[Observer] = (),
+        *,
+        past: Past | None = None,
+        scene: TrackedScene | None = None,
     ) -> None:
-        sensors = sensors.select(sensors.is_single)
-        if len(sensors) == 0:
-            raise TrackingError('there is no tool sensor to track that is a single coil')
-        if len(set(sensors.channel.tolist())) != len(sensors):
-            raise TrackingError('a channel appears twice in the sensors')
-        if len(set(sensors.name)) != len(sensors):
-            raise TrackingError('a name appears twice in the sensors')
         self.settings = settings or TrackerSettings()
-        self.sensors = sensors
-        self.counters: Counter[str] = Counter()
-        self._coil_tracks = {name: CoilTrack() for name in sensors.name}
-        self._body_tracks = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
-        self._source_tracks: dict[str, SourceTrack] = {}
-        self.sources: dict[str, PoseEstimate] = {}
-        # It holds the counters and not the tracker: in a cycle, a tracker that was replaced would
-        # keep its tables until a collection of garbage, of which a running node makes few.
-        count = partial(_add, self.counters)
-        self._intake = Intake(sensors.channel, count, spares_dead=True, error=TrackingError)
-        self._freshness = Freshness()
-        self._judgement = Judgement()
-        self._first_ns: list[int] = []
-        self._context: SolveContext | None = None
-        self._reduced: ReducedScene | None = None
-        self._effects: tuple[EffectRecord, ...] = ()
-        self._correction: Correction | None = None
-        self._table = sensors
-        self._find_bodies()
-        self._use(model)
+        if past is None:
+            sensors = _checked(sensors)
+            past = Past(sensors, observers)
+        self.sensors, self._past = sensors, past
+        if scene is None:
+            scene = TrackedScene(sensors)
+            if model is not None:
+                scene = scene.with_model(model, self.settings)
+        self._scene = scene
 
-    def _use(self, model: FieldModel | None, model_id: str | None = None) -> None:
-        if model is not None:
-            context = build_context(model, self.settings, self._context, model_id)
-            if model.effects is not self._effects or self._correction is None:
-                self._correction = Correction.of(model.effects, self.sensors, model.frequencies_hz)
-                self._table = self._correction.sensors()
-                self._find_bodies()
-            self._context, self._effects = context, model.effects
-        self._model = model
-
-    def _find_bodies(self) -> None:
-        """Determine which coils make bodies whose six degrees of freedom they see."""
-        table = self._table
-        self._bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = {}
-        for body in self._body_tracks:
-            rows = np.array([i for i, name in enumerate(table.body) if name == body])
-            changes = None if self._correction is None else self._correction.gain_changes()
-            coils = BodyCoils(
-                table.position[rows], table.axis[rows], table.length[rows],
-                None if changes is None else changes[:, rows],
-            )  # fmt: skip
-            if coils.observable:
-                self._bodies[body] = (rows, coils)
+    @property
+    def counters(self) -> Counter[str]:
+        """Return how often what was seen, by name."""
+        return self._past.counters
 
     @property
     def model(self) -> FieldModel | None:
-        """Return the field model in force, or None."""
-        return self._model
+        """Return the active field model, or None."""
+        return self._scene.model
 
     @property
     def dead_emitters(self) -> tuple[str, ...]:
         """Return emitters that no sensor received in the last frame while others were received."""
-        return self._intake.dead
+        return self._past.intake.dead
 
     @property
     def drifting_effects(self) -> tuple[str, ...]:
         """Return the model's effects left to the references: no recorded course applies."""
-        if self._correction is None or self.settings.recorded_drift:
-            return ()
-        return self._correction.drifting
+        correction = self._scene.correction
+        return () if correction is None or self.settings.recorded_drift else correction.drifting
 
     @property
     def corrected_effects(self) -> tuple[str, ...]:
         """Return the model's effects that are undone on what is measured."""
-        return () if self._correction is None else self._correction.corrected
+        correction = self._scene.correction
+        return () if correction is None else correction.corrected
 
     @property
     def bodies(self) -> tuple[str, ...]:
         """Return the bodies that get a 6-DoF pose."""
-        return tuple(self._bodies)
+        return tuple(self._scene.bodies)
 
     def with_model(self, model: FieldModel, model_id: str | None = None) -> 'Tracker':
         """Return the same tracker with another field model; warm starts and counters go on.
@@ -177,52 +220,42 @@ class Tracker:
         TrackingError
             When the model can't be used; this tracker is as it was.
         """
-        other = Tracker.__new__(Tracker)
-        other.__dict__.update(self.__dict__)
-        other._use(model, model_id)
-        if other._context is not None:
-            other._context.make_ready()
-        return other
+        scene = self._scene.with_model(model, self.settings, model_id)
+        assert scene.context is not None
+        scene.context.make_ready()
+        return self._copy(scene)
 
     def renamed(self, model_id: str) -> 'Tracker':
         """Return the same tracker whose model has another name: one found again, but the same."""
-        other = Tracker.__new__(Tracker)
-        other.__dict__.update(self.__dict__)
-        if self._context is not None:
-            other._context = replace(self._context, model_id=model_id)
-        return other
+        scene = copy(self._scene)
+        if scene.context is not None:
+            scene.context = replace(scene.context, model_id=model_id)
+        return self._copy(scene)
 
     def with_settings(self, settings: TrackerSettings) -> 'Tracker':
         """Return the same tracker with other settings; warm starts and counters go on."""
-        other = Tracker.__new__(Tracker)
-        other.__dict__.update(self.__dict__)
-        other.settings = settings
-        if depends_on(settings) == depends_on(self.settings):
-            return other
-        if self._model is not None and self._context is not None:
-            model_id, other._context, other._reduced = self._context.model_id, None, None
-            other._use(self._model, model_id)
-        return other
+        scene = self._scene
+        if depends_on(settings) != depends_on(self.settings) and scene.model is not None:
+            assert scene.context is not None
+            bare = replace(scene, context=None, reduced=None)
+            scene = bare.with_model(scene.model, settings, scene.context.model_id)
+        return Tracker(scene.model, self.sensors, settings, past=self._past, scene=scene)
 
     def with_past_of(self, other: 'Tracker') -> 'Tracker':
         """Return a tracker like this one that goes on from where another one of its sensors is.
 
         What it sees from now on, the other one has seen, and this one has not.
         """
-        new = Tracker.__new__(Tracker)
-        new.__dict__.update(self.__dict__)
-        new.__dict__.update({name: other.__dict__[name] for name in PAST})
-        return new
+        return Tracker(
+            self.model, self.sensors, self.settings, past=other._past, scene=copy(self._scene)
+        )
+
+    def _copy(self, scene: TrackedScene) -> 'Tracker':
+        return Tracker(scene.model, self.sensors, self.settings, past=self._past, scene=scene)
 
     def reset(self) -> None:
         """Forget all warm starts, and what was seen of the sensors and bodies so far."""
-        self._judgement.forget()
-        for coil in self._coil_tracks.values():
-            coil.forget()
-        for body in self._body_tracks.values():
-            body.forget()
-        for source in self._source_tracks.values():
-            source.forget()
+        self._past.forget()
 
     def update(
         self,
@@ -269,8 +302,8 @@ class Tracker:
             Before the first estimate: when the stamp is not positive, shapes don't fit, a channel
             appears twice, or the emitters are not as many as the model's.
         """
-        names = None if self._model is None else self._model.emitters
-        frame = self._intake.admit(
+        names = None if self.model is None else self.model.emitters
+        frame = self._past.intake.admit(
             stamp_ns, channels, flux, flags, names, self.settings.warm_age_s
         )
         if frame is not None:
@@ -286,38 +319,49 @@ class Tracker:
         withheld : Withheld, optional
             Why no pose may be given for it.
         """
+        past, context = self._past, self._scene.context
         if frame.goes_back:
             self.reset()
-        frame = self._freshness.judged(frame, self.settings.flux_noise_t)
-        if not self._first_ns:
-            self._first_ns.append(frame.stamp_ns)
-        context = self._context
+        frame = past.freshness.judged(frame, self.settings.flux_noise_t)
+        past.first_ns = past.first_ns or frame.stamp_ns
         if context is None:
             yield from self._without_poses(frame, states.NO_MODEL, '', 'no field model yet')
             return
+        state, reason = '', ''
         if withheld is not None:
-            yield from self._without_poses(
-                frame, withheld.state, context.model_id, withheld.reason
-            )
+            state, reason = withheld.state, withheld.reason
+        elif frame.living is not None and frame.living.sum() < FEWEST_EMITTERS:
+            state, reason = states.NO_SIGNAL, self._few_emitters(frame.living)
+        if state:
+            yield from self._without_poses(frame, state, context.model_id, reason)
             return
-        living = frame.living
-        if living is not None:
-            if living.sum() < FEWEST_EMITTERS:
-                names = [name for name, lives in zip(self._emitters, living, strict=True)
-                         if not lives]  # fmt: skip
-                reason = (
-                    f'no flux of {", ".join(names)}; {living.sum()} emitters are left, '
-                    f'{FEWEST_EMITTERS} needed'
-                )
-                model_id = context.model_id
-                yield from self._without_poses(frame, states.NO_SIGNAL, model_id, reason)
-                return
-            self._reduced = without_dead(context, living, self._reduced)
-            context = self._reduced.context
         flux, codes = self._corrected(frame)
-        if living is not None:
-            flux = flux[:, living]
+        if frame.living is not None:
+            self._scene.reduced = without_dead(context, frame.living, self._scene.reduced)
+            flux, context = flux[:, frame.living], self._scene.reduced.context
         yield from self._solved(frame.stamp_ns, np.ascontiguousarray(flux), codes, context)
+
+    def _few_emitters(self, living: NDArray[np.bool_]) -> str:
+        """Why a frame with so few emitters has no poses."""
+        emitters = () if self.model is None else self.model.emitters
+        silent = [name for name, lives in zip(emitters, living, strict=True) if not lives]
+        return (
+            f'no flux of {", ".join(silent)}; {living.sum()} emitters are left, '
+            f'{FEWEST_EMITTERS} needed'
+        )
+
+    def _corrected(self, frame: Frame) -> tuple[ComplexArray, NDArray[np.int64]]:
+        """Fluxes (S, K) without what the model's effects did to them, and the readings' codes."""
+        correction = self._scene.correction
+        if correction is None or not correction.changes_flux:
+            return frame.flux, frame.codes
+        time = (frame.stamp_ns - self._past.first_ns) * NANO
+        recorded = self.settings.recorded_drift
+        sound = correction.flux(time, self.sensors.channel, frame.flux, recorded=recorded)
+        flux = np.asarray(sound, dtype=np.complex128)
+        # A correction may carry one sensor's absurd value over to another.
+        codes = np.where(frame.codes == GOOD, value_codes(flux), frame.codes)
+        return flux, codes
 
     def _solved(
         self, stamp_ns: int, flux: ComplexArray, codes: NDArray[np.int64], context: SolveContext
@@ -328,59 +372,44 @@ class Tracker:
         """
         values = flux.view(np.float64)
         coils = self._solved_coils(stamp_ns, values, codes, context)
-        bodies = []
-        self.sources.clear()
-        for name, (rows, table) in self._bodies.items():
+        frames, bodies = [], []
+        for name, (rows, table) in self._scene.bodies.items():
             single = [coils[i] for i in rows]
-            usable = np.array([coil.usable for coil in single])
+            frame = BodyFrame(name, stamp_ns, values[rows], context, self.settings, table, single)
+            frames.append(frame)
             if context.symmetry is not None:
-                frame = SourceFrame(
-                    name, stamp_ns, table, values[rows], context.symmetry, context, self.settings
-                )
-                bodies.append(RigidBody(rows, table, self._source(frame, usable)))
-                continue
-            result = track_body(
-                self._body_tracks[name], name, table, stamp_ns, values[rows], usable, single,
-                context, self.settings,
-            )  # fmt: skip
+                reason = 'the field is the same all around its axis: a turn about it stays unknown'
+                result = BodyResult(frame.no_pose(states.AMBIGUOUS, reason))
+            else:
+                result = track_body(self._past.bodies[name], frame)
             bodies.append(RigidBody(rows, table, result))
-        judged = self._judgement.judged(stamp_ns, coils, bodies, self.settings)
+        for observer in self._past.observers:
+            observer.observe(frames)
+        judged = self._past.judgement.judged(stamp_ns, coils, bodies, self.settings)
         if context.shift_sigma_m == 0.0:
             yield from judged
             return
         # No judge reckons with it: what all poses share contradicts none of them.
         yield from (estimate.with_shift(context.shift_sigma_m) for estimate in judged)
 
-    def _source(self, frame: SourceFrame, usable: NDArray[np.bool_]) -> BodyResult:
-        """Find the source in a body's frame; its pose stays unknown by a turn about the axis."""
-        track = self._source_tracks.setdefault(frame.name, SourceTrack())
-        self.sources[frame.name] = track_source(track, frame, usable)
-        reason = 'the field is the same all around its axis: a turn about it stays unknown'
-        model_id = frame.context.model_id
-        return BodyResult(no_pose(frame.name, frame.stamp_ns, states.AMBIGUOUS, model_id, reason))
-
     def _solved_coils(
         self, stamp_ns: int, values: Array, codes: NDArray[np.int64], context: SolveContext
     ) -> list[CoilResult]:
         """Solve each sensor by itself, from flux components (S, 2K)."""
-        table, results = self._table, []
-        tracks = [self._coil_tracks[name] for name in table.name]
-        warm = solve_warm(
-            tracks, table.length, stamp_ns, values, codes == GOOD, context, self.settings
-        )
+        table, past, settings, results = self._scene.table, self._past, self.settings, []
+        tracks = [past.coils[name] for name in table.name]
+        warm = solve_warm(tracks, table.length, stamp_ns, values, codes == GOOD, context, settings)
+        lengths = table.length.tolist()
         for i, (name, code) in enumerate(zip(table.name, codes.tolist(), strict=True)):
             fault = FAULTS[code]
-            if fault is not None:
-                self.counters[f'readings_{fault.kind}'] += 1
-                reason = self._freshness.reason(i) if code == STUCK_CODE else fault.reason
-                bad = no_pose(name, stamp_ns, fault.state, context.model_id, reason)
-                result = CoilResult(bad, None)
+            frame = CoilFrame(name, stamp_ns, values[i], context, settings, lengths[i])
+            if fault is None:
+                result = track_coil(tracks[i], frame, warm[i])
+                past.counters['cold_starts'] += result.cold
             else:
-                result = track_coil(
-                    tracks[i], name, float(table.length[i]), stamp_ns, values[i], context,
-                    self.settings, warm[i],
-                )  # fmt: skip
-                self.counters['cold_starts'] += result.cold
+                past.counters[f'readings_{fault.kind}'] += 1
+                reason = past.freshness.reason(i) if code == STUCK_CODE else fault.reason
+                result = CoilResult(frame.no_pose(fault.state, reason), None)
             results.append(result)
         return results
 
@@ -388,21 +417,17 @@ class Tracker:
         self, frame: Frame, state: str, model_id: str, reason: str
     ) -> Iterator[PoseEstimate]:
         """Yield an estimate without a pose for every sensor and body."""
-        for name in (*self._table.name, *self._bodies):
+        for name in (*self._scene.table.name, *self._scene.bodies):
             yield no_pose(name, frame.stamp_ns, state, model_id, reason)
 
-    @property
-    def _emitters(self) -> tuple[str, ...]:
-        return () if self._model is None else self._model.emitters
 
-    def _corrected(self, frame: Frame) -> tuple[ComplexArray, NDArray[np.int64]]:
-        """Fluxes (S, K) without what the model's effects did to them, and the readings' codes."""
-        if self._correction is None or not self._correction.changes_flux:
-            return frame.flux, frame.codes
-        time = (frame.stamp_ns - self._first_ns[0]) * NANO
-        recorded = self.settings.recorded_drift
-        sound = self._correction.flux(time, self.sensors.channel, frame.flux, recorded=recorded)
-        flux = np.asarray(sound, dtype=np.complex128)
-        # A correction may carry one sensor's absurd value over to another.
-        codes = np.where(frame.codes == GOOD, value_codes(flux), frame.codes)
-        return flux, codes
+def _checked(sensors: SensorTable) -> SensorTable:
+    """The single coils among sensors; raises `TrackingError` where they cannot be tracked."""
+    sensors = sensors.select(sensors.is_single)
+    if len(sensors) == 0:
+        raise TrackingError('there is no tool sensor to track that is a single coil')
+    if len(set(sensors.channel.tolist())) != len(sensors):
+        raise TrackingError('a channel appears twice in the sensors')
+    if len(set(sensors.name)) != len(sensors):
+        raise TrackingError('a name appears twice in the sensors')
+    return sensors

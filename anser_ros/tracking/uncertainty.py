@@ -14,6 +14,7 @@ from scipy.special import chdtri
 
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.tangent import fill_tangent
+from anser_ros.tracking.descent import damped_step
 
 Array = NDArray[np.float64]
 
@@ -31,44 +32,8 @@ def chi2_limit(degrees_of_freedom: int, probability: float) -> float:
 
 
 SMALLEST_PIVOT = 1e-9
-"""Pivot of a scaled information matrix from which on its factor is inverted; with a smaller one
+"""Pivot of a scaled information matrix from which on its factor is used; with a smaller one
 rounding is felt, and what the fluxes hardly determine is looked for among the eigenvectors."""
-
-
-@kernel
-def inverse_by_factor(matrix, inverse):  # type: ignore[no-untyped-def]
-    """Write the inverse of a symmetric matrix (n, n) of unit diagonal into ``inverse``.
-
-    Returns whether all pivots were large enough; otherwise what is written means nothing.
-    """
-    n = matrix.shape[0]
-    root = np.zeros((n, n))  # the inverse of the lower triangular factor, from the factor itself
-    for j in range(n):
-        pivot = matrix[j, j]
-        for k in range(j):
-            pivot -= root[j, k] * root[j, k]
-        if not pivot > SMALLEST_PIVOT:
-            return False
-        root[j, j] = math.sqrt(pivot)
-        for i in range(j + 1, n):
-            left = matrix[i, j]
-            for k in range(j):
-                left -= root[i, k] * root[j, k]
-            root[i, j] = left / root[j, j]
-    for j in range(n):
-        root[j, j] = 1.0 / root[j, j]
-        for i in range(j + 1, n):
-            left = 0.0
-            for k in range(j, i):
-                left -= root[i, k] * root[k, j]
-            root[i, j] = left / root[i, i]
-    for i in range(n):
-        for j in range(i, n):
-            total = 0.0
-            for k in range(j, n):
-                total += root[k, i] * root[k, j]
-            inverse[i, j] = inverse[j, i] = total
-    return True
 
 
 @kernel
@@ -79,44 +44,48 @@ def bounded_inverse(information):  # type: ignore[no-untyped-def]
     """
     n = information.shape[0]
     scale, scaled, covariance = np.empty(n), np.empty((n, n)), np.empty((n, n))
+    factor, unit, column = np.empty((n, n)), np.zeros(n), np.empty(n)
     for i in range(n):
         scale[i] = 1.0 / math.sqrt(max(information[i, i], 1e-30))
     for i in range(n):
         for j in range(n):
             scaled[i, j] = information[i, j] * scale[i] * scale[j]
-    if not inverse_by_factor(scaled, covariance):
+    is_sure = True
+    for j in range(n):
+        unit[j] = 1.0
+        is_sure &= damped_step(scaled, unit, 0.0, factor, column)
+        is_sure &= factor[j, j] * factor[j, j] > SMALLEST_PIVOT
+        unit[j] = 0.0
+        for i in range(j, n):
+            covariance[i, j] = covariance[j, i] = column[i]
+    if not is_sure:
         values, vectors = np.linalg.eigh(scaled)
         for i in range(n):
-            values[i] = 1.0 / max(values[i], 1e-14)
-        covariance[:] = np.dot(vectors * values, vectors.T)
+            for j in range(n):
+                covariance[i, j] = 0.0
+                for k in range(n):
+                    part = vectors[i, k] * vectors[j, k]
+                    covariance[i, j] += part / max(values[k], 1e-14)
     for i in range(n):
         for j in range(n):
             covariance[i, j] *= scale[i] * scale[j]
     for i in range(n):
         if covariance[i, i] > UNKNOWN_VARIANCE:
             shrink = math.sqrt(UNKNOWN_VARIANCE / covariance[i, i])
-            covariance[i, :] *= shrink
-            covariance[:, i] *= shrink
+            for j in range(n):
+                covariance[i, j] *= shrink
+            for j in range(n):
+                covariance[j, i] *= shrink
     return covariance
 
 
 @kernel
 def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def]
-    """Return the covariance of a single coil's pose.
+    """Return the covariance (6, 6) of a coil's position and rotation vector, both in fg, m and
+    rad.
 
-    Parameters
-    ----------
-    normal : ndarray, shape (6, 6)
-        ``J^T J`` of the whitened residuals by position (per m) and free axis vector.
-    axis : ndarray, shape (3,)
-        Unit sensitive axis, frame fg.
-    roll_variance : float
-        rad^2, given to the rotation about the axis.
-
-    Returns
-    -------
-    ndarray, shape (6, 6)
-        m^2, m rad, rad^2: position, then rotation vector, both in fg.
+    ``normal`` (6, 6) is ``J^T J`` of the whitened residuals by position (per m) and free axis
+    vector; ``roll_variance``, rad^2, is given to the rotation about the axis.
     """
     t = np.empty((2, 3))
     fill_tangent(axis, t)
@@ -155,21 +124,9 @@ def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def
 def add_motion(covariance, position, next_position, axes, next_axes, share):  # type: ignore[no-untyped-def]
     """Add to a pose's covariance (6, 6), in place, a part of its last motion as an error.
 
-    Parameters
-    ----------
-    covariance : ndarray, shape (6, 6)
-        Of position and rotation vector, fg.
-    position, next_position : ndarray, shape (3,)
-        m.
-    axes, next_axes : ndarray, shape (3, 3) or (3, 1)
-        All axes of a body, or that of a coil, in columns.
-    share : float
-        Standard deviation of the error in units of the motion.
-
-    Returns
-    -------
-    float
-        Square root of the trace of the position's covariance, m.
+    ``axes`` and ``next_axes`` hold all axes of a body, or that of a coil, in columns: (3, 3) or
+    (3, 1). ``share`` is the error's standard deviation in units of the motion. Returns the square
+    root of the trace of the position's covariance, m.
     """
     move = np.zeros(6)
     # Each axis n turns by w x n; the sum of n x (w x n) over three axes is 2 w, over one it is w.

@@ -1,21 +1,14 @@
 """Solves all coils of a frame near where they are expected, in one call of compiled code.
 
 One by one, calling the kernels takes longer than what they calculate. The lock of the interpreter
-is kept: who gives it away in the middle of a frame waits for another thread's turn to end.
+is kept: a thread that releases it in the middle of a frame waits for another's turn to end.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.kernel_cache import kernel
-from anser_ros.stamps import NANO
-from anser_ros.tracking.coil_track import (
-    UNKNOWNS,
-    CoilTrack,
-    Start,
-    take_errors,
-    whitening_at,
-)
+from anser_ros.tracking.coil_track import UNKNOWNS, CoilTrack, take_errors, whitening_at
 from anser_ros.tracking.descent import descend
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.solve import MAX_EVALUATIONS, CoilSolution
@@ -41,35 +34,20 @@ def descend_all(  # type: ignore[no-untyped-def]
         found[s, 0], found[s, 1], found[s, 2] = chi2, used, converged
 
 
-def expected_poses(
-    tracks: list[CoilTrack],
-    lengths: Array,
-    stamp_ns: int,
-    context: SolveContext,
-    settings: TrackerSettings,
-) -> list[Start | None]:
-    """Return where each sensor is expected, None where nowhere, and take the model's error there.
+def _expected(tracks: list[CoilTrack], stamp_ns: int) -> tuple[Array, Array]:
+    """Positions and axes (S, 3) of sensors that move on as between their last two good poses.
 
     For all coils together this takes a third of the time.
     """
-    starts = [
-        None if (stamp_ns - track.good_ns) * NANO > settings.warm_age_s
-        else track.expected(stamp_ns)
-        for track in tracks
-    ]  # fmt: skip
-    if context.modes is None:
-        return starts
-    far = {
-        i: start
-        for i, (track, start) in enumerate(zip(tracks, starts, strict=True))
-        if start is not None and not (track.error and track.error.holds(context, *start))
-    }
-    if far:
-        rows = list(far)
-        points, axes = (np.array(part) for part in zip(*far.values(), strict=True))
-        for i, error in zip(rows, take_errors(context, points, axes, lengths[rows]), strict=True):
-            tracks[i].error = error
-    return starts
+    good = [track.good for track in tracks if track.good is not None]
+    old = [g if t.before is None else t.before[1] for t, g in zip(tracks, good, strict=True)]
+    steps = np.array([track.steps(stamp_ns) for track in tracks])[:, None]
+    place, last_place = (np.concatenate([s.position for s in some]) for some in (good, old))
+    axis, last_axis = (np.concatenate([s.axis for s in some]) for some in (good, old))
+    positions = place.reshape(-1, 3) + steps * (place - last_place).reshape(-1, 3)
+    axes = axis.reshape(-1, 3) + steps * (axis - last_axis).reshape(-1, 3)
+    axes /= np.where(steps > 0.0, np.sqrt((axes * axes).sum(axis=1, keepdims=True)), 1.0)
+    return positions, axes
 
 
 def solve_warm(
@@ -83,37 +61,32 @@ def solve_warm(
 ) -> list[CoilSolution | None]:
     """Return each sensor's solution near where it is expected; None where it is nowhere.
 
-    Parameters
-    ----------
-    tracks : list of CoilTrack
-    lengths : ndarray, shape (S,)
-        Of the coils, m.
-    stamp_ns : int
-    values : ndarray, shape (S, 2K)
-        Flux components, T.
-    sound : ndarray of bool, shape (S,)
-        Which readings can be used.
-    context : SolveContext
-    settings : TrackerSettings
+    ``lengths`` (S,) are the coils', m; ``values`` (S, 2K) flux components, T; ``sound`` (S,) tells
+    which of them can be used.
     """
     solutions: list[CoilSolution | None] = [None] * len(tracks)
-    starts = expected_poses(tracks, lengths, stamp_ns, context, settings)
-    given = [
-        (i, start, whitening_at(tracks[i], context, *start, float(lengths[i])))
-        for i, (start, good) in enumerate(zip(starts, sound.tolist(), strict=True))
-        if start is not None and good and context.readings >= UNKNOWNS
-    ]
-    if not given:
+    rows = [i for i in np.flatnonzero(sound).tolist() if tracks[i].fresh(stamp_ns, settings)]
+    if not rows or context.readings < UNKNOWNS:
         return solutions
-    rows = [i for i, _, _ in given]
-    positions = np.array([start[0] for _, start, _ in given])
-    axes = np.array([start[1] for _, start, _ in given])
-    weights = np.array([whitening for _, _, whitening in given])
+    followed = [tracks[i] for i in rows]
+    positions, axes = _expected(followed, stamp_ns)
+    spans = lengths[rows]
+    if context.modes is not None:
+        far = [
+            k for k, track in enumerate(followed)
+            if not (track.error and track.error.holds(context, positions[k], axes[k]))
+        ]  # fmt: skip
+        if far:
+            fresh = take_errors(context, positions[far], axes[far], spans[far])
+            for k, error in zip(far, fresh, strict=True):
+                followed[k].error = error
+    each = zip(followed, positions, axes, spans.tolist(), strict=True)
+    weights = np.array([whitening_at(track, context, *start) for track, *start in each])
     count, width = len(rows), values.shape[1]
     normals, residuals = np.empty((count, 6, 6)), np.empty((count, width))
     found, field = np.empty((count, 3)), context.field
     descend_all(
-        positions, axes, lengths[rows], values[rows], weights, field.columns, field.moments,
+        positions, axes, spans, values[rows], weights, field.columns, field.moments,
         context.low, context.high, MAX_EVALUATIONS, normals, residuals, found,
     )  # fmt: skip
     for i, position, axis, normal, residual, (chi2, used, converged) in zip(
