@@ -10,15 +10,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from anser_ros.cli.evaluation_figures import WIDE
+from anser_ros.cli.html_page import AFTER, BEFORE, legend_under
 from anser_ros.diagnosis.problem import Part, State
 from anser_ros.diagnosis.residuals import tool_parts
-from anser_ros.pictures import spell_out
+from anser_ros.pictures import WIDE, spell_out
 
 Array = NDArray[np.float64]
-
-BEFORE, AFTER = '#c44e52', '#4c72b0'
-"""Colours of the residuals without and with the effects that were found."""
 
 
 def strongest(state: State) -> str:
@@ -95,14 +92,8 @@ def maps(before: State, after: State) -> Figure:
 def course(path: dict[str, Any], sigma: Any, state: State) -> Figure:
     """Draw where something was, from above and over time, with the tool's places and the board.
 
-    Parameters
-    ----------
-    path : mapping
-        ``time_s`` (P,) and ``position_m`` (P, 3) in fg.
-    sigma : array_like, shape (P, 3) or (P,), or None
-        Standard deviation of the positions, m.
-    state : State
-        Holds where the tool was.
+    ``path`` has ``time_s`` (P,) and ``position_m`` (P, 3) in fg; ``sigma``, m, is (P, 3), (P,) or
+    None; ``state`` holds where the tool was.
     """
     figure, (above, over) = plt.subplots(1, 2, figsize=(9, 3.6), layout='constrained')
     time, place = np.asarray(path['time_s']), 1e3 * np.asarray(path['position_m'])
@@ -120,7 +111,7 @@ def course(path: dict[str, Any], sigma: Any, state: State) -> Figure:
             over.fill_between(time, low, high, color=BEFORE, alpha=0.12, lw=0)
     over.set(xlabel='time, s', ylabel='position, mm')
     for panel in (above, over):
-        panel.legend(fontsize=8, loc='upper center', bbox_to_anchor=(0.5, -0.16), ncols=3)
+        legend_under(panel)
         panel.grid(alpha=0.3)
     return figure
 
@@ -143,18 +134,13 @@ def bars(before: State, after: State) -> Figure:
 
 def _by(state: State, axis: str) -> tuple[list[str], Array]:
     """Return the names of all channels or emitters, and the residual of each."""
-    names: list[str] = []
-    sizes: list[float] = []
-    squares: Array | None = None
-    for part in tool_parts(state):
+    parts = tool_parts(state)
+    power = []
+    for part in parts:
         sensors, emitters = part.view.flux.shape[1:]
-        size = (_rms(part, 0) ** 2).reshape(2, sensors, emitters).mean(axis=0)
-        if axis == 'channel':
-            names += [str(c) for c in part.view.sensors.channel.tolist()]
-            sizes += np.sqrt(size.mean(axis=1)).tolist()
-        else:
-            squares = size.mean(axis=0) if squares is None else squares + size.mean(axis=0)
-            names = [str(k) for k in range(emitters)]
-    if squares is not None:
-        sizes = np.sqrt(squares / len(tool_parts(state))).tolist()
-    return names, np.array(sizes)
+        power.append((_rms(part, 0) ** 2).reshape(2, sensors, emitters).mean(axis=0))
+    if axis == 'channel':
+        names = [str(c) for part in parts for c in part.view.sensors.channel.tolist()]
+        return names, np.sqrt(np.concatenate([one.mean(axis=1) for one in power]))
+    size = np.sqrt(np.mean([one.mean(axis=0) for one in power], axis=0))
+    return [str(k) for k in range(len(size))], size

@@ -2,7 +2,6 @@
 
 import argparse
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,14 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.error_map import ErrorMap, HeldOutError, learn_error_map
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import say_written
-from anser_ros.cli.progress import progress_of
+from anser_ros.cli.output import Result, write_files
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.errors import FitError, ParameterError, PlausibilityError
 from anser_ros.poses.point_model import to_point_model
 from anser_ros.sessions.plausibility import check_points
 from anser_ros.wire.fiducials import read_fiducials
-from anser_ros.wire.text_files import read_rows
+from anser_ros.wire.text_files import read_numbers, read_rows
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')
@@ -39,63 +39,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'CSV with the columns {", ".join((*TRACKED, *TRUE))}; or, with --true, tracked '
         f'positions: a CSV with {", ".join(TRACKED)}, or a list of 3D Slicer ({MARKUPS}, mm)',
     )  # fmt: skip
-    parser.add_argument(
-        '--true',
-        type=Path,
-        metavar='PLACES',
-        help='the true positions, one row per tracked position',
-    )
+    words = 'the true positions, one row per tracked position'
+    parser.add_argument('--true', type=Path, metavar='PLACES', help=words)
     parser.add_argument(
         '--register', action='store_true',
         help='the true positions are in another frame: a shift and a rotation between both are '
         'not counted as errors',
     )  # fmt: skip
-    parser.add_argument(
-        '--out',
-        required=True,
-        type=Path,
-        help='folder for error_map.json and model.yaml, made if missing',
-    )
+    add_out(parser, 'error_map.json and model.yaml')
     parser.add_argument(
         '--sensor', default='sensor', help='name of the sensor whose poses the model corrects'
     )
     parser.add_argument(
         '--apply', type=Path, metavar='POSES', help='CSV to correct, e.g. poses.csv of evaluate'
     )
-    parser.add_argument('--json', action='store_true', help='print error_map.json on stdout')
+    add_json(parser, 'error_map.json on stdout')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command and return the exit code."""
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Learn a map, and correct the poses of ``--apply``."""
     make_folder(args.out)
     tracked, true = _points(args)
     try:
         check_points(tracked, true)
     except PlausibilityError as error:
         raise PlausibilityError(f'{args.points}: {error}') from error
-    with progress_of('learning') as tell:
-        tell(f'a map of {len(tracked)} places')
-        error_map = learn_error_map(tracked, true, registers=args.register)
+    tell(f'a map of {len(tracked)} places')
+    error_map = learn_error_map(tracked, true, registers=args.register)
     if args.apply is not None:
-        poses, names = _read(args.apply)
-        places = _columns(poses, TRACKED, args.apply)
+        names, poses = _read(args.apply)
+        places = read_numbers(args.apply, TRACKED, poses)
         corrected = error_map.apply(places) if error_map.is_confirmed else places
-    text = json.dumps(to_document(error_map), indent=1)
-    (args.out / 'error_map.json').write_text(text + '\n', encoding='utf-8')
-    model = to_point_model(error_map, args.sensor, str(args.points))
-    text_of_model = yaml.safe_dump(model, sort_keys=False)
-    (args.out / 'model.yaml').write_text(text_of_model, encoding='utf-8')
+    document = to_document(error_map)
+    model = yaml.safe_dump(
+        to_point_model(error_map, args.sensor, str(args.points)), sort_keys=False
+    )
+    written = write_files(args.out, {'error_map.json': document, 'model.yaml': model})
     if args.apply is not None:
-        _write(args.out / 'corrected.csv', poses, names, corrected)
-    if args.json:
-        print(text)
-    else:
-        print(verdict(error_map))
-        files = ['error_map.json', 'model.yaml'] + (
-            [] if args.apply is None else ['corrected.csv']
-        )
-        say_written(*(args.out / name for name in files))
-    return 0
+        written = (*written, args.out / 'corrected.csv')
+        _write(written[-1], poses, names, corrected)
+    return Result(document, (), (verdict(error_map),), written)
 
 
 def verdict(error_map: ErrorMap) -> str:
@@ -118,10 +101,15 @@ def _points(args: argparse.Namespace) -> tuple[Array, Array]:
     if args.true is None:
         if args.points.suffix == MARKUPS:
             raise ParameterError(f'{args.points} has tracked positions only; --true is needed')
-        rows, _ = _read(args.points)
-        return _columns(rows, TRACKED, args.points), _columns(rows, TRUE, args.points)
+        _, rows = _read(args.points)
+        return (
+            read_numbers(args.points, TRACKED, rows),
+            read_numbers(args.points, TRUE, rows),
+        )
     tracked, true = (
-        read_fiducials(path) if path.suffix == MARKUPS else _columns(_read(path)[0], TRACKED, path)
+        read_fiducials(path)
+        if path.suffix == MARKUPS
+        else read_numbers(path, TRACKED, _read(path)[1])
         for path in (args.points, args.true)
     )
     if len(tracked) != len(true):
@@ -159,21 +147,11 @@ def _plain(error: HeldOutError) -> dict[str, float | None]:
     }
 
 
-def _read(path: Path) -> tuple[list[dict[str, str]], list[str]]:
+def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     names, rows = read_rows(path)
     if not rows:
         raise FitError(f'{path}: no rows')
-    return rows, names
-
-
-def _columns(rows: list[dict[str, str]], names: tuple[str, ...], path: Path) -> Array:
-    """Return columns as numbers, with NaN for an empty cell."""
-    try:
-        return np.array([[float(row[name] or 'nan') for name in names] for row in rows])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ParameterError(
-            f'{path}: needs the columns {", ".join(names)} with numbers: {error}'
-        ) from error
+    return names, rows
 
 
 def _write(path: Path, rows: list[dict[str, str]], names: list[str], places: Array) -> None:

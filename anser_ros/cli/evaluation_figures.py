@@ -3,8 +3,6 @@
 Each figure is a PNG of its own, and all stand in one page that needs nothing else.
 """
 
-import base64
-import html
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,9 +13,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from anser_ros.cli.html_page import page
+from anser_ros.cli.html_page import Html, heading, page, picture, table, top
+from anser_ros.cli.output import number
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pictures import legend_below, save, spell_out
+from anser_ros.pictures import WIDE, legend_below, save, spell_out
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import PoseSeries
 
@@ -26,17 +25,10 @@ Array = NDArray[np.float64]
 MOST_POINTS = 4000
 """Most points that a figure shows of one coil: more cannot be distinguished, and make files
 large."""
-WIDE = 4.0
-"""Largest over smallest value from which their axis is logarithmic: on a shorter one, labels at 1,
-2 and 5 are too few."""
 COVERAGE_SIGMAS = np.linspace(0.0, 4.0, 81)
 """Multiples of sigma for which the share of errors within is drawn, to where all should be."""
-STYLE = """
-body { font: 15px/1.5 sans-serif; max-width: 62em; margin: 2em auto; padding: 0 1em; color: #222 }
-table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .25em .8em; text-align: right;
-border-bottom: 1px solid #ddd } td:first-child, th:first-child { text-align: left }
-th { background: #f4f4f4 } img { max-width: 100% } .note { color: #666 }
-"""
+ERRORS_HEAD = ('sensor', 'frames', 'tracked', 'RMSE mm', 'PRC95 mm', 'RMSE deg', 'PRC95 deg')
+"""Head of the table of `error_rows`."""
 
 
 def _series(evaluation: Evaluation) -> dict[str, PoseSeries]:
@@ -177,14 +169,9 @@ FIGURES = {
 
 
 def write_figures(
-    evaluation: Evaluation,
-    document: Mapping[str, Any],
-    folder: Path,
-    *,
-    session: str,
-    model: str,
-    jitter_m: float = 0.0,
-) -> list[Path]:
+    evaluation: Evaluation, document: Mapping[str, Any], folder: Path, *, session: str,
+    model: str, jitter_m: float = 0.0,
+) -> list[Path]:  # fmt: skip
     """Write every figure and the page that holds them; return the files.
 
     Without an optical pose there is no error, and nothing is drawn or written.
@@ -192,40 +179,33 @@ def write_figures(
     found = _series(evaluation)
     if not any(np.isfinite(series.position_error).any() for series in found.values()):
         return []
-    parts, files = [], []
+    parts: list[Html] = []
+    files = []
     drawn = (
         over_time(evaluation), over_space(evaluation), by_coil(evaluation),
         against_sigma(evaluation, jitter_m),
     )  # fmt: skip
     for (name, title), figure in zip(FIGURES.items(), drawn, strict=True):
-        path = folder / f'{name}.png'
-        save(figure, path)
-        data = base64.b64encode(path.read_bytes()).decode('ascii')
-        parts.append(
-            f'<h2>{html.escape(title)}</h2>'
-            f'<img alt="{html.escape(title)}" src="data:image/png;base64,{data}">'
-        )
-        files.append(path)
-    heading = (
-        f'<h1>Evaluation</h1><p class="note">session <code>{html.escape(session)}</code>, '
-        f'model <code>{html.escape(model)}</code></p>'
-    )
-    path = folder / 'evaluation.html'
-    text = page('Evaluation', [heading, _table(document), *parts], STYLE)
-    path.write_text(text, encoding='utf-8')
-    return [*files, path]
+        files.append(folder / f'{name}.png')
+        save(figure, files[-1])
+        parts += [heading(title), picture(files[-1])]
+    head = top('Evaluation', session=session, model=model)
+    text = page('Evaluation', head, table(ERRORS_HEAD, error_rows(document)), parts)
+    files.append(folder / 'evaluation.html')
+    files[-1].write_text(text, encoding='utf-8')
+    return files
 
 
-def _table(document: Mapping[str, Any]) -> str:
-    head = ('', 'poses', 'tracked', 'RMSE, mm', '95 %, mm', 'RMSE, deg', '95 %, deg')
-    rows = ''.join(f'<th>{cell}</th>' for cell in head)
-    for group in ('sensors', 'bodies'):
-        for name, row in document[group].items():
-            cells = [html.escape(name), str(row['n']), f'{row["tracked_fraction"]:.1%}']
-            for key, scale in (
-                ('position_rmse_m', 1e3), ('position_prc95_m', 1e3),
-                ('orientation_rmse_rad', DEGREES), ('orientation_prc95_rad', DEGREES),
-            ):  # fmt: skip
-                cells.append('-' if row[key] is None else f'{scale * row[key]:.3f}')
-            rows += '</tr><tr>' + ''.join(f'<td>{cell}</td>' for cell in cells)
-    return f'<table><tr>{rows}</tr></table>'
+def error_rows(document: Mapping[str, Any]) -> list[list[str]]:
+    """Return the errors of every sensor, body and source as rows of a table."""
+    return [
+        [
+            f'source seen from {name}' if group == 'sources' else name,
+            str(row['n']),
+            f'{row["tracked_fraction"]:.1%}',
+            *(number(row[f'position_{key}_m'], 1e3) for key in ('rmse', 'prc95')),
+            *(number(row[f'orientation_{key}_rad'], DEGREES) for key in ('rmse', 'prc95')),
+        ]
+        for group in ('sensors', 'bodies', 'sources')
+        for name, row in document.get(group, {}).items()
+    ]

@@ -12,14 +12,16 @@ _made: list[Path] = []
 """Folders that this command has made, parents first."""
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder for results before the work begins.
+def make_folder(folder: Path | None) -> None:
+    """Make a folder for results before the work begins, where one is wanted.
 
     Raises
     ------
     ParameterError
         When the folder cannot be made, or nothing can be written there.
     """
+    if folder is None:
+        return
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,11 @@
 import csv
 import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.errors import AnserError, ParameterError
 
@@ -38,3 +42,21 @@ def read_rows(path: str | os.PathLike[str]) -> tuple[list[str], list[dict[str, s
     except csv.Error as error:
         raise ParameterError(f'{os.fspath(path)}: no table: {error}') from error
     return list(reader.fieldnames or []), rows
+
+
+def read_numbers(
+    path: str | os.PathLike[str], names: Sequence[str], rows: Sequence[dict[str, str]]
+) -> NDArray[np.float64]:
+    """Return columns of a CSV file's rows as numbers, shape (rows, names); NaN for an empty cell.
+
+    Raises
+    ------
+    ParameterError
+        When a column is missing, or has something else than numbers.
+    """
+    try:
+        return np.array([[float(row[name] or 'nan') for name in names] for row in rows])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ParameterError(
+            f'{os.fspath(path)}: needs the columns {", ".join(names)} with numbers: {error}'
+        ) from error
