@@ -109,10 +109,10 @@ def _table(findings: list[Observation]) -> Table:
 
 def python() -> list[Observation]:
     """Check the interpreter: whether it is one that is tested."""
-    own, words = sys.version_info[:2], sys.version.split()[0]
-    tested = ' and '.join('.'.join(map(str, one)) for one in TESTED)
-    if own in TESTED:
+    words = sys.version.split()[0]
+    if sys.version_info[:2] in TESTED:
         return [Observation('Python', GOOD, words)]
+    tested = ' and '.join('.'.join(map(str, one)) for one in TESTED)
     return [Observation('Python', NOTE, words, f'tested are {tested}')]
 
 

@@ -35,11 +35,6 @@ def _series(evaluation: Evaluation) -> dict[str, PoseSeries]:
     return {**evaluation.sensors, **evaluation.bodies}
 
 
-def _seconds(series: PoseSeries, start_ns: int) -> Array:
-    stamps = np.array([estimate.stamp_ns for estimate in series.estimates], dtype=np.int64)
-    return np.asarray(1e-9 * (stamps - start_ns), dtype=np.float64)
-
-
 def _thinned(count: int) -> slice:
     return slice(0, None, max(1, -(-count // MOST_POINTS)))
 
@@ -52,11 +47,10 @@ def over_time(evaluation: Evaluation) -> Figure:
         2, 1, figsize=(9, 5.6), sharex=True, layout='constrained', height_ratios=(3, 1)
     )
     for rank, (name, series) in enumerate(found.items()):
-        time, keep = _seconds(series, start), _thinned(len(series.estimates))
-        colour = f'C{rank % 10}'
-        upper.plot(
-            time[keep], 1e3 * series.position_error[keep], '.', ms=3, color=colour, label=name
-        )
+        stamps = np.array([one.stamp_ns for one in series.estimates], dtype=np.int64)
+        time, keep, colour = 1e-9 * (stamps - start), _thinned(stamps.size), f'C{rank % 10}'
+        error = 1e3 * series.position_error[keep]
+        upper.plot(time[keep], error, '.', ms=3, color=colour, label=name)
         lost = time[~series.ok]
         lower.plot(lost, np.full(lost.size, rank), '|', color=colour)
     upper.set(ylabel='position error, mm', yscale='log')
@@ -82,12 +76,10 @@ def over_space(evaluation: Evaluation) -> Figure:
     keep = _thinned(len(where))
     figure, panels = plt.subplots(1, 2, figsize=(9, 4.2), layout='constrained')
     top = float(np.percentile(size, 98)) if size.size else 1.0
-    for panel, (across, up) in zip(panels, (('x', 'y'), ('x', 'z')), strict=True):
-        columns = ['xyz'.index(name) for name in (across, up)]
-        shown = panel.scatter(
-            where[keep, columns[0]], where[keep, columns[1]], c=size[keep], s=8, vmin=0.0, vmax=top
-        )
-        panel.set(xlabel=f'{across}, mm', ylabel=f'{up}, mm', aspect='equal')
+    for panel, up in zip(panels, (1, 2), strict=True):
+        places = where[keep][:, [0, up]]
+        shown = panel.scatter(*places.T, c=size[keep], s=8, vmin=0.0, vmax=top)
+        panel.set(xlabel='x, mm', ylabel=f'{"xyz"[up]}, mm', aspect='equal')
         panel.grid(alpha=0.3)
     figure.colorbar(shown, ax=panels, label='position error, mm', extend='max')
     return figure
@@ -99,12 +91,11 @@ def by_coil(evaluation: Evaluation) -> Figure:
     figure, panels = plt.subplots(
         1, 2, figsize=(9, 1.4 + 0.3 * len(found)), layout='constrained', sharey=True
     )
-    for panel, scale, unit, errors in (
-        (panels[0], 1e3, 'position error, mm', [s.position_error for s in found.values()]),
-        (panels[1], DEGREES, 'orientation error, deg',
-         [s.orientation_error for s in found.values()]),
+    for panel, scale, kind, unit in (
+        (panels[0], 1e3, 'position', 'mm'), (panels[1], DEGREES, 'orientation', 'deg'),
     ):  # fmt: skip
-        for row, error in enumerate(errors, start=1):
+        for row, series in enumerate(found.values(), start=1):
+            error = getattr(series, f'{kind}_error')
             finite = scale * error[np.isfinite(error)]
             if not finite.size:
                 continue
@@ -112,7 +103,7 @@ def by_coil(evaluation: Evaluation) -> Figure:
             panel.hlines(row, least, most, color='0.5')
             panel.barh(row, upper - lower, 0.6, left=lower, color='C0', alpha=0.6)
             panel.vlines(middle, row - 0.3, row + 0.3, color='C1', lw=2)
-        panel.set(xlabel=unit)
+        panel.set(xlabel=f'{kind} error, {unit}')
         panel.set_xlim(left=0.0)
         panel.locator_params(axis='x', nbins=5)
         panel.grid(alpha=0.3, axis='x')

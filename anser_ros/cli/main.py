@@ -60,7 +60,7 @@ def _dispatch(arguments: list[str]) -> int:
         try:
             missing.check(name)
         except AnserError as error:
-            print(f'anser {name}: {_one_line(error)}', file=sys.stderr)
+            print(f'anser {name}: {" ".join(str(error).split())}', file=sys.stderr)
             return EXIT_BAD_INPUT
         exec_node(name, rest)
     if name in OFFLINE:
@@ -140,16 +140,12 @@ def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
         return EXIT_BAD_INPUT, None, _one_line(error)
     except BrokenPipeError:
         raise
-    except ModuleNotFoundError as error:
-        if error.name is not None and error.name.split('.')[0] in missing.PYPI:
-            return EXIT_BAD_INPUT, None, missing.words_of(error.name)
-        return EXIT_DEFECT, None, traceback.format_exc().rstrip()
-    except OSError as error:
+    except Exception as error:  # noqa: BLE001 - the outermost place: whatever is left is a defect
+        if isinstance(error, ModuleNotFoundError) and missing.is_known(error.name):
+            return EXIT_BAD_INPUT, None, missing.words_of(str(error.name))
         # A file that is not there or can't be written is the caller's input, not a defect.
-        if error.filename is not None:
+        if isinstance(error, OSError) and error.filename is not None:
             return EXIT_BAD_INPUT, None, f'{error.filename}: {error.strerror}'
-        return EXIT_DEFECT, None, traceback.format_exc().rstrip()
-    except Exception:  # noqa: BLE001 - the outermost place: whatever is left is a defect
         return EXIT_DEFECT, None, traceback.format_exc().rstrip()
 
 

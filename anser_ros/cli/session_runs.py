@@ -10,8 +10,8 @@ import os
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from anser_ros.cli.commands import OFFLINE
 from anser_ros.cli.folders import make_folder
@@ -25,29 +25,14 @@ ALONE = threading.Lock()
 """One session at a time in a process: drawing, the working folder and the threads are shared."""
 
 
-@dataclass(frozen=True)
-class SessionRun:
-    """Runs a command on one session.
+class SessionRun(NamedTuple):
+    """A command to run on one session, by the arguments that its ``work`` takes."""
 
-    Attributes
-    ----------
-    command : str
-        `calibrate`, `diagnose` or `evaluate`.
-    name : str
-        The session's name in the summary, and of its folder.
-    session : str
-        The bag.
-    args : argparse.Namespace
-        What the command's own ``work`` takes.
-    folder : str
-        The folder from which the paths in the arguments hold.
-    """
-
-    command: str
-    name: str
-    session: str
+    command: str  # calibrate, diagnose or evaluate
+    name: str  # the session's in the summary, and of its folder
+    session: str  # the bag
     args: argparse.Namespace
-    folder: str
+    folder: str  # from which the paths in the arguments hold
 
 
 def runs_of(command: str, args: argparse.Namespace) -> list[SessionRun]:

@@ -45,13 +45,7 @@ Document = dict[str, Any]
 
 
 def number_of(text: str, what: str) -> float:
-    """Return the finite number that a text says.
-
-    Raises
-    ------
-    ParameterError
-        When the text is not a finite number.
-    """
+    """Return the finite number that a text says; raises `ParameterError` where it is none."""
     try:
         value = float(text)
     except ValueError:
@@ -71,9 +65,7 @@ def numbers_of(text: str, counts: Sequence[int], what: str) -> list[float]:
 
 
 def metres(values: Sequence[float]) -> list[float]:
-    """Return lengths in mm as lengths in m, without the rounding of the division in the
-    document.
-    """
+    """Return lengths in mm in m, without the rounding of the division in the document."""
     return [round(1e-3 * value, 9) for value in values]
 
 
@@ -123,9 +115,7 @@ def sensor_of(text: str, body: str = '') -> Document:
 
 
 def axis_of(text: str, what: str) -> list[float]:
-    """Return a direction: x, -z and the like, or three numbers of any length, blanks
-    between them.
-    """
+    """Return a direction: x, -z and the like, or three numbers with blanks between them."""
     if text.lower() in DIRECTIONS:
         return DIRECTIONS[text.lower()]
     if len(text.split()) != 3:
@@ -138,13 +128,7 @@ def axis_of(text: str, what: str) -> list[float]:
 
 
 def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
-    """Return the rows of a CSV file with a head, each as the text that is typed for it.
-
-    Raises
-    ------
-    ParameterError
-        When the head is another one, or there is no row.
-    """
+    """Return the rows of a CSV file with a head, each as the text that is typed for it."""
     names, found_rows = read_rows(path)
     extra = [name for name in names if name == 'length_mm']
     found = [name for name in names if name not in extra]
@@ -161,9 +145,9 @@ def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
 def document_of(
     emitter: Document,
     sensors: list[Document],
-    rate_hz: float,
-    volume_mm: Sequence[float] | None,
-    stated: Mapping[str, float],
+    rate_hz: float = 50.0,
+    volume_mm: Sequence[float] | None = None,
+    stated: Mapping[str, float] | None = None,
 ) -> Document:
     """Return the whole document as plain data."""
     document: Document = {
@@ -173,9 +157,9 @@ def document_of(
     if volume_mm is not None:
         low, high = metres(volume_mm[:3]), metres(volume_mm[3:])
         document['volume'] = {'low_m': low, 'high_m': high}
+    given = stated or {}
     for section, names in SECTIONS.items():
-        values = {name: stated[name] for name in names if name in stated}
-        if values:
+        if values := {name: given[name] for name in names if name in given}:
             document[section] = values
     return document
 

@@ -3,7 +3,6 @@
 import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,35 +23,16 @@ MM, DEG, PT, PERCENT = 1e3, DEGREES, 1e12, 1e2
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Holds what a command left of one session.
+class Outcome(NamedTuple):
+    """What a command left of one session."""
 
-    Attributes
-    ----------
-    name : str
-        The session's name in the summary, and of its folder.
-    session : str
-        The bag.
-    code : int
-        The exit code that the command alone would have had.
-    document : dict
-        The content of its JSON file; empty where it failed.
-    words : str
-        Why it failed, or what users have to know, in one line.
-    traceback : str
-        Of a defect.
-    seconds : float
-        Duration.
-    """
-
-    name: str
-    session: str
-    code: int
-    document: dict[str, Any]
-    words: str
-    traceback: str = ''
-    seconds: float = 0.0
+    name: str  # the session's in the summary, and of its folder
+    session: str  # the bag
+    code: int  # the exit code that the command alone would have had
+    document: dict[str, Any]  # of its JSON file; empty where it failed
+    words: str  # why it failed, or what users have to know, in one line
+    traceback: str = ''  # of a defect
+    seconds: float = 0.0  # duration
 
 
 class Column(NamedTuple):
