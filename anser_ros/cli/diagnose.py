@@ -6,9 +6,9 @@ from anser_ros.cli.diagnosis_report import render
 from anser_ros.cli.diagnosis_words import held_out_rows, verdict
 from anser_ros.cli.few_poses_report import render_few_poses
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, loss_notes, snapshot_notes, terminal_table, write_files
+from anser_ros.cli.output import Result, loss_notes, terminal_table, write_files
 from anser_ros.cli.progress import Tell
-from anser_ros.cli.session_kinds import add_session_kinds, named_kind, need_model
+from anser_ros.cli.session_kinds import add_session_kinds, named_kind, need_model, snapshot_notes
 from anser_ros.cli.stated_values import add_json, add_out, add_session_options, stated_values
 from anser_ros.sessions import few_poses
 from anser_ros.sessions.calibration import is_estimated_jointly

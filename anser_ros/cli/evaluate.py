@@ -7,9 +7,9 @@ from typing import Any
 from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.cli.evaluation_figures import ERRORS_HEAD, error_rows, write_figures
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, loss_notes, snapshot_notes, terminal_table, write_files
+from anser_ros.cli.output import Result, loss_notes, terminal_table, write_files
 from anser_ros.cli.progress import Tell
-from anser_ros.cli.session_kinds import add_session_kinds, named_kind, need_model
+from anser_ros.cli.session_kinds import add_session_kinds, named_kind, need_model, snapshot_notes
 from anser_ros.cli.session_runs import perform, runs_of, summed_up
 from anser_ros.cli.stated_values import (
     add_json,

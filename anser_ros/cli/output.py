@@ -17,8 +17,6 @@ from rich.table import Table
 
 from anser_ros.cli.folders import make_folder
 from anser_ros.errors import ParameterError
-from anser_ros.field.model import FieldModel
-from anser_ros.sessions.model_file import SNAPSHOT, is_snapshot
 
 
 def check_file(path: Path) -> None:
@@ -123,11 +121,6 @@ def terminal_table(head: Sequence[str], rows: Iterable[Sequence[str]], **style: 
     for row in rows:
         shown.add_row(*row)
     return shown
-
-
-def snapshot_notes(name: str, model: FieldModel) -> tuple[str, ...]:
-    """Report that a command works with a snapshot of a refit, where it does."""
-    return (f'{name} is a {SNAPSHOT}, not a calibration',) if is_snapshot(model) else ()
 
 
 def loss_notes(session: str, lost: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Finds what takes a session of other trackers, by the options of `commands.SESSION_KINDS`."""
+"""Finds what takes a session: a module of `commands.SESSION_KINDS`, or a model for its fluxes."""
 
 import argparse
 import importlib
@@ -6,6 +6,8 @@ from types import ModuleType
 
 from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.errors import ParameterError
+from anser_ros.field.model import FieldModel
+from anser_ros.sessions.model_file import SNAPSHOT, is_snapshot
 
 
 def add_session_kinds(parser: argparse.ArgumentParser) -> None:
@@ -28,3 +30,8 @@ def need_model(args: argparse.Namespace) -> None:
     if args.model is None:
         kinds = ', '.join(f'--{name}' for name in SESSION_KINDS)
         raise ParameterError(f'the following arguments are required: --model (or {kinds})')
+
+
+def snapshot_notes(name: str, model: FieldModel) -> tuple[str, ...]:
+    """Report that a command works with a snapshot of a refit, where it does."""
+    return (f'{name} is a {SNAPSHOT}, not a calibration',) if is_snapshot(model) else ()

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from anser_ros.settings import SECTIONS, parse_entries
+# Nothing that needs numpy is imported here: doctor tells where that is missing.
 
 
 def add_out(parser: argparse.ArgumentParser, what: str = '', **options: Any) -> None:
@@ -25,6 +25,8 @@ def add_list(parser: argparse.ArgumentParser, option: str, **options: Any) -> No
 
 def add_stated_values(parser: argparse.ArgumentParser, *sections: str) -> None:
     """Declare ``--set``; ``sections`` of `SECTIONS` are those that the command uses."""
+    from anser_ros.settings import SECTIONS
+
     names = ', '.join(name for section in sections for name in SECTIONS[section])
     words = 'state a value in place of the setup document and the default; may be repeated. '
     add_list(parser, '--set', dest='stated', metavar='NAME=VALUE', help=f'{words}Names: {names}')
@@ -32,6 +34,8 @@ def add_stated_values(parser: argparse.ArgumentParser, *sections: str) -> None:
 
 def stated_values(args: argparse.Namespace) -> dict[str, float]:
     """Return the values that the command line states; raises as `parse_entries`."""
+    from anser_ros.settings import parse_entries
+
     return parse_entries(args.stated)
 
 
