@@ -11,6 +11,7 @@ import matplotlib
 
 matplotlib.use('Agg')
 from matplotlib import pyplot as plt
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
@@ -51,6 +52,15 @@ def legend_below(figure: Figure, panel: Axes, markers: float = 1.0) -> None:
         handles, labels, loc='outside lower center', ncols=min(len(labels), 5), fontsize=8,
         markerscale=markers,
     )  # fmt: skip
+
+
+def legend_beside(figure: Figure) -> None:
+    """Put one legend beside all panels, with an entry for each label of any of them."""
+    unique: dict[str, Artist] = {}
+    for panel in figure.axes:
+        handles, labels = panel.get_legend_handles_labels()
+        unique |= dict(zip(labels, handles, strict=True))
+    figure.legend(list(unique.values()), list(unique), loc='outside right upper', fontsize=8)
 
 
 def spell_out(axis: Axis) -> None:

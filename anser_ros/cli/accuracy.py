@@ -97,7 +97,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     found = assess(args.protocol, recordings, options, np.random.default_rng(SEED))
     missing = tuple(filter(None, (missing_words(one.poses) for one in recordings)))
     found = replace(found, notes=(*found.notes, *missing))
-    if found.start_ns < NO_DATE_NS:  # a device's own counter: the file tells when
+    if found.start_ns < NO_DATE_NS:  # a device's own counter: the file says when
         found = replace(found, start_ns=args.recordings[0].stat().st_mtime_ns)
     is_judged = args.history is not None or bool(tolerances)
     verdict = judge(found, args.history, tolerances) if is_judged else None

@@ -12,7 +12,7 @@ from anser_ros.assessment.protocols import PROTOCOLS, Assessment
 from anser_ros.cli.accuracy_document import figure_rows, qa_words
 from anser_ros.cli.control_chart import control_chart
 from anser_ros.cli.html_page import heading, page, paragraph, picture, table, top
-from anser_ros.pictures import legend_below
+from anser_ros.pictures import legend_below, legend_beside
 
 MOST_ROWS = 500  # rows of a table of single errors; all are in accuracy.json
 
@@ -96,7 +96,7 @@ def _allan(found: Assessment) -> Figure:
     axes.set(xlabel='averaging time, s', ylabel='overlapping Allan deviation, mm',
              xscale='log', yscale='log')  # fmt: skip
     axes.grid(alpha=0.3, which='both')
-    figure.legend(loc='outside right upper')
+    legend_beside(figure)
     return figure
 
 

@@ -34,7 +34,7 @@ WORKERS = {
     'distributed.nanny.pre-spawn-environ': dict.fromkeys(ONE_THREAD, '1'),
     'distributed.worker.profile.enabled': False,
 }
-"""What Dask is told for the workers on this machine."""
+"""Settings of Dask for the workers on this machine."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +101,7 @@ def _client(args: argparse.Namespace, sessions: int) -> Iterator[tuple['Client',
             yield client, 1
         return
     workers = min(args.workers, sessions)
-    # Silent: what becomes of a session is told in its row.
+    # Silent: what becomes of a session stands in its row.
     with (
         dask.config.set(WORKERS),
         LocalCluster(

@@ -113,7 +113,7 @@ def by_coil(evaluation: Evaluation) -> Figure:
 
 
 def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
-    """Draw the errors against the sigma told, and how many lie within a multiple of it.
+    """Draw the errors against the reported sigma, and how many lie within a multiple of it.
 
     ``jitter_m``, the optical tracker's own error per component, m, is part of the expected error.
     """

@@ -20,6 +20,7 @@ from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.errors import ParameterError
 from anser_ros.field.plain_data import plain
 from anser_ros.physics.constants import DEGREES
+from anser_ros.pictures import legend_beside
 from anser_ros.poses.convention import reading_words
 from anser_ros.poses.document import finite
 from anser_ros.poses.hand_eye_fit import HandEye, fit_hand_eye, matrix_of, turn_of
@@ -238,5 +239,5 @@ def _over_time(found: HandEye) -> Figure:
         size = 1e3 * np.linalg.norm(part.residual[part.used, :3], axis=1)
         axes.plot(part.view.time[part.used], size, '.', ms=2, label=part.view.sensor)
     axes.set(xlabel='time, s', ylabel='distance, mm', yscale='log')
-    figure.legend(loc='outside right upper')
+    legend_beside(figure)
     return figure

@@ -103,7 +103,7 @@ def record(run: Run) -> Path:
             _wait(supervisor, run, lambda: _unready(bag, listeners))
             unit = simulated_unit(ports / 'cu', setup_file=run.setup, metal=False, **run.unit)
             supervisor.start('cu_simulator', unit)
-            _wait(supervisor, run, lambda: _unheard(bag))
+            _wait(supervisor, run, lambda: _without_flux(bag))
             end = time.monotonic() + run.duration_s
             while time.monotonic() < end:
                 _check(supervisor)
@@ -166,7 +166,7 @@ def _unready(bag: Path, names: Sequence[str]) -> str:
     return f'{", ".join(missing)} not ready' if missing else ''
 
 
-def _unheard(bag: Path) -> str:
+def _without_flux(bag: Path) -> str:
     try:
         return '' if read_bag(bag).tool is not None else 'no tool flux was recorded'
     except AnserError as error:

@@ -56,7 +56,7 @@ def _dispatch(arguments: list[str]) -> int:
         print(_version())
         return EXIT_OK
     name, rest = arguments[0].replace('-', '_'), arguments[1:]
-    if name in {**NODES, **COMPOSED}:
+    if name in NODES or name in COMPOSED:
         try:
             missing.check(name)
         except AnserError as error:

@@ -109,8 +109,8 @@ def _cook(
                 code = main.main(command)
             if code:
                 last = (printed.getvalue().strip().splitlines() or ['nothing said'])[-1]
-                told = f'anser {command[0]} ended with {code}: {last}'
-                raise ParameterError(f'{recipe.name}: {told}')
+                words = f'anser {command[0]} ended with {code}: {last}'
+                raise ParameterError(f'{recipe.name}: {words}')
         return recipe.rows(folder, bags, out)
 
 

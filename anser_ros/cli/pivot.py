@@ -17,6 +17,7 @@ from anser_ros.cli.pose_source import add_source_options, live_poses, source_of
 from anser_ros.cli.progress import Tell
 from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.errors import FitError, ParameterError, SetupError
+from anser_ros.pictures import legend_beside
 from anser_ros.poses.sequence import missing_words
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.setup_tips import SCHEMA, UPPER, TipSpec, dump_tips, with_tips
@@ -180,7 +181,7 @@ def render(fit: PivotFit, document: dict[str, Any]) -> str:
     for mask, colour, label in ((fit.agrees, 'C0', 'agrees'), (~fit.agrees, 'C3', 'left out')):
         axes.plot(fit.time[mask], 1e3 * fit.distance[mask], '.', ms=3, color=colour, label=label)
     axes.set(xlabel='time, s', ylabel='tip from the point, mm', yscale='log')
-    figure.legend(loc='outside right upper')
+    legend_beside(figure)
     verdict = (
         f'The tip of {document["body"]} is known to '
         f'{1e3 * float(np.sqrt(np.trace(fit.covariance))):.2f} mm; {_agreement(fit, document)}.'

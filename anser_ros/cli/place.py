@@ -44,7 +44,7 @@ AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -1, -1]]) / np.
 LENGTH_M = 0.008
 """Length of a coil that is not stated, m: about that of the coils of the demo's setup."""
 FARTHEST = 10.0
-"""Distance of a coil, in halves of the board, beyond which it hears nothing of it."""
+"""Distance of a coil, in halves of the board, beyond which it receives nothing of it."""
 MOST_CANDIDATES = 400
 """Coils to choose from at most; more take minutes and gigabytes."""
 RANDOM_TRIES, SEED = 20, 1
@@ -184,7 +184,7 @@ def _plane(origin: str, region: Region) -> Array:
 
 
 def _bounded(table: SensorTable, origin: str, region: Region) -> SensorTable:
-    """The coils, if they are not too many and none is too far from the board to hear it."""
+    """The coils, if they are not too many and none is too far from the board to receive it."""
     away = np.linalg.norm(table.position - np.array([*region.centre, 0.0]), axis=1)
     if away.max() > FARTHEST * region.half:
         unit = unit_words(float(np.median(away)) / region.half, LENGTH_UNITS)

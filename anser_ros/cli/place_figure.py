@@ -13,11 +13,11 @@ from anser_ros.pictures import spell_out
 from anser_ros.refit.clouds import Region
 from anser_ros.refit.design import Design
 
-ARROW = 0.15
+PLACE_ARROW = 0.15
 """Length of an axis in the picture, in halves of the board."""
 ARROW_POINTS = 8
 """Points of an arrow that no number should cover."""
-LETTERS_PT = 8.0
+NUMBERS_PT = 8.0
 """Size of the coils' numbers, points."""
 
 
@@ -42,7 +42,7 @@ def places_figure(
         legend_under(panel, 0.14, columns=2)
     figure.draw_without_rendering()
     for axes, labels, drawn in named:
-        name_points(axes, labels, drawn, LETTERS_PT)
+        name_points(axes, labels, drawn, NUMBERS_PT)
     return figure
 
 
@@ -52,7 +52,7 @@ def _draw_places(
     """Draw candidates, chosen coils and board; the coils' numbers, and what these should spare."""
     axes.plot(*candidates.position[:, sides].T, '.', color='0.75', label='candidates')
     at, axis = candidates.position[chosen][:, sides], candidates.axis[chosen][:, sides]
-    size = ARROW * region.half
+    size = PLACE_ARROW * region.half
     axes.quiver(
         *at.T, *axis.T, angles='xy', scale_units='xy', scale=1.0 / size, color='tab:blue',
         width=0.006,

@@ -117,7 +117,7 @@ def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -
 
 
 def short_label(label: str) -> str:
-    """Return a candidate's label without where its polynomial is centred, which tells nobody."""
+    """Return a candidate's label without the centre of its polynomial."""
     text = re.sub(r',? ?(centre_m \[[^]]*\]|(size_m|middle_s) [-+.\de]+)', '', label)
     return text.replace(' ()', '')
 

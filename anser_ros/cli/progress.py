@@ -13,7 +13,7 @@ LINE_INTERVAL_S = 5.0
 """Time from one line to the next, s: enough to see that it goes on, few enough for a log."""
 LEAST_DONE, LEAST_S = 0.1, 1.0
 """Finished share of a stage, and time that its later half took, s, from which on the time that is
-left is told. Before, it would be that of loading and compiling, which do not come again."""
+left is shown. Before, it would be that of loading and compiling, which do not come again."""
 
 
 class Tell(Protocol):

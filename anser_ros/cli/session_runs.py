@@ -10,8 +10,8 @@ import os
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from anser_ros.cli.commands import OFFLINE
 from anser_ros.cli.folders import make_folder
@@ -25,7 +25,8 @@ ALONE = threading.Lock()
 """One session at a time in a process: drawing, the working folder and the threads are shared."""
 
 
-class SessionRun(NamedTuple):
+@dataclass(frozen=True)
+class SessionRun:
     """A command to run on one session, by the arguments that its ``work`` takes."""
 
     command: str  # calibrate, diagnose or evaluate

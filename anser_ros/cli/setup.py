@@ -37,7 +37,7 @@ from anser_ros.sessions.starting_model import board_of
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import Setup, parse_setup
 
-SCHEMA = 'anser_setup_result/1'
+RESULT = 'anser_setup_result/1'
 DOCUMENT, PICTURE = 'setup.yaml', 'setup.png'
 
 
@@ -114,7 +114,7 @@ def _document(args: argparse.Namespace) -> Document:
     else:
         emitter = emitter_of(args.board, _geometry(args.geometry), coils)
     rows = [*args.sensor, *(row for path in args.sensors for row in rows_of(path, SENSOR_COLUMNS))]
-    volume = None if args.volume is None else numbers_of(args.volume, (6,), '--volume')
+    volume = None if args.volume is None else numbers_of(args.volume, 6, '--volume')
     sensors = [sensor_of(row) for row in rows]
     return document_of(emitter, sensors, args.rate, volume, stated_values(args))
 
@@ -138,7 +138,7 @@ def _write(args: argparse.Namespace, text: str, setup: Setup) -> int:
         f'{len(setup.emitter.coils)} emitter coils, {len(setup.reference_sensors)} reference '
         f'coils, tools: {", ".join(setup.bodies) or "none"}'
     )
-    document = {'schema': SCHEMA, 'files': list(map(str, written)), 'advice': advice}
+    document = {'schema': RESULT, 'files': list(map(str, written)), 'advice': advice}
     say('setup', Result(document, tuple(advice), (words,), written), as_json=args.json)
     return 0
 

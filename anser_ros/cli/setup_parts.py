@@ -55,12 +55,11 @@ def number_of(text: str, what: str) -> float:
     return value
 
 
-def numbers_of(text: str, counts: Sequence[int], what: str) -> list[float]:
-    """Return numbers with commas or blanks between them, as many as one of the counts says."""
+def numbers_of(text: str, count: int, what: str) -> list[float]:
+    """Return so many numbers with commas or blanks between them."""
     parts = text.replace(',', ' ').split()
-    if len(parts) not in counts:
-        wanted = ' or '.join(map(str, counts))
-        raise ParameterError(f'{what} takes {wanted} numbers, got {text.strip()!r}')
+    if len(parts) != count:
+        raise ParameterError(f'{what} takes {count} numbers, got {text.strip()!r}')
     return [number_of(part, what) for part in parts]
 
 
@@ -85,7 +84,7 @@ def anser_emitter() -> Document:
 
 def coil_of(name: str, text: str) -> Document:
     """Return an emitter coil of ``x, y, z, turn about z, tone`` in mm, degrees and Hz."""
-    x, y, z, turn, tone = numbers_of(text, (5,), f'coil {name}')
+    x, y, z, turn, tone = numbers_of(text, 5, f'coil {name}')
     return {
         'name': name, 'centre_m': metres((x, y, z)), 'rotation_deg': turn, 'frequency_hz': tone,
     }  # fmt: skip
@@ -120,7 +119,7 @@ def axis_of(text: str, what: str) -> list[float]:
         return DIRECTIONS[text.lower()]
     if len(text.split()) != 3:
         raise ParameterError(f'{what}: axis is x, -x, ... or three numbers, got {text!r}')
-    values = np.array(numbers_of(text, (3,), f'{what}: axis'))
+    values = np.array(numbers_of(text, 3, f'{what}: axis'))
     length = float(np.linalg.norm(values))
     if length == 0.0:
         raise ParameterError(f'{what}: an axis must not have zero length')

@@ -72,7 +72,7 @@ class _Questions:
         rate = self._ask('flux windows a second [50]', lambda t: number_of(t or '50', 'the rate'))
         volume = self._ask(
             'corners of the tracked volume, x y z x y z [above the board, by its size]',
-            lambda t: numbers_of(t, (6,), 'the volume') if t else None,
+            lambda t: numbers_of(t, 6, 'the volume') if t else None,
         )
         return document_of(self._emitter, self._sensors, rate, volume)
 

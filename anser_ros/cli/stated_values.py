@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-# Nothing that needs numpy is imported here: doctor tells where that is missing.
+# Nothing that needs numpy is imported here: doctor reports where that is missing.
 
 
 def add_out(parser: argparse.ArgumentParser, what: str = '', **options: Any) -> None:

@@ -134,8 +134,8 @@ class _Listener(numba.core.event.Listener):
 
 def kernels() -> dict[str, Dispatcher]:
     """Return all kernels of the modules that have been imported, by name."""
-    rooms = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
-    found = [v for room in rooms for v in vars(room).values() if isinstance(v, Dispatcher)]
+    modules = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
+    found = [v for module in modules for v in vars(module).values() if isinstance(v, Dispatcher)]
     return {f'{k.py_func.__module__}.{k.py_func.__qualname__}': k for k in found}
 
 
