@@ -62,10 +62,6 @@ class Supervisor:
         self._children.append(Child(name, process, log))
         return self._children[-1]
 
-    def forget(self, child: Child) -> None:
-        """Stop watching a process that has done its work."""
-        self._children.remove(child)
-
     def ended(self) -> Child | None:
         """Return a process that has ended by itself, or None while all run."""
         return next((c for c in self._children if c.process.poll() is not None), None)
