@@ -71,11 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the demo and return the exit code.
 
-    Raises
-    ------
-    ParameterError
-        When the duration or the rate is out of range, the folder to draw from has no demo, or
-        another demo has the stated ROS domain.
+    Raises `ParameterError` when the duration or the rate is out of range, the folder to draw from
+    has no demo, or another demo has the stated ROS domain.
     """
     if args.draw is not None:
         if not (args.draw / DATA).is_file():

@@ -23,7 +23,7 @@ from rich.table import Table
 
 from anser_ros.cli.commands import NODES
 from anser_ros.cli.missing import OPTIONAL, PYPI, ROS_REMEDY
-from anser_ros.cli.output import Result
+from anser_ros.cli.output import Result, terminal_table
 from anser_ros.cli.progress import Tell
 from anser_ros.cli.stated_values import add_json
 from anser_ros.errors import ParameterError
@@ -100,11 +100,11 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
 
 
 def _table(findings: list[Observation]) -> Table:
-    table = Table('', 'found', 'remedy')
-    for one in findings:
-        name = f'[{COLOURS[one.state]}]{escape(one.name)}'
-        table.add_row(name, escape(one.found), escape(one.remedy))
-    return table
+    rows = [
+        [f'[{COLOURS[one.state]}]{escape(one.name)}', escape(one.found), escape(one.remedy)]
+        for one in findings
+    ]
+    return terminal_table(['', 'found', 'remedy'], rows)
 
 
 def python() -> list[Observation]:
@@ -200,9 +200,7 @@ def _group(name: str) -> str:
 
 
 def clock(tool: str = 'timedatectl') -> list[Observation]:
-    """Check the system's clock: whether something keeps it right, as poses of two machines
-    need it.
-    """
+    """Check the system's clock: whether something keeps it right, as two machines need it."""
     said = ''
     if shutil.which(tool) is not None:
         command = [tool, 'show', '-p', 'NTPSynchronized', '--value']

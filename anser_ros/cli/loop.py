@@ -74,12 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the loop and return the exit code.
 
-    Raises
-    ------
-    ParameterError
-        When the duration or the seed is out of range.
-    DiagnosisError
-        When a run records nothing or a diagnosis fails.
+    Raises `ParameterError` when the duration or the seed is out of range, `DiagnosisError` when a
+    run records nothing or a diagnosis fails.
     """
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)

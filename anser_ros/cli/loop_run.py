@@ -45,10 +45,7 @@ def make_world(folder: Path) -> LoopFiles:
 
     The field without metal does not depend on the tones, so that the model stays right.
 
-    Raises
-    ------
-    SetupError
-        When the demo's setup has another number of coils than there are tones.
+    Raises `SetupError` when the demo's setup has another number of coils than there are tones.
     """
     setup = parse_setup(read_config('demo_setup.yaml'))
     if len(setup.emitter.coils) != len(TONES_HZ):
@@ -85,10 +82,7 @@ def record(run: Run) -> Path:
     The unit is started once all nodes are ready: drifts begin with its first start, which is then
     the first frame of the recording and of every tracker.
 
-    Raises
-    ------
-    DiagnosisError
-        When a process ends, or no flux arrives in time.
+    Raises `DiagnosisError` when a process ends, or no flux arrives in time.
     """
     ports = Path(tempfile.mkdtemp(prefix='anser_loop_'))
     bag = run.folder / 'bag'

@@ -117,12 +117,9 @@ def _cook(
 def shared_folder(given: Path | None) -> Path:
     """Return the folder that contains ``measured/``.
 
-    Raises
-    ------
-    ParameterError
-        When there is no such folder.
+    Raises `ParameterError` when there is no such folder.
     """
-    source = Path(__file__).resolve().parents[2].parent / 'shared'
+    source = main.PACKAGE_FOLDER.parents[1] / 'shared'
     folder = given or Path(os.environ.get(SHARED, source))
     if not (folder / 'measured').is_dir():
         raise ParameterError(f'no measured data: {folder} has no folder measured; use --shared')

@@ -22,10 +22,7 @@ from anser_ros.errors import ParameterError
 def check_file(path: Path) -> None:
     """Make the folder of a file that is written at the end, before the work begins.
 
-    Raises
-    ------
-    ParameterError
-        When the folder cannot be made, or the file cannot be written.
+    Raises `ParameterError` when the folder cannot be made, or the file cannot be written.
     """
     make_folder(path.parent)
     if path.is_dir():

@@ -112,12 +112,8 @@ def propose(
     ``origin`` is ``setup``, ``frame``, ``plane=Z`` or the path of a CSV file, ``kinds`` are of
     `KINDS`, and ``error_m`` is the error of poses, m, that each metal makes uncorrected.
 
-    Raises
-    ------
-    ParameterError
-        When there are not as many places, or the list of them can't be read.
-    SetupError
-        When the board can't be drawn from the setup.
+    Raises `ParameterError` when there are not as many places, or the list of them can't be read,
+    `SetupError` when the board can't be drawn from the setup.
     """
     field = Drawing.of(setup).field
     if field is None:

@@ -25,13 +25,7 @@ class Tell(Protocol):
 
 @contextmanager
 def progress_of(command: str) -> Iterator[Tell]:
-    """Yield a function that takes how far a command is.
-
-    Parameters
-    ----------
-    command : str
-        What goes on, before a stage has a name.
-    """
+    """Yield a function that takes how far a command is, which a bar or lines then show."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield _Lines(command).tell

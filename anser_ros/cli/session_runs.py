@@ -51,10 +51,7 @@ def runs_of(command: str, args: argparse.Namespace) -> list[SessionRun]:
 def names_of(sessions: Sequence[str]) -> list[str]:
     """Return names for sessions by their paths: as many last parts as distinguish them.
 
-    Raises
-    ------
-    ParameterError
-        When a session is given twice.
+    Raises `ParameterError` when a session is given twice.
     """
     paths = [Path(session).resolve() for session in sessions]
     for place, path in enumerate(paths):

@@ -178,10 +178,7 @@ class _RowDumper(yaml.SafeDumper):
 def text_of(document: Document) -> tuple[str, Setup]:
     """Return the document as YAML, and what readers make of it.
 
-    Raises
-    ------
-    SetupError
-        When the document breaks a rule.
+    Raises `SetupError` when the document breaks a rule.
     """
     plain = yaml.safe_load(yaml.safe_dump(document))  # nothing in it is shared
     text = yaml.dump(plain, Dumper=_RowDumper, sort_keys=False, width=200)

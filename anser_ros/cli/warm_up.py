@@ -40,10 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compile what is not there yet, and say how far that is.
 
-    Raises
-    ------
-    ParameterError
-        When a kernel can't be compiled.
+    Raises `ParameterError` when a kernel can't be compiled.
     """
     stream = sys.stderr if args.json else sys.stdout
     compile_kernels(lambda text: print(text, file=stream, flush=True))
@@ -60,17 +57,8 @@ def compile_kernels(
 ) -> None:
     """Let processes compile all kernels, unless they are there.
 
-    Parameters
-    ----------
-    say : callable
-        Gets a line at the start and every few seconds, none where all is there.
-    is_stopped : callable
-        Whether to give up, which is no error.
-
-    Raises
-    ------
-    ParameterError
-        When a process fails, with its last line.
+    ``say`` gets a line at the start and every few seconds; ``is_stopped`` is whether to give up,
+    which is no error. Raises `ParameterError` when a process fails, with its last line.
     """
     cache = KernelCache(folder_of(fill_frame))
     if cache.is_full:
