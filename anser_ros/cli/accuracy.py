@@ -22,7 +22,7 @@ from anser_ros.cli.progress import Tell
 from anser_ros.cli.stated_values import add_json, add_list, add_out
 from anser_ros.errors import ParameterError
 from anser_ros.poses.sequence import missing_words
-from anser_ros.wire.text_files import read_numbers, read_rows
+from anser_ros.wire.text_files import numbers_of, read_rows
 
 SEED = 1
 """Seed of the resamples, so that the same recordings give the same intervals."""
@@ -162,10 +162,7 @@ def _truth(path: Path) -> Array:
     for unit, scale in (('m', 1.0), ('mm', 1e-3)):
         names = [f'{axis}_{unit}' for axis in 'xyz']
         if rows and all(name in rows[0] for name in names):
-            table = read_numbers(path, names, rows)
-            if not np.isfinite(table).all():
-                raise ParameterError(f'{path}: needs finite numbers in {", ".join(names)}')
-            return scale * table
+            return scale * numbers_of(path, rows, names)
     raise ParameterError(f'{path}: needs rows with the columns x_m, y_m, z_m, or x_mm, y_mm, z_mm')
 
 

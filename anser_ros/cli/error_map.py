@@ -18,7 +18,7 @@ from anser_ros.errors import FitError, ParameterError, PlausibilityError
 from anser_ros.poses.point_model import to_point_model
 from anser_ros.sessions.plausibility import check_points
 from anser_ros.wire.fiducials import read_fiducials
-from anser_ros.wire.text_files import read_numbers, read_rows
+from anser_ros.wire.text_files import numbers_of, read_rows
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')
@@ -68,7 +68,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     error_map = learn_error_map(tracked, true, registers=args.register)
     if args.apply is not None:
         names, poses = _read(args.apply)
-        places = read_numbers(args.apply, TRACKED, poses)
+        places = numbers_of(args.apply, poses, TRACKED, with_gaps=True)
         corrected = error_map.apply(places) if error_map.is_confirmed else places
     document = to_document(error_map)
     model = yaml.safe_dump(
@@ -102,16 +102,9 @@ def _points(args: argparse.Namespace) -> tuple[Array, Array]:
         if args.points.suffix == MARKUPS:
             raise ParameterError(f'{args.points} has tracked positions only; --true is needed')
         _, rows = _read(args.points)
-        return (
-            read_numbers(args.points, TRACKED, rows),
-            read_numbers(args.points, TRUE, rows),
-        )
-    tracked, true = (
-        read_fiducials(path)
-        if path.suffix == MARKUPS
-        else read_numbers(path, TRACKED, _read(path)[1])
-        for path in (args.points, args.true)
-    )
+        tracked, true = (numbers_of(args.points, rows, n, with_gaps=True) for n in (TRACKED, TRUE))
+        return tracked, true
+    tracked, true = map(_places, (args.points, args.true))
     if len(tracked) != len(true):
         raise ParameterError(
             f'{args.points} has {len(tracked)} positions and {args.true} {len(true)}; '
@@ -145,6 +138,13 @@ def _plain(error: HeldOutError) -> dict[str, float | None]:
         'in_plane_rmse_m': error.in_plane,
         'out_of_plane_rmse_m': error.out_of_plane,
     }
+
+
+def _places(path: Path) -> Array:
+    """Positions of a list of points, or of a table."""
+    if path.suffix == MARKUPS:
+        return read_fiducials(path)
+    return numbers_of(path, _read(path)[1], TRACKED, with_gaps=True)
 
 
 def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:

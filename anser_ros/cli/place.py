@@ -26,7 +26,7 @@ from anser_ros.sessions.units import LENGTH_UNITS, unit_words
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
-from anser_ros.wire.text_files import read_numbers, read_rows
+from anser_ros.wire.text_files import numbers_of, read_rows
 
 Array = NDArray[np.float64]
 
@@ -218,23 +218,16 @@ def _read(path: Path) -> SensorTable:
     _, rows = read_rows(path)
     if not rows:
         raise ParameterError(f'{path}: no rows')
-    places = _numbers(path, rows, ('x_m', 'y_m', 'z_m'))
+    places = numbers_of(path, rows, ('x_m', 'y_m', 'z_m'))
     if 'ax' not in rows[0]:
         return _every_axis(places)
-    axes = _numbers(path, rows, ('ax', 'ay', 'az'))
+    axes = numbers_of(path, rows, ('ax', 'ay', 'az'))
     if not (np.linalg.norm(axes, axis=1) > 0.0).all():
         raise ParameterError(f'{path}: an axis has zero length')
     length: float | Array = LENGTH_M
     if 'length_m' in rows[0]:
-        length = _numbers(path, rows, ('length_m',))[:, 0]
+        length = numbers_of(path, rows, ('length_m',))[:, 0]
     return _coils(places, axes, length)
-
-
-def _numbers(path: Path, rows: list[dict[str, str]], names: tuple[str, ...]) -> Array:
-    values = read_numbers(path, names, rows)
-    if not np.isfinite(values).all():
-        raise ParameterError(f'{path}: the columns {", ".join(names)} must be finite')
-    return values
 
 
 def to_document(proposal: Proposal, origin: str) -> dict[str, Any]:

@@ -44,19 +44,28 @@ def read_rows(path: str | os.PathLike[str]) -> tuple[list[str], list[dict[str, s
     return list(reader.fieldnames or []), rows
 
 
-def read_numbers(
-    path: str | os.PathLike[str], names: Sequence[str], rows: Sequence[dict[str, str]]
+def numbers_of(
+    path: str | os.PathLike[str],
+    rows: Sequence[dict[str, str]],
+    names: Sequence[str],
+    *,
+    with_gaps: bool = False,
 ) -> NDArray[np.float64]:
-    """Return columns of a CSV file's rows as numbers, shape (rows, names); NaN for an empty cell.
+    """Return columns of a table's rows as numbers, shape (rows, names).
 
     Raises
     ------
     ParameterError
-        When a column is missing, or has something else than numbers.
+        When a column is missing or a cell is no finite number; ``with_gaps`` empty ones are NaN.
     """
     try:
-        return np.array([[float(row[name] or 'nan') for name in names] for row in rows])
+        values = np.array(
+            [[float((row[n] or 'nan') if with_gaps else row[n]) for n in names] for row in rows]
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise ParameterError(
             f'{os.fspath(path)}: needs the columns {", ".join(names)} with numbers: {error}'
         ) from error
+    if not (with_gaps or np.isfinite(values).all()):
+        raise ParameterError(f'{os.fspath(path)}: the columns {", ".join(names)} must be finite')
+    return values
