@@ -11,6 +11,7 @@ import matplotlib
 
 matplotlib.use('Agg')
 from matplotlib import pyplot as plt
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
@@ -18,6 +19,9 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 DOTS_PER_INCH = 110
 """Resolution of the figures, a compromise between legible text and the size of the files."""
+WIDE = 4.0
+"""Largest over smallest value from which an axis is logarithmic: on a shorter one, labels at 1, 2
+and 5 are too few."""
 
 
 def save(figure: Figure, path: Path | io.BytesIO) -> None:
@@ -27,11 +31,14 @@ def save(figure: Figure, path: Path | io.BytesIO) -> None:
     plt.close(figure)
 
 
-def image(figure: Figure) -> str:
-    """Return the figure as an HTML element that holds the picture itself; the figure is closed."""
-    buffer = io.BytesIO()
-    save(figure, buffer)
-    data = base64.b64encode(buffer.getvalue()).decode('ascii')
+def image(figure: Figure | Path) -> str:
+    """Return a figure, which is closed, or a file of one as an HTML element that holds it."""
+    if isinstance(figure, Path):
+        content = figure.read_bytes()
+    else:
+        save(figure, buffer := io.BytesIO())
+        content = buffer.getvalue()
+    data = base64.b64encode(content).decode('ascii')
     return f'<img alt="figure" src="data:image/png;base64,{data}">'
 
 
@@ -45,6 +52,15 @@ def legend_below(figure: Figure, panel: Axes, markers: float = 1.0) -> None:
         handles, labels, loc='outside lower center', ncols=min(len(labels), 5), fontsize=8,
         markerscale=markers,
     )  # fmt: skip
+
+
+def legend_beside(figure: Figure) -> None:
+    """Put one legend beside all panels, with an entry for each label of any of them."""
+    unique: dict[str, Artist] = {}
+    for panel in figure.axes:
+        handles, labels = panel.get_legend_handles_labels()
+        unique |= dict(zip(labels, handles, strict=True))
+    figure.legend(list(unique.values()), list(unique), loc='outside right upper', fontsize=8)
 
 
 def spell_out(axis: Axis) -> None:

@@ -78,11 +78,15 @@ def test_every_command_is_an_executable(installed):
 
 def test_the_table_lists_every_module_that_is_a_command():
     def modules(room, mark):
-        files = (REPO / 'anser_ros' / room).glob('*.py')
-        return {path.stem for path in files if mark in path.read_text()}
+        files = (REPO / 'anser_ros' / room).rglob('*.py')
+        found = {path.relative_to(REPO) for path in files if mark in path.read_text()}
+        return {'.'.join(path.with_suffix('').parts) for path in found}
 
-    assert {*NODES, *COMPOSED} == modules('nodes', "\nif __name__ == '__main__':")
-    assert set(OFFLINE) == modules('cli', '\ndef add_arguments(')
+    def of(*groups):
+        return {module for group in groups for module, _ in group.values()}
+
+    assert of(NODES, COMPOSED) == modules('nodes', "\nif __name__ == '__main__':")
+    assert of(OFFLINE) == modules('.', '\ndef add_arguments(')
 
 
 def test_an_installed_node_runs(installed, overlay, ros, tmp_path):
@@ -125,7 +129,7 @@ class TestConsole:
 
         def place(run):
             Module.run = staticmethod(run)
-            monkeypatch.setattr(cli, 'OFFLINE', {'sample': 'A command of the tests.'})
+            monkeypatch.setattr(cli, 'OFFLINE', {'sample': ('', 'A command of the tests.')})
             monkeypatch.setattr(cli.importlib, 'import_module', lambda name: Module)
 
         return place

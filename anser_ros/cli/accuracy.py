@@ -1,27 +1,25 @@
 """Assess a tracker by the protocols that the field publishes, and watch it over sessions."""
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from anser_ros.assessment.history import judge, keep
 from anser_ros.assessment.hummel import ORDERS, RING_STEP_DEG, SPACING_M
 from anser_ros.assessment.protocols import PROTOCOLS, Assessment, ProtocolOptions, assess
 from anser_ros.assessment.source import read_poses
 from anser_ros.assessment.stillness import PauseRule
-from anser_ros.cli.accuracy_document import figure_rows, to_document
+from anser_ros.cli.accuracy_document import figure_rows, qa_words, to_document
 from anser_ros.cli.accuracy_page import render
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import say_written
+from anser_ros.cli.output import Result, terminal_table, write_files
 from anser_ros.cli.pose_source import add_source_options, source_of
-from anser_ros.cli.progress import progress_of
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json, add_list, add_out
 from anser_ros.errors import ParameterError
 from anser_ros.poses.sequence import missing_words
 from anser_ros.wire.text_files import numbers_of, read_rows
@@ -61,27 +59,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'shortest pause that counts as a point, s ({PauseRule().least_s:g})',
     )  # fmt: skip
     parser.add_argument('--grid', metavar='RxC', help='rows and columns of a board of your own')
-    parser.add_argument(
-        '--spacing-mm',
-        type=float,
-        default=1e3 * SPACING_M,
-        help='spacing of the holes of the board, mm (50)',
-    )
-    parser.add_argument(
-        '--order', choices=ORDERS, default=ORDERS[0],
-        help='rows: all in one direction; serpentine: every other one backwards',
-    )  # fmt: skip
-    parser.add_argument(
-        '--step-deg',
-        type=float,
-        default=RING_STEP_DEG,
-        help='step of the holes of the ring, degrees (11.25)',
-    )
-    parser.add_argument(
-        '--axis',
-        metavar='X,Y,Z',
-        help='for a sensor without roll: the direction whose rotation is evaluated',
-    )
+    words = 'spacing of the holes of the board, mm (50)'
+    parser.add_argument('--spacing-mm', type=float, default=1e3 * SPACING_M, help=words)
+    words = 'rows: all in one direction; serpentine: every other one backwards'
+    parser.add_argument('--order', choices=ORDERS, default=ORDERS[0], help=words)
+    words = 'step of the holes of the ring, degrees (11.25)'
+    parser.add_argument('--step-deg', type=float, default=RING_STEP_DEG, help=words)
+    words = 'for a sensor without roll: the direction whose rotation is evaluated'
+    parser.add_argument('--axis', metavar='X,Y,Z', help=words)
     parser.add_argument(
         '--truth', default=OPTICAL_TRUTH, metavar='FILE',
         help="CSV of the phantom's points in order (x_m,y_m,z_m or x_mm,y_mm,z_mm); without it "
@@ -92,76 +77,52 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='judge by the earlier sessions in this folder (pass, note, alert, fail), and keep '
         'this one there',
     )  # fmt: skip
-    parser.add_argument(
-        '--limit', action='append', default=[], metavar='FIGURE=VALUE',
-        help='largest size of a figure, beyond which the session fails',
-    )  # fmt: skip
-    parser.add_argument(
-        '--out', type=Path, help='folder for accuracy.json and report.html, made if missing'
-    )
-    parser.add_argument('--json', action='store_true', help='print accuracy.json on stdout')
+    words = 'largest size of a figure, beyond which the session fails'
+    add_list(parser, '--limit', metavar='FIGURE=VALUE', help=words)
+    add_out(parser, 'accuracy.json and report.html', required=False)
+    add_json(parser, 'accuracy.json on stdout')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Assess the recordings of the arguments, and judge them where that is wanted."""
     options, tolerances = _options(args), _tolerances(args.limit)
-    for folder in filter(None, (args.out, args.history)):
-        make_folder(folder)
+    make_folder(args.out)
+    make_folder(args.history)
     wanted = source_of(args)
-    with progress_of('accuracy') as progress:
-        recordings = []
-        for k, path in enumerate(args.recordings):
-            progress('reading', k / len(args.recordings))
-            recordings.append(read_poses(path, wanted))
-        progress(args.protocol, 0.5)
-        found = assess(args.protocol, recordings, options, np.random.default_rng(SEED))
+    recordings = []
+    for k, path in enumerate(args.recordings):
+        tell('reading', k / len(args.recordings))
+        recordings.append(read_poses(path, wanted))
+    tell(args.protocol, 0.5)
+    found = assess(args.protocol, recordings, options, np.random.default_rng(SEED))
     missing = tuple(filter(None, (missing_words(one.poses) for one in recordings)))
     found = replace(found, notes=(*found.notes, *missing))
-    if found.start_ns < NO_DATE_NS:  # a device's own counter: the file tells when
+    if found.start_ns < NO_DATE_NS:  # a device's own counter: the file says when
         found = replace(found, start_ns=args.recordings[0].stat().st_mtime_ns)
     is_judged = args.history is not None or bool(tolerances)
     verdict = judge(found, args.history, tolerances) if is_judged else None
     document = to_document(found, verdict)
-    text = json.dumps(document, indent=1)
-    written = []
+    written: tuple[Path, ...] = ()
     if args.out is not None:
-        for name, content in (
-            ('accuracy.json', text + '\n'), ('report.html', render(found, document, verdict))
-        ):  # fmt: skip
-            (args.out / name).write_text(content, encoding='utf-8')
-            written.append(args.out / name)
+        page = render(found, document, verdict)
+        written = write_files(args.out, {'accuracy.json': document, 'report.html': page})
     if verdict is not None and args.history is not None:
-        written.append(keep(found, args.history, verdict.figures))
-    if args.json:
-        print(text)
-        return 0
-    _say(found, document)
-    if written:
-        say_written(*written)
-    return 0
+        written = (*written, keep(found, args.history, verdict.figures))
+    return Result(document, (), _shown(found, document), written)
 
 
-def _say(found: Assessment, document: dict[str, Any]) -> None:
-    console = Console()
+def _shown(found: Assessment, document: dict[str, Any]) -> tuple[Any, ...]:
+    def coloured(state: str) -> str:
+        return f'[{COLORS.get(state, "white")}]{state}[/]'
+
     qa = document.get('qa')
-    head = ['figure', 'value', '95 % interval']
-    shown = Table(*head, *(['state'] if qa else []))
-    for name, value, interval, judged in figure_rows(found, document):
-        color = COLORS.get(judged, 'white')
-        shown.add_row(name, value, interval, *([f'[{color}]{judged}[/]'] if qa else []))
-    console.print(shown)
-    if found.points:
-        console.print(f'{len(found.points)} points', highlight=False)
-    for words in found.notes:
-        console.print(words, highlight=False)
-    if qa:
-        words = ', '.join(
-            f'{name}: {one["words"]}' for name, one in qa['figures'].items() if one['words']
-        )
-        console.print(
-            f'[{COLORS[qa["state"]]}]{qa["state"]}[/], compared with {qa["earlier_sessions"]} '
-            'earlier sessions' + (f': {words}' if words else ''), highlight=False,
-        )  # fmt: skip
+    head = ['figure', 'value', '95 % interval', *(['state'] if qa else [])]
+    rows = [
+        [*cells, *([coloured(state)] if qa else [])]
+        for *cells, state in figure_rows(found, document)
+    ]
+    points = [f'{len(found.points)} points'] if found.points else []
+    return (terminal_table(head, rows), *points, *found.notes, *([qa_words(qa)] if qa else []))
 
 
 def _options(args: argparse.Namespace) -> ProtocolOptions:

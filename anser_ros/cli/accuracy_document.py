@@ -23,14 +23,7 @@ SHOWN_UNITS = (
 
 
 def to_document(found: Assessment, verdict: SessionVerdict | None) -> dict[str, Any]:
-    """Return the assessment as plain data; null where there is no number.
-
-    Parameters
-    ----------
-    found : Assessment
-    verdict : SessionVerdict or None
-        None where nothing is judged.
-    """
+    """Return the assessment as plain data, null where there is no number; judged by a verdict."""
     document: dict[str, Any] = {
         'schema': SCHEMA, 'protocol': found.protocol, 'body': found.body,
         'recordings': list(found.recordings), 'start_ns': found.start_ns,
@@ -92,36 +85,37 @@ def _group(group: ErrorGroup) -> dict[str, Any]:
 
 def _verdict(verdict: Verdict) -> dict[str, Any]:
     limits = verdict.limits
+    names = ('mean', 'sigma', 'note', 'alert')
     return {
-        'state': verdict.state, 'words': verdict.words,
-        'mean': None if limits is None else limits.mean,
-        'sigma': None if limits is None else limits.sigma,
-        'note': None if limits is None else limits.note,
-        'alert': None if limits is None else limits.alert,
+        'state': verdict.state,
+        'words': verdict.words,
+        **{name: None if limits is None else getattr(limits, name) for name in names},
         'sessions': 0 if limits is None else limits.n,
         'tolerance': verdict.tolerance,
-    }  # fmt: skip
+    }
+
+
+def qa_words(qa: Mapping[str, Any]) -> str:
+    """State in a line how a session compares with earlier ones."""
+    words = [f'{name}: {one["words"]}' for name, one in qa['figures'].items() if one['words']]
+    compared = f'{qa["state"]}, compared with {qa["earlier_sessions"]} earlier sessions'
+    return ': '.join([compared, *filter(None, ['; '.join(words)])])
 
 
 def figure_rows(found: Assessment, document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     """Return name, value with unit, interval, and state of every figure."""
     judged = document.get('qa', {}).get('figures', {})
-    rows = []
-    for name, estimate in found.estimates.items():
-        state = judged.get(name, {}).get('state', '')
-        rows.append((name, *_texts(estimate, *shown_unit(found, name)), state))
+    figures = dict(found.estimates)
     for name, group in found.groups.items():
-        for key, estimate in group.summary.items():
-            label = f'{name}/{key}'
-            state = judged.get(label, {}).get('state', '')
-            rows.append((label, *_texts(estimate, 1.0, group.unit), state))
-    return rows
+        figures |= {f'{name}/{key}': estimate for key, estimate in group.summary.items()}
+    return [
+        (name, *_texts(one, *shown_unit(found, name)), judged.get(name, {}).get('state', ''))
+        for name, one in figures.items()
+    ]
 
 
 def shown_unit(found: Assessment, name: str) -> tuple[float, str]:
-    """Return the factor from a figure, by its name, to the unit that it is shown in, and that
-    unit.
-    """
+    """Return the factor from a figure, by its name, to the unit that is shown, and that unit."""
     group = found.groups.get(name.rpartition('/')[0])
     if group is not None:
         return 1.0, group.unit

@@ -2,14 +2,14 @@
 
 import argparse
 import contextlib
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.progress import progress_of
+from anser_ros.cli.output import Result
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.manufacture import manufactured
@@ -41,63 +41,53 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = 'example: anser bags --out bags/'
     parser.add_argument(
-        '--setup',
-        default='demo_setup.yaml',
+        '--setup', default='demo_setup.yaml',
         help='setup document: a path, or a file of config/ (%(default)s)',
-    )
+    )  # fmt: skip
     parser.add_argument(
         '--out', type=Path, default=Path('bags'), metavar='DIR',
         help='folder for the bags, made if missing (%(default)s)',
     )  # fmt: skip
     parser.add_argument('--seed', type=int, default=1, help='of board and noise (%(default)s)')
-    parser.add_argument('--json', action='store_true', help='print what was written as JSON')
+    add_json(parser, 'what was written as JSON')
 
 
-def run(args: argparse.Namespace) -> int:
+def work(args: argparse.Namespace, tell: Tell) -> Result:
     """Write factory, moving, metal and scan.mcap; bags of those names are replaced."""
     setup = parse_setup(read_config(args.setup))
     rng = np.random.default_rng(args.seed)
     source = board_source(manufactured(setup, rng))
     make_folder(args.out)
-    scan = GridScan()
-    scanned = World(setup, source, paths=dict.fromkeys(setup.bodies, scan))
-    tall = GridScan(heights_m=SCAN_HEIGHTS_M)
-    scanned_tall = World(setup, source, paths=dict.fromkeys(setup.bodies, tall))
+    scan, tall = GridScan(), GridScan(heights_m=SCAN_HEIGHTS_M)
     frames = int(SECONDS * RATE_HZ)
     # The path stays within the heights that the scan covers, outside which a model is worse.
     path = Lissajous(centre_m=(0.0, 0.0, 0.16), amplitude_m=(0.08, 0.08, 0.02))
-    paths = dict.fromkeys(setup.bodies, path)
+    scanned, scanned_tall, moving = (
+        World(setup, source, paths=dict.fromkeys(setup.bodies, way)) for way in (scan, tall, path)
+    )
     visit = steel_disc(Approach(near_m=(0.05, -0.03, -0.06), start_s=2.0, travel_s=3.0))
+    metal = World(setup, source, paths=dict.fromkeys(setup.bodies, path), metal=[visit])
     static, live = Accuracy(STATIC_NOISE_T), Accuracy()
     sessions = (
         ('factory', scanned, scan.frames, 1.0, None, static),
-        ('moving', World(setup, source, paths=paths), frames, RATE_HZ, OPTICAL_RATE_HZ, live),
-        (
-            'metal',
-            World(setup, source, paths=paths, metal=[visit]),
-            frames,
-            RATE_HZ,
-            OPTICAL_RATE_HZ,
-            live,
-        ),
+        ('moving', moving, frames, RATE_HZ, OPTICAL_RATE_HZ, live),
+        ('metal', metal, frames, RATE_HZ, OPTICAL_RATE_HZ, live),
         ('scan', scanned_tall, tall.frames, 1.0, None, SCAN_ERRORS),
     )
-    written: list[dict[str, Any]] = []
-    with progress_of('recording') as progress:
-        for number, (name, world, count, rate, optical_rate, errors) in enumerate(sessions):
-            progress('recording', number / len(sessions))
-            file = args.out / f'{name}.mcap'
-            with contextlib.suppress(FileNotFoundError):
-                file.unlink()
-            record(
-                str(file), world, frames=count, rate_hz=rate, optical_rate_hz=optical_rate,
-                errors=errors, rng=rng,
-            )  # fmt: skip
-            size = file.stat().st_size
-            written.append({'file': str(bag_file(file)), 'frames': count, 'bytes': size})
-    if args.json:
-        print(json.dumps({'schema': SCHEMA, 'bags': written}, indent=1))
-        return 0
-    for one in written:
-        print(f'{one["file"]}: {one["frames"]} frames, {one["bytes"] / 1e6:.2f} MB, simulated')
-    return 0
+    written = []
+    for rank, (name, world, count, rate, optical_rate, errors) in enumerate(sessions):
+        tell('recording', rank / len(sessions))
+        file = args.out / f'{name}.mcap'
+        with contextlib.suppress(FileNotFoundError):
+            file.unlink()
+        record(
+            str(file), world, frames=count, rate_hz=rate, optical_rate_hz=optical_rate,
+            errors=errors, rng=rng,
+        )  # fmt: skip
+        size = file.stat().st_size
+        written.append({'file': str(bag_file(file)), 'frames': count, 'bytes': size})
+    shown = tuple(
+        f'{one["file"]}: {one["frames"]} frames, {one["bytes"] / 1e6:.2f} MB, simulated'
+        for one in written
+    )
+    return Result({'schema': SCHEMA, 'bags': written}, (), shown)

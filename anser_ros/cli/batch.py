@@ -10,14 +10,15 @@ import contextlib
 import importlib
 import logging
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from anser_ros.cli.commands import OFFLINE
 from anser_ros.cli.folders import make_folder
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, attempt
-from anser_ros.cli.progress import progress_of
-from anser_ros.cli.session_runs import SessionRun, finish, perform, runs_of
+from anser_ros.cli.output import Result
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.session_runs import SessionRun, perform, runs_of, summed_up
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.cli.summary import COMMANDS, Outcome, row_of, write_summary
 from anser_ros.errors import ParameterError
 from anser_ros.parallel import ONE_THREAD, cores
@@ -33,7 +34,7 @@ WORKERS = {
     'distributed.nanny.pre-spawn-environ': dict.fromkeys(ONE_THREAD, '1'),
     'distributed.worker.profile.enabled': False,
 }
-"""What Dask is told for the workers on this machine."""
+"""Settings of Dask for the workers on this machine."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,19 +45,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     verbs = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name in COMMANDS:
+        module, words = OFFLINE[name]
+        model = '' if name == 'calibrate' else '--model config/demo_model.yaml '
         verb = verbs.add_parser(
-            name,
-            help=f'{OFFLINE[name]}, each session by itself',
+            name, help=f'{words}, each session by itself',
             description=f'anser {name} on each session by itself',
-            epilog=f'example: anser batch {name} bags/*.mcap '
-            f'{"" if name == "calibrate" else "--model config/demo_model.yaml "}--out results/',
-        )
-        verb.add_argument('sessions', nargs='+', metavar='BAG', help='.mcap files or bag folders')
-        verb.add_argument(
-            '--out', required=True, type=Path,
-            help='folder for summary.csv, summary.html and one folder per session, made if '
-            'missing',
+            epilog=f'example: anser batch {name} bags/*.mcap {model}--out results/',
         )  # fmt: skip
+        verb.add_argument('sessions', nargs='+', metavar='BAG', help='.mcap files or bag folders')
+        add_out(verb, 'summary.csv, summary.html and one folder per session')
         where = verb.add_mutually_exclusive_group()
         where.add_argument(
             '--scheduler', metavar='ADDRESS',
@@ -67,18 +64,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             '--workers', type=int, default=cores(), metavar='N',
             help='processes on this machine, by default one per core',
         )  # fmt: skip
-        importlib.import_module(f'anser_ros.cli.{name}').add_options(verb)
-        verb.add_argument('--json', action='store_true', help='print the summary on stdout')
+        importlib.import_module(module).add_options(verb)
+        add_json(verb, 'the summary on stdout')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Run the command of the arguments on all sessions."""
     if args.workers < 1:
         raise ParameterError(f'--workers must be at least 1, got {args.workers}')
     runs = runs_of(args.command, args)
     make_folder(args.out)
     found: dict[str, Outcome] = {}
-    with progress_of('starting workers') as tell, _client(args, len(runs)) as (client, threads):
+    with _client(args, len(runs)) as (client, threads):
         sessions = f'{len(runs)} sessions'
         tell(sessions, 0.0)
         for outcome in _outcomes(client, runs, threads):
@@ -86,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
             done = [found[one.name] for one in runs if one.name in found]
             write_summary(args.out, args.command, [row_of(args.command, one) for one in done])
             tell(sessions, len(done) / len(runs))
-    return finish('batch', args.command, [found[one.name] for one in runs], args)
+    return summed_up(args.command, [found[one.name] for one in runs], args.out)
 
 
 @contextlib.contextmanager
@@ -104,7 +101,7 @@ def _client(args: argparse.Namespace, sessions: int) -> Iterator[tuple['Client',
             yield client, 1
         return
     workers = min(args.workers, sessions)
-    # Silent: what becomes of a session is told in its row.
+    # Silent: what becomes of a session stands in its row.
     with (
         dask.config.set(WORKERS),
         LocalCluster(

@@ -1,9 +1,8 @@
 """Fits a field model to recorded sessions."""
 
 import argparse
-import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,12 @@ from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.cli.calibration_figure import draw_choice, draw_populations
-from anser_ros.cli.carry_out import carry_out
+from anser_ros.cli.calibration_figure import choice_figure
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, check_file, loss_notes
-from anser_ros.cli.populations import population_table, populations
-from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.cli.output import Result, check_file, loss_notes, terminal_table, write_files
+from anser_ros.cli.populations import population_figure, population_table, populations
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json, add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.constants import DEGREES
@@ -37,19 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = 'example: anser calibrate bags/scan.mcap --out model.yaml --report report/'
     parser.add_argument('sessions', nargs='+', metavar='SESSION', help='bags to learn from')
-    parser.add_argument(
-        '--out',
-        required=True,
-        type=Path,
-        help='model file to write; its folder is made if missing',
-    )
-    parser.add_argument(
-        '--report',
-        type=Path,
-        help='folder for calibration.json and choice.png, made if missing',
-    )
+    words = 'model file to write; its folder is made if missing'
+    parser.add_argument('--out', required=True, type=Path, help=words)
+    words = 'folder for calibration.json and choice.png, made if missing'
+    parser.add_argument('--report', type=Path, help=words)
     add_options(parser)
-    parser.add_argument('--json', action='store_true', help='print calibration.json on stdout')
+    add_json(parser, 'calibration.json on stdout')
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -92,41 +84,25 @@ def _kinds(text: str) -> tuple[str, ...]:
     return kinds
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command and return the exit code."""
-    return carry_out('calibrate', 'calibrating', work, args)
-
-
-def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result:
+def work(args: argparse.Namespace, tell: Tell) -> Result:
     """Calibrate with the sessions of the arguments, into their files.
 
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Of `add_arguments`.
-    tell : callable
-        Called with the stage and the finished share of it.
-
-    Raises
-    ------
-    FitError
-        When the drawing of the board is the better model, and that is not forced.
+    Raises `FitError` when the drawing of the board is the better model, and that is not forced.
     """
     stated = stated_values(args)
     options = _options(args)
     sessions = [load_session(path).with_stated(stated) for path in args.sessions]
     check_same_board(sessions)
-    lost = [loss_notes(path, one.lost) for path, one in zip(args.sessions, sessions, strict=True)]
     check_file(args.out)
-    if args.report is not None:
-        make_folder(args.report)
+    make_folder(args.report)
     calibration = calibrate_sessions(sessions, options, tell)
     document = to_document(calibration)
-    text = json.dumps(document, indent=1)
     if args.report is not None:
-        (args.report / 'calibration.json').write_text(text + '\n', encoding='utf-8')
-        draw_choice(calibration, args.report / 'choice.png')
-        draw_populations(calibration, args.report / 'populations.png')
+        figures = {
+            'choice.png': choice_figure(calibration),
+            'populations.png': population_figure(calibration.scan.corrections),
+        }
+        write_files(args.report, {'calibration.json': document, **figures})
     if not calibration.better_than_nominal and not args.force:
         raise FitError(
             f'no model written: its held-out error {document["heldout_flux_rmse_t"]:.3g} T is '
@@ -134,15 +110,12 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
             '--force writes it'
         )
     save_model(args.out, calibration.model)
+    lost = [loss_notes(path, one.lost) for path, one in zip(args.sessions, sessions, strict=True)]
     return Result(
         document,
-        (
-            *(note for notes in lost for note in notes),
-            *document['unobservable'],
-            *document['contradictions'],
-        ),
+        (*sum(lost, ()), *document['unobservable'], *document['contradictions']),
         (_table(calibration, document), *_populations(calibration)),
-        (args.out, *(() if args.report is None else (args.report,))),
+        tuple(filter(None, (args.out, args.report))),
     )
 
 
@@ -153,30 +126,24 @@ def _options(args: argparse.Namespace) -> Options:
 
 
 def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
-    table = Table(title='calibration', show_header=False)
-    held_out = calibration.held_out
-    rows: tuple[tuple[str, str], ...] = (
+    rows = [
         ('readings per emitter', f'{document["n_measurements"]}'),
         ('dipoles', calibration.layout.describe()),
         ('damping', f'{calibration.damping:g}'),
         ('residual, T rms', f'{document["flux_rmse_t"]:.4g}'),
         ('held out, T rms', f'{document["heldout_flux_rmse_t"]:.4g}'),
         ('held out, % of the range', f'{document["heldout_n_rmse_percent"]:.4f}'),
-        ("the field model's own error, T", f'{held_out.flux_error_t:.3g}'),
+        ("the field model's own error, T", f'{calibration.held_out.flux_error_t:.3g}'),
         ('noise, T a component', f'{calibration.fit.noise_t:.3g}'),
-    )
+    ]
     if optical := document['optical_noise']:
-        jitter = (
-            f'{1e3 * optical["position_m"]:.3f} mm, {DEGREES * optical["rotation_rad"]:.4f} deg'
-        )
-        rows += (('optical jitter a component, at most', jitter),)
-    for name, value in rows:
-        table.add_row(name, value)
-    for effect in calibration.model.effects:
-        table.add_row(effect.name, _parameters(effect))
+        position, rotation = 1e3 * optical['position_m'], DEGREES * optical['rotation_rad']
+        jitter = f'{position:.3f} mm, {rotation:.4f} deg'
+        rows.append(('optical jitter a component, at most', jitter))
+    rows += [(effect.name, _parameters(effect)) for effect in calibration.model.effects]
     for effect in calibration.scan.reported_effects:
-        table.add_row(f'{effect.name}, not in the model', _parameters(effect))
-    return table
+        rows.append((f'{effect.name}, not in the model', _parameters(effect)))
+    return terminal_table(['', ''], rows, title='calibration', show_header=False)
 
 
 def _parameters(effect: EffectRecord) -> str:
@@ -188,10 +155,8 @@ def _populations(calibration: Calibration) -> Iterator[Table]:
     """A table of each kind in which the sensors differ, as far as the scan says that they do."""
     for record in populations(calibration.scan.corrections):
         head, rows = population_table([record])
-        table = Table(*(name.removeprefix(f'{record.name} ') for name in head), title=record.name)
-        for row in rows:
-            table.add_row(*row)
-        yield table
+        names = [name.removeprefix(f'{record.name} ') for name in head]
+        yield terminal_table(names, rows, title=record.name)
 
 
 def _short(value: Any) -> str:

@@ -1,7 +1,6 @@
 """Compare two evaluations of one session: errors frame by frame, and how often there is a pose."""
 
 import argparse
-import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -10,14 +9,13 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from matplotlib.figure import Figure
 
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import say_written
-from anser_ros.cli.progress import progress_of
+from anser_ros.cli.output import Result, number, terminal_table, write_files
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pictures import save
 from anser_ros.sessions.comparison import (
     Compared,
     ComparedShares,
@@ -33,8 +31,6 @@ SEED = 1
 """Seed of the resamples, so that the same folders give the same intervals."""
 KINDS = (('position', 1e3, 'mm'), ('orientation', DEGREES, 'deg'))
 """What is compared, with the factor to the unit that is shown."""
-
-
 WORDS = {'a': 'first', 'b': 'second', 'neither': '-'}
 
 
@@ -47,46 +43,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('first', type=Path, help='folder that anser evaluate has written')
     parser.add_argument('second', type=Path, help='another one, of the same session')
-    parser.add_argument(
-        '--out',
-        type=Path,
-        help='folder for comparison.json and comparison.png, made if missing',
-    )
-    parser.add_argument('--json', action='store_true', help='print comparison.json on stdout')
+    add_out(parser, 'comparison.json and comparison.png', required=False)
+    add_json(parser, 'comparison.json on stdout')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
-    if args.out is not None:
-        make_folder(args.out)
-    with progress_of('comparing') as tell:
-        check_same_recording(args.first, args.second)
-        one, two = read_errors(args.first), read_errors(args.second)
-        tell('resampling')
-        rng = np.random.default_rng(SEED)
-        found = {kind: compare_errors(one[kind], two[kind], rng) for kind, _, _ in KINDS}
-        shares = compare_shares(read_states(args.first), read_states(args.second), rng)
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Compare the two evaluations."""
+    make_folder(args.out)
+    check_same_recording(args.first, args.second)
+    one, two = read_errors(args.first), read_errors(args.second)
+    tell('resampling')
+    rng = np.random.default_rng(SEED)
+    found = {kind: compare_errors(one[kind], two[kind], rng) for kind, _, _ in KINDS}
+    shares = compare_shares(read_states(args.first), read_states(args.second), rng)
     everything: dict[str, Mapping[str, Compared | ComparedShares]] = {**found, 'coverage': shares}
     document: dict[str, Any] = {
         'schema': SCHEMA, 'first': str(args.first), 'second': str(args.second),
         **{kind: {name: _plain(c) for name, c in all_of.items()}
            for kind, all_of in everything.items()},
     }  # fmt: skip
-    text = json.dumps(document, indent=1)
-    if args.out is not None:
-        (args.out / 'comparison.json').write_text(text + '\n', encoding='utf-8')
-        draw(found, shares, args.out / 'comparison.png')
-    if args.json:
-        print(text)
-        return 0
-    for kind, scale, unit in KINDS:
-        Console().print(_errors(found[kind], f'{kind} error, RMSE, {unit}', scale))
-    Console().print(_shares(shares))
-    print(verdict(everything))
-    print(alone(found['position']))
-    if args.out is not None:
-        say_written(args.out / 'comparison.json', args.out / 'comparison.png')
-    return 0
+    picture = None if args.out is None else draw(found, shares)
+    written = write_files(args.out, {'comparison.json': document, 'comparison.png': picture})
+    ends = ['first', 'second', 'difference, 95 %', 'better']
+    tables = [
+        terminal_table(['name', 'pairs', *ends], _rows(found[kind], scale, 4),
+                       title=f'{kind} error, RMSE, {unit}')
+        for kind, scale, unit in KINDS
+    ]  # fmt: skip
+    rows = _rows(shares, 100.0, 2)
+    tables.append(terminal_table(['name', 'frames', *ends], rows, title='frames with a pose, %'))
+    shown = (*tables, verdict(everything), alone(found['position']))
+    return Result(document, (), shown, written)
 
 
 def _plain(one: Compared | ComparedShares) -> dict[str, Any]:
@@ -116,39 +103,30 @@ def alone(found: Mapping[str, Compared]) -> str:
     return f'Both have {pairs} poses with an error; {", ".join(counted)} has.'
 
 
-def _errors(found: Mapping[str, Compared], title: str, scale: float) -> Table:
-    """One table of at most 80 columns."""
-    table = Table('name', 'pairs', 'first', 'second', 'difference, 95 %', 'better', title=title)
+def _pair(one: Compared | ComparedShares) -> tuple[float, float]:
+    if isinstance(one, Compared):
+        return one.rmse_a, one.rmse_b
+    return one.share_a, one.share_b
+
+
+def _rows(
+    found: Mapping[str, Compared | ComparedShares], scale: float, digits: int
+) -> list[list[str]]:
+    """Rows of a table of at most 80 columns."""
+    rows = []
     for name, one in found.items():
-        cells = [_cell(scale * value, 4) for value in (one.rmse_a, one.rmse_b)]
-        table.add_row(name, str(one.n), *cells, _interval(one, scale, 4), WORDS[one.verdict])
-    return table
-
-
-def _shares(found: Mapping[str, ComparedShares]) -> Table:
-    heads = 'name', 'frames', 'first', 'second', 'difference, 95 %', 'better'
-    table = Table(*heads, title='frames with a pose, %')
-    for name, one in found.items():
-        cells = [_cell(100 * value, 2) for value in (one.share_a, one.share_b)]
-        table.add_row(name, str(one.n), *cells, _interval(one, 100.0, 2), WORDS[one.verdict])
-    return table
-
-
-def _cell(value: float, digits: int) -> str:
-    return '-' if np.isnan(value) else f'{value:.{digits}f}'
-
-
-def _interval(one: Compared | ComparedShares, scale: float, digits: int) -> str:
-    if np.isnan(one.low):
-        return '-'
-    return f'{scale * one.low:+.{digits}f} .. {scale * one.high:+.{digits}f}'
+        interval = f'{scale * one.low:+.{digits}f} .. {scale * one.high:+.{digits}f}'
+        rows.append([
+            name, str(one.n), *(number(value, scale, f'.{digits}f') for value in _pair(one)),
+            '-' if np.isnan(one.low) else interval, WORDS[one.verdict],
+        ])  # fmt: skip
+    return rows
 
 
 def draw(
     found: Mapping[str, Mapping[str, Compared]],
     shares: Mapping[str, ComparedShares],
-    path: Path,
-) -> None:
+) -> Figure:
     """Draw the differences of each name's errors and shares of poses with their intervals.
 
     Left of zero the second evaluation has smaller errors, and right of zero more poses.
@@ -168,11 +146,7 @@ def draw(
             panel.set(xticks=[], xlabel=label)
             continue
         for name, one in all_of.items():
-            row, pair = names.index(name), asdict(one)
-            first, second = (
-                (pair['rmse_a'], pair['rmse_b']) if 'rmse_a' in pair
-                else (pair['share_a'], pair['share_b'])
-            )  # fmt: skip
+            row, (first, second) = names.index(name), _pair(one)
             panel.plot(scale * (second - first), row, 'o', color='C0')
             if np.isfinite(one.low):
                 panel.hlines(row, scale * one.low, scale * one.high, color='C0')
@@ -184,4 +158,4 @@ def draw(
         panel.locator_params(axis='x', nbins=5)
         panel.set_ylim(len(names) - 0.5, -0.5)
     panels[0].set_yticks(np.arange(len(names)), names)
-    save(figure, path)
+    return figure

@@ -20,6 +20,7 @@ from anser_ros.cli import missing
 from anser_ros.cli.demo_report import FROZEN, LIVE, MEANINGS, draw, load, summarise
 from anser_ros.cli.folders import make_new_folder
 from anser_ros.cli.ros_domain import LAST_DOMAIN, VARIABLE, own_domain
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.errors import ParameterError
@@ -51,41 +52,32 @@ SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command line of the demo."""
     parser.epilog = 'example: anser demo --duration 30'
-    parser.add_argument(
-        '--duration',
-        type=float,
-        default=30.0,
-        metavar='S',
-        help='duration, from the first pose on, s',
-    )
-    parser.add_argument(
-        '--out', type=Path, default=Path('recordings'), metavar='DIR',
-        help='folder, made if missing, for a new folder with bag, picture and logs (%(default)s)',
+    words = 'duration, from the first pose on, s'
+    parser.add_argument('--duration', type=float, default=30.0, metavar='S', help=words)
+    add_out(
+        parser, 'a new folder with bag, picture and logs (%(default)s)', required=False,
+        default=Path('recordings'), metavar='DIR',
     )  # fmt: skip
     parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
-    parser.add_argument(
-        '--dashboard', action='store_true', help='serve the live view to a browser, too'
-    )
+    words = 'serve the live view to a browser, too'
+    parser.add_argument('--dashboard', action='store_true', help=words)
     parser.add_argument('--no-metal', action='store_true', help='simulate no steel disc')
     parser.add_argument('--no-picture', action='store_true', help='draw no picture at the end')
-    parser.add_argument(
-        '--draw', type=Path, metavar='DIR',
-        help='only draw the picture of an interrupted demo, from the folder of its results',
-    )  # fmt: skip
-    parser.add_argument('--json', action='store_true', help='print only the summary, as JSON')
+    words = 'only draw the picture of an interrupted demo, from the folder of its results'
+    parser.add_argument('--draw', type=Path, metavar='DIR', help=words)
+    add_json(parser, 'only the summary, as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the demo and return the exit code.
 
-    Raises
-    ------
-    ParameterError
-        When the duration or the rate is out of range, the folder to draw from has no demo, or
-        another demo has the stated ROS domain.
+    Raises `ParameterError` when the duration or the rate is out of range, the folder to draw from
+    has no demo, or another demo has the stated ROS domain.
     """
     if args.draw is not None:
-        return _draw_left(args.draw, args)
+        if not (args.draw / DATA).is_file():
+            raise ParameterError(f'{args.draw} holds no {DATA} of a demo that showed poses')
+        return _report(args.draw, args, interrupted=False)
     if not 1.0 <= args.duration <= 3600.0:
         raise ParameterError(f'--duration must be 1 to 3600 s, got {args.duration:g}')
     if not 1.0 <= args.rate <= 200.0:
@@ -117,7 +109,7 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
             compile_kernels(lambda text: _say(text, args), lambda: bool(stopped))
             if stopped:
                 return _report(folder, args, interrupted=True)
-            for name, command in _commands(folder, ports / 'cu', args):
+            for name, command in _commands(folder, ports / 'cu', args).items():
                 supervisor.start(name, command)
             if args.dashboard:
                 _say(f'live view: http://127.0.0.1:{LIVE_VIEW}/', args)
@@ -145,39 +137,35 @@ def _say(text: str, args: argparse.Namespace) -> None:
         print(text, flush=True)
 
 
-def _draw_left(folder: Path, args: argparse.Namespace) -> int:
-    """Write the summary and the picture of a demo that was interrupted before."""
-    if not (folder / DATA).is_file():
-        raise ParameterError(f'{folder} holds no {DATA} of a demo that showed poses')
-    return _report(folder, args, interrupted=False)
-
-
 def _report(folder: Path, args: argparse.Namespace, *, interrupted: bool) -> int:
+    """Sum the demo up, and draw its picture unless somebody waits for its end."""
     bag, data = folder / 'bag', folder / DATA
     there = bag.is_dir()
     summary: dict[str, object] = {
         'schema': SCHEMA, 'bag': str(bag) if there else None, 'interrupted': interrupted,
+        **(bag_summary(bag) if there else {}),
     }  # fmt: skip
-    if there:
-        summary |= bag_summary(bag)
-    results = load(data) if data.is_file() else None
-    if results is not None:
-        summary |= summarise(results)
+    has_poses = False
+    if data.is_file():
+        results = load(data)
+        figures = summarise(results)
+        has_poses = LIVE in figures['chains']
+        summary |= figures
         if interrupted:  # drawing takes longer than someone who interrupts wants to wait
             summary['draw'] = f'anser demo --draw {folder}'
         elif not args.no_picture:
             draw(results, folder / 'demo.png')
             summary['picture'] = str(folder / 'demo.png')
-    if there and results is not None:
-        summary['evaluate'] = (
-            f'anser evaluate {bag} --model {config_path("demo_model.yaml")} '
-            f'--out {folder / "evaluation"}'
-        )
+        if there:
+            summary['evaluate'] = (
+                f'anser evaluate {bag} --model {config_path("demo_model.yaml")} '
+                f'--out {folder / "evaluation"}'
+            )
     if args.json:
         print(json.dumps(summary, indent=1))
     else:
         _print(summary)
-    if interrupted or args.draw or results is None or LIVE in summarise(results)['chains']:
+    if interrupted or args.draw or not data.is_file() or has_poses:
         return 0
     print('anser demo: the live chain gave no pose; the table says why', file=sys.stderr)
     return 1
@@ -211,16 +199,9 @@ def _print(summary: dict[str, object]) -> None:
 
 
 def node_command(name: str, /, *words: str, **parameters: object) -> list[str]:
-    """Return the command line of a node.
+    """Return the command line of a node, with further ROS arguments and its parameters.
 
-    Parameters
-    ----------
-    name : str
-        Name of the node's module.
-    *words : str
-        Further ROS arguments.
-    **parameters : object
-        Values of the node's parameters; ``NODE__NAME`` is one of several nodes' in one process.
+    ``NODE__NAME`` is a parameter of one of several nodes in one process.
     """
     command = [sys.executable, '-P', '-m', f'anser_ros.nodes.{name}', '--ros-args', *words]
     for key, value in parameters.items():
@@ -229,42 +210,39 @@ def node_command(name: str, /, *words: str, **parameters: object) -> list[str]:
     return command
 
 
-def _commands(folder: Path, port: Path, args: argparse.Namespace) -> list[tuple[str, list[str]]]:
+def in_namespace(namespace: str) -> list[str]:
+    """Return the ROS arguments of a node beside the others, which takes their setup and fluxes."""
+    remaps = [f'{topic}:=/anser/{topic}' for topic in SHARED_TOPICS]
+    return [word for remap in (f'__ns:={namespace}', *remaps) for word in ('-r', remap)]
+
+
+def simulated_unit(port: Path, **parameters: object) -> list[str]:
+    """Return the command line of the simulated control unit."""
+    return node_command(
+        'cu_simulator', link=port, board_seed=BOARD_SEED, sample_rate_hz=SAMPLE_RATE_HZ,
+        **parameters,
+    )  # fmt: skip
+
+
+def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, list[str]]:
+    """The command line of each process by its name."""
     model = config_path('demo_model.yaml')
-    apart = ['-r', f'__ns:=/anser/{FROZEN}']
-    for topic in SHARED_TOPICS:
-        apart += ['-r', f'{topic}:=/anser/{topic}']
-    return [
-        (
-            'cu_simulator',
-            node_command(
-                'cu_simulator',
-                link=port,
-                metal=not args.no_metal,
-                metal_radius_m=METAL_RADIUS_M,
-                board_seed=BOARD_SEED,
-                sample_rate_hz=SAMPLE_RATE_HZ,
-            ),
+    apart = in_namespace(f'/anser/{FROZEN}')
+    commands = {
+        'cu_simulator': simulated_unit(
+            port, metal=not args.no_metal, metal_radius_m=METAL_RADIUS_M
         ),
-        (
-            'live',
-            node_command(
-                'live',
-                acquisition__device=port,
-                acquisition__rate_hz=float(args.rate),
-                field_model__model_file=model,
-                field_model__baseline_at_start=True,
-            ),
+        'live': node_command(
+            'live', acquisition__device=port, acquisition__rate_hz=float(args.rate),
+            field_model__model_file=model, field_model__baseline_at_start=True,
         ),
-        ('field_model_frozen', node_command('field_model', *apart, model_file=model)),
-        ('tracker_frozen', node_command('tracker', *apart, **FROZEN_TRACKER)),
-        ('recorder', node_command('recorder', directory=folder, name='bag')),
-        *(
-            [('dashboard', node_command('dashboard', directory=folder, port=LIVE_VIEW))]
-            if args.dashboard
-            else []
-        ),
-    ]
+        'field_model_frozen': node_command('field_model', *apart, model_file=model),
+        'tracker_frozen': node_command('tracker', *apart, **FROZEN_TRACKER),
+        'recorder': node_command('recorder', directory=folder, name='bag'),
+    }  # fmt: skip
+    if args.dashboard:
+        commands['dashboard'] = node_command('dashboard', directory=folder, port=LIVE_VIEW)
+    return commands
 
 
 def _monitor(data: Path, args: argparse.Namespace) -> list[str]:

@@ -86,9 +86,10 @@ def _shown_target(results: Results) -> int:
     return len(counts) - 1 if counts[-1] else int(np.argmax(counts))
 
 
-def _behind_first(results: Results) -> list[int]:
-    """Return the ranks of the chains so that the live one is drawn last and lies on top."""
-    return list(reversed(range(len(results['chains']))))
+def _chains(results: Results) -> list[tuple[int, str, str]]:
+    """Return rank, name and colour of the chains; the live one is last, to be drawn on top."""
+    names = [str(name) or LIVE for name in results['chains']]
+    return list(zip(range(len(names)), names, COLOURS, strict=False))[::-1]
 
 
 def broken(stamp_s: NDArray[np.float64], values: NDArray[np.float64]) -> Any:
@@ -99,52 +100,39 @@ def broken(stamp_s: NDArray[np.float64], values: NDArray[np.float64]) -> Any:
 
 
 def _draw_path(axes: Any, results: Results, shown: int, first: int, second: int) -> None:
-    letters = 'xyz'
-    name = str(results['names'][shown])
-    if f'optical_{name}' in results:
-        stamps, true = results[f'optical_{name}'][:, 0], 1e3 * results[f'optical_{name}'][:, 1:]
+    sides = [first, second]
+    optical = results.get(f'optical_{results["names"][shown]}')
+    if optical is not None:
+        stamps, true = optical[:, 0], 1e3 * optical[:, 1:]
         tracked_s = results[f'stamp_0_{shown}']
         if tracked_s.size:
             true = true[(stamps >= tracked_s[0]) & (stamps <= tracked_s[-1])]
-        axes.plot(true[:, first], true[:, second], color='0.6', lw=4, label='true path')
-    for rank in _behind_first(results):
-        chain = str(results['chains'][rank]) or LIVE
+        axes.plot(*true[:, sides].T, color='0.6', lw=4, label='true path')
+    for rank, chain, colour in _chains(results):
         stamp, position = results[f'stamp_{rank}_{shown}'], results[f'position_{rank}_{shown}']
         if len(position):
             tracked = 1e3 * broken(stamp, position)[1]
-            axes.plot(
-                tracked[:, first], tracked[:, second], lw=1.0, color=COLOURS[rank],
-                label=f'tracked, {chain}',
-            )  # fmt: skip
-    axes.set_xlabel(f'{letters[first]}, mm')
-    axes.set_ylabel(f'{letters[second]}, mm')
+            axes.plot(*tracked[:, sides].T, lw=1.0, color=colour, label=f'tracked, {chain}')
+    axes.set(xlabel=f'{"xyz"[first]}, mm', ylabel=f'{"xyz"[second]}, mm')
     axes.set_aspect('equal', adjustable='datalim')
 
 
 def _draw_error(axes: Any, results: Results, shown: int) -> None:
     begin = float(results[f'stamp_0_{shown}'][0]) if len(results[f'stamp_0_{shown}']) else 0.0
     end = begin
-    for rank in _behind_first(results):
+    for rank, chain, colour in _chains(results):
         stamp = results[f'stamp_{rank}_{shown}']
         end = max(end, float(stamp[-1])) if stamp.size else end
-        error = 1e3 * results[f'error_{rank}_{shown}']
-        chain = str(results['chains'][rank]) or LIVE
-        axes.plot(
-            stamp - begin, error, '.', ms=2.5, color=COLOURS[rank],
-            label=f'error, {chain}: {MEANINGS[chain]}',
-        )  # fmt: skip
+        error, label = 1e3 * results[f'error_{rank}_{shown}'], f'error, {chain}: {MEANINGS[chain]}'
+        axes.plot(stamp - begin, error, '.', ms=2.5, color=colour, label=label)
     stamp, sigma = results[f'stamp_0_{shown}'], 1e3 * results[f'sigma_0_{shown}']
     if stamp.size:
         at, level = broken(stamp - begin, _smoothed(sigma))
-        axes.fill_between(
-            at, level / 2, 2 * level, color='k', alpha=0.15, lw=0,
-            label='half to twice the sigma, live',
-        )  # fmt: skip
+        words = 'half to twice the sigma, live'
+        axes.fill_between(at, level / 2, 2 * level, color='k', alpha=0.15, lw=0, label=words)
     _shade_metal(axes, results['metal'], begin)
-    axes.set_yscale('log')
+    axes.set(xlabel='time, s', ylabel='position error, mm', yscale='log')
     axes.set_xlim(0.0, max(end - begin, 1.0))
-    axes.set_xlabel('time, s')
-    axes.set_ylabel('position error, mm')
     axes.grid(alpha=0.3, which='both')
 
 
@@ -160,12 +148,10 @@ def _shade_metal(axes: Any, metal: NDArray[np.float64], begin: float) -> None:
     near = metal[metal[:, 1] < METAL_NEAR_M, 0] - begin
     if not near.size:
         return
-    breaks = np.flatnonzero(np.diff(near) > VISITS_APART_S)
-    starts = near[np.concatenate([[0], breaks + 1])]
-    ends = near[np.concatenate([breaks, [near.size - 1]])]
-    for rank, (start, end) in enumerate(zip(starts, ends, strict=True)):
+    visits = np.split(near, np.flatnonzero(np.diff(near) > VISITS_APART_S) + 1)
+    for rank, visit in enumerate(visits):
         label = 'metal near' if rank == 0 else None
-        axes.axvspan(start, end, color='tab:red', alpha=0.12, label=label)
+        axes.axvspan(visit[0], visit[-1], color='tab:red', alpha=0.12, label=label)
 
 
 def _joined(results: Results, kind: str, rank: int) -> NDArray[np.float64]:

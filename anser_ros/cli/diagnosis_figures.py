@@ -10,30 +10,24 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from anser_ros.cli.evaluation_figures import WIDE
+from anser_ros.cli.html_page import AFTER, BEFORE, legend_under
 from anser_ros.diagnosis.problem import Part, State
 from anser_ros.diagnosis.residuals import tool_parts
-from anser_ros.pictures import spell_out
+from anser_ros.pictures import WIDE, legend_beside, spell_out
 
 Array = NDArray[np.float64]
-
-BEFORE, AFTER = '#c44e52', '#4c72b0'
-"""Colours of the residuals without and with the effects that were found."""
 
 
 def strongest(state: State) -> str:
     """State in words on which channel and emitter the residual is largest."""
     largest = []
     parts = tool_parts(state)
-    emitters = state.problem.fields.omega.size
-    for kind, axis in (('channel', 1), ('emitter', 2)):
+    for kind, axis in (('channel', 1), ('emitter', 0)):
         sizes: dict[int, float] = {}
         for part in parts:
-            channels = part.view.sensors.channel
-            cells = _rms(part, 0).reshape(2, len(channels), emitters)
-            values = np.sqrt(np.mean(cells**2, axis=(0, 3 - axis)))
-            names = channels.tolist() if kind == 'channel' else range(emitters)
-            for name, value in zip(names, values.tolist(), strict=True):
+            values = np.sqrt(_power(part).mean(axis=axis)).tolist()
+            names = part.view.sensors.channel.tolist() if axis else range(len(values))
+            for name, value in zip(names, values, strict=True):
                 sizes[name] = max(sizes.get(name, 0.0), value)
         worst = max(sizes, key=lambda name: sizes[name])
         usual = float(np.median(list(sizes.values())))
@@ -48,6 +42,12 @@ def _rms(part: Part, axis: int) -> Array:
     return np.asarray(
         np.sqrt((part.white**2 * good).sum(axis=axis) / np.maximum(good.sum(axis=axis), 1))
     )
+
+
+def _power(part: Part) -> Array:
+    """Mean square of the residual by channel and emitter."""
+    sensors, emitters = part.view.flux.shape[1:]
+    return np.asarray((_rms(part, 0) ** 2).reshape(2, sensors, emitters).mean(axis=0))
 
 
 def time_line(before: State, after: State) -> Figure:
@@ -65,15 +65,8 @@ def time_line(before: State, after: State) -> Figure:
     if sizes.max() > WIDE * sizes.min():
         axes.set(yscale='log')
         spell_out(axes.yaxis)
-    _legend_beside(figure, axes)
+    legend_beside(figure)
     return figure
-
-
-def _legend_beside(figure: Figure, axes: Any) -> None:
-    """One entry a label, where it covers nothing that is drawn."""
-    handles, labels = axes.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    figure.legend(unique.values(), unique.keys(), loc='outside right upper', fontsize=8)
 
 
 def maps(before: State, after: State) -> Figure:
@@ -95,14 +88,8 @@ def maps(before: State, after: State) -> Figure:
 def course(path: dict[str, Any], sigma: Any, state: State) -> Figure:
     """Draw where something was, from above and over time, with the tool's places and the board.
 
-    Parameters
-    ----------
-    path : mapping
-        ``time_s`` (P,) and ``position_m`` (P, 3) in fg.
-    sigma : array_like, shape (P, 3) or (P,), or None
-        Standard deviation of the positions, m.
-    state : State
-        Holds where the tool was.
+    ``path`` has ``time_s`` (P,) and ``position_m`` (P, 3) in fg; ``sigma``, m, is (P, 3), (P,) or
+    None; ``state`` holds where the tool was.
     """
     figure, (above, over) = plt.subplots(1, 2, figsize=(9, 3.6), layout='constrained')
     time, place = np.asarray(path['time_s']), 1e3 * np.asarray(path['position_m'])
@@ -120,7 +107,7 @@ def course(path: dict[str, Any], sigma: Any, state: State) -> Figure:
             over.fill_between(time, low, high, color=BEFORE, alpha=0.12, lw=0)
     over.set(xlabel='time, s', ylabel='position, mm')
     for panel in (above, over):
-        panel.legend(fontsize=8, loc='upper center', bbox_to_anchor=(0.5, -0.16), ncols=3)
+        legend_under(panel)
         panel.grid(alpha=0.3)
     return figure
 
@@ -137,24 +124,15 @@ def bars(before: State, after: State) -> Figure:
             panel.set_xticks(np.arange(len(names)), names)
             panel.set_xlabel(axis)
     panels[0].set_ylabel('residual / expected')
-    _legend_beside(figure, panels[0])
+    legend_beside(figure)
     return figure
 
 
 def _by(state: State, axis: str) -> tuple[list[str], Array]:
     """Return the names of all channels or emitters, and the residual of each."""
-    names: list[str] = []
-    sizes: list[float] = []
-    squares: Array | None = None
-    for part in tool_parts(state):
-        sensors, emitters = part.view.flux.shape[1:]
-        size = (_rms(part, 0) ** 2).reshape(2, sensors, emitters).mean(axis=0)
-        if axis == 'channel':
-            names += [str(c) for c in part.view.sensors.channel.tolist()]
-            sizes += np.sqrt(size.mean(axis=1)).tolist()
-        else:
-            squares = size.mean(axis=0) if squares is None else squares + size.mean(axis=0)
-            names = [str(k) for k in range(emitters)]
-    if squares is not None:
-        sizes = np.sqrt(squares / len(tool_parts(state))).tolist()
-    return names, np.array(sizes)
+    parts = tool_parts(state)
+    if axis == 'channel':
+        names = [str(c) for part in parts for c in part.view.sensors.channel.tolist()]
+        return names, np.sqrt(np.concatenate([_power(part).mean(axis=1) for part in parts]))
+    size = np.sqrt(np.mean([_power(part).mean(axis=0) for part in parts], axis=0))
+    return [str(k) for k in range(len(size))], size

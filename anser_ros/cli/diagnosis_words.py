@@ -3,6 +3,9 @@
 from collections import Counter
 from typing import Any
 
+from anser_ros.cli.output import number
+from anser_ros.physics.constants import DEGREES
+
 LONGEST = 9
 """Most numbers of a parameter that are shown in a line: those of a 3 x 3 matrix. Longer ones stand
 in diagnosis.json, paths in a table of the report too."""
@@ -19,21 +22,34 @@ def flux_unit(size_t: float) -> tuple[float, str]:
     return next((factor, unit) for most, factor, unit in FLUX_UNITS if size_t < most)
 
 
+def held_out_rows(document: dict[str, Any]) -> list[list[str]]:
+    """Return the errors on held-out data, before and after, and the noise floor, as a table."""
+    held = document['held_out']
+    factor, shown = flux_unit(held['flux_rms_before_t'])
+    rows = []
+    for label, key, unit, scale in (
+        (f'flux residual, {shown} rms', 'flux_rms', 't', factor),
+        ('position RMSE of the coils, mm', 'position_rmse', 'm', 1e3),
+        ('orientation RMSE of the coils, deg', 'orientation_rmse', 'rad', DEGREES),
+    ):
+        pair = [held[f'{key}_{when}_{unit}'] for when in ('before', 'after')]
+        if pair != [None, None] or key == 'flux_rms':
+            rows.append([label, *(number(value, scale, '.4g') for value in pair)])
+    floor = number(held['flux_rms_floor_t'], factor, '.4g')
+    return [*rows, [f'noise floor of the flux, {shown} rms', '', floor]]
+
+
 def verdict(document: dict[str, Any]) -> str:
     """State in one short paragraph what was found and what stays unexplained.
 
     Effects are named with their parameters if there is room, otherwise without.
     """
     effects = document['effects']
-    for named in (_with_values, _by_name):
-        text = _paragraph(document, named(effects))
+    for names in (', '.join(map(_named, effects)), _by_name(effects)):
+        text = _paragraph(document, names)
         if len(text) < MOST_CHARACTERS:
             return text
     return _paragraph(document, 'see the table of effects')
-
-
-def _with_values(effects: list[dict[str, Any]]) -> str:
-    return ', '.join(_named(effect) for effect in effects)
 
 
 def _by_name(effects: list[dict[str, Any]]) -> str:

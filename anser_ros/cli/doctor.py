@@ -12,20 +12,20 @@ import shutil
 import stat
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from anser_ros.cli.commands import NODES
 from anser_ros.cli.missing import OPTIONAL, PYPI, ROS_REMEDY
-from anser_ros.cli.progress import progress_of
+from anser_ros.cli.output import Result, terminal_table
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json
 from anser_ros.errors import ParameterError
 
 SCHEMA = 'anser_doctor/1'
@@ -53,8 +53,7 @@ TIMEX_BYTES = 512
 """Room for the kernel's record of its clock, bytes: more than any of its versions takes."""
 
 
-@dataclass(frozen=True)
-class Observation:
+class Observation(NamedTuple):
     """Holds one thing that was looked at: how it is, and what to do where it is not well."""
 
     name: str
@@ -70,59 +69,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--seconds', type=float, default=LOOK_S, help='how long to look at the graph, s'
     )
-    parser.add_argument('--json', action='store_true', help='print the findings as JSON')
+    add_json(parser, 'the findings as JSON')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command: 0 where nothing is wrong, 2 where something is."""
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Look at everything; the exit code is 2 where something is wrong."""
     if not 0.0 < args.seconds <= LONGEST_LOOK_S:
         raise ParameterError(
             f'--seconds must be above 0 and at most {LONGEST_LOOK_S:g}, got {args.seconds:g}'
         )
-    with progress_of('looking') as tell:
-        findings: list[Observation] = []
-        for name, look in looks(args.device, args.seconds):
-            tell(f'looking at {name}')
-            findings += look()
-    problems = [finding for finding in findings if finding.state == BAD]
-    if args.json:
-        listed = [asdict(finding) for finding in findings]
-        print(json.dumps({'schema': SCHEMA, 'problems': len(problems), 'findings': listed}))
-    else:
-        Console().print(_table(findings))
-        several = '' if len(problems) == 1 else 's'
-        print(f'{len(problems)} problem{several}' if problems else 'nothing is wrong')
-    return 2 if problems else 0
-
-
-def looks(
-    device: str | None, seconds: float
-) -> Iterator[tuple[str, Callable[[], list[Observation]]]]:
-    """Return everything that is looked at, by what it is called."""
-    yield 'Python', python
-    yield 'packages', packages
-    yield 'kernels', kernels
-    yield 'ports', lambda: ports(device)
-    yield 'clock', clock
-    yield 'disk', lambda: disk(Path.cwd())
-    yield 'the domain', domain
-    yield 'the graph', lambda: graph(seconds)
+    looks: dict[str, Callable[[], list[Observation]]] = {
+        'Python': python,
+        'packages': packages,
+        'kernels': kernels,
+        'ports': lambda: ports(args.device),
+        'clock': clock,
+        'disk': lambda: disk(Path.cwd()),
+        'the domain': domain,
+        'the graph': lambda: graph(args.seconds),
+    }
+    findings: list[Observation] = []
+    for name, look in looks.items():
+        tell(f'looking at {name}')
+        findings += look()
+    count = sum(finding.state == BAD for finding in findings)
+    words = f'{count} problem{"s" if count > 1 else ""}' if count else 'nothing is wrong'
+    listed = [finding._asdict() for finding in findings]
+    document = {'schema': SCHEMA, 'problems': count, 'findings': listed}
+    return Result(document, (), (_table(findings), words), code=2 if count else 0)
 
 
 def _table(findings: list[Observation]) -> Table:
-    table = Table('', 'found', 'remedy')
-    for one in findings:
-        name = f'[{COLOURS[one.state]}]{escape(one.name)}'
-        table.add_row(name, escape(one.found), escape(one.remedy))
-    return table
+    rows = [
+        [f'[{COLOURS[one.state]}]{escape(one.name)}', escape(one.found), escape(one.remedy)]
+        for one in findings
+    ]
+    return terminal_table(['', 'found', 'remedy'], rows)
 
 
 def python() -> list[Observation]:
     """Check the interpreter: whether it is one that is tested."""
-    own, words = sys.version_info[:2], sys.version.split()[0]
-    tested = ' and '.join('.'.join(map(str, one)) for one in TESTED)
-    if own in TESTED:
+    words = sys.version.split()[0]
+    if sys.version_info[:2] in TESTED:
         return [Observation('Python', GOOD, words)]
+    tested = ' and '.join('.'.join(map(str, one)) for one in TESTED)
     return [Observation('Python', NOTE, words, f'tested are {tested}')]
 
 
@@ -209,9 +199,7 @@ def _group(name: str) -> str:
 
 
 def clock(tool: str = 'timedatectl') -> list[Observation]:
-    """Check the system's clock: whether something keeps it right, as poses of two machines
-    need it.
-    """
+    """Check the system's clock: whether something keeps it right, as two machines need it."""
     said = ''
     if shutil.which(tool) is not None:
         command = [tool, 'show', '-p', 'NTPSynchronized', '--value']

@@ -2,7 +2,6 @@
 
 import argparse
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,9 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.error_map import ErrorMap, HeldOutError, learn_error_map
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import say_written
-from anser_ros.cli.progress import progress_of
+from anser_ros.cli.output import Result, write_files
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.errors import FitError, ParameterError, PlausibilityError
 from anser_ros.poses.point_model import to_point_model
 from anser_ros.sessions.plausibility import check_points
@@ -39,63 +39,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'CSV with the columns {", ".join((*TRACKED, *TRUE))}; or, with --true, tracked '
         f'positions: a CSV with {", ".join(TRACKED)}, or a list of 3D Slicer ({MARKUPS}, mm)',
     )  # fmt: skip
-    parser.add_argument(
-        '--true',
-        type=Path,
-        metavar='PLACES',
-        help='the true positions, one row per tracked position',
-    )
+    words = 'the true positions, one row per tracked position'
+    parser.add_argument('--true', type=Path, metavar='PLACES', help=words)
     parser.add_argument(
         '--register', action='store_true',
         help='the true positions are in another frame: a shift and a rotation between both are '
         'not counted as errors',
     )  # fmt: skip
-    parser.add_argument(
-        '--out',
-        required=True,
-        type=Path,
-        help='folder for error_map.json and model.yaml, made if missing',
-    )
+    add_out(parser, 'error_map.json and model.yaml')
     parser.add_argument(
         '--sensor', default='sensor', help='name of the sensor whose poses the model corrects'
     )
     parser.add_argument(
         '--apply', type=Path, metavar='POSES', help='CSV to correct, e.g. poses.csv of evaluate'
     )
-    parser.add_argument('--json', action='store_true', help='print error_map.json on stdout')
+    add_json(parser, 'error_map.json on stdout')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command and return the exit code."""
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Learn a map, and correct the poses of ``--apply``."""
     make_folder(args.out)
     tracked, true = _points(args)
     try:
         check_points(tracked, true)
     except PlausibilityError as error:
         raise PlausibilityError(f'{args.points}: {error}') from error
-    with progress_of('learning') as tell:
-        tell(f'a map of {len(tracked)} places')
-        error_map = learn_error_map(tracked, true, registers=args.register)
+    tell(f'a map of {len(tracked)} places')
+    error_map = learn_error_map(tracked, true, registers=args.register)
     if args.apply is not None:
-        poses, names = _read(args.apply)
-        places = _numbers(args.apply, poses, TRACKED)
+        names, poses = _read(args.apply)
+        places = numbers_of(args.apply, poses, TRACKED, with_gaps=True)
         corrected = error_map.apply(places) if error_map.is_confirmed else places
-    text = json.dumps(to_document(error_map), indent=1)
-    (args.out / 'error_map.json').write_text(text + '\n', encoding='utf-8')
-    model = to_point_model(error_map, args.sensor, str(args.points))
-    text_of_model = yaml.safe_dump(model, sort_keys=False)
-    (args.out / 'model.yaml').write_text(text_of_model, encoding='utf-8')
+    document = to_document(error_map)
+    model = yaml.safe_dump(
+        to_point_model(error_map, args.sensor, str(args.points)), sort_keys=False
+    )
+    written = write_files(args.out, {'error_map.json': document, 'model.yaml': model})
     if args.apply is not None:
-        _write(args.out / 'corrected.csv', poses, names, corrected)
-    if args.json:
-        print(text)
-    else:
-        print(verdict(error_map))
-        files = ['error_map.json', 'model.yaml'] + (
-            [] if args.apply is None else ['corrected.csv']
-        )
-        say_written(*(args.out / name for name in files))
-    return 0
+        written = (*written, args.out / 'corrected.csv')
+        _write(written[-1], poses, names, corrected)
+    return Result(document, (), (verdict(error_map),), written)
 
 
 def verdict(error_map: ErrorMap) -> str:
@@ -118,12 +101,10 @@ def _points(args: argparse.Namespace) -> tuple[Array, Array]:
     if args.true is None:
         if args.points.suffix == MARKUPS:
             raise ParameterError(f'{args.points} has tracked positions only; --true is needed')
-        rows, _ = _read(args.points)
-        return _numbers(args.points, rows, TRACKED), _numbers(args.points, rows, TRUE)
-    tracked, true = (
-        read_fiducials(path) if path.suffix == MARKUPS else _numbers(path, _read(path)[0], TRACKED)
-        for path in (args.points, args.true)
-    )
+        _, rows = _read(args.points)
+        tracked, true = (numbers_of(args.points, rows, n, with_gaps=True) for n in (TRACKED, TRUE))
+        return tracked, true
+    tracked, true = map(_places, (args.points, args.true))
     if len(tracked) != len(true):
         raise ParameterError(
             f'{args.points} has {len(tracked)} positions and {args.true} {len(true)}; '
@@ -159,15 +140,18 @@ def _plain(error: HeldOutError) -> dict[str, float | None]:
     }
 
 
-def _read(path: Path) -> tuple[list[dict[str, str]], list[str]]:
+def _places(path: Path) -> Array:
+    """Positions of a list of points, or of a table."""
+    if path.suffix == MARKUPS:
+        return read_fiducials(path)
+    return numbers_of(path, _read(path)[1], TRACKED, with_gaps=True)
+
+
+def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     names, rows = read_rows(path)
     if not rows:
         raise FitError(f'{path}: no rows')
-    return rows, names
-
-
-def _numbers(path: Path, rows: list[dict[str, str]], names: tuple[str, ...]) -> Array:
-    return numbers_of(path, rows, names, with_gaps=True)
+    return names, rows
 
 
 def _write(path: Path, rows: list[dict[str, str]], names: list[str], places: Array) -> None:

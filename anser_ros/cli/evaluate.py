@@ -1,22 +1,23 @@
 """Track recorded sessions and compare their poses with the optical ones."""
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
-from anser_ros.cli.carry_out import carry_out
-from anser_ros.cli.evaluation_figures import write_figures
+from anser_ros.cli.commands import SESSION_KINDS
+from anser_ros.cli.evaluation_figures import ERRORS_HEAD, error_rows, write_figures
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, loss_notes, snapshot_notes
-from anser_ros.cli.pose_session import add_pose_options, evaluate_pose_session, need_model
-from anser_ros.cli.progress import Tell, progress_of
-from anser_ros.cli.session_runs import finish, perform, runs_of
-from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
+from anser_ros.cli.output import Result, loss_notes, terminal_table, write_files
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.session_kinds import add_session_kinds, named_kind, need_model, snapshot_notes
+from anser_ros.cli.session_runs import perform, runs_of, summed_up
+from anser_ros.cli.stated_values import (
+    add_json,
+    add_list,
+    add_session_options,
+    stated_values,
+)
 from anser_ros.errors import ParameterError
-from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.chosen_references import parse_references, with_references
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import recording_of, to_document
@@ -26,6 +27,9 @@ from anser_ros.sessions.pose_table import write_tables
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
+
+ALONE = ('refit', 'baseline', 'patch', 'references', 'witnesses', 'in_phase', *SESSION_KINDS)
+"""Options that do not go together with ``--known-metal``."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,103 +42,72 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'sessions', nargs='+', metavar='BAG', help='bags to track (.mcap files or bag folders)'
     )
     parser.add_argument(
-        '--out',
-        required=True,
-        type=Path,
+        '--out', required=True, type=Path,
         help='folder for the results, made if missing; with several bags each has a folder in '
         'it, and summary.csv and summary.html summarise them',
-    )
+    )  # fmt: skip
     add_options(parser)
-    parser.add_argument(
-        '--json', action='store_true', help='print evaluation.json, or the summary, on stdout'
-    )
+    add_json(parser, 'evaluation.json, or the summary, on stdout')
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options that hold for every session."""
-    parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
-    parser.add_argument('--baseline', help='distortion-free recording of the same board')
+    add_session_options(parser)
     parser.add_argument(
         '--refit', action='store_true', help='let the model follow the reference sensors'
     )
     parser.add_argument(
-        '--references',
-        metavar='CHANNEL,...|none',
+        '--references', metavar='CHANNEL,...|none',
         help='reference sensors that the refit may use; the others are ignored',
-    )
+    )  # fmt: skip
     parser.add_argument(
-        '--witnesses',
-        action='store_true',
+        '--witnesses', action='store_true',
         help='let the refit also use contradictions among the coils of rigid tools; for few '
         'references',
-    )
+    )  # fmt: skip
     parser.add_argument(
-        '--known-metal',
-        type=Path,
-        metavar='FILE',
+        '--known-metal', type=Path, metavar='FILE',
         help='metal that anser known_metal has learnt: let the model follow it by the tools, '
         'without references',
-    )
-    parser.add_argument(
-        '--patch',
-        action='append',
-        default=[],
-        metavar='BODY=TOPIC',
+    )  # fmt: skip
+    add_list(
+        parser, '--patch', metavar='BODY=TOPIC',
         help='body that carries reference coils too, and the topic of its poses in the bag',
-    )
-    add_resurveyed(parser)
+    )  # fmt: skip
     parser.add_argument(
         '--in-phase', action='store_true', help="use in-phase fluxes only, the article's way"
     )
     parser.add_argument(
-        '--gate',
-        type=float,
-        default=TrackerSettings().gate,
+        '--gate', type=float, default=TrackerSettings().gate,
         help='largest residual of a pose, in units of the expected one; inf withholds none (only '
         'to see the error that a wrong model would cause)',
-    )
-    add_pose_options(parser)
-    add_stated_values(parser, 'accuracy', 'refit', 'tools')
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
-    if len(args.sessions) > 1:
-        return _several(args)
-    args.session = args.sessions[0]
-    return carry_out('evaluate', 'evaluating', work, args)
-
-
-def _several(args: argparse.Namespace) -> int:
-    """Evaluate one session after the other, and sum them up."""
-    runs = runs_of('evaluate', args)
-    make_folder(args.out)
-    outcomes = []
-    with progress_of('evaluating') as tell:
-        for count, one in enumerate(runs):
-            tell('evaluating', count / len(runs))
-            outcomes.append(perform(one))
-    return finish('evaluate', 'evaluate', outcomes, args)
+    )  # fmt: skip
+    add_session_kinds(parser)
 
 
 def work(args: argparse.Namespace, tell: Tell) -> Result:
-    """Evaluate the session of the arguments into its folder.
+    """Evaluate the session of the arguments into its folder; several one after the other."""
+    if len(args.sessions) == 1:
+        args.session = args.sessions[0]
+        return _one(args, tell)
+    runs = runs_of('evaluate', args)
+    make_folder(args.out)
+    outcomes = []
+    for count, one in enumerate(runs):
+        tell('evaluating', count / len(runs))
+        outcomes.append(perform(one))
+    return summed_up('evaluate', outcomes, args.out)
 
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Of `add_arguments`, and ``session``, the one to evaluate.
-    tell : callable
-        Called with the stage, and the finished share of it where that is known.
-    """
-    others = ('refit', 'baseline', 'patch', 'references', 'witnesses', 'in_phase', 'poses')
-    given = [f'--{name.replace("_", "-")}' for name in others if getattr(args, name)]
+
+def _one(args: argparse.Namespace, tell: Tell) -> Result:
+    given = [f'--{name.replace("_", "-")}' for name in ALONE if getattr(args, name)]
     if args.known_metal is not None and given:
         raise ParameterError(
             f'--known-metal follows metal by the tools alone; leave out {", ".join(given)}'
         )
-    if args.poses:
-        return evaluate_pose_session(args, tell)
+    if kind := named_kind(args):
+        done: Result = kind.evaluate(args, tell)
+        return done
     need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
     if args.witnesses and not args.refit:
@@ -148,26 +121,18 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     known = None if args.known_metal is None else load_known_metal(args.known_metal)
     make_folder(args.out)
     evaluation = track_session(
-        session,
-        model,
-        TrackerSettings(gate=args.gate),
-        baseline=baseline,
-        refit=args.refit,
-        in_phase=args.in_phase,
-        patches=parse_patches(args.patch),
-        witnesses=args.witnesses,
-        known_metal=known,
-        progress=lambda share: tell('tracking', share),
-    )
+        session, model, TrackerSettings(gate=args.gate), baseline=baseline, refit=args.refit,
+        in_phase=args.in_phase, patches=parse_patches(args.patch), witnesses=args.witnesses,
+        known_metal=known, progress=lambda share: tell('tracking', share),
+    )  # fmt: skip
     document = {**to_document(evaluation), 'recording': recording_of(session)}
-    text = json.dumps(document, indent=1)
-    (args.out / 'evaluation.json').write_text(text + '\n', encoding='utf-8')
-    written = [args.out / 'evaluation.json', *write_tables(args.out, evaluation)]
+    written = list(write_files(args.out, {'evaluation.json': document}))
+    written += write_tables(args.out, evaluation)
     written += write_figures(
         evaluation, document, args.out, session=args.session, model=args.model,
         jitter_m=session.setup.accuracy.optical_position_m,
     )[-1:]  # fmt: skip
-    shown: list[Any] = [_table(document)]
+    shown: list[Any] = [terminal_table(ERRORS_HEAD, error_rows(document))]
     if 'refit' in document:
         shown.append(_refit_line(document['refit'], known is not None))
     notes = (
@@ -196,25 +161,3 @@ def _refit_line(refit: dict[str, dict[str, int]], known: bool) -> str:
     if known:
         return f'known metal: {states}'
     return f'refit: {states or "no frame"}; left out: {out or "no reference"}'
-
-
-def _table(document: dict[str, Any]) -> Table:
-    table = Table('sensor', 'frames', 'tracked', 'RMSE mm', 'PRC95 mm', 'RMSE deg', 'PRC95 deg')
-    for group in ('sensors', 'bodies', 'sources'):
-        for name, row in document.get(group, {}).items():
-            cells = [
-                _cell(row[key], scale)
-                for key, scale in (
-                    ('position_rmse_m', 1e3),
-                    ('position_prc95_m', 1e3),
-                    ('orientation_rmse_rad', DEGREES),
-                    ('orientation_prc95_rad', DEGREES),
-                )
-            ]
-            shown = f'source seen from {name}' if group == 'sources' else name
-            table.add_row(shown, str(row['n']), f'{row["tracked_fraction"]:.1%}', *cells)
-    return table
-
-
-def _cell(value: float | None, scale: float) -> str:
-    return '-' if value is None else f'{value * scale:.3f}'

@@ -3,8 +3,6 @@
 Each figure is a PNG of its own, and all stand in one page that needs nothing else.
 """
 
-import base64
-import html
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,9 +13,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from anser_ros.cli.html_page import page
+from anser_ros.cli.html_page import Html, heading, page, picture, table, top
+from anser_ros.cli.output import number
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pictures import legend_below, save, spell_out
+from anser_ros.pictures import WIDE, legend_below, save, spell_out
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import PoseSeries
 
@@ -26,26 +25,14 @@ Array = NDArray[np.float64]
 MOST_POINTS = 4000
 """Most points that a figure shows of one coil: more cannot be distinguished, and make files
 large."""
-WIDE = 4.0
-"""Largest over smallest value from which their axis is logarithmic: on a shorter one, labels at 1,
-2 and 5 are too few."""
 COVERAGE_SIGMAS = np.linspace(0.0, 4.0, 81)
 """Multiples of sigma for which the share of errors within is drawn, to where all should be."""
-STYLE = """
-body { font: 15px/1.5 sans-serif; max-width: 62em; margin: 2em auto; padding: 0 1em; color: #222 }
-table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .25em .8em; text-align: right;
-border-bottom: 1px solid #ddd } td:first-child, th:first-child { text-align: left }
-th { background: #f4f4f4 } img { max-width: 100% } .note { color: #666 }
-"""
+ERRORS_HEAD = ('sensor', 'frames', 'tracked', 'RMSE mm', 'PRC95 mm', 'RMSE deg', 'PRC95 deg')
+"""Head of the table of `error_rows`."""
 
 
 def _series(evaluation: Evaluation) -> dict[str, PoseSeries]:
     return {**evaluation.sensors, **evaluation.bodies}
-
-
-def _seconds(series: PoseSeries, start_ns: int) -> Array:
-    stamps = np.array([estimate.stamp_ns for estimate in series.estimates], dtype=np.int64)
-    return np.asarray(1e-9 * (stamps - start_ns), dtype=np.float64)
 
 
 def _thinned(count: int) -> slice:
@@ -60,11 +47,10 @@ def over_time(evaluation: Evaluation) -> Figure:
         2, 1, figsize=(9, 5.6), sharex=True, layout='constrained', height_ratios=(3, 1)
     )
     for rank, (name, series) in enumerate(found.items()):
-        time, keep = _seconds(series, start), _thinned(len(series.estimates))
-        colour = f'C{rank % 10}'
-        upper.plot(
-            time[keep], 1e3 * series.position_error[keep], '.', ms=3, color=colour, label=name
-        )
+        stamps = np.array([one.stamp_ns for one in series.estimates], dtype=np.int64)
+        time, keep, colour = 1e-9 * (stamps - start), _thinned(stamps.size), f'C{rank % 10}'
+        error = 1e3 * series.position_error[keep]
+        upper.plot(time[keep], error, '.', ms=3, color=colour, label=name)
         lost = time[~series.ok]
         lower.plot(lost, np.full(lost.size, rank), '|', color=colour)
     upper.set(ylabel='position error, mm', yscale='log')
@@ -90,12 +76,10 @@ def over_space(evaluation: Evaluation) -> Figure:
     keep = _thinned(len(where))
     figure, panels = plt.subplots(1, 2, figsize=(9, 4.2), layout='constrained')
     top = float(np.percentile(size, 98)) if size.size else 1.0
-    for panel, (across, up) in zip(panels, (('x', 'y'), ('x', 'z')), strict=True):
-        columns = ['xyz'.index(name) for name in (across, up)]
-        shown = panel.scatter(
-            where[keep, columns[0]], where[keep, columns[1]], c=size[keep], s=8, vmin=0.0, vmax=top
-        )
-        panel.set(xlabel=f'{across}, mm', ylabel=f'{up}, mm', aspect='equal')
+    for panel, up in zip(panels, (1, 2), strict=True):
+        places = where[keep][:, [0, up]]
+        shown = panel.scatter(*places.T, c=size[keep], s=8, vmin=0.0, vmax=top)
+        panel.set(xlabel='x, mm', ylabel=f'{"xyz"[up]}, mm', aspect='equal')
         panel.grid(alpha=0.3)
     figure.colorbar(shown, ax=panels, label='position error, mm', extend='max')
     return figure
@@ -107,12 +91,11 @@ def by_coil(evaluation: Evaluation) -> Figure:
     figure, panels = plt.subplots(
         1, 2, figsize=(9, 1.4 + 0.3 * len(found)), layout='constrained', sharey=True
     )
-    for panel, scale, unit, errors in (
-        (panels[0], 1e3, 'position error, mm', [s.position_error for s in found.values()]),
-        (panels[1], DEGREES, 'orientation error, deg',
-         [s.orientation_error for s in found.values()]),
+    for panel, scale, kind, unit in (
+        (panels[0], 1e3, 'position', 'mm'), (panels[1], DEGREES, 'orientation', 'deg'),
     ):  # fmt: skip
-        for row, error in enumerate(errors, start=1):
+        for row, series in enumerate(found.values(), start=1):
+            error = getattr(series, f'{kind}_error')
             finite = scale * error[np.isfinite(error)]
             if not finite.size:
                 continue
@@ -120,7 +103,7 @@ def by_coil(evaluation: Evaluation) -> Figure:
             panel.hlines(row, least, most, color='0.5')
             panel.barh(row, upper - lower, 0.6, left=lower, color='C0', alpha=0.6)
             panel.vlines(middle, row - 0.3, row + 0.3, color='C1', lw=2)
-        panel.set(xlabel=unit)
+        panel.set(xlabel=f'{kind} error, {unit}')
         panel.set_xlim(left=0.0)
         panel.locator_params(axis='x', nbins=5)
         panel.grid(alpha=0.3, axis='x')
@@ -130,7 +113,7 @@ def by_coil(evaluation: Evaluation) -> Figure:
 
 
 def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
-    """Draw the errors against the sigma told, and how many lie within a multiple of it.
+    """Draw the errors against the reported sigma, and how many lie within a multiple of it.
 
     ``jitter_m``, the optical tracker's own error per component, m, is part of the expected error.
     """
@@ -177,14 +160,9 @@ FIGURES = {
 
 
 def write_figures(
-    evaluation: Evaluation,
-    document: Mapping[str, Any],
-    folder: Path,
-    *,
-    session: str,
-    model: str,
-    jitter_m: float = 0.0,
-) -> list[Path]:
+    evaluation: Evaluation, document: Mapping[str, Any], folder: Path, *, session: str,
+    model: str, jitter_m: float = 0.0,
+) -> list[Path]:  # fmt: skip
     """Write every figure and the page that holds them; return the files.
 
     Without an optical pose there is no error, and nothing is drawn or written.
@@ -192,40 +170,33 @@ def write_figures(
     found = _series(evaluation)
     if not any(np.isfinite(series.position_error).any() for series in found.values()):
         return []
-    parts, files = [], []
+    parts: list[Html] = []
+    files = []
     drawn = (
         over_time(evaluation), over_space(evaluation), by_coil(evaluation),
         against_sigma(evaluation, jitter_m),
     )  # fmt: skip
     for (name, title), figure in zip(FIGURES.items(), drawn, strict=True):
-        path = folder / f'{name}.png'
-        save(figure, path)
-        data = base64.b64encode(path.read_bytes()).decode('ascii')
-        parts.append(
-            f'<h2>{html.escape(title)}</h2>'
-            f'<img alt="{html.escape(title)}" src="data:image/png;base64,{data}">'
-        )
-        files.append(path)
-    heading = (
-        f'<h1>Evaluation</h1><p class="note">session <code>{html.escape(session)}</code>, '
-        f'model <code>{html.escape(model)}</code></p>'
-    )
-    path = folder / 'evaluation.html'
-    text = page('Evaluation', [heading, _table(document), *parts], STYLE)
-    path.write_text(text, encoding='utf-8')
-    return [*files, path]
+        files.append(folder / f'{name}.png')
+        save(figure, files[-1])
+        parts += [heading(title), picture(files[-1])]
+    head = top('Evaluation', session=session, model=model)
+    text = page('Evaluation', head, table(ERRORS_HEAD, error_rows(document)), parts)
+    files.append(folder / 'evaluation.html')
+    files[-1].write_text(text, encoding='utf-8')
+    return files
 
 
-def _table(document: Mapping[str, Any]) -> str:
-    head = ('', 'poses', 'tracked', 'RMSE, mm', '95 %, mm', 'RMSE, deg', '95 %, deg')
-    rows = ''.join(f'<th>{cell}</th>' for cell in head)
-    for group in ('sensors', 'bodies'):
-        for name, row in document[group].items():
-            cells = [html.escape(name), str(row['n']), f'{row["tracked_fraction"]:.1%}']
-            for key, scale in (
-                ('position_rmse_m', 1e3), ('position_prc95_m', 1e3),
-                ('orientation_rmse_rad', DEGREES), ('orientation_prc95_rad', DEGREES),
-            ):  # fmt: skip
-                cells.append('-' if row[key] is None else f'{scale * row[key]:.3f}')
-            rows += '</tr><tr>' + ''.join(f'<td>{cell}</td>' for cell in cells)
-    return f'<table><tr>{rows}</tr></table>'
+def error_rows(document: Mapping[str, Any]) -> list[list[str]]:
+    """Return the errors of every sensor, body and source as rows of a table."""
+    return [
+        [
+            f'source seen from {name}' if group == 'sources' else name,
+            str(row['n']),
+            f'{row["tracked_fraction"]:.1%}',
+            *(number(row[f'position_{key}_m'], 1e3) for key in ('rmse', 'prc95')),
+            *(number(row[f'orientation_{key}_rad'], DEGREES) for key in ('rmse', 'prc95')),
+        ]
+        for group in ('sensors', 'bodies', 'sources')
+        for name, row in document.get(group, {}).items()
+    ]

@@ -12,14 +12,13 @@ _made: list[Path] = []
 """Folders that this command has made, parents first."""
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder for results before the work begins.
+def make_folder(folder: Path | None) -> None:
+    """Make a folder for results before the work begins, where one is wanted.
 
-    Raises
-    ------
-    ParameterError
-        When the folder cannot be made, or nothing can be written there.
+    Raises `ParameterError` when the folder cannot be made, or nothing can be written there.
     """
+    if folder is None:
+        return
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -38,10 +37,7 @@ def make_folder(folder: Path) -> None:
 def make_new_folder(parent: Path, stem: str) -> Path:
     """Make and return a folder that was not there; others of the same second get a number.
 
-    Raises
-    ------
-    ParameterError
-        When it cannot be made, or nothing can be written there.
+    Raises `ParameterError` when it cannot be made, or nothing can be written there.
     """
     make_folder(parent)
     for number in itertools.count(1):

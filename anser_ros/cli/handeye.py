@@ -1,9 +1,6 @@
 """Fit registration, lever arm, mount and clocks of two streams of poses, jointly."""
 
 import argparse
-import html
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +8,24 @@ import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
 from anser_ros.assessment.source import PoseSource, read_poses
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.html_page import page, table
-from anser_ros.cli.output import say_written
+from anser_ros.cli.html_page import heading, listed, page, paragraph, picture, table, top
+from anser_ros.cli.import_poses import add_form_options
+from anser_ros.cli.output import Result, number, terminal_table, write_files
 from anser_ros.cli.pose_session import add_topic_options, load_poses
-from anser_ros.cli.progress import progress_of
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.errors import ParameterError
 from anser_ros.field.plain_data import plain
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pictures import image
+from anser_ros.pictures import legend_beside
 from anser_ros.poses.convention import reading_words
 from anser_ros.poses.document import finite
-from anser_ros.poses.forms import ORDERS
 from anser_ros.poses.hand_eye_fit import HandEye, fit_hand_eye, matrix_of, turn_of
-from anser_ros.poses.importing import STAMPS, import_poses
+from anser_ros.poses.importing import import_poses
 from anser_ros.poses.sequence import PoseSession, missing_words
-from anser_ros.sessions.units import LENGTH_M
 
 SCHEMA = 'anser_handeye/1'
 BAGS = ('.mcap', '.db3', '.bag')
@@ -63,59 +58,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='poses at rest: pair the n-th of one stream with the n-th of the other, without '
         'clocks',
     )  # fmt: skip
-    parser.add_argument(
-        '--stamps', choices=STAMPS, default='host', help='for files: which of their times to use'
-    )
-    parser.add_argument(
-        '--unit', choices=list(LENGTH_M), help='for files: unit of the tracked positions'
-    )
-    parser.add_argument(
-        '--quaternion',
-        choices=list(ORDERS),
-        help='for files: how the tracked quaternions are written',
-    )
-    parser.add_argument(
-        '--out',
-        type=Path,
-        help='folder for handeye.yaml, handeye.json and report.html, made if missing',
-    )
-    parser.add_argument('--json', action='store_true', help='print handeye.json on stdout')
+    add_form_options(parser, 'for files: ')
+    add_out(parser, 'handeye.yaml, handeye.json and report.html', required=False)
+    add_json(parser, 'handeye.json on stdout')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Fit both streams."""
     session = _session(args)
-    if args.out is not None:
-        make_folder(args.out)
-    with progress_of('hand-eye') as progress:
-        found = fit_hand_eye(session, pairs=args.pairs, progress=progress)
+    make_folder(args.out)
+    found = fit_hand_eye(session, pairs=args.pairs, progress=tell)
     document = to_document(found)
-    text = json.dumps(document, indent=1)
+    written: tuple[Path, ...] = ()
     if args.out is not None:
-        files = {
-            'handeye.yaml': yaml.safe_dump(document, sort_keys=False, default_flow_style=None),
-            'handeye.json': text + '\n',
-            'report.html': render(found, document),
-        }
-        for name, content in files.items():
-            (args.out / name).write_text(content, encoding='utf-8')
+        plain_yaml = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
+        report = render(found, document)
+        files = {'handeye.yaml': plain_yaml, 'handeye.json': document, 'report.html': report}
+        written = write_files(args.out, files)
     notes = [session.lost] if session.lost else []
     if found.convention is not None:
         notes.append(reading_words(found.convention))
     notes += filter(None, map(missing_words, session.streams.values()))
-    for note in notes:
-        print(f'anser handeye: {session.path}: {note}', file=sys.stderr)
-    if args.json:
-        print(text)
-        return 0
-    console = Console()
-    console.print(_table(document))
+    rows = [[row[column] for column in SHOWN_COLUMNS] for row in _rows(document, 1)]
+    table = terminal_table([HEAD[column] for column in SHOWN_COLUMNS], rows)
+    for column in table.columns:
+        column.no_wrap = True
     lines = (*clock_words(document), *left_out_words(document))
-    for line in (*lines, *(f'not determined: {w}' for w in found.undetermined)):
-        console.print(line, highlight=False)
-    if args.out is not None:
-        say_written(*(args.out / name for name in files))
-    return 0
+    shown = (table, *lines, *(f'not determined: {words}' for words in found.undetermined))
+    return Result(document, tuple(f'{session.path}: {note}' for note in notes), shown, written)
 
 
 def _session(args: argparse.Namespace) -> PoseSession:
@@ -210,19 +180,15 @@ HEAD = ('sensor', 'lever arm, mm', '1 sigma', 'mount, deg', '1 sigma', 'rms, mm'
 
 def _rows(document: dict[str, Any], digits: int) -> list[list[str]]:
     def triple(values: list[float | None] | None, scale: float) -> str:
-        if values is None:
-            return '-'
-        return ' '.join('-' if v is None else f'{scale * v:.{digits}f}' for v in values)
-
-    def single(value: float | None, scale: float) -> str:
-        return '-' if value is None else f'{scale * value:.2f}'
+        return ' '.join(number(v, scale, f'.{digits}f') for v in values or [None])
 
     return [
         [
             name, triple(one['lever_arm_m'], 1e3), triple(one['lever_arm_sigma_m'], 1e3),
             triple(one['mount_rotation_deg'], 1.0), triple(one['mount_rotation_sigma_deg'], 1.0),
-            single(one['position_rmse_m'], 1e3), single(one['heldout_position_rmse_m'], 1e3),
-            single(one['heldout_orientation_rmse_rad'], DEGREES),
+            number(one['position_rmse_m'], 1e3, '.2f'),
+            number(one['heldout_position_rmse_m'], 1e3, '.2f'),
+            number(one['heldout_orientation_rmse_rad'], DEGREES, '.2f'),
         ]
         for name, one in document['sensors'].items()
     ]  # fmt: skip
@@ -232,43 +198,39 @@ SHOWN_COLUMNS = (0, 1, 2, 3, 6)
 """Columns of `HEAD` that fit into a terminal of eighty letters."""
 
 
-def _table(document: dict[str, Any]) -> Table:
-    shown = Table()
-    for column in SHOWN_COLUMNS:
-        shown.add_column(HEAD[column], no_wrap=True)
-    for row in _rows(document, 1):
-        shown.add_row(*(row[column] for column in SHOWN_COLUMNS))
-    return shown
-
-
 def render(found: HandEye, document: dict[str, Any]) -> str:
     """Return the page as HTML: frames, clocks, what is open, and what is left over time."""
     columns = [
-        (scale, document[f'registration_{key}'])
-        for scale, key in (
-            (1e3, 'translation_m'), (1e3, 'translation_sigma_m'),
-            (1.0, 'rotation_deg'), (1.0, 'rotation_sigma_deg'),
+        (document[f'registration_{key}'], scale)
+        for key, scale in (
+            ('translation_m', 1e3), ('translation_sigma_m', 1e3), ('rotation_deg', 1.0),
+            ('rotation_sigma_deg', 1.0),
         )
     ]  # fmt: skip
-    rows = [
-        [axis, *('-' if v[k] is None else f'{scale * v[k]:.3f}' for scale, v in columns)]
-        for k, axis in enumerate('xyz')
-    ]
-    open_ones = ''.join(f'<li>{html.escape(words)}</li>' for words in found.undetermined)
     lines = [*clock_words(document), *left_out_words(document)]
-    clocks = '; '.join(lines) or 'the clocks were not compared'
-    return page('Hand-eye', [
-        '<h1>Hand-eye calibration</h1>'
-        f'<p class="note"><code>{html.escape(found.session.path)}</code></p>'
-        f'<p class="verdict">{html.escape(clocks)}</p>'
-        + (f'<p class="note">{html.escape(reading_words(found.convention))}</p>'
-           if found.convention is not None else ''),
-        '<h2>Sensors on the body</h2>', table(HEAD, _rows(document, 2)),
-        "<h2>From the optical frame to the tracker's</h2>",
-        table(('axis', 'translation, mm', '1 sigma', 'rotation vector, deg', '1 sigma'), rows),
-        f'<h2>Not determined</h2><ul>{open_ones}</ul>' if open_ones else '',
-        '<h2>Residuals over time</h2>', image(_over_time(found)),
-    ])  # fmt: skip
+    is_open = bool(found.undetermined)
+    return page(
+        'Hand-eye',
+        top(
+            'Hand-eye calibration',
+            '; '.join(lines) or 'the clocks were not compared',
+            recording=found.session.path,
+        ),
+        paragraph(reading_words(found.convention) if found.convention else '', 'note'),
+        heading('Sensors on the body'),
+        table(HEAD, _rows(document, 2)),
+        heading("From the optical frame to the tracker's"),
+        table(
+            ['axis', 'translation, mm', '1 sigma', 'rotation vector, deg', '1 sigma'],
+            [
+                [axis, *(number(values[k], scale) for values, scale in columns)]
+                for k, axis in enumerate('xyz')
+            ],
+        ),
+        [heading('Not determined'), listed(found.undetermined)] if is_open else [],
+        heading('Residuals over time'),
+        picture(_over_time(found)),
+    )
 
 
 def _over_time(found: HandEye) -> Figure:
@@ -277,5 +239,5 @@ def _over_time(found: HandEye) -> Figure:
         size = 1e3 * np.linalg.norm(part.residual[part.used, :3], axis=1)
         axes.plot(part.view.time[part.used], size, '.', ms=2, label=part.view.sensor)
     axes.set(xlabel='time, s', ylabel='distance, mm', yscale='log')
-    figure.legend(loc='outside right upper')
+    legend_beside(figure)
     return figure

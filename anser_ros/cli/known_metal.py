@@ -3,10 +3,9 @@
 import argparse
 from pathlib import Path
 
-from anser_ros.cli.carry_out import carry_out
 from anser_ros.cli.output import Result, check_file, loss_notes
 from anser_ros.cli.progress import Tell
-from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.cli.stated_values import add_json, add_model, add_stated_values, stated_values
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.known_metal_file import save_known_metal
 from anser_ros.sessions.metal_frames import learn
@@ -26,9 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='bag in which one rigid piece of metal moves, seen by reference sensors and a tool '
         'with optical poses',
     )  # fmt: skip
-    parser.add_argument(
-        '--model', required=True, help="model file, or 'nominal' for the setup's own geometry"
-    )
+    add_model(parser, required=True)
     parser.add_argument(
         '--baseline', required=True, help='recording of the same board without the metal'
     )
@@ -37,18 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--out', required=True, type=Path, help='file to write; its folder is made if missing'
     )
     add_stated_values(parser, 'accuracy', 'refit', 'tools')
-    parser.add_argument('--json', action='store_true', help='print what was learnt on stdout')
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
-    if not args.name.strip():
-        raise ParameterError('--name must not be empty')
-    return carry_out('known_metal', 'learning', work, args)
+    add_json(parser, 'what was learnt on stdout')
 
 
 def work(args: argparse.Namespace, tell: Tell) -> Result:
     """Learn the metal of the session, and write it."""
+    if not args.name.strip():
+        raise ParameterError('--name must not be empty')
     session = load_session(args.session).with_stated(stated_values(args))
     model = model_for(args.model, session)
     prepared = prepare(session, model, load_session(args.baseline))

@@ -1,7 +1,7 @@
 """Names points of a picture, so that no name lies on another one, or on what is drawn."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,37 +22,19 @@ POINTS_PER_INCH = 72.0
 """A point is a 72nd of an inch."""
 
 
-@dataclass(frozen=True)
-class Label:
-    """Holds the name of a point.
-
-    Attributes
-    ----------
-    text : str
-    at : tuple of float
-        The point, in the coordinates of the data.
-    away : tuple of float
-        Direction in which the name should lie, in those coordinates; zeros for any.
-    """
+class Label(NamedTuple):
+    """The name of a point, in the coordinates of the data."""
 
     text: str
     at: tuple[float, float]
-    away: tuple[float, float] = (0.0, 0.0)
+    away: tuple[float, float] = (0.0, 0.0)  # where the name should lie from the point; or anywhere
 
 
 def name_points(axes: Axes, labels: Sequence[Label], drawn: ArrayLike, size: float) -> None:
-    """Write names beside their points, once all else is drawn, also by
-    ``figure.draw_without_rendering()``, which settles the layout and with it the scale.
+    """Write names of a size, points, beside their points, once all else is drawn.
 
-    Parameters
-    ----------
-    axes : Axes
-        Its texts are kept free, too.
-    labels : sequence of Label
-    drawn : array_like, shape (n, 2)
-        Points that names should not cover, in the coordinates of the data.
-    size : float
-        Of the letters, points.
+    That may be by ``figure.draw_without_rendering()``, which settles the layout and with it the
+    scale. Texts of the axes, and points ``drawn``, shape (n, 2), are not covered.
     """
     figure = axes.figure.figure  # not a figure inside it; older versions have no other way
     dots = figure.dpi / POINTS_PER_INCH
@@ -96,24 +78,16 @@ def _best(
     """
     begin = float(np.arctan2(away[1], away[0])) if away.any() else -0.75 * np.pi
     turns = np.arange(DIRECTIONS)
-    turns = np.where(turns % 2, (turns + 1) // 2, -(turns // 2))
-    best, least = (np.zeros(2), 0.0), np.inf
-    for distance in DISTANCES_PT:
-        for turn in turns:
-            angle = begin + 2.0 * np.pi * turn / DIRECTIONS
-            way = np.array([np.cos(angle), np.sin(angle)])
-            # Where a box of this size is beside the point, whichever way it is.
-            reach = np.min(half / np.maximum(np.abs(way), 1e-9)) + distance * dots
-            shift = reach * way
-            low, high = here + shift - half - margin, here + shift + half + margin
-            hidden = np.all((covered > low) & (covered < high), axis=1).sum()
-            across = sum(
-                bool(np.all(low < other[2:]) and np.all(high > other[:2])) for other in taken
-            )
-            outside = bool(np.any(low < frame[:2]) or np.any(high > frame[2:]))
-            cost = 100.0 * across + 100.0 * outside + float(hidden)
-            if cost < least:
-                best, least = (shift, distance), cost
-            if not cost:
-                return best
-    return best
+    angle = begin + 2.0 * np.pi / DIRECTIONS * np.where(turns % 2, (turns + 1) // 2, -(turns // 2))
+    way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    # Where a box of this size is beside the point, whichever way it is.
+    beside = np.min(half / np.maximum(np.abs(way), 1e-9), axis=1)
+    reach = np.add.outer(dots * np.array(DISTANCES_PT), beside)
+    shift = (reach[..., None] * way).reshape(-1, 2)
+    low, high = here + shift - half - margin, here + shift + half + margin
+    hidden = np.all((covered > low[:, None]) & (covered < high[:, None]), axis=2).sum(axis=1)
+    other = np.reshape(taken, (-1, 4))
+    across = np.all((low[:, None] < other[:, 2:]) & (high[:, None] > other[:, :2]), axis=2)
+    outside = np.any((low < frame[:2]) | (high > frame[2:]), axis=1)
+    best = int(np.argmin(100.0 * across.sum(axis=1) + 100.0 * outside + hidden))
+    return shift[best], DISTANCES_PT[best // DIRECTIONS]

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ from anser_ros.cli import missing
 from anser_ros.cli.folders import make_new_folder
 from anser_ros.cli.loop_result import parameter_errors, second_run, table, verdict
 from anser_ros.cli.loop_run import AFTER, LoopFiles, Run, make_world, record
-from anser_ros.cli.output import say_written
+from anser_ros.cli.output import say_written, write_files
 from anser_ros.cli.ros_domain import LAST_DOMAIN, own_domain
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import DiagnosisError, ParameterError
@@ -62,22 +64,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--watch', action='store_true', help='also report what the watcher found in the first run'
     )
-    parser.add_argument(
-        '--out', type=Path, default=Path('recordings'), metavar='DIR',
-        help='folder, made if missing, for a new folder with all results (%(default)s)',
+    add_out(
+        parser, 'a new folder with all results (%(default)s)', required=False,
+        default=Path('recordings'), metavar='DIR',
     )  # fmt: skip
-    parser.add_argument('--json', action='store_true', help='print only the result, as JSON')
+    add_json(parser, 'only the result, as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the loop and return the exit code.
 
-    Raises
-    ------
-    ParameterError
-        When the duration or the seed is out of range.
-    DiagnosisError
-        When a run records nothing or a diagnosis fails.
+    Raises `ParameterError` when the duration or the seed is out of range, `DiagnosisError` when a
+    run records nothing or a diagnosis fails.
     """
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
@@ -100,27 +98,26 @@ def _run(args: argparse.Namespace, effects: list[str], seed: int) -> int:
     if args.clean:
         say.print(f'a clean recording, {args.clean:g} s')
         clean = record(Run(folder / 'clean', world.setup, args.clean))
-    document: dict[str, Any] = {
-        'schema': SCHEMA, 'data': 'simulated', 'folder': str(folder), 'rounds': [],
-    }  # fmt: skip
-    for number, effect in enumerate(effects):
-        where = f'round {number + 1} of {len(effects)}: '
-
-        def tell(text: str, where: str = where) -> None:
-            say.print(where + text)
-
+    rounds: list[dict[str, Any]] = []
+    document = {'schema': SCHEMA, 'data': 'simulated', 'folder': str(folder), 'rounds': rounds}
+    for count, effect in enumerate(effects):
+        say_of = partial(_say_of, say, f'round {count + 1} of {len(effects)}: ')
         found = _round(
-            folder / f'{number + 1:02d}', world, clean, effect, seed + number, args.duration,
-            args.watch, tell,
+            folder / f'{count + 1:02d}', world, clean, effect, seed + count, args.duration,
+            args.watch, say_of,
         )  # fmt: skip
-        document['rounds'].append(found)
-        (folder / 'loop.json').write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
+        rounds.append(found)
+        write_files(folder, {'loop.json': document})
     if args.json:
         print(json.dumps(document, indent=1))
     else:
-        table(document['rounds'], Console(width=None if os.isatty(1) else 200))
+        table(rounds, Console(width=None if os.isatty(1) else 200))
         say_written(folder)
     return 0
+
+
+def _say_of(console: Console, where: str, text: str) -> None:
+    console.print(where + text)
 
 
 def _check(args: argparse.Namespace, seed: int) -> None:
@@ -164,10 +161,9 @@ def _round(
     say(f'the corrected model is served, {second_s:g} s on another path')
     other = {'path_phase_rad': OTHER_PATH_RAD, 'seed': 3}
     baseline = clean if follows else None
+    unit |= other
     second = record(
-        Run(
-            folder / 'second', world.setup, second_s, {**unit, **other}, corrected, baseline, model
-        )
+        Run(folder / 'second', world.setup, second_s, unit, corrected, baseline, model)
     )
     truth = json.loads(truth_file.read_text(encoding='utf-8'))  # not before all is analysed
     return {

@@ -18,7 +18,6 @@ from anser_ros.sessions.session import Session
 NAMED, PARTLY, UNEXPLAINED = 'named', 'named in part', 'said unexplained'
 MISSED, WRONG = 'missed', 'wrong name'
 SITES = ('channel', 'channels', 'coil', 'coils')
-FIGURES = ('rmse', 'prc95')
 TRACKERS = ('ungated', 'before', 'after')
 
 
@@ -28,17 +27,8 @@ def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
     An effect that the diagnosis knows must be named, at its site, and nothing else. One that it
     does not know must be reported as unexplained: completely, or in part among other names.
 
-    Parameters
-    ----------
-    truth : mapping
-        Name, parameters and answers of the effect that was put in.
-    diagnosis : mapping
-        The document of the diagnosis.
-
-    Returns
-    -------
-    str
-        `NAMED`, `PARTLY`, `UNEXPLAINED`, `MISSED`, `WRONG` or the empty string.
+    ``truth`` has name, parameters and answers of the effect that was put in, ``diagnosis`` is the
+    document of the diagnosis.
     """
     names = [effect['name'] for effect in diagnosis['effects']]
     unexplained = diagnosis['unexplained']['fraction'] > 0.0
@@ -102,13 +92,9 @@ def _figures(errors: list[LiveErrors]) -> dict[str, float | None]:
     out: dict[str, float | None] = {}
     for key, unit in (('position', 'm'), ('orientation', 'rad')):
         values = np.concatenate([getattr(error, key) for error in errors])
-        both = (
-            (float(np.sqrt(np.mean(values**2))), float(np.percentile(values, 95)))
-            if values.size
-            else (None, None)
-        )
-        for statistic, value in zip(FIGURES, both, strict=True):
-            out[f'{key}_{statistic}_{unit}'] = value
+        has = bool(values.size)
+        out[f'{key}_rmse_{unit}'] = float(np.sqrt(np.mean(values**2))) if has else None
+        out[f'{key}_prc95_{unit}'] = float(np.percentile(values, 95)) if has else None
     return out
 
 

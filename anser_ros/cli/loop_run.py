@@ -6,14 +6,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
-from anser_ros.cli.demo import (
-    BOARD_SEED,
-    FROZEN_TRACKER,
-    PATIENCE_S,
-    SAMPLE_RATE_HZ,
-    SHARED_TOPICS,
-)
+from anser_ros.cli.demo import FROZEN_TRACKER, PATIENCE_S, in_namespace, simulated_unit
 from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.errors import AnserError, DiagnosisError, SetupError
@@ -31,7 +26,6 @@ AFTER, BEFORE, UNGATED = '/anser', '/anser/before', '/anser/ungated'
 """Namespaces of the trackers: with the corrected model, with the model as it was, and with the
 latter without residual gate, whose error shows what the gate withholds."""
 
-
 TONES_HZ = tuple(5025.0 + 100.0 * mark for mark in (0, 1, 4, 9, 15, 22, 32, 34))
 """Drive tones, Hz, at the marks of a Golomb ruler (no two pairs are equally far apart) in steps of
 100 Hz. Where a channel compresses, the third-order products of the tones, also those that the
@@ -39,9 +33,8 @@ converter's rate of 20 kHz folds back, then fall between the tones, whole cycles
 away."""
 
 
-@dataclass(frozen=True)
-class LoopFiles:
-    """Holds the files of setup and uncorrected model, which all runs of a loop share."""
+class LoopFiles(NamedTuple):
+    """The files of setup and uncorrected model, which all runs of a loop share."""
 
     setup: Path
     model: Path
@@ -52,10 +45,7 @@ def make_world(folder: Path) -> LoopFiles:
 
     The field without metal does not depend on the tones, so that the model stays right.
 
-    Raises
-    ------
-    SetupError
-        When the demo's setup has another number of coils than there are tones.
+    Raises `SetupError` when the demo's setup has another number of coils than there are tones.
     """
     setup = parse_setup(read_config('demo_setup.yaml'))
     if len(setup.emitter.coils) != len(TONES_HZ):
@@ -74,36 +64,16 @@ def make_world(folder: Path) -> LoopFiles:
 
 @dataclass(frozen=True)
 class Run:
-    """Holds the settings of one run: what is simulated, and which nodes track it.
+    """Holds the settings of one run: what is simulated, and which nodes track it."""
 
-    Attributes
-    ----------
-    folder : Path
-        Folder for the bag and the logs.
-    setup : Path
-        Setup document of the unit and of all nodes.
-    duration_s : float
-        Duration from the first flux on, s.
-    unit : mapping
-        Parameters of the simulated control unit.
-    served : Path or None
-        Model of the chain whose poses are judged; without it no tracker runs in this chain.
-    baseline : Path or None
-        Clean recording; with it the served model follows the references.
-    known : Path or None
-        Uncorrected model of the trackers that run in parallel; None for no such trackers.
-    watched : mapping or None
-        Parameters of a watcher; None for no watcher.
-    """
-
-    folder: Path
-    setup: Path
-    duration_s: float
-    unit: Mapping[str, object] = field(default_factory=dict)
-    served: Path | None = None
-    baseline: Path | None = None
-    known: Path | None = None
-    watched: Mapping[str, object] | None = None
+    folder: Path  # for the bag and the logs
+    setup: Path  # of the unit and of all nodes
+    duration_s: float  # from the first flux on
+    unit: Mapping[str, object] = field(default_factory=dict)  # parameters of the simulated unit
+    served: Path | None = None  # model whose poses are judged; no tracker in its chain without it
+    baseline: Path | None = None  # clean recording; with it the model follows the references
+    known: Path | None = None  # uncorrected model of the trackers beside; none without it
+    watched: Mapping[str, object] | None = None  # parameters of a watcher; none without them
 
 
 def record(run: Run) -> Path:
@@ -112,10 +82,7 @@ def record(run: Run) -> Path:
     The unit is started once all nodes are ready: drifts begin with its first start, which is then
     the first frame of the recording and of every tracker.
 
-    Raises
-    ------
-    DiagnosisError
-        When a process ends, or no flux arrives in time.
+    Raises `DiagnosisError` when a process ends, or no flux arrives in time.
     """
     ports = Path(tempfile.mkdtemp(prefix='anser_loop_'))
     bag = run.folder / 'bag'
@@ -128,8 +95,9 @@ def record(run: Run) -> Path:
             listeners += [f'{AFTER}/watcher'] if run.watched is not None else []
             listeners += [f'{apart}/tracker' for apart in _beside(run)]
             _wait(supervisor, run, lambda: _unready(bag, listeners))
-            supervisor.start('cu_simulator', _unit(run, ports / 'cu'))
-            _wait(supervisor, run, lambda: _unheard(bag))
+            unit = simulated_unit(ports / 'cu', setup_file=run.setup, metal=False, **run.unit)
+            supervisor.start('cu_simulator', unit)
+            _wait(supervisor, run, lambda: _without_flux(bag))
             end = time.monotonic() + run.duration_s
             while time.monotonic() < end:
                 _check(supervisor)
@@ -137,13 +105,6 @@ def record(run: Run) -> Path:
     finally:
         shutil.rmtree(ports, ignore_errors=True)
     return bag
-
-
-def _unit(run: Run, port: Path) -> list[str]:
-    return node(
-        'cu_simulator', link=port, setup_file=run.setup, metal=False, board_seed=BOARD_SEED,
-        sample_rate_hz=SAMPLE_RATE_HZ, **run.unit,
-    )  # fmt: skip
 
 
 def _commands(run: Run, port: Path) -> dict[str, list[str]]:
@@ -160,11 +121,9 @@ def _commands(run: Run, port: Path) -> dict[str, list[str]]:
     if run.watched is not None:
         commands['watcher'] = node('watcher', **run.watched)
     for namespace, settings in _beside(run).items():
-        words = ['-r', f'__ns:={namespace}']
-        for topic in SHARED_TOPICS:
-            words += ['-r', f'{topic}:={AFTER}/{topic}']
         name = f'tracker_{namespace.rsplit("/", 1)[-1]}'
-        commands[name] = node('tracker', *words, model_file=run.known, **settings)
+        beside = in_namespace(namespace)
+        commands[name] = node('tracker', *beside, model_file=run.known, **settings)
     return commands
 
 
@@ -201,7 +160,7 @@ def _unready(bag: Path, names: Sequence[str]) -> str:
     return f'{", ".join(missing)} not ready' if missing else ''
 
 
-def _unheard(bag: Path) -> str:
+def _without_flux(bag: Path) -> str:
     try:
         return '' if read_bag(bag).tool is not None else 'no tool flux was recorded'
     except AnserError as error:

@@ -4,6 +4,7 @@ A node is started by exec of its own module, so that this layer never loads rclp
 command is imported only when it is the one asked for. `commands` lists both.
 """
 
+import argparse
 import importlib
 import os
 import sys
@@ -29,12 +30,7 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb and return the exit code.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        The verb and its arguments; those of the process when not given.
+    """Run one verb with its arguments, by default those of the process.
 
     Returns
     -------
@@ -60,11 +56,11 @@ def _dispatch(arguments: list[str]) -> int:
         print(_version())
         return EXIT_OK
     name, rest = arguments[0].replace('-', '_'), arguments[1:]
-    if name in {**NODES, **COMPOSED}:
+    if name in NODES or name in COMPOSED:
         try:
             missing.check(name)
         except AnserError as error:
-            print(f'anser {name}: {_one_line(error)}', file=sys.stderr)
+            print(f'anser {name}: {" ".join(str(error).split())}', file=sys.stderr)
             return EXIT_BAD_INPUT
         exec_node(name, rest)
     if name in OFFLINE:
@@ -85,7 +81,8 @@ def exec_node(name: str, arguments: Sequence[str]) -> NoReturn:
     paths = [str(PACKAGE_FOLDER.parent), environment.get('PYTHONPATH', '')]
     environment['PYTHONPATH'] = os.pathsep.join(path for path in paths if path)
     # -P: a file in the caller's folder must not shadow a module.
-    command = [sys.executable, '-P', '-m', f'anser_ros.nodes.{name}', *arguments]
+    module, _ = {**NODES, **COMPOSED}[name]
+    command = [sys.executable, '-P', '-m', module, *arguments]
     sys.stdout.flush()
     sys.stderr.flush()
     os.execve(sys.executable, command, environment)
@@ -95,15 +92,13 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
     """Run one offline command in this process and return the exit code."""
 
     def work() -> int:
-        # Set before numpy is loaded: BLAS threads that wait for one another cost more than they
-        # gain.
-        os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-        module = importlib.import_module(f'anser_ros.cli.{name}')
-        parser = OneLineParser(prog=f'anser {name}', description=OFFLINE[name])
+        path, words = OFFLINE[name]
+        module = importlib.import_module(path)
+        parser = OneLineParser(prog=f'anser {name}', description=words)
         module.add_arguments(parser)
         args = parser.parse_args(arguments)
         with shared_among(cores()):
-            return int(module.run(args))
+            return int(module.run(args)) if hasattr(module, 'run') else _show(name, module, args)
 
     try:
         code, done, words = attempt(work)
@@ -117,6 +112,17 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
         return int(done)
     print(words if code == EXIT_DEFECT else f'anser {name}: {words}', file=sys.stderr)
     return code
+
+
+def _show(name: str, module: Any, args: argparse.Namespace) -> int:
+    """Do the work of a command under a bar of progress, and show what came of it."""
+    from anser_ros.cli.output import say
+    from anser_ros.cli.progress import progress_of
+
+    with progress_of(name) as tell:
+        result = module.work(args, tell)
+    say(name, result, as_json=args.json)
+    return int(result.code)
 
 
 def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
@@ -134,16 +140,12 @@ def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
         return EXIT_BAD_INPUT, None, _one_line(error)
     except BrokenPipeError:
         raise
-    except ModuleNotFoundError as error:
-        if error.name is not None and error.name.split('.')[0] in missing.PYPI:
-            return EXIT_BAD_INPUT, None, missing.words_of(error.name)
-        return EXIT_DEFECT, None, traceback.format_exc().rstrip()
-    except OSError as error:
+    except Exception as error:  # noqa: BLE001 - the outermost place: whatever is left is a defect
+        if isinstance(error, ModuleNotFoundError) and missing.is_known(error.name):
+            return EXIT_BAD_INPUT, None, missing.words_of(str(error.name))
         # A file that is not there or can't be written is the caller's input, not a defect.
-        if error.filename is not None:
+        if isinstance(error, OSError) and error.filename is not None:
             return EXIT_BAD_INPUT, None, f'{error.filename}: {error.strerror}'
-        return EXIT_DEFECT, None, traceback.format_exc().rstrip()
-    except Exception:  # noqa: BLE001 - the outermost place: whatever is left is a defect
         return EXIT_DEFECT, None, traceback.format_exc().rstrip()
 
 
@@ -159,11 +161,11 @@ def _version() -> str:
 
 
 def _usage() -> str:
-    lines = ['usage: anser VERB [arguments]      (anser VERB --help says which)', '', 'nodes:']
-    lines += [f'  {name:<14} {line}' for name, line in NODES.items()]
-    lines += [f'  {name:<14} {line}' for name, line in COMPOSED.items()]
-    lines += ['', 'offline, no ROS needed:']
-    lines += [f'  {name:<14} {line}' for name, line in OFFLINE.items()]
+    lines = ['usage: anser VERB [arguments]      (anser VERB --help says which)']
+    for title, group in (
+        ('nodes:', {**NODES, **COMPOSED}), ('offline, no ROS needed:', OFFLINE),
+    ):  # fmt: skip
+        lines += ['', title, *(f'  {name:<14} {words}' for name, (_, words) in group.items())]
     return '\n'.join(lines)
 
 

@@ -3,11 +3,9 @@
 import argparse
 import contextlib
 import io
-import json
 import math
 import os
 import tempfile
-from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,8 @@ from rich.table import Table
 
 from anser_ros.cli import main
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import say_written
+from anser_ros.cli.output import Result, say, write_files
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.errors import ParameterError
 from anser_ros.measured import (
     ReportRow,
@@ -46,29 +45,16 @@ SCHEMA = 'anser_measured/1'
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = 'example: anser measured anser_board --out measured/'
-    parser.add_argument(
-        'datasets',
-        nargs='*',
-        metavar='DATASET',
-        help=f'some of {", ".join(RECIPES)}; all by default',
-    )
-    parser.add_argument(
-        '--shared',
-        type=Path,
-        help=f'folder with measured/ (${SHARED}, or ../shared of the source)',
-    )
-    parser.add_argument(
-        '--out',
-        type=Path,
-        help='folder for measured.json and what the commands write, made if missing',
-    )
-    parser.add_argument(
-        '--bags', type=Path, help='folder for sessions of the data, made if missing'
-    )
-    parser.add_argument(
-        '--quiet', action='store_true', help='print only the table, without the commands'
-    )
-    parser.add_argument('--json', action='store_true', help='print measured.json on stdout')
+    words = f'some of {", ".join(RECIPES)}; all by default'
+    parser.add_argument('datasets', nargs='*', metavar='DATASET', help=words)
+    words = f'folder with measured/ (${SHARED}, or ../shared of the source)'
+    parser.add_argument('--shared', type=Path, help=words)
+    add_out(parser, 'measured.json and what the commands write', required=False)
+    words = 'folder for sessions of the data, made if missing'
+    parser.add_argument('--bags', type=Path, help=words)
+    words = 'print only the table, without the commands'
+    parser.add_argument('--quiet', action='store_true', help=words)
+    add_json(parser, 'measured.json on stdout')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -78,23 +64,20 @@ def run(args: argparse.Namespace) -> int:
         raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(RECIPES)}')
     shared = shared_folder(args.shared)
     console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
-    for folder in filter(None, (args.out, args.bags)):
-        make_folder(folder)
-    rows: list[ReportRow] = []
+    make_folder(args.out)
+    make_folder(args.bags)
     names = args.datasets or _present(shared, console)
     if args.bags is not None:
-        _write_bags(names, shared, args.bags, console)
-    for name in names:
-        rows += _cook(RECIPES[name], shared, args, console)
-    document = json.dumps(to_document(rows), indent=1)
-    if args.out is not None:
-        (args.out / 'measured.json').write_text(document + '\n', encoding='utf-8')
-    if args.json:
-        print(document)
-    else:
+        for name in names:
+            for path in RECIPES[name].write_sessions(RECIPES[name].data(shared), args.bags):
+                console.print(f'wrote {path}', highlight=False)
+    rows = [row for name in names for row in _cook(RECIPES[name], shared, args, console)]
+    document = to_document(rows)
+    write_files(args.out, {'measured.json': document})
+    written = () if args.out is None else (args.out,)
+    if not args.json:
         console.print(table(rows))
-        if args.out is not None:
-            say_written(args.out)
+    say('measured', Result(document, written=written), as_json=args.json)
     return 0
 
 
@@ -125,33 +108,18 @@ def _cook(
             with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
                 code = main.main(command)
             if code:
-                raise ParameterError(
-                    f'{recipe.name}: anser {command[0]} ended with {code}: {_last(printed)}'
-                )
+                last = (printed.getvalue().strip().splitlines() or ['nothing said'])[-1]
+                words = f'anser {command[0]} ended with {code}: {last}'
+                raise ParameterError(f'{recipe.name}: {words}')
         return recipe.rows(folder, bags, out)
-
-
-def _last(printed: io.StringIO) -> str:
-    """The last line that a command said."""
-    return (printed.getvalue().strip().splitlines() or ['nothing said'])[-1]
-
-
-def _write_bags(names: Iterable[str], shared: Path, into: Path, console: Console) -> None:
-    """Write the sessions of data sets, and print their paths."""
-    for name in names:
-        for path in RECIPES[name].write_sessions(RECIPES[name].data(shared), into):
-            console.print(f'wrote {path}', highlight=False)
 
 
 def shared_folder(given: Path | None) -> Path:
     """Return the folder that contains ``measured/``.
 
-    Raises
-    ------
-    ParameterError
-        When there is no such folder.
+    Raises `ParameterError` when there is no such folder.
     """
-    source = Path(__file__).resolve().parents[2].parent / 'shared'
+    source = main.PACKAGE_FOLDER.parents[1] / 'shared'
     folder = given or Path(os.environ.get(SHARED, source))
     if not (folder / 'measured').is_dir():
         raise ParameterError(f'no measured data: {folder} has no folder measured; use --shared')

@@ -38,6 +38,11 @@ def check(node: str) -> None:
             raise MissingPackageError(words_of(module))
 
 
+def is_known(module: str | None) -> bool:
+    """Return whether a module is of a package that may be missing."""
+    return module is not None and module.split('.')[0] in PYPI
+
+
 def words_of(module: str) -> str:
     """Return what is missing, with its remedy; the module may be one inside a package."""
     package = module.split('.')[0]

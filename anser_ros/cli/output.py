@@ -1,27 +1,28 @@
-"""Checks folders that commands write to, and says what a command has done."""
+"""Says what a command has done: its document or tables, its notes, the files that it wrote.
+
+A command returns a `Result`; `main` shows it. All figures of tables and pages go through `number`.
+"""
 
 import json
+import math
 import os
 import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.table import Table
 
 from anser_ros.cli.folders import make_folder
 from anser_ros.errors import ParameterError
-from anser_ros.field.model import FieldModel
-from anser_ros.sessions.model_file import SNAPSHOT, is_snapshot
 
 
 def check_file(path: Path) -> None:
     """Make the folder of a file that is written at the end, before the work begins.
 
-    Raises
-    ------
-    ParameterError
-        When the folder cannot be made, or the file cannot be written.
+    Raises `ParameterError` when the folder cannot be made, or the file cannot be written.
     """
     make_folder(path.parent)
     if path.is_dir():
@@ -39,24 +40,27 @@ def check_new_file(path: Path) -> None:
 
 @dataclass(frozen=True)
 class Result:
-    """Holds what a command has found out about a session, and how it says so.
+    """Holds what a command has found out, and how it says so.
 
     Attributes
     ----------
     document : dict
-        The content of its JSON file.
+        What ``--json`` prints.
     notes : tuple of str
         What users have to know of the session or the model, a line each.
     shown : tuple
         Tables and texts for the reader of the terminal.
     written : tuple of Path
         The files to look at.
+    code : int
+        The exit code.
     """
 
     document: dict[str, Any]
-    notes: tuple[str, ...]
-    shown: tuple[Any, ...]
-    written: tuple[Path, ...]
+    notes: tuple[str, ...] = ()
+    shown: tuple[Any, ...] = ()
+    written: tuple[Path, ...] = ()
+    code: int = 0
 
 
 def say(command: str, result: Result, *, as_json: bool) -> None:
@@ -71,7 +75,8 @@ def say(command: str, result: Result, *, as_json: bool) -> None:
             print(item)
         else:
             Console().print(item)
-    say_written(*result.written)
+    if result.written:
+        say_written(*result.written)
 
 
 def say_written(*paths: Path) -> None:
@@ -79,9 +84,40 @@ def say_written(*paths: Path) -> None:
     print(f'wrote {", ".join(map(str, paths))}')
 
 
-def snapshot_notes(name: str, model: FieldModel) -> tuple[str, ...]:
-    """Report that a command works with a snapshot of a refit, where it does."""
-    return (f'{name} is a {SNAPSHOT}, not a calibration',) if is_snapshot(model) else ()
+def write_files(folder: Path | None, contents: Mapping[str, Any]) -> tuple[Path, ...]:
+    """Write documents (as JSON), texts and figures by their names; the paths, none without folder.
+
+    What is None is not written.
+    """
+    if folder is None:
+        return ()
+    written = []
+    for name, content in contents.items():
+        if content is None:
+            continue
+        written.append(folder / name)
+        if isinstance(content, str):
+            written[-1].write_text(content, encoding='utf-8')
+        elif isinstance(content, dict):
+            written[-1].write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
+        else:
+            from anser_ros.pictures import save
+
+            save(content, written[-1])
+    return tuple(written)
+
+
+def number(value: float | None, scale: float = 1.0, form: str = '.3f') -> str:
+    """Return a figure in another unit as text; a dash where there is none."""
+    return '-' if value is None or math.isnan(value) else f'{scale * value:{form}}'
+
+
+def terminal_table(head: Sequence[str], rows: Iterable[Sequence[str]], **style: Any) -> Table:
+    """Return rows of text as a table for the terminal."""
+    shown = Table(*head, **style)
+    for row in rows:
+        shown.add_row(*row)
+    return shown
 
 
 def loss_notes(session: str, lost: str) -> tuple[str, ...]:

@@ -1,27 +1,23 @@
 """Find the tip of a stylus from poses while it turns about its tip, and write it to the setup."""
 
 import argparse
-import html
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import yaml
-from rich.console import Console
-from rich.table import Table
 
 from anser_ros.assessment.pivot import PivotFit, PivotLimits, fit_pivot
 from anser_ros.assessment.source import AssessedPoses, read_poses
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.html_page import page, table
-from anser_ros.cli.output import say_written
+from anser_ros.cli.html_page import page, picture, table, top
+from anser_ros.cli.output import Result, terminal_table, write_files
 from anser_ros.cli.pose_source import add_source_options, live_poses, source_of
-from anser_ros.cli.progress import progress_of
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.errors import FitError, ParameterError, SetupError
-from anser_ros.pictures import image
+from anser_ros.pictures import legend_beside
 from anser_ros.poses.sequence import missing_words
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.setup_tips import SCHEMA, UPPER, TipSpec, dump_tips, with_tips
@@ -53,11 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--setup', type=Path, metavar='FILE', help='setup document that the tip is written into'
     )
-    parser.add_argument(
-        '--out',
-        type=Path,
-        help='folder for pivot.json, tips.yaml and report.html, made if missing',
-    )
+    add_out(parser, 'pivot.json, tips.yaml and report.html', required=False)
     limits = PivotLimits()
     parser.add_argument(
         '--max-sigma-mm', type=float, default=1e3 * limits.sigma_m,
@@ -67,11 +59,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--max-rms-mm', type=float, default=1e3 * limits.rms_m,
         help=f'largest rms distance of the poses from one point ({1e3 * limits.rms_m:g})',
     )  # fmt: skip
-    parser.add_argument('--json', action='store_true', help='print pivot.json on stdout')
+    add_json(parser, 'pivot.json on stdout')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Find the tip, and write it."""
     if args.live == bool(args.recording):
         raise ParameterError('give a recording, or --live with --topic')
     if args.live and not args.topic:
@@ -79,38 +71,28 @@ def run(args: argparse.Namespace) -> int:
     if not (args.max_sigma_mm > 0 and args.max_rms_mm > 0):
         raise ParameterError('--max-sigma-mm and --max-rms-mm must be positive')
     text = read_text(args.setup) if args.setup else ''
-    if args.out is not None:
-        make_folder(args.out)
-    with progress_of('pivot') as progress:
-        if args.live:
-            found = live_poses(args.topic, args.seconds, progress)
-        else:
-            found = read_poses(
-                args.recording, source_of(args), lambda share: progress('tracking', share)
-            )
-        body, missing = _body(args, found, text), missing_words(found.poses)
-        progress('fitting', 0.5)
-        limits = PivotLimits(1e-3 * args.max_sigma_mm, 1e-3 * args.max_rms_mm)
-        try:
-            fit = fit_pivot(found.poses, np.random.default_rng(SEED), limits)
-        except FitError as error:
-            words = '; '.join(filter(None, (str(error), missing)))
-            raise FitError(f'{found.session.path}: {found.name}: {words}') from error
+    make_folder(args.out)
+    if args.live:
+        found = live_poses(args.topic, args.seconds, tell)
+    else:
+        found = read_poses(args.recording, source_of(args), lambda share: tell('tracking', share))
+    body, missing = _body(args, found, text), missing_words(found.poses)
+    tell('fitting', 0.5)
+    limits = PivotLimits(1e-3 * args.max_sigma_mm, 1e-3 * args.max_rms_mm)
+    try:
+        fit = fit_pivot(found.poses, np.random.default_rng(SEED), limits)
+    except FitError as error:
+        words = '; '.join(filter(None, (str(error), missing)))
+        raise FitError(f'{found.session.path}: {found.name}: {words}') from error
     document = to_document(fit, found, body)
     written = _write(args, text, body, fit, document)
-    if missing:
-        print(f'anser pivot: {found.session.path}: {missing}', file=sys.stderr)
-    if args.json:
-        print(json.dumps(document, indent=1))
-        return 0
-    Console().print(_table(fit))
-    Console().print(
-        f'{document["n_agree"]} of {document["n"]} poses agree, rms {1e3 * fit.rms_m:.2f} mm',
-        highlight=False,
-    )
-    if written:
-        say_written(*written)
-    return 0
+    notes = (f'{found.session.path}: {missing}',) if missing else ()
+    shown = terminal_table(HEAD, _rows(fit)), _agreement(fit, document)
+    return Result(document, notes, shown, written)
+
+
+def _agreement(fit: PivotFit, document: dict[str, Any]) -> str:
+    return f'{document["n_agree"]} of {document["n"]} poses agree, rms {1e3 * fit.rms_m:.2f} mm'
 
 
 def _body(args: argparse.Namespace, found: AssessedPoses, text: str) -> str:
@@ -156,10 +138,9 @@ def to_document(fit: PivotFit, found: AssessedPoses, body: str) -> dict[str, Any
 
 def _write(
     args: argparse.Namespace, text: str, body: str, fit: PivotFit, document: dict[str, Any]
-) -> list[Path]:
+) -> tuple[Path, ...]:
     x, y, z = (float(v) for v in fit.tip)
     spec = TipSpec((x, y, z), tuple(float(fit.covariance[i, j]) for i, j in UPPER))
-    written = []
     if args.setup is not None:
         new = with_tips(text, {body: spec})
         try:
@@ -174,18 +155,14 @@ def _write(
         aside = args.setup.with_name(args.setup.name + '.new')
         aside.write_text(new, encoding='utf-8')
         aside.replace(args.setup)
-        written.append(args.setup)
-    if args.out is not None:
-        tips = {'schema': SCHEMA, 'tips': dump_tips({body: spec})}
-        files = {
-            'pivot.json': json.dumps(document, indent=1) + '\n',
-            'tips.yaml': yaml.safe_dump(tips, sort_keys=False, default_flow_style=None),
-            'report.html': render(fit, document),
-        }
-        for name, content in files.items():
-            (args.out / name).write_text(content, encoding='utf-8')
-            written.append(args.out / name)
-    return written
+    written: tuple[Path, ...] = () if args.setup is None else (args.setup,)
+    if args.out is None:
+        return written
+    tips = {'schema': SCHEMA, 'tips': dump_tips({body: spec})}
+    tips_yaml = yaml.safe_dump(tips, sort_keys=False, default_flow_style=None)
+    report = render(fit, document)
+    files = {'pivot.json': document, 'tips.yaml': tips_yaml, 'report.html': report}
+    return (*written, *write_files(args.out, files))
 
 
 def _rows(fit: PivotFit) -> list[list[str]]:
@@ -198,28 +175,20 @@ def _rows(fit: PivotFit) -> list[list[str]]:
 HEAD = ('axis of the body', 'tip, mm', '1 sigma, mm', 'tilt of the axis, rms deg')
 
 
-def _table(fit: PivotFit) -> Table:
-    shown = Table(*HEAD)
-    for row in _rows(fit):
-        shown.add_row(*row)
-    return shown
-
-
 def render(fit: PivotFit, document: dict[str, Any]) -> str:
     """Return the page as HTML: the tip, and how far each pose puts it from where it rested."""
     figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
     for mask, colour, label in ((fit.agrees, 'C0', 'agrees'), (~fit.agrees, 'C3', 'left out')):
         axes.plot(fit.time[mask], 1e3 * fit.distance[mask], '.', ms=3, color=colour, label=label)
     axes.set(xlabel='time, s', ylabel='tip from the point, mm', yscale='log')
-    figure.legend(loc='outside right upper')
+    legend_beside(figure)
     verdict = (
         f'The tip of {document["body"]} is known to '
-        f'{1e3 * float(np.sqrt(np.trace(fit.covariance))):.2f} mm; {document["n_agree"]} of '
-        f'{document["n"]} poses agree, rms {1e3 * fit.rms_m:.2f} mm.'
+        f'{1e3 * float(np.sqrt(np.trace(fit.covariance))):.2f} mm; {_agreement(fit, document)}.'
     )
-    return page('Pivot', [
-        '<h1>Pivot calibration</h1>'
-        f'<p class="note"><code>{html.escape(str(document["recording"]))}</code></p>'
-        f'<p class="verdict">{html.escape(verdict)}</p>',
-        table(HEAD, _rows(fit)), image(figure),
-    ])  # fmt: skip
+    return page(
+        'Pivot',
+        top('Pivot calibration', verdict, recording=str(document['recording'])),
+        table(HEAD, _rows(fit)),
+        picture(figure),
+    )

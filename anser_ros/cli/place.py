@@ -2,7 +2,6 @@
 
 import argparse
 import csv
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +9,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import say_written
-from anser_ros.cli.place_figure import write_figure
-from anser_ros.cli.progress import progress_of
-from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.cli.output import Result, terminal_table, write_files
+from anser_ros.cli.place_figure import places_figure
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json, add_out, add_stated_values, stated_values
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Region
@@ -47,7 +44,7 @@ AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -1, -1]]) / np.
 LENGTH_M = 0.008
 """Length of a coil that is not stated, m: about that of the coils of the demo's setup."""
 FARTHEST = 10.0
-"""Distance of a coil, in halves of the board, beyond which it hears nothing of it."""
+"""Distance of a coil, in halves of the board, beyond which it receives nothing of it."""
 MOST_CANDIDATES = 400
 """Coils to choose from at most; more take minutes and gigabytes."""
 RANDOM_TRIES, SEED = 20, 1
@@ -73,57 +70,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('setup', help='setup document: a path, or a file of config/')
     parser.add_argument('--references', type=int, required=True, metavar='N', help='coils wanted')
     parser.add_argument(
-        '--from',
-        dest='origin',
-        default='setup',
-        metavar='WHERE',
+        '--from', dest='origin', default='setup', metavar='WHERE',
         help="places to choose from: 'setup' (its own reference sensors, the default), 'frame' "
         '(around the board), plane=Z (a lattice at that height, m), or a CSV file with x_m, y_m, '
         'z_m and, where they are given, ax, ay, az, length_m',
-    )
-    parser.add_argument(
-        '--metal',
-        default=','.join(KINDS),
-        help='family of metals: below the board, around the volume, or both (%(default)s)',
-    )
-    parser.add_argument(
-        '--error-mm',
-        type=float,
-        default=5.0,
-        help='pose error that each metal causes while it is not compensated (%(default)s)',
-    )
-    parser.add_argument('--out', required=True, type=Path, help='folder, made if missing')
+    )  # fmt: skip
+    words = 'family of metals: below the board, around the volume, or both (%(default)s)'
+    parser.add_argument('--metal', default=','.join(KINDS), help=words)
+    words = 'pose error that each metal causes while it is not compensated (%(default)s)'
+    parser.add_argument('--error-mm', type=float, default=5.0, help=words)
+    add_out(parser)
     add_stated_values(parser, 'accuracy', 'refit')
-    parser.add_argument('--json', action='store_true', help=f'print {DOCUMENT} on stdout')
+    add_json(parser, f'{DOCUMENT} on stdout')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Propose places for the setup of the arguments."""
     kinds = [kind.strip() for kind in args.metal.split(',')]
-    unknown = sorted(set(kinds) - set(KINDS))
-    if unknown or not kinds:
+    if not set(kinds) <= set(KINDS):
         raise ParameterError(f'--metal {args.metal}: must be some of {", ".join(KINDS)}')
     if not (np.isfinite(args.error_mm) and args.error_mm > 0.0):
         raise ParameterError(f'--error-mm must be positive, got {args.error_mm}')
     setup = parse_setup(read_config(args.setup)).with_stated(stated_values(args))
-    with progress_of('placing') as progress:
-        proposal = propose(
-            setup, args.references, args.origin, kinds, 1e-3 * args.error_mm, progress
-        )
+    found = propose(setup, args.references, args.origin, kinds, 1e-3 * args.error_mm, tell)
     make_folder(args.out)
-    document = to_document(proposal, args.origin)
-    text = json.dumps(document, indent=1)
-    (args.out / DOCUMENT).write_text(text + '\n', encoding='utf-8')
+    document = to_document(found, args.origin)
+    figure = places_figure(found.candidates, found.region, found.designs, found.random)
+    written = write_files(args.out, {DOCUMENT: document, FIGURE: figure})
     _write_table(args.out / TABLE, document['places'])
-    write_figure(
-        args.out / FIGURE, proposal.candidates, proposal.region, proposal.designs, proposal.random
-    )
-    if args.json:
-        print(text)
-    else:
-        Console().print(_table(document))
-        say_written(*(args.out / name for name in (DOCUMENT, TABLE, FIGURE)))
-    return 0
+    head = ['references', 'expected error mm', 'random places mm (best to worst)']
+    table = terminal_table(head, _rows(document))
+    return Result(document, (), (table,), (*written, args.out / TABLE))
 
 
 def propose(
@@ -132,26 +109,11 @@ def propose(
 ) -> Proposal:  # fmt: skip
     """Choose reference coils of a setup.
 
-    Parameters
-    ----------
-    setup : Setup
-    count : int
-        Coils wanted.
-    origin : str
-        ``setup``, ``frame``, ``plane=Z`` or the path of a CSV file.
-    kinds : list of str
-        Of `KINDS`.
-    error_m : float
-        Error of poses that each metal makes while it is not corrected, m.
-    progress : callable
-        Called with the stage and the finished share of all.
+    ``origin`` is ``setup``, ``frame``, ``plane=Z`` or the path of a CSV file, ``kinds`` are of
+    `KINDS`, and ``error_m`` is the error of poses, m, that each metal makes uncorrected.
 
-    Raises
-    ------
-    ParameterError
-        When there are not as many places, or the list of them can't be read.
-    SetupError
-        When the board can't be drawn from the setup.
+    Raises `ParameterError` when there are not as many places, or the list of them can't be read,
+    `SetupError` when the board can't be drawn from the setup.
     """
     field = NominalBoard.of(setup).field
     if field is None:
@@ -186,32 +148,39 @@ def candidates_of(setup: Setup, origin: str, region: Region) -> SensorTable:
         table = sensor_table(setup.reference_sensors)
         if not len(table):
             raise ParameterError('the setup has no reference sensors; use --from frame or plane=Z')
-        return _bounded(table, origin, region)
-    half, middle = region.half, region.centre
-    if origin == 'frame':
-        angle = 2.0 * np.pi * np.arange(FRAME_PLACES) / FRAME_PLACES
-        rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        rim *= FRAME_WIDTH * half / np.abs(rim).max(axis=1, keepdims=True)
-        places = np.concatenate(
-            [np.column_stack([rim + middle, np.full(len(rim), z * half)]) for z in FRAME_HEIGHTS]
-        )
-        return _bounded(_every_axis(places), origin, region)
-    if origin.startswith('plane='):
-        try:
-            height = float(origin.removeprefix('plane='))
-        except ValueError:
-            height = float('nan')
-        if not np.isfinite(height):
-            raise ParameterError(f'--from {origin}: the height must be a number, m')
-        line = SPACING * half * np.arange(-3, 4)
-        x, y = np.meshgrid(line + middle[0], line + middle[1], indexing='ij')
-        places = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
-        return _bounded(_every_axis(places), origin, region)
-    return _bounded(_read(Path(origin)), origin, region)
+    elif origin == 'frame':
+        table = _every_axis(_frame(region))
+    elif origin.startswith('plane='):
+        table = _every_axis(_plane(origin, region))
+    else:
+        table = _read(Path(origin))
+    return _bounded(table, origin, region)
+
+
+def _frame(region: Region) -> Array:
+    """Places around the board."""
+    angle = 2.0 * np.pi * np.arange(FRAME_PLACES) / FRAME_PLACES
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rim *= FRAME_WIDTH * region.half / np.abs(rim).max(axis=1, keepdims=True)
+    heights = [np.full(len(rim), z * region.half) for z in FRAME_HEIGHTS]
+    return np.concatenate([np.column_stack([rim + region.centre, z]) for z in heights])
+
+
+def _plane(origin: str, region: Region) -> Array:
+    """Places of a lattice at the height that ``plane=Z`` states."""
+    try:
+        height = float(origin.removeprefix('plane='))
+    except ValueError:
+        height = float('nan')
+    if not np.isfinite(height):
+        raise ParameterError(f'--from {origin}: the height must be a number, m')
+    line = SPACING * region.half * np.arange(-3, 4)
+    x, y = np.meshgrid(line + region.centre[0], line + region.centre[1], indexing='ij')
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
 
 
 def _bounded(table: SensorTable, origin: str, region: Region) -> SensorTable:
-    """The coils, if they are not too many and none is too far from the board to hear it."""
+    """The coils, if they are not too many and none is too far from the board to receive it."""
     away = np.linalg.norm(table.position - np.array([*region.centre, 0.0]), axis=1)
     if away.max() > FARTHEST * region.half:
         unit = unit_words(float(np.median(away)) / region.half, LENGTH_UNITS)
@@ -300,16 +269,17 @@ def to_document(proposal: Proposal, origin: str) -> dict[str, Any]:
     }
 
 
-def _table(document: dict[str, Any]) -> Table:
+def _rows(document: dict[str, Any]) -> list[list[str]]:
     drawn = {row['references']: row for row in document['random']}
-    table = Table('references', 'expected error mm', 'random places mm (best to worst)')
+    rows = []
     for row in document['expected']:
-        other = drawn.get(row['references'])
-        if other is not None:
-            spread = f'{1e3 * other["best_error_m"]:.3f} to {1e3 * other["worst_error_m"]:.3f}'
-            cell = f'{1e3 * other["mean_error_m"]:.3f} ({spread})'
-            table.add_row(str(row['references']), f'{1e3 * row["error_m"]:.3f}', cell)
-    return table
+        if other := drawn.get(row['references']):
+            mean, best, worst = (
+                1e3 * other[f'{which}_error_m'] for which in ('mean', 'best', 'worst')
+            )
+            cell = f'{mean:.3f} ({best:.3f} to {worst:.3f})'
+            rows.append([str(row['references']), f'{1e3 * row["error_m"]:.3f}', cell])
+    return rows
 
 
 def _write_table(path: Path, places: list[dict[str, Any]]) -> None:

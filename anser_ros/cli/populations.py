@@ -42,14 +42,9 @@ def population_table(
         rows = {int(c): i for i, c in enumerate(record.parameters['channels'])}
         for part, name in enumerate(names):
             head.append(f'{record.name}{f" {name}" if name else ""}, {unit}')
-            columns.append(
-                [
-                    f'{values[rows[c], part]:.4f} ± {sigma[rows[c], part]:.4f}'
-                    if c in rows
-                    else ''
-                    for c in channels
-                ]
-            )
+            pairs = zip(values[:, part], sigma[:, part], strict=True)
+            cells = [f'{value:.4f} ± {spread:.4f}' for value, spread in pairs]
+            columns.append([cells[rows[c]] if c in rows else '' for c in channels])
     return head, [list(row) for row in zip(*columns, strict=True)]
 
 
@@ -62,6 +57,8 @@ def population_figure(records: Sequence[EffectRecord]) -> 'Figure | None':
     if not found:
         return None
     from matplotlib import pyplot as plt
+
+    from anser_ros.cli.html_page import legend_under
 
     width = 4 * len(found)
     figure, panels = plt.subplots(
@@ -82,7 +79,7 @@ def population_figure(records: Sequence[EffectRecord]) -> 'Figure | None':
         panel.set_xticks(named, [str(record.parameters['channels'][k]) for k in named])
         panel.set(title=f'{record.name}: {spread:.3g} {unit}', xlabel='channel', ylabel=unit)
         panel.grid(alpha=0.3)
-        panel.legend(fontsize=7, loc='upper center', bbox_to_anchor=(0.5, -0.17), ncols=3)
+        legend_under(panel, 0.17, 7)
     return figure
 
 

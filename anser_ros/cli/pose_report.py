@@ -1,21 +1,33 @@
 """Shows the diagnosis of a tracker of poses as a self-contained page for a clinic's engineer."""
 
-import html
 import re
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.cli.diagnosis_figures import AFTER, BEFORE
-from anser_ros.cli.html_page import page, table
+from anser_ros.cli.html_page import (
+    AFTER,
+    BEFORE,
+    Html,
+    details,
+    heading,
+    page,
+    paragraph,
+    picture,
+    table,
+    top,
+)
+from anser_ros.cli.output import number
 from anser_ros.cli.pose_values import sizes
-from anser_ros.pictures import image, legend_below
+from anser_ros.physics.constants import DEGREES
+from anser_ros.pictures import legend_below, spell_out
 from anser_ros.poses.diagnosis import PoseDiagnosis
 from anser_ros.poses.effect import Role
 from anser_ros.poses.problem import PosePart, PoseState
@@ -40,13 +52,11 @@ def pose_verdict(document: dict[str, Any]) -> str:
     else:
         text = f'No effect is found: with hand-eye alone the held-out error is {after:.2f} mm.'
     if not document['knows_levers']:
-        text += (
-            ' The motion hardly determines where the sensors sit on the body, so that no effect'
-        )
-        text += ' of place or of a single sensor can be told: turn the body about two axes.'
+        text += ' The motion hardly determines where the sensors sit on the body, so that no '
+        text += 'effect of place or of a single sensor can be told: turn the body about two axes.'
     if document['left_out']:
-        text += ' Left out, with too few poses at times with a reference: '
-        text += f'{", ".join(document["left_out"])}.'
+        names = ', '.join(document['left_out'])
+        text += f' Left out, with too few poses at times with a reference: {names}.'
     if rest['fraction'] > 0:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         text += f' {rest["fraction"]:.0%} of the squared error above the jitter stays'
@@ -62,102 +72,108 @@ def pose_verdict(document: dict[str, Any]) -> str:
 def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -> str:
     """Return the page as HTML with its figures inside."""
     before, after = found.states
-    sections = [
-        f'<h1>Diagnosis of poses</h1><p class="note">session <code>{html.escape(session)}</code>'
-        f'</p><p class="verdict">{html.escape(pose_verdict(document))}</p>',
-        '<h2>What is wrong, and what to do</h2>',
+    return page(
+        'Diagnosis of poses',
+        top('Diagnosis of poses', pose_verdict(document), session=session),
+        heading('What is wrong, and what to do'),
         _effects(document),
-        '<h2>Error before and after</h2><p>Distance between both trackers, root mean square. '
-        'Every fifth stretch of time took no part in choosing or fitting; these are its errors '
-        '(of eight or more recordings at rest each, by a fit of the others). '
-        '<i>Before</i> is with the lever arm and mount of each sensor, <i>after</i> with what was '
-        'found as well.</p>',
+        heading(
+            'Error before and after',
+            'Distance between both trackers, root mean square. Every fifth stretch of time took '
+            'no part in choosing or fitting; these are its errors (of eight or more recordings at '
+            'rest each, by a fit of the others). Before is with the lever arm and mount of each '
+            'sensor, after with what was found as well.',
+        ),
         _by_sensor(document),
-        image(_groups(before, after)),
-        '<h2>Over time</h2>',
-        image(_over_time(before, after)),
-        '<h2>Agreement of both trackers (Bland and Altman)</h2><p>Difference of the two trackers '
-        'after correction against their mean, by axis of the tracker. The middle line is the mean '
-        'difference; 95% of differences lie between the others, the limits of agreement.</p>',
-        image(_bland_altman(after)),
+        picture(_groups(before, after)),
+        heading('Over time'),
+        picture(_over_time(before, after)),
+        heading(
+            'Agreement of both trackers (Bland and Altman)',
+            'Difference of the two trackers after correction against their mean, by axis of the '
+            'tracker. The middle line is the mean difference; 95% of differences lie between the '
+            'others, the limits of agreement.',
+        ),
+        picture(_bland_altman(after)),
         _agreement(after),
-        '<h2>Frames</h2><p>Where the optical frame is in that of the tracker, and where each '
-        'sensor is on the body; a dash is what the motion does not determine.</p>',
+        heading(
+            'Frames',
+            'Where the optical frame is in that of the tracker, and where each sensor is on the '
+            'body; a dash is what the motion does not determine.',
+        ),
         _frames(document),
-        '<details><summary>What was tried and not named</summary><p>The gain is by how much the '
-        'squared error falls on blocks that took no part, in units of the noise.</p>',
-        table(['candidate', 'why not'],
-              [[short_label(row['candidate']), row['why']] for row in document['refused']]),
-        '</details>',
-    ]  # fmt: skip
-    return page('Diagnosis of poses', sections)
-
-
-def short_label(label: str) -> str:
-    """Return a candidate's label without where its polynomial is centred, which tells nobody."""
-    return re.sub(r',? ?(centre_m \[[^]]*\]|(size_m|middle_s) [-+.\de]+)', '', label).replace(
-        ' ()', ''
+        details(
+            'What was tried and not named',
+            paragraph(
+                'The gain is by how much the squared error falls on blocks that took no part, in '
+                'units of the noise.'
+            ),
+            table(
+                ['candidate', 'why not'],
+                [[short_label(row['candidate']), row['why']] for row in document['refused']],
+            ),
+        ),
     )
 
 
-def _mm(value: float | None) -> str:
-    return '-' if value is None else f'{1e3 * value:.2f}'
+def short_label(label: str) -> str:
+    """Return a candidate's label without the centre of its polynomial."""
+    text = re.sub(r',? ?(centre_m \[[^]]*\]|(size_m|middle_s) [-+.\de]+)', '', label)
+    return text.replace(' ()', '')
 
 
-def _deg(value: float | None) -> str:
-    return '-' if value is None else f'{np.rad2deg(value):.2f}'
-
-
-def _by_sensor(document: dict[str, Any]) -> str:
-    rows = [
-        [
-            name, _mm(row['position_rmse_registration_only_m']),
-            _mm(row['position_rmse_before_m']), _mm(row['position_rmse_after_m']),
-            _deg(row['orientation_rmse_before_rad']), _deg(row['orientation_rmse_after_rad']),
-        ]
-        for name, row in document['sensors'].items()
-    ]  # fmt: skip
+def _by_sensor(document: dict[str, Any]) -> Html:
+    places = [f'position_rmse_{key}_m' for key in ('registration_only', 'before', 'after')]
+    turns = [f'orientation_rmse_{key}_rad' for key in ('before', 'after')]
     return table(
         ['sensor', 'registration only, mm', 'with lever arm and mount, mm', 'with effects, mm',
-         'with mount, deg', 'with effects, deg'], rows,
+         'with mount, deg', 'with effects, deg'],
+        [
+            [
+                name, *(number(row[key], 1e3, '.2f') for key in places),
+                *(number(row[key], DEGREES, '.2f') for key in turns),
+            ]
+            for name, row in document['sensors'].items()
+        ],
     )  # fmt: skip
 
 
-def _effects(document: dict[str, Any]) -> str:
+def _effects(document: dict[str, Any]) -> Html:
     rows = []
     for effect in document['effects']:
         if effect['name'] == HAND_EYE:
             continue
         evidence = effect['evidence']
-        error = ' to '.join(_mm(evidence.get(f'position_rmse_{k}_m')) for k in ('without', 'with'))
+        pair = [evidence.get(f'position_rmse_{when}_m') for when in ('without', 'with')]
         rows.append([
             effect['name'], str(evidence.get('summary') or ''),
             '\n'.join(sizes(effect['parameters'], effect['uncertainty'])),
-            '' if error == '- to -' else error, str(evidence.get('advice') or ''),
+            '' if pair == [None, None] else ' to '.join(number(v, 1e3, '.2f') for v in pair),
+            str(evidence.get('advice') or ''),
         ])  # fmt: skip
     if not rows:
-        return '<p>Nothing was found.</p>'
+        return paragraph('Nothing was found.')
     head = ['name', 'what it is', 'how much, ± 1 sigma', 'takes the error from, mm', 'what to do']
-    return table(head, rows).replace('\n', '<br>')
+    return table(head, rows)
 
 
-def _frames(document: dict[str, Any]) -> str:
+def _frames(document: dict[str, Any]) -> Html:
     """The lever arm and mount of each sensor, and the registration, which all of them share."""
-    rows = []
+    rows, shared = [], []
     for effect in document['effects']:
         if effect['name'] == HAND_EYE:
-            values, sigma = effect['parameters'], effect['uncertainty']
-            rows.append([
-                values['sensor'], _triple(values, sigma, 'lever_arm_m', 1e3),
-                _triple(values, sigma, 'mount_rotation_deg', 1.0),
-            ])  # fmt: skip
-            shared = [
-                'optical frame', _triple(values, sigma, 'registration_translation_m', 1e3),
-                _triple(values, sigma, 'registration_rotation_deg', 1.0),
-            ]  # fmt: skip
-    if rows and shared[1]:
-        rows.append(shared)
-    return table(['', 'place x, y, z ± 1 sigma, mm', 'rotation vector ± 1 sigma, deg'], rows)
+            pair = effect['parameters'], effect['uncertainty']
+            lever, mount, translation, rotation = (
+                _triple(*pair, key, scale)
+                for key, scale in (
+                    ('lever_arm_m', 1e3), ('mount_rotation_deg', 1.0),
+                    ('registration_translation_m', 1e3), ('registration_rotation_deg', 1.0),
+                )
+            )  # fmt: skip
+            rows.append([effect['parameters']['sensor'], lever, mount])
+            shared = [['optical frame', translation, rotation]] if translation else []
+    head = ['', 'place x, y, z ± 1 sigma, mm', 'rotation vector ± 1 sigma, deg']
+    return table(head, [*rows, *shared])
 
 
 def _triple(values: dict[str, Any], sigma: dict[str, Any], key: str, scale: float) -> str:
@@ -183,31 +199,32 @@ def _groups(before: PoseState, after: PoseState) -> Figure:
         1, len(measures), figsize=(9, 3), layout='constrained', sharey=True
     )
     for panel, (label, measure) in zip(panels, measures.items(), strict=True):
-        for state, colour, way, name in (
-            (before, BEFORE, -0.2, 'before'), (after, AFTER, 0.2, 'after'),
-        ):  # fmt: skip
-            value = np.concatenate([measure(part)[part.used] for part in state.parts])
-            square = np.concatenate(
-                [np.sum(p.residual[p.used, :3] ** 2, axis=1) for p in state.parts]
-            )
-            if value.size < 2 * GROUPS:
-                continue
-            edges = np.quantile(value, np.linspace(0, 1, GROUPS + 1))
-            group = np.clip(np.searchsorted(edges, value, side='right') - 1, 0, GROUPS - 1)
-            for k in np.unique(group):
-                size = 1e3 * float(np.sqrt(np.mean(square[group == k])))
-                panel.bar(
-                    k + way, size, 0.4, color=colour, label=name if k == group.min() else None
-                )
-                words = f'{size:.2g}' if size < 10 else f'{size:.0f}'
-                panel.annotate(words, (k + way, size), ha='center', va='bottom', fontsize=6)
-            digits = 0 if np.ptp(edges) > 10 * GROUPS else 1
-            names = [f'{a:.{digits}f} to\n{b:.{digits}f}' for a, b in pairwise(edges)]
-            panel.set_xticks(range(GROUPS), names, fontsize=7)
         panel.set(xlabel=label)
+        _bars(panel, before, measure, -0.2, {'color': BEFORE, 'label': 'before'})
+        _bars(panel, after, measure, 0.2, {'color': AFTER, 'label': 'after'})
     panels[0].set_ylabel('error, mm')
     legend_below(figure, panels[0])
     return figure
+
+
+def _bars(
+    panel: Axes, state: PoseState, measure: Callable[[PosePart], Array], way: float,
+    style: dict[str, Any],
+) -> None:  # fmt: skip
+    """The error of each group by a measure, beside its middle."""
+    value = np.concatenate([measure(part)[part.used] for part in state.parts])
+    square = np.concatenate([np.sum(p.residual[p.used, :3] ** 2, axis=1) for p in state.parts])
+    if value.size < 2 * GROUPS:
+        return
+    edges = np.quantile(value, np.linspace(0, 1, GROUPS + 1))
+    group = np.clip(np.searchsorted(edges, value, side='right') - 1, 0, GROUPS - 1)
+    found = np.unique(group)
+    error = [1e3 * float(np.sqrt(np.mean(square[group == k]))) for k in found]
+    bars = panel.bar(found + way, error, 0.4, **style)
+    panel.bar_label(bars, [f'{v:.2g}' if v < 10 else f'{v:.0f}' for v in error], fontsize=6)
+    digits = 0 if np.ptp(edges) > 10 * GROUPS else 1
+    names = [f'{a:.{digits}f} to\n{b:.{digits}f}' for a, b in pairwise(edges)]
+    panel.set_xticks(range(GROUPS), names, fontsize=7)
 
 
 def _distance(part: PosePart) -> Array:
@@ -231,9 +248,7 @@ def _over_time(before: PoseState, after: PoseState) -> Figure:
             axes.plot(part.view.time[part.used], size[part.used], '.', ms=2, color=colour,
                       label=label if k == 0 else None)  # fmt: skip
     axes.set(xlabel='time, s', ylabel='distance, mm', yscale='log')
-    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    spell_out(axes.yaxis)
     legend_below(figure, axes, markers=4.0)
     return figure
 
@@ -248,7 +263,7 @@ def _limits(values: Array) -> tuple[float, float, float]:
     return middle - spread, middle, middle + spread
 
 
-def _agreement(state: PoseState) -> str:
+def _agreement(state: PoseState) -> Html:
     rows = [
         [name, *(f'{value:.2f}' for value in _limits(_differences(state, axis)))]
         for axis, name in enumerate('xyz')

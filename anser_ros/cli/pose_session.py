@@ -1,50 +1,41 @@
-"""Adds options to commands that take a session of poses, and carries them out."""
+"""Takes sessions of trackers that give poses only: options, diagnosis and evaluation."""
 
 import argparse
 import csv
-import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from rich.table import Table
 
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, loss_notes
+from anser_ros.cli.output import Result, loss_notes, number, terminal_table, write_files
 from anser_ros.cli.pose_report import pose_verdict, render_poses
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_list
 from anser_ros.errors import ParameterError
+from anser_ros.physics.constants import DEGREES
 from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses
 from anser_ros.poses.document import to_document, to_model
 from anser_ros.poses.recording import read_pose_session
 from anser_ros.poses.sequence import PoseSession
 
 
-def add_pose_options(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of a session of poses."""
-    parser.add_argument(
-        '--poses', action='store_true', help='a session of a tracker that gives poses only'
-    )
     add_topic_options(parser, 'sensor', 'with --poses: ')
 
 
 def add_topic_options(parser: argparse.ArgumentParser, what: str, when: str = '') -> None:
     """Declare the options that name topics of poses in a bag."""
-    parser.add_argument(
-        '--tracked', action='append', default=[], metavar='NAME=TOPIC', dest='topics',
+    add_list(
+        parser, '--tracked', metavar='NAME=TOPIC', dest='topics',
         help=f'{when}a tracked {what} and its topic, by default all /tracked/<sensor>/pose',
     )  # fmt: skip
     parser.add_argument(
         '--optical', metavar='TOPIC',
         help=f'{when}topic of the reference, by default the only /optical/<body>/pose',
     )  # fmt: skip
-
-
-def need_model(args: argparse.Namespace) -> None:
-    """Raise `ParameterError` where a session of fluxes has no model."""
-    if args.model is None:
-        raise ParameterError('the following arguments are required: --model (or --poses)')
 
 
 def load_poses(path: Path | str, args: argparse.Namespace) -> PoseSession:
@@ -58,29 +49,30 @@ def load_poses(path: Path | str, args: argparse.Namespace) -> PoseSession:
     return read_pose_session(path, topics or None, args.optical)
 
 
-def diagnose_pose_session(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:
-    """Diagnose a session of poses into the folder of the arguments, and tell the stages."""
+def diagnose(args: argparse.Namespace, tell: Tell) -> Result:
+    """Diagnose a session of poses into the folder of the arguments."""
     found, document = _found(args, tell)
-    model = yaml.safe_dump(to_model(found), sort_keys=False)
-    (args.out / 'model.yaml').write_text(model, encoding='utf-8')
-    page = render_poses(found, document, str(args.session))
-    (args.out / 'report.html').write_text(page, encoding='utf-8')
-    files = 'diagnosis.json', 'model.yaml', 'report.html'
-    return _result(args, found, document, document, files)
+    written = write_files(
+        args.out,
+        {
+            'diagnosis.json': document,
+            'model.yaml': yaml.safe_dump(to_model(found), sort_keys=False),
+            'report.html': render_poses(found, document, str(args.session)),
+        },
+    )
+    return _result(args, found, document, document, written)
 
 
-def evaluate_pose_session(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:
-    """Report the errors of a session of poses, into the folder of the arguments, and the
-    stages."""
+def evaluate(args: argparse.Namespace, tell: Tell) -> Result:
+    """Report the errors of a session of poses, into the folder of the arguments."""
     found, diagnosis = _found(args, tell)
     document = _evaluation(found, diagnosis)
+    written = write_files(args.out, {'evaluation.json': document})
     _write_poses(args.out / 'poses.csv', found)
-    return _result(args, found, document, diagnosis, ('evaluation.json', 'poses.csv'))
+    return _result(args, found, document, diagnosis, (*written, args.out / 'poses.csv'))
 
 
-def _found(
-    args: argparse.Namespace, tell: Callable[[str], None]
-) -> tuple[PoseDiagnosis, dict[str, Any]]:
+def _found(args: argparse.Namespace, tell: Tell) -> tuple[PoseDiagnosis, dict[str, Any]]:
     session = load_poses(args.session, args)
     make_folder(args.out)
     found = diagnose_poses(session, tell)
@@ -88,31 +80,21 @@ def _found(
 
 
 def _result(
-    args: argparse.Namespace,
-    found: PoseDiagnosis,
-    document: dict[str, Any],
-    diagnosis: dict[str, Any],
-    files: tuple[str, ...],
-) -> Result:
-    """Write the document into the first of the files, and say all of it."""
-    text = json.dumps(document, indent=1)
-    (args.out / files[0]).write_text(text + '\n', encoding='utf-8')
-    return Result(
-        document,
-        loss_notes(args.session, found.session.lost),
-        (_table(diagnosis), pose_verdict(diagnosis)),
-        tuple(args.out / name for name in files),
-    )
-
-
-def _table(document: dict[str, Any]) -> Table:
-    table = Table('sensor', 'registration mm', 'hand-eye mm', 'effects mm', 'effects deg')
-    for name, row in document['sensors'].items():
-        cells = [row[f'position_rmse_{key}_m'] for key in ('registration_only', 'before', 'after')]
-        turn = row['orientation_rmse_after_rad']
-        shown = ['-' if v is None else f'{1e3 * v:.2f}' for v in cells]
-        table.add_row(name, *shown, '-' if turn is None else f'{np.rad2deg(turn):.2f}')
-    return table
+    args: argparse.Namespace, found: PoseDiagnosis, document: dict[str, Any],
+    diagnosis: dict[str, Any], written: tuple[Path, ...],
+) -> Result:  # fmt: skip
+    rows = [
+        [
+            name,
+            *(number(row[f'position_rmse_{key}_m'], 1e3, '.2f')
+              for key in ('registration_only', 'before', 'after')),
+            number(row['orientation_rmse_after_rad'], DEGREES, '.2f'),
+        ]
+        for name, row in diagnosis['sensors'].items()
+    ]  # fmt: skip
+    head = ['sensor', 'registration mm', 'hand-eye mm', 'effects mm', 'effects deg']
+    shown = terminal_table(head, rows), pose_verdict(diagnosis)
+    return Result(document, loss_notes(args.session, found.session.lost), shown, written)
 
 
 def _evaluation(found: PoseDiagnosis, document: dict[str, Any]) -> dict[str, Any]:

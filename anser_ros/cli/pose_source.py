@@ -45,10 +45,7 @@ def add_source_options(parser: argparse.ArgumentParser, *, tip: bool = True) -> 
 def source_of(args: argparse.Namespace) -> PoseSource:
     """Return which poses the options mean.
 
-    Raises
-    ------
-    ParameterError
-        When a file of tips has several and no body is named.
+    Raises `ParameterError` when a file of tips has several and no body is named.
     """
     place = None
     if getattr(args, 'tip', None) is not None:
@@ -67,16 +64,9 @@ def live_poses(
     """Return poses of a topic of the running graph, received for some seconds from the first one
     on.
 
-    Raises
-    ------
-    ParameterError
-        When the time is not one that can be waited.
-    BagError
-        When there is no pose on the topic.
-    MissingPackageError
-        When there is no ROS.
-    PlausibilityError
-        When the positions cannot be in metres.
+    Raises `ParameterError` when the time is not one that can be waited, `BagError` when there is
+    no pose on the topic, `MissingPackageError` when there is no ROS, `PlausibilityError` when the
+    positions cannot be in metres.
     """
     if not 0.0 < seconds <= LONGEST_LOOK_S:
         raise ParameterError(f'--seconds must be in (0, {LONGEST_LOOK_S:g}], got {seconds:g}')

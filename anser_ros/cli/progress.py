@@ -13,7 +13,7 @@ LINE_INTERVAL_S = 5.0
 """Time from one line to the next, s: enough to see that it goes on, few enough for a log."""
 LEAST_DONE, LEAST_S = 0.1, 1.0
 """Finished share of a stage, and time that its later half took, s, from which on the time that is
-left is told. Before, it would be that of loading and compiling, which do not come again."""
+left is shown. Before, it would be that of loading and compiling, which do not come again."""
 
 
 class Tell(Protocol):
@@ -25,13 +25,7 @@ class Tell(Protocol):
 
 @contextmanager
 def progress_of(command: str) -> Iterator[Tell]:
-    """Yield a function that takes how far a command is.
-
-    Parameters
-    ----------
-    command : str
-        What goes on, before a stage has a name.
-    """
+    """Yield a function that takes how far a command is, which a bar or lines then show."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield _Lines(command).tell

@@ -18,10 +18,7 @@ def own_domain(preferred: Iterable[int]) -> Iterator[int]:
 
     Where the environment states one, it is this one or none.
 
-    Raises
-    ------
-    ParameterError
-        When all of them are taken, or the stated one is.
+    Raises `ParameterError` when all of them are taken, or the stated one is.
     """
     stated = os.environ.get(VARIABLE, '')
     if stated and not stated.isdecimal():

@@ -6,20 +6,17 @@ Each session has its own folder; one that fails has an outcome like the others.
 import argparse
 import contextlib
 import importlib
-import json
 import os
-import sys
 import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
-
+from anser_ros.cli.commands import OFFLINE
 from anser_ros.cli.folders import make_folder
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, attempt
-from anser_ros.cli.output import Result, say_written
+from anser_ros.cli.output import Result
 from anser_ros.cli.summary import SCHEMA, Outcome, row_of, table_of, write_summary
 from anser_ros.errors import ParameterError
 from anser_ros.parallel import shared_among
@@ -30,27 +27,13 @@ ALONE = threading.Lock()
 
 @dataclass(frozen=True)
 class SessionRun:
-    """Runs a command on one session.
+    """A command to run on one session, by the arguments that its ``work`` takes."""
 
-    Attributes
-    ----------
-    command : str
-        `calibrate`, `diagnose` or `evaluate`.
-    name : str
-        The session's name in the summary, and of its folder.
-    session : str
-        The bag.
-    args : argparse.Namespace
-        What the command's own ``work`` takes.
-    folder : str
-        The folder from which the paths in the arguments hold.
-    """
-
-    command: str
-    name: str
-    session: str
+    command: str  # calibrate, diagnose or evaluate
+    name: str  # the session's in the summary, and of its folder
+    session: str  # the bag
     args: argparse.Namespace
-    folder: str
+    folder: str  # from which the paths in the arguments hold
 
 
 def runs_of(command: str, args: argparse.Namespace) -> list[SessionRun]:
@@ -68,10 +51,7 @@ def runs_of(command: str, args: argparse.Namespace) -> list[SessionRun]:
 def names_of(sessions: Sequence[str]) -> list[str]:
     """Return names for sessions by their paths: as many last parts as distinguish them.
 
-    Raises
-    ------
-    ParameterError
-        When a session is given twice.
+    Raises `ParameterError` when a session is given twice.
     """
     paths = [Path(session).resolve() for session in sessions]
     for place, path in enumerate(paths):
@@ -93,13 +73,9 @@ def names_of(sessions: Sequence[str]) -> list[str]:
 def perform(run: SessionRun, threads: int | None = None) -> Outcome:
     """Do a run in this process, whatever comes of it.
 
-    Parameters
-    ----------
-    run : SessionRun
-    threads : int, optional
-        Among how many threads it may share its work; as many as its caller by default.
+    It may share its work among as many threads as are stated, by default as its caller.
     """
-    module = importlib.import_module(f'anser_ros.cli.{run.command}')
+    module = importlib.import_module(OFFLINE[run.command][0])
 
     def work() -> Result:
         sharing = contextlib.nullcontext() if threads is None else shared_among(threads)
@@ -112,48 +88,34 @@ def perform(run: SessionRun, threads: int | None = None) -> Outcome:
         code, result, words = attempt(work)
         seconds = time.monotonic() - began_s
     if result is not None:
-        return Outcome(
-            run.name, run.session, code, result.document, '; '.join(result.notes), '', seconds
-        )
+        notes = '; '.join(result.notes)
+        return Outcome(run.name, run.session, code, result.document, notes, '', seconds)
     trace = words if code == EXIT_DEFECT else ''
     line = f'a defect of the program: {words.splitlines()[-1]}' if trace else words
     return Outcome(run.name, run.session, code, {}, line, trace, seconds)
 
 
-def finish(verb: str, command: str, outcomes: Sequence[Outcome], args: argparse.Namespace) -> int:
-    """Write and show the summary of all runs; the exit code.
+def summed_up(command: str, outcomes: Sequence[Outcome], folder: Path) -> Result:
+    """Write the summary of all runs of a command into a folder.
 
-    Parameters
-    ----------
-    verb : str
-        The command that the user gave, for what is said on stderr.
-    command : str
-        The command that ran on each session.
-    outcomes : sequence of Outcome
-    args : argparse.Namespace
-        With ``out``, the folder of the summary, and ``json``.
-
-    Returns
-    -------
-    int
-        0 where all went well, 1 where there was a defect of the program, else 2.
+    The exit code is 0 where all went well, 1 where there was a defect of the program, else 2.
     """
     rows = [row_of(command, outcome) for outcome in outcomes]
-    make_folder(args.out)
-    written = write_summary(args.out, command, rows)
-    for outcome in outcomes:
-        if outcome.traceback:
-            print(f'{outcome.session}:\n{outcome.traceback}', file=sys.stderr)
-    if args.json:
-        document = {'schema': SCHEMA, 'command': command, 'sessions': rows}
-        print(json.dumps(document, indent=1))
-    else:
-        Console().print(table_of(command, rows))
-        say_written(*written)
+    make_folder(folder)
+    written = write_summary(folder, command, rows)
     failed = [outcome for outcome in outcomes if outcome.code != EXIT_OK]
-    if not failed:
-        return EXIT_OK
-    for outcome in failed:
-        print(f'anser {verb}: {outcome.name}: {outcome.words}', file=sys.stderr)
-    print(f'anser {verb}: {len(failed)} of {len(outcomes)} sessions failed', file=sys.stderr)
-    return EXIT_DEFECT if any(one.code == EXIT_DEFECT for one in failed) else EXIT_BAD_INPUT
+    notes = [f'{one.session}:\n{one.traceback}' for one in failed if one.traceback]
+    notes += [f'{one.name}: {one.words}' for one in failed]
+    if failed:
+        notes.append(f'{len(failed)} of {len(outcomes)} sessions failed')
+    return Result(
+        {'schema': SCHEMA, 'command': command, 'sessions': rows},
+        tuple(notes),
+        (table_of(command, rows),),
+        written,
+        EXIT_DEFECT
+        if EXIT_DEFECT in [one.code for one in failed]
+        else EXIT_BAD_INPUT
+        if failed
+        else EXIT_OK,
+    )

@@ -1,13 +1,12 @@
 """Write a setup document by questions or options, check it, and draw it."""
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import say_written
-from anser_ros.cli.setup_figure import draw_setup
+from anser_ros.cli.output import Result, say, write_files
+from anser_ros.cli.setup_figure import setup_figure
 from anser_ros.cli.setup_parts import (
     ANSER,
     COIL_COLUMNS,
@@ -26,13 +25,19 @@ from anser_ros.cli.setup_parts import (
     text_of,
 )
 from anser_ros.cli.setup_questions import ask_all
-from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.cli.stated_values import (
+    add_json,
+    add_list,
+    add_out,
+    add_stated_values,
+    stated_values,
+)
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.drawing import board_of
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import Setup, parse_setup
 
-SCHEMA = 'anser_setup_result/1'
+RESULT = 'anser_setup_result/1'
 DOCUMENT, PICTURE = 'setup.yaml', 'setup.png'
 
 
@@ -44,46 +49,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'anser setup config/demo_setup.yaml --out picture/ (checks and draws it)'
     )
     parser.add_argument('document', nargs='?', help='a setup document to check and draw')
-    parser.add_argument(
-        '--out', required=True, type=Path,
-        help=f'folder for {DOCUMENT} and {PICTURE}, made if missing',
-    )  # fmt: skip
-    parser.add_argument(
-        '--board',
-        choices=[ANSER, *GEOMETRY],
-        help='the Anser v1 board, or the kind of its coils',
+    add_out(parser, f'{DOCUMENT} and {PICTURE}')
+    words = 'the Anser v1 board, or the kind of its coils'
+    parser.add_argument('--board', choices=[ANSER, *GEOMETRY], help=words)
+    kinds = '; '.join(f'{kind}: {", ".join(keys)}' for kind, keys in GEOMETRY.items())
+    words = f'geometry of emitter coils, SI units: {kinds}'
+    add_list(parser, '--geometry', metavar='KEY=VALUE', help=words)
+    words = 'an emitter coil: centre in mm, turn about z in degrees, tone in Hz; may be repeated'
+    add_list(parser, '--coil', metavar='X,Y,Z,TURN,TONE', help=words)
+    words = f'emitter coils: {",".join(COIL_COLUMNS)}'
+    parser.add_argument('--coils', type=Path, metavar='CSV', help=words)
+    words = (
+        'a sensor coil: position in mm in the frame of its body, which is fg for a reference '
+        'coil; the axis is x, -x, ... or three numbers with blanks; may be repeated'
     )
-    parser.add_argument(
-        '--geometry', action='append', default=[], metavar='KEY=VALUE',
-        help='geometry of emitter coils, SI units: ' + '; '.join(f'{k}: {", ".join(v)}' for k, v in
-                                                            GEOMETRY.items()),
-    )  # fmt: skip
-    parser.add_argument(
-        '--coil', action='append', default=[], metavar='X,Y,Z,TURN,TONE',
-        help='an emitter coil: centre in mm, turn about z in degrees, tone in Hz; may be repeated',
-    )  # fmt: skip
-    parser.add_argument(
-        '--coils', type=Path, metavar='CSV', help=f'emitter coils: {",".join(COIL_COLUMNS)}'
-    )
-    parser.add_argument(
-        '--sensor', action='append', default=[], metavar='CHANNEL,NAME,BODY,X,Y,Z,AXIS[,LENGTH]',
-        help='a sensor coil: position in mm in the frame of its body, which is fg for a '
-        'reference coil; the axis is x, -x, ... or three numbers with blanks; may be '
-        'repeated',
-    )  # fmt: skip
-    parser.add_argument(
-        '--sensors', type=Path, action='append', default=[], metavar='CSV',
-        help=f'sensor coils: {",".join(SENSOR_COLUMNS)}[,length_mm]; may be repeated',
-    )  # fmt: skip
+    add_list(parser, '--sensor', metavar='CHANNEL,NAME,BODY,X,Y,Z,AXIS[,LENGTH]', help=words)
+    words = f'sensor coils: {",".join(SENSOR_COLUMNS)}[,length_mm]; may be repeated'
+    add_list(parser, '--sensors', type=Path, metavar='CSV', help=words)
     parser.add_argument('--rate', type=float, default=50.0, help='flux windows a second (50)')
     parser.add_argument(
         '--volume', metavar='X,Y,Z,X,Y,Z',
         help='two corners of the tracked volume, mm; by default above the board, by its size',
     )  # fmt: skip
     add_stated_values(parser, 'accuracy', 'refit', 'tools')
-    parser.add_argument(
-        '--json', action='store_true', help='print the written files and the advice as JSON'
-    )
+    add_json(parser, 'the written files and the advice as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -125,7 +114,7 @@ def _document(args: argparse.Namespace) -> Document:
     else:
         emitter = emitter_of(args.board, _geometry(args.geometry), coils)
     rows = [*args.sensor, *(row for path in args.sensors for row in rows_of(path, SENSOR_COLUMNS))]
-    volume = None if args.volume is None else numbers_of(args.volume, (6,), '--volume')
+    volume = None if args.volume is None else numbers_of(args.volume, 6, '--volume')
     sensors = [sensor_of(row) for row in rows]
     return document_of(emitter, sensors, args.rate, volume, stated_values(args))
 
@@ -143,22 +132,14 @@ def _write(args: argparse.Namespace, text: str, setup: Setup) -> int:
     if args.document is None:
         board_of(setup)
     advice = advice_on(setup)
-    written = [args.out / PICTURE]
-    draw_setup(setup, written[0])
-    if args.document is None:
-        written.insert(0, args.out / DOCUMENT)
-        written[0].write_text(text, encoding='utf-8')
-    for line in advice:
-        print(f'anser setup: {line}', file=sys.stderr)
-    if args.json:
-        files = [str(path) for path in written]
-        print(json.dumps({'schema': SCHEMA, 'files': files, 'advice': advice}, indent=1))
-        return 0
-    print(
+    own = {} if args.document else {DOCUMENT: text}
+    written = write_files(args.out, {**own, PICTURE: setup_figure(setup)})
+    words = (
         f'{len(setup.emitter.coils)} emitter coils, {len(setup.reference_sensors)} reference '
         f'coils, tools: {", ".join(setup.bodies) or "none"}'
     )
-    say_written(*written)
+    document = {'schema': RESULT, 'files': list(map(str, written)), 'advice': advice}
+    say('setup', Result(document, tuple(advice), (words,), written), as_json=args.json)
     return 0
 
 

@@ -1,16 +1,15 @@
 """Draws a setup document: board, references and volume from above and the side, and tools."""
 
 from collections import defaultdict
-from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from anser_ros.cli.labels import Label, name_points
-from anser_ros.pictures import save
 from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.setup import SensorRows, SensorSpec, Setup
@@ -33,7 +32,7 @@ SMALLEST_MM = 5.0
 """Least extent of a tool as drawn, mm: one of a single coil has none."""
 
 
-def draw_setup(setup: Setup, path: Path) -> None:
+def setup_figure(setup: Setup) -> Figure:
     """Draw the board with references and tracked volume, and each tool in its own frame."""
     rows = 1 + len(setup.bodies)
     figure, panels = plt.subplots(
@@ -60,7 +59,7 @@ def draw_setup(setup: Setup, path: Path) -> None:
     figure.draw_without_rendering()
     for panel, labels, drawn in named:
         name_points(panel, labels, drawn, LETTERS_PT)
-    save(figure, path)
+    return figure
 
 
 def _board(panel: Any, setup: Setup, across: int, up: int) -> Array:
@@ -85,10 +84,8 @@ def _board(panel: Any, setup: Setup, across: int, up: int) -> Array:
         Rectangle((low[across], low[up]), size[across], size[up], fill=False, ls='--', color='0.5')
     )
     panel.annotate('tracked volume', (low[across], high[up]), fontsize=7, color='0.4', va='bottom')
-    left, right, bottom, top = low[across], high[across], low[up], high[up]
-    lines.append(
-        np.array([[left, bottom], [right, bottom], [right, top], [left, top], [left, bottom]])
-    )
+    round_it = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+    lines.append(low[[across, up]] + round_it * size[[across, up]])
     return np.vstack([_along(line) for line in lines])
 
 

@@ -45,13 +45,7 @@ Document = dict[str, Any]
 
 
 def number_of(text: str, what: str) -> float:
-    """Return the finite number that a text says.
-
-    Raises
-    ------
-    ParameterError
-        When the text is not a finite number.
-    """
+    """Return the finite number that a text says; raises `ParameterError` where it is none."""
     try:
         value = float(text)
     except ValueError:
@@ -61,19 +55,16 @@ def number_of(text: str, what: str) -> float:
     return value
 
 
-def numbers_of(text: str, counts: Sequence[int], what: str) -> list[float]:
-    """Return numbers with commas or blanks between them, as many as one of the counts says."""
+def numbers_of(text: str, count: int, what: str) -> list[float]:
+    """Return so many numbers with commas or blanks between them."""
     parts = text.replace(',', ' ').split()
-    if len(parts) not in counts:
-        wanted = ' or '.join(map(str, counts))
-        raise ParameterError(f'{what} takes {wanted} numbers, got {text.strip()!r}')
+    if len(parts) != count:
+        raise ParameterError(f'{what} takes {count} numbers, got {text.strip()!r}')
     return [number_of(part, what) for part in parts]
 
 
 def metres(values: Sequence[float]) -> list[float]:
-    """Return lengths in mm as lengths in m, without the rounding of the division in the
-    document.
-    """
+    """Return lengths in mm in m, without the rounding of the division in the document."""
     return [round(1e-3 * value, 9) for value in values]
 
 
@@ -93,7 +84,7 @@ def anser_emitter() -> Document:
 
 def coil_of(name: str, text: str) -> Document:
     """Return an emitter coil of ``x, y, z, turn about z, tone`` in mm, degrees and Hz."""
-    x, y, z, turn, tone = numbers_of(text, (5,), f'coil {name}')
+    x, y, z, turn, tone = numbers_of(text, 5, f'coil {name}')
     return {
         'name': name, 'centre_m': metres((x, y, z)), 'rotation_deg': turn, 'frequency_hz': tone,
     }  # fmt: skip
@@ -123,14 +114,12 @@ def sensor_of(text: str, body: str = '') -> Document:
 
 
 def axis_of(text: str, what: str) -> list[float]:
-    """Return a direction: x, -z and the like, or three numbers of any length, blanks
-    between them.
-    """
+    """Return a direction: x, -z and the like, or three numbers with blanks between them."""
     if text.lower() in DIRECTIONS:
         return DIRECTIONS[text.lower()]
     if len(text.split()) != 3:
         raise ParameterError(f'{what}: axis is x, -x, ... or three numbers, got {text!r}')
-    values = np.array(numbers_of(text, (3,), f'{what}: axis'))
+    values = np.array(numbers_of(text, 3, f'{what}: axis'))
     length = float(np.linalg.norm(values))
     if length == 0.0:
         raise ParameterError(f'{what}: an axis must not have zero length')
@@ -138,13 +127,7 @@ def axis_of(text: str, what: str) -> list[float]:
 
 
 def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
-    """Return the rows of a CSV file with a head, each as the text that is typed for it.
-
-    Raises
-    ------
-    ParameterError
-        When the head is another one, or there is no row.
-    """
+    """Return the rows of a CSV file with a head, each as the text that is typed for it."""
     names, found_rows = read_rows(path)
     extra = [name for name in names if name == 'length_mm']
     found = [name for name in names if name not in extra]
@@ -161,9 +144,9 @@ def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
 def document_of(
     emitter: Document,
     sensors: list[Document],
-    rate_hz: float,
-    volume_mm: Sequence[float] | None,
-    stated: Mapping[str, float],
+    rate_hz: float = 50.0,
+    volume_mm: Sequence[float] | None = None,
+    stated: Mapping[str, float] | None = None,
 ) -> Document:
     """Return the whole document as plain data."""
     document: Document = {
@@ -173,7 +156,7 @@ def document_of(
     if volume_mm is not None:
         low, high = metres(volume_mm[:3]), metres(volume_mm[3:])
         document['volume'] = {'low_m': low, 'high_m': high}
-    document |= {name: values for name, values in sections_of(stated).items() if values}
+    document |= {name: values for name, values in sections_of(stated or {}).items() if values}
     return document
 
 
@@ -192,10 +175,7 @@ class _RowDumper(yaml.SafeDumper):
 def text_of(document: Document) -> tuple[str, Setup]:
     """Return the document as YAML, and what readers make of it.
 
-    Raises
-    ------
-    SetupError
-        When the document breaks a rule.
+    Raises `SetupError` when the document breaks a rule.
     """
     plain = yaml.safe_load(yaml.safe_dump(document))  # nothing in it is shared
     text = yaml.dump(plain, Dumper=_RowDumper, sort_keys=False, width=200)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from anser_ros.cli.setup_parts import (
     ANSER,
@@ -32,129 +32,118 @@ ONE_TOOL_COIL = {'channel': 0, 'name': 'tool/0', 'body': 'tool', 'position_m': [
 def ask_all(ask: Callable[[str], str], say: Callable[[str], object]) -> Document:
     """Ask for everything, and return the document.
 
-    Parameters
-    ----------
-    ask : callable
-        Gives the answer to a question; raises `EOFError` where there is none.
-    say : callable
-        Shows a line.
+    ``ask`` gives the answer to a question and raises `EOFError` where there is none; ``say`` shows
+    a line.
     """
-    say('Lengths are in mm, in the frame of the board: origin at its centre, z up to the patient.')
-    say('An empty answer accepts the value in [brackets].')
-    emitter = _emitter(ask, say)
-    sensors: list[Document] = []
-    say('Now the tools: coils fixed to a body that moves, places and axes in its own frame.')
-    while True:
-        body = _ask(ask, say, 'name of a tool, or empty if there are no more', str)
-        if not body:
-            if sensors:
+    return _Questions(ask, say).document()
+
+
+class _Questions:
+    """The questions in their order, of which each is asked until its answer can be read."""
+
+    def __init__(self, ask: Callable[[str], str], say: Callable[[str], object]) -> None:
+        self._put, self._say = ask, say
+        self._sensors: list[Document] = []
+
+    def document(self) -> Document:
+        """Ask for board, tools, reference coils, rate and volume."""
+        self._say(
+            'Lengths are in mm, in the frame of the board: origin at its centre, z up to the '
+            'patient.'
+        )
+        self._say('An empty answer accepts the value in [brackets].')
+        self._emitter = self._board()
+        self._say(
+            'Now the tools: coils fixed to a body that moves, places and axes in its own frame.'
+        )
+        while True:
+            body = self._ask('name of a tool, or empty if there are no more', str)
+            if body:
+                self._coils(body)
+            elif self._sensors:
                 break
-            say('  at least one tool is needed')
-            continue
-        sensors += _sensors(ask, say, emitter, sensors, body)
-    say('Reference coils are fixed in the frame of the board; with them the model follows metal.')
-    sensors += _sensors(ask, say, emitter, sensors, FIELD_GENERATOR)
-    rate = _ask(ask, say, 'flux windows a second [50]', lambda t: number_of(t or '50', 'the rate'))
-    volume = _ask(
-        ask, say, 'corners of the tracked volume, x y z x y z [above the board, by its size]',
-        lambda t: numbers_of(t, (6,), 'the volume') if t else None,
-    )  # fmt: skip
-    return document_of(emitter, sensors, rate, volume, {})
+            else:
+                self._say('  at least one tool is needed')
+        self._say(
+            'Reference coils are fixed in the frame of the board; with them the model follows '
+            'metal.'
+        )
+        self._coils(FIELD_GENERATOR)
+        rate = self._ask('flux windows a second [50]', lambda t: number_of(t or '50', 'the rate'))
+        volume = self._ask(
+            'corners of the tracked volume, x y z x y z [above the board, by its size]',
+            lambda t: numbers_of(t, 6, 'the volume') if t else None,
+        )
+        return document_of(self._emitter, self._sensors, rate, volume)
 
+    def _ask(self, question: str, read: Callable[[str], Answer]) -> Answer:
+        while True:
+            try:
+                text = self._put(f'{question}: ').strip()
+            except EOFError as error:
+                raise ParameterError(f'no answer to: {question}') from error
+            try:
+                return read(text)
+            except (AnserError, OSError) as error:
+                self._say(f'  {error}')
 
-def _ask(
-    ask: Callable[[str], str],
-    say: Callable[[str], object],
-    question: str,
-    read: Callable[[str], Answer],
-) -> Answer:
-    """Ask until the answer can be read."""
-    while True:
-        try:
-            text = ask(f'{question}: ').strip()
-        except EOFError as error:
-            raise ParameterError(f'no answer to: {question}') from error
-        try:
-            return read(text)
-        except (AnserError, OSError) as error:
-            say(f'  {error}')
+    def _board(self) -> Document:
+        kinds = [ANSER, *GEOMETRY]
 
+        def kind_of(text: str) -> str:
+            if (text or ANSER) not in kinds:
+                raise ParameterError(f'there are: {", ".join(kinds)}')
+            return text or ANSER
 
-def _emitter(ask: Callable[[str], str], say: Callable[[str], object]) -> Document:
-    kinds = [ANSER, *GEOMETRY]
+        kind = self._ask(f'board: {", ".join(kinds)} [{ANSER}]', kind_of)
+        if kind == ANSER:
+            return anser_emitter()
+        while True:
+            geometry = {
+                key: self._ask(f'{key} (SI units)', partial(number_of, what=key))
+                for key in GEOMETRY[kind]
+            }
+            words = 'x, y, z, turn about z in degrees, tone in Hz'
+            coils = [
+                self._ask(f'coil{rank}: {words}', partial(coil_of, f'coil{rank}'))
+                for rank in range(self._ask('number of emitter coils [8]', _count(8, 1)))
+            ]
+            emitter = emitter_of(kind, geometry, coils)
+            try:
+                text_of(document_of(emitter, [ONE_TOOL_COIL]))
+            except AnserError as error:
+                self._say(f'  {error}; try again')
+                continue
+            return emitter
 
-    def kind_of(text: str) -> str:
-        if (text or ANSER) not in kinds:
-            raise ParameterError(f'there are: {", ".join(kinds)}')
-        return text or ANSER
+    def _coils(self, body: str) -> None:
+        """Take the sensors of one body: typed one after the other, or all of a CSV file."""
+        is_board = body == FIELD_GENERATOR
+        what, usual = ('reference coils', 0) if is_board else (f'coils on {body}', 1)
+        names = tuple(name for name in SENSOR_COLUMNS if name != 'body')
+        columns = ','.join(names)
 
-    kind = _ask(ask, say, f'board: {", ".join(kinds)} [{ANSER}]', kind_of)
-    if kind == ANSER:
-        return anser_emitter()
-    while True:
-        geometry = {
-            key: _ask(ask, say, f'{key} (SI units)', partial(number_of, what=key))
-            for key in GEOMETRY[kind]
-        }
-        count = int(_ask(ask, say, 'number of emitter coils [8]', _count(8, 1)))
-        coils = []
+        def count_or_file(text: str) -> int:
+            if Path(text).suffix != '.csv':
+                return _count(usual, usual)(text)
+            self._add([sensor_of(row, body) for row in rows_of(Path(text), names)])
+            return 0
+
+        count = self._ask(
+            f'number of {what}, or a .csv file of {columns} [{usual}]', count_or_file
+        )
         for rank in range(count):
-            question = f'coil{rank}: x, y, z, turn about z in degrees, tone in Hz'
-            coils.append(_ask(ask, say, question, partial(coil_of, f'coil{rank}')))
-        emitter = emitter_of(kind, geometry, coils)
-        try:
-            check_document(document_of(emitter, [ONE_TOOL_COIL], 50.0, None, {}))
-        except AnserError as error:
-            say(f'  {error}; try again')
-            continue
-        return emitter
+            self._ask(
+                f'{what}, {rank + 1} of {count}: {columns}',
+                lambda text: self._add([sensor_of(text, body)]),
+            )
 
-
-def _sensors(
-    ask: Callable[[str], str],
-    say: Callable[[str], object],
-    emitter: Document,
-    others: list[Document],
-    body: str,
-) -> list[Document]:
-    """The sensors of one body: typed one after the other, or all of a CSV file."""
-    what = 'reference coils' if body == FIELD_GENERATOR else f'coils on {body}'
-    usual = 0 if body == FIELD_GENERATOR else 1
-    columns = ','.join(name for name in SENSOR_COLUMNS if name != 'body')
-
-    def checked(found: list[Document]) -> list[Document]:
-        filler = [] if others or body != FIELD_GENERATOR else [ONE_TOOL_COIL]
+    def _add(self, found: list[Document]) -> None:
+        """Keep sensors with which the document breaks no rule; it raises where it does."""
+        every = [*self._sensors, *found]
         if found:
-            check_document(document_of(emitter, [*others, *filler, *found], 50.0, None, {}))
-        return found
-
-    def count_or_file(text: str) -> int | list[Document]:
-        if Path(text).suffix == '.csv':
-            names = tuple(name for name in SENSOR_COLUMNS if name != 'body')
-            return checked([sensor_of(row, body) for row in rows_of(Path(text), names)])
-        return _count(usual, 0 if body == FIELD_GENERATOR else 1)(text)
-
-    given = _ask(
-        ask, say, f'number of {what}, or a .csv file of {columns} [{usual}]', count_or_file
-    )
-    if isinstance(given, list):
-        return given
-    found: list[Document] = []
-    for rank in range(given):
-        question = f'{what}, {rank + 1} of {given}: {columns}'
-
-        def read(text: str) -> Document:
-            one = sensor_of(text, body)
-            checked([*found, one])
-            return one
-
-        found.append(_ask(ask, say, question, read))
-    return found
-
-
-def check_document(document: Document) -> Any:
-    """Return what readers make of a document; raises `SetupError` where it breaks a rule."""
-    return text_of(document)[1]
+            text_of(document_of(self._emitter, every))
+        self._sensors = every
 
 
 def _count(usual: int, least: int) -> Callable[[str], int]:

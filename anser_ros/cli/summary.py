@@ -1,16 +1,15 @@
 """Makes a table of many sessions, a row each, the failed ones with why, as CSV, page and text."""
 
 import csv
-import html
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.table import Table
 
-from anser_ros.cli.html_page import STYLE, page
+from anser_ros.cli.html_page import Html, escaped, page, paragraph, table, top
+from anser_ros.cli.output import number
 from anser_ros.physics.constants import DEGREES
 
 SCHEMA = 'anser_summary/1'
@@ -24,57 +23,25 @@ MM, DEG, PT, PERCENT = 1e3, DEGREES, 1e12, 1e2
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Holds what a command left of one session.
+class Outcome(NamedTuple):
+    """What a command left of one session."""
 
-    Attributes
-    ----------
-    name : str
-        The session's name in the summary, and of its folder.
-    session : str
-        The bag.
-    code : int
-        The exit code that the command alone would have had.
-    document : dict
-        The content of its JSON file; empty where it failed.
-    words : str
-        Why it failed, or what users have to know, in one line.
-    traceback : str
-        Of a defect.
-    seconds : float
-        How long it took.
-    """
-
-    name: str
-    session: str
-    code: int
-    document: dict[str, Any]
-    words: str
-    traceback: str = ''
-    seconds: float = 0.0
+    name: str  # the session's in the summary, and of its folder
+    session: str  # the bag
+    code: int  # the exit code that the command alone would have had
+    document: dict[str, Any]  # of its JSON file; empty where it failed
+    words: str  # why it failed, or what users have to know, in one line
+    traceback: str = ''  # of a defect
+    seconds: float = 0.0  # duration
 
 
-@dataclass(frozen=True)
-class Column:
-    """Describes a figure of the summary.
-
-    Attributes
-    ----------
-    key : str
-        Its name in CSV and JSON, in SI units.
-    heading : str
-        What people read above it, with the unit there.
-    scale : float
-        From the one unit to the other.
-    is_short : bool
-        Whether the table on the terminal has it too.
-    """
+class Column(NamedTuple):
+    """A figure: its key, in SI units, its heading, and the factor to the unit of the heading."""
 
     key: str
     heading: str
     scale: float = 1.0
-    is_short: bool = False
+    is_short: bool = False  # whether the table on the terminal has it too
 
 
 EVALUATION = (
@@ -133,18 +100,16 @@ def _evaluation(document: Mapping[str, Any]) -> Row:
 
 
 def _diagnosis(document: Mapping[str, Any]) -> Row:
-    names = [effect['name'] for effect in document['effects']]
-    unexplained = document['unexplained']['fraction']
-    return {
-        **document['held_out'],
-        'effects': ' '.join(dict.fromkeys(names)),
-        'unexplained_fraction': unexplained,
-    }
+    fraction = document['unexplained']['fraction']
+    return {**document['held_out'], **_names(document), 'unexplained_fraction': fraction}
 
 
 def _calibration(document: Mapping[str, Any]) -> Row:
-    names = [effect['name'] for effect in document['effects']]
-    return {**document, 'effects': ' '.join(dict.fromkeys(names))}
+    return {**document, **_names(document)}
+
+
+def _names(document: Mapping[str, Any]) -> Row:
+    return {'effects': ' '.join(dict.fromkeys(one['name'] for one in document['effects']))}
 
 
 COMMANDS: dict[str, tuple[tuple[Column, ...], Callable[[Mapping[str, Any]], Row], str]] = {
@@ -180,57 +145,47 @@ def write_summary(folder: Path, command: str, rows: Sequence[Row]) -> tuple[Path
 
 
 def table_of(command: str, rows: Sequence[Row]) -> Table:
-    """Return the rows for a terminal of 80 columns: names, the most important figures, or
-    why not.
-    """
+    """Return the names and most important figures for a terminal of 80 columns."""
     columns = [column for column in COMMANDS[command][0] if column.is_short]
-    table = Table('session', *(column.heading for column in columns))
+    shown = Table('session', *(column.heading for column in columns))
     failed = [row for row in rows if row['status'] != 'ok']
     for row in rows:
         if row['status'] == 'ok':
-            table.add_row(row['name'], *(_text(column, row) for column in columns))
+            shown.add_row(row['name'], *(_text(column, row) for column in columns))
         else:
-            table.add_row(row['name'], 'failed', style='red')
+            shown.add_row(row['name'], 'failed', style='red')
     if failed:
-        table.caption = f'{len(failed)} of {len(rows)} sessions failed'
-    return table
+        shown.caption = f'{len(failed)} of {len(rows)} sessions failed'
+    return shown
 
 
 def _text(column: Column, row: Row) -> str:
     value = row[column.key]
-    if value is None:
-        return '-'
     if isinstance(value, str):
         return value.replace(' ', '\n')
-    return str(value) if isinstance(value, int) else f'{value * column.scale:.4g}'
+    return str(value) if isinstance(value, int) else number(value, column.scale, '.4g')
 
 
 def _page(command: str, folder: Path, rows: Sequence[Row]) -> str:
     columns, _, file = COMMANDS[command]
     failed = sum(row['status'] != 'ok' for row in rows)
-    head = ''.join(
-        f'<th>{html.escape(text)}</th>'
-        for text in ('session', *(column.heading for column in columns), 's', 'notes')
-    )
     lines = []
     for row in rows:
-        name, cells = html.escape(row['name']), [_text(column, row) for column in columns]
+        name = escaped(row['name'])
         if (folder / row['name'] / file).is_file():
-            name = f'<a href="{name}/{file}">{name}</a>'
-        if row['status'] == 'ok':
-            figures = ''.join(f'<td class="n">{html.escape(cell)}</td>' for cell in cells)
-        else:
-            figures = f'<td colspan="{len(columns)}">failed</td>'
-        lines.append(
-            f'<tr><td title="{html.escape(row["session"])}">{name}</td>{figures}'
-            f'<td class="n">{row["seconds"]:.1f}</td><td>{html.escape(row["message"])}</td></tr>'
-        )
-    words = (
-        f'{len(rows)} sessions, {failed} of them failed.' if failed else f'{len(rows)} sessions.'
+            name = Html(f'<a href="{name}/{file}">{name}</a>')
+        cells = [_text(column, row) for column in columns]
+        if row['status'] != 'ok':
+            cells = ['failed', *('' for _ in cells[1:])]
+        lines.append([
+            Html(f'<span title="{escaped(row["session"])}">{name}</span>'), *cells,
+            f'{row["seconds"]:.1f}', row['message'],
+        ])  # fmt: skip
+    words = f'{len(rows)} sessions, {failed} of them failed.'
+    return page(
+        f'anser {command}: summary',
+        top(f'anser {command}', words if failed else f'{len(rows)} sessions.'),
+        table(['session', *(column.heading for column in columns), 's', 'notes'], lines),
+        paragraph('The same in SI units: summary.csv.', 'note'),
+        style=WIDE,
     )
-    sections = (
-        f'<h1>anser {command}</h1><p class="verdict">{words}</p>',
-        f'<table><tr>{head}</tr>{"".join(lines)}</table>',
-        '<p class="note">The same in SI units: <code>summary.csv</code>.</p>',
-    )
-    return page(f'anser {command}: summary', sections, STYLE + WIDE)

@@ -10,8 +10,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 _PR_SET_PDEATHSIG = 1
 """Option of Linux's prctl that sends a signal to a process when its parent ends."""
@@ -23,22 +23,11 @@ _TAIL_LINES = 8
 """Last lines of a log that an error message shows: a traceback's last calls and its reason."""
 
 
-@dataclass(frozen=True)
-class Child:
-    """Holds a process that a supervisor has started.
-
-    Attributes
-    ----------
-    name : str
-        Name in messages.
-    process : subprocess.Popen
-        The process, leader of a separate group.
-    log : Path or None
-        File of its output; None for the terminal.
-    """
+class Child(NamedTuple):
+    """A process that a supervisor has started, and the file of its output; None: the terminal."""
 
     name: str
-    process: subprocess.Popen[bytes]
+    process: subprocess.Popen[bytes]  # leader of a group of its own
     log: Path | None
 
 
@@ -46,12 +35,8 @@ class Supervisor:
     """Starts processes and ends them together when its context is left.
 
     Each process is in a separate group, so that Ctrl-C reaches only the supervisor, which ends
-    them in order. When the supervisor itself is killed, the system ends them (Linux).
-
-    Parameters
-    ----------
-    logs : Path
-        Folder for their output.
+    them in order. When the supervisor itself is killed, the system ends them (Linux). Their output
+    goes to the folder ``logs``.
     """
 
     def __init__(self, logs: Path) -> None:
@@ -66,37 +51,16 @@ class Supervisor:
         self.end()
 
     def start(self, name: str, command: Sequence[str], *, on_terminal: bool = False) -> Child:
-        """Start a process whose output goes to a log, or to the terminal if asked.
-
-        Parameters
-        ----------
-        name : str
-            Name in messages and of the log.
-        command : sequence of str
-            The program with its arguments.
-        on_terminal : bool
-            Whether the process writes to the terminal.
-        """
+        """Start a process whose output goes to a log of its name, or to the terminal if asked."""
         log = None if on_terminal else self._logs / f'{name}.log'
-        stream = None if log is None else log.open('wb')
-        try:
+        with contextlib.nullcontext() if log is None else log.open('wb') as stream:
             process = subprocess.Popen(
-                list(command),
-                stdin=subprocess.DEVNULL,
-                stdout=stream,
-                stderr=None if stream is None else subprocess.STDOUT,
-                start_new_session=True,
+                list(command), stdin=subprocess.DEVNULL, stdout=stream,
+                stderr=None if stream is None else subprocess.STDOUT, start_new_session=True,
                 preexec_fn=_prepare,
-            )
-        finally:
-            if stream is not None:
-                stream.close()
+            )  # fmt: skip
         self._children.append(Child(name, process, log))
         return self._children[-1]
-
-    def forget(self, child: Child) -> None:
-        """Stop watching a process that has done its work."""
-        self._children.remove(child)
 
     def ended(self) -> Child | None:
         """Return a process that has ended by itself, or None while all run."""

@@ -6,13 +6,14 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import say_written
+from anser_ros.cli.output import Result, write_files
+from anser_ros.cli.progress import Tell
+from anser_ros.cli.stated_values import add_json, add_out
 from anser_ros.errors import ParameterError
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import SensorSpec, Setup, parse_setup, topic_of
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = 'example: anser views config/demo_setup.yaml --namespace left --out views/'
     parser.add_argument('setup', help='setup document: a path, or a file of config/')
-    parser.add_argument('--out', required=True, type=Path, help='folder, made if missing')
+    add_out(parser)
     parser.add_argument('--namespace', default='anser', help='of the nodes (%(default)s)')
     parser.add_argument(
         '--optical', default='/optical', help='namespace of the optical poses (%(default)s)'
@@ -41,11 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default='',
         help="the tracker's frame_prefix, if there are several boards",
     )
-    parser.add_argument('--json', action='store_true', help='print the written files as JSON')
+    add_json(parser, 'the written files as JSON')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Write both views."""
     space = args.namespace.strip('/')
     if not NAMESPACE.match(space):
         raise ParameterError(f'{args.namespace!r} is not a namespace')
@@ -53,28 +54,20 @@ def run(args: argparse.Namespace) -> int:
     make_folder(args.out)
     topics = Topics(space, args.optical.rstrip('/'), args.frame_prefix)
     rviz = yaml.safe_dump(rviz_view(setup, topics), sort_keys=False, allow_unicode=True)
-    (args.out / RVIZ).write_text(rviz, encoding='utf-8')
-    layout = json.dumps(foxglove_view(setup, topics), indent=1)
-    (args.out / FOXGLOVE).write_text(layout + '\n', encoding='utf-8')
-    if args.json:
-        files = [str(args.out / name) for name in (RVIZ, FOXGLOVE)]
-        print(json.dumps({'schema': SCHEMA, 'files': files}, indent=1))
-    else:
-        say_written(args.out / RVIZ, args.out / FOXGLOVE)
-    return 0
+    written = write_files(args.out, {RVIZ: rviz, FOXGLOVE: foxglove_view(setup, topics)})
+    return Result({'schema': SCHEMA, 'files': list(map(str, written))}, written=written)
 
 
-class Topics:
+class Topics(NamedTuple):
     """Holds a board's full names: topics in its namespace and of the optical tracker, frames."""
 
-    def __init__(self, namespace: str, optical: str, prefix: str) -> None:
-        self.namespace = namespace
-        self._prefix = prefix
-        self._optical = optical
+    namespace: str
+    optical_namespace: str
+    prefix: str
 
     def frame(self, setup: Setup) -> str:
         """Return the name of the board's frame."""
-        return f'{self._prefix}{setup.frame_id}'
+        return f'{self.prefix}{setup.frame_id}'
 
     def own(self, name: str) -> str:
         """Return the name of a topic of the nodes."""
@@ -86,7 +79,7 @@ class Topics:
 
     def optical(self, body: str) -> str:
         """Return the name of the topic of a body's optical pose."""
-        return f'{self._optical}/{topic_of(body)}/pose'
+        return f'{self.optical_namespace}/{topic_of(body)}/pose'
 
 
 def _solid_bodies(setup: Setup) -> list[str]:

@@ -39,10 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compile what is not there yet, and say how far that is.
 
-    Raises
-    ------
-    ParameterError
-        When a kernel can't be compiled.
+    Raises `ParameterError` when a kernel can't be compiled.
     """
     stream = sys.stderr if args.json else sys.stdout
     compile_kernels(lambda text: print(text, file=stream, flush=True))
@@ -59,17 +56,8 @@ def compile_kernels(
 ) -> None:
     """Let processes compile all kernels, unless they are there.
 
-    Parameters
-    ----------
-    say : callable
-        Gets a line at the start and every few seconds, none where all is there.
-    is_stopped : callable
-        Whether to give up, which is no error.
-
-    Raises
-    ------
-    ParameterError
-        When a process fails, with its last line.
+    ``say`` gets a line at the start and every few seconds; ``is_stopped`` is whether to give up,
+    which is no error. Raises `ParameterError` when a process fails, with its last line.
     """
     cache = KernelCache()
     if cache.is_full:
@@ -133,8 +121,8 @@ class _Listener(numba.core.event.Listener):
 
 def kernels() -> dict[str, Dispatcher]:
     """Return all kernels of the modules that have been imported, by name."""
-    rooms = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
-    found = [v for room in rooms for v in vars(room).values() if isinstance(v, Dispatcher)]
+    modules = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
+    found = [v for module in modules for v in vars(module).values() if isinstance(v, Dispatcher)]
     return {f'{k.py_func.__module__}.{k.py_func.__qualname__}': k for k in found}
 
 
