@@ -66,9 +66,6 @@ class Accuracy:
         along both tangents, rad.
     reference_gain : float
         Relative error of a reference sensor's gain.
-    patch_position_m, patch_rotation_rad : float
-        Error of the tracked pose of a patch of reference coils along and about each axis, m and
-        rad; its coils' gains have ``reference_gain``.
     stamp_sigma_s : float
         Error of a flux stamp against the moment that it names, s: a tool at a speed v is where
         its pose says to v times this. The default is that of a line which delivers in frames of
@@ -89,13 +86,6 @@ class Accuracy:
         math.radians(0.3), "error of a reference sensor's surveyed axis, rad a tangent", 0.0, 1.0
     )
     reference_gain: float = _value(0.004, "relative error of a reference sensor's gain", 0.0, 1.0)
-    patch_position_m: float = _value(
-        0.15e-3, "error of a patch's tracked position along each axis, m", 0.0, 0.1
-    )
-    patch_rotation_rad: float = _value(
-        2e-3, "error of a patch's tracked orientation about each axis, rad", 0.0, 1.0
-    )
-
     stamp_sigma_s: float = _value(0.3e-3, 'error of a flux stamp, s', 0.0, 0.1)
 
     def __post_init__(self) -> None:

@@ -21,7 +21,6 @@ from anser_ros.sessions.chosen_references import parse_references, with_referenc
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import recording_of, to_document
 from anser_ros.sessions.known_metal_file import load_known_metal
-from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.pose_table import (
     BODIES_FILE,
     ERRORS_FILE,
@@ -86,13 +85,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='metal that anser known_metal has learnt: let the model follow it by the tools, '
         'without references',
     )
-    parser.add_argument(
-        '--patch',
-        action='append',
-        default=[],
-        metavar='BODY=TOPIC',
-        help='body that carries reference coils too, and the topic of its poses in the bag',
-    )
     add_resurveyed(parser)
     parser.add_argument(
         '--in-phase', action='store_true', help="use in-phase fluxes only, the article's way"
@@ -138,7 +130,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     tell : callable
         Called with the stage, and the finished share of it where that is known.
     """
-    others = ('refit', 'baseline', 'patch', 'references', 'witnesses', 'in_phase', 'poses')
+    others = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', 'poses')
     given = [f'--{name.replace("_", "-")}' for name in others if getattr(args, name)]
     if args.known_metal is not None and given:
         raise ParameterError(
@@ -165,7 +157,6 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         baseline=baseline,
         refit=args.refit,
         in_phase=args.in_phase,
-        patches=parse_patches(args.patch),
         witnesses=args.witnesses,
         known_metal=known,
         progress=lambda share: tell('tracking', share),
@@ -189,7 +180,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         shown.append(_refit_line(document['refit'], known is not None))
     notes = (
         *snapshot_notes(args.model, model), *loss_notes(args.session, session.lost),
-        *(_few_notes(session) if args.refit and not args.patch else ()),
+        *(_few_notes(session) if args.refit else ()),
     )  # fmt: skip
     return Result(document, notes, tuple(shown), tuple(written))
 

@@ -15,7 +15,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from anser_ros import pose_states as states
-from anser_ros.errors import AnserError, FitError, ModelFileError, ParameterError
+from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.nodes.field_model_parts import refit_status
@@ -23,7 +23,6 @@ from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelP
 from anser_ros.nodes.field_model_parts.kept_baseline import CONFIRM_S, KeptBaseline
 from anser_ros.nodes.field_model_parts.metal_view import MetalView
 from anser_ros.nodes.field_model_parts.model_output import ModelOutput
-from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
 from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
 from anser_ros.nodes.field_model_parts.refit_in_force import RefitInForce
 from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
@@ -39,7 +38,6 @@ from anser_ros.refit.change import Pace
 from anser_ros.sessions.baseline import clean_flux, clean_mean
 from anser_ros.sessions.kept_tables import ReadAhead, kept_folder
 from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, save_model
-from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import is_nominal, model_of, starting_model
 from anser_ros.stamps import is_live
@@ -79,17 +77,13 @@ class FieldModelNode(AnserNode):
         self._metal = MetalView(self)
         setups = setup_source(self, self._on_setup)
         self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
-        topics = parse_patches(table.patches)
-        self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)
         name = self.get_fully_qualified_name()
         folder = kept_folder(table.keep_state)
         ahead = ReadAhead(folder, self._file_model) if table.refit else None
         kept = KeptBaseline(folder, name, self._fluxes.sender, ahead)
-        if table.witnesses and topics:
-            raise ParameterError('witnesses: tools cannot be witnesses where patches move')
         witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)
-        self._refit = RefitInForce(self._moving, witnesses, self._pace, self.count, kept)
-        self._sources = [setups, self._fluxes, *self._moving.sources, *witnesses.sources]
+        self._refit = RefitInForce(witnesses, self._pace, self.count, kept)
+        self._sources = [setups, self._fluxes, *witnesses.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)

@@ -117,7 +117,7 @@ def distance_of(
     basis, variance = bank.bases[hypothesis], seen.noise**2
     ahead = bank.all_drift[rows]
     shared = variance * (ahead @ bank.drift.T)
-    own = np.diag((noise * bank.all_noise[rows]) ** 2) + variance * (ahead @ ahead.T)
+    own = noise**2 * np.eye(len(rows)) + variance * (ahead @ ahead.T)
     total = 0.0
     for part in range(2):
         strength = int(seen.strength[hypothesis, part].argmax())

@@ -26,8 +26,6 @@ class Banks:
     baseline : ndarray, shape (S, K), complex
         Readings without the metal, T; NaN for a coil that has none.
     settings : RefitSettings
-    row_noise : ndarray, shape (S K,)
-        Noise of every reading over the nominal one.
     """
 
     def __init__(
@@ -35,9 +33,8 @@ class Banks:
         tables: RefitTables,
         baseline: NDArray[np.complex128],
         settings: RefitSettings,
-        row_noise: Array,
     ) -> None:
-        self._tables, self._row_noise = tables, row_noise
+        self._tables = tables
         self._width = k = baseline.shape[1]
         turned = baseline * tables.excitation.phase.conj()
         scale = settings.emitter_drift / settings.accuracy.flux_noise_t
@@ -55,9 +52,7 @@ class Banks:
             if len(self._known) >= MOST_BANKS:
                 del self._known[next(iter(self._known))]
             tables = self._tables
-            bank = Bank(
-                tables.priors, rows, self._drift, self._row_noise, SLOTS, len(tables.bodies)
-            )
+            bank = Bank(tables.priors, rows, self._drift, SLOTS, len(tables.bodies))
             self._known[key] = (bank, BodySlots(bank, tables))
             begin_in_background(bank.make_ready)
         return self._known[key]

@@ -40,25 +40,15 @@ class BaselineCheck:
     """
 
     def __init__(self, baseline: ComplexArray) -> None:
-        self._least = _least_power(baseline)
+        power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
+        # T^2, below which a coil is silent; NaN without a baseline.
+        self._least = np.where(np.isfinite(power), QUIET**2 * power, np.nan)
 
-    def read(
-        self, frame: Frame, baseline: ComplexArray | None = None
-    ) -> tuple[NDArray[np.bool_], list[str]]:
-        """Return which readings (S,) of a judged frame can be used, and why others cannot.
-
-        ``baseline`` (S, K) is the baseline of this frame, where coils move.
-        """
-        least = self._least if baseline is None else _least_power(baseline)
+    def read(self, frame: Frame) -> tuple[NDArray[np.bool_], list[str]]:
+        """Return which readings (S,) of a judged frame can be used, and why others cannot."""
         codes = frame.codes.copy()
-        find_silent(frame.flux, least, SILENT_CODE, NO_BASELINE_CODE, codes)
+        find_silent(frame.flux, self._least, SILENT_CODE, NO_BASELINE_CODE, codes)
         return codes == faults.GOOD, [_REASONS[code] for code in codes.tolist()]
-
-
-def _least_power(baseline: ComplexArray) -> NDArray[np.float64]:
-    """Return the power (S,), T^2, below which a coil is silent, with NaN without a baseline."""
-    power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
-    return np.where(np.isfinite(power), QUIET**2 * power, np.nan)
 
 
 class NoiseUnits:

@@ -157,7 +157,7 @@ class Courses:
         self._away[away], self._farthest[away] = 0.0, 0.0
         return away
 
-    def returned(self, noise: Array) -> NDArray[np.int64]:
+    def returned(self, noise_t: float) -> NDArray[np.int64]:
         """Return the references that are no longer off by jumps, which is then forgotten.
 
         One has jumped back when little of its jump is left. All have that jumped when all of them
@@ -166,13 +166,13 @@ class Courses:
 
         Parameters
         ----------
-        noise : ndarray, shape (S,)
-            Of a phasor component of each, T.
+        noise_t : float
+            Of a phasor component, T.
         """
         away, size = self._is_away, np.linalg.norm(self._away, axis=1)
-        calm = math.sqrt(LEAST_JUMP_POWER * 2 * self._away.shape[1]) * noise
+        calm = math.sqrt(LEAST_JUMP_POWER * 2 * self._away.shape[1]) * noise_t
         back = away & (size < np.maximum(RETURNED * self._farthest, calm))
-        if (np.linalg.norm(self._last[away], axis=1) < calm[away]).all():
+        if (np.linalg.norm(self._last[away], axis=1) < calm).all():
             back = away
         self._away[back], self._farthest[back] = 0.0, 0.0
         return np.flatnonzero(back)
@@ -190,7 +190,7 @@ def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
 def _is_predicted(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
     """Return whether each coil's jump is what the others predict, as when metal is put down."""
     _, residual = left_out(bank, seen, int(seen.log_evidence.argmax()))
-    noise = LEAST_JUMP_POWER * jumps[0].size * (seen.noise * bank.row_noise[:: bank.width]) ** 2
+    noise = LEAST_JUMP_POWER * jumps[0].size * seen.noise**2
     off = (residual**2).sum(axis=(1, 2))
     size = (jumps**2).sum(axis=(1, 2)) + ((jumps - residual) ** 2).sum(axis=(1, 2))
     concerned = size > noise
@@ -218,12 +218,12 @@ def jumped(
         Size of the readings' change, noise units, that metal may have made since the last frame.
     """
     free, seen = seen, _bounded(bank, seen, largest)
-    freedom, noise = bank.width, bank.row_noise[:: bank.width, None]
+    freedom = bank.width
     # In phase and quadrature apart: most faults are in one of the two.
-    power = (jumps**2).sum(axis=1) / noise**2
-    quiet = -0.5 * power / seen.noise**2 - freedom * np.log(seen.noise * noise)
+    power = (jumps**2).sum(axis=1)
+    quiet = -0.5 * power / seen.noise**2 - freedom * np.log(seen.noise)
     scales = FAULT_SCALES[:, None, None]
-    curve = -0.5 * power / scales**2 - freedom * np.log(scales * noise)
+    curve = -0.5 * power / scales**2 - freedom * np.log(scales)
     top = curve.max(axis=0)
     broad = top + np.log(np.exp(curve - top).mean(axis=0))
     apart = np.maximum(quiet, broad)
@@ -241,7 +241,6 @@ def are_over(
     units: NoiseUnits,
     bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]],
     level: float,
-    noise: Array,
     drift: float,
 ) -> bool:
     """Return whether jumps are over: metal alone explains how all has changed since before them.
@@ -255,8 +254,8 @@ def are_over(
     units : NoiseUnits
     bank_of : callable
         Returns the hypotheses for references (S,) first.
-    level, noise : float and ndarray, shape (S,)
-        Noise of a usual reference and of each, of a component, in units of the nominal one.
+    level : float
+        Noise of a component of a reading, in units of the nominal one.
     drift : float
         Prior deviation of an emitter's strength.
     """
@@ -264,7 +263,7 @@ def are_over(
     power = (units.of(courses.bend())[readable] ** 2).mean(axis=(1, 2)) / BEND_VARIANCE
     if not courses.away().size or not power.size:
         return False
-    if (power > LEAST_JUMP_POWER * noise[readable] ** 2).any():
+    if (power > LEAST_JUMP_POWER * level**2).any():
         return False
     change, seconds = courses.since_sound()
     spread = math.sqrt(2.0)

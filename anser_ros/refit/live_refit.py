@@ -7,7 +7,6 @@ few dozen readings determine the change of the whole field. See `docs/refit.md`.
 
 import math
 from collections.abc import Callable, Sequence
-from copy import copy
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from anser_ros.refit import tables as refit_tables
 from anser_ros.refit.agreement import distance_of, evidence_without, left_out
 from anser_ros.refit.assembly import Assembly
 from anser_ros.refit.banks import Banks
-from anser_ros.refit.baseline import checked_baseline, checked_noise
+from anser_ros.refit.baseline import checked_baseline
 from anser_ros.refit.belief import Belief
 from anser_ros.refit.change import Average, NoiseLevel
 from anser_ros.refit.evidence import FrameEvidence
@@ -73,13 +72,10 @@ class LiveRefit:
     drawing : callable, optional
         Field of the board as drawn (`physics.board.Board.field`): points (P, 3) to (P, K, 3), T.
         Without it the model's own dipoles drive the metal, which is much less accurate.
-    noise : ndarray, shape (S,), optional
-        Noise of each reference over the nominal one, at least 1; more for coils whose place is
-        only known from a tracker (see `refit.patches`).
     volume : TrackedVolume, optional
         Where the field must be right; by default the volume over such a board.
     tables : RefitTables, optional
-        Of all these but the baseline and the noise, where they are there already.
+        Of all these but the baseline, where they are there already.
 
     Raises
     ------
@@ -94,14 +90,12 @@ class LiveRefit:
         baseline: ComplexArray,
         settings: RefitSettings | None = None,
         drawing: FieldFunction | None = None,
-        noise: Array | None = None,
         volume: TrackedVolume | None = None,
         tables: refit_tables.RefitTables | None = None,
     ) -> None:
         self.model, self.references = model, references
         self.settings = settings or RefitSettings()
         self.baseline = checked_baseline(model, references, baseline)
-        self._row_noise = checked_noise(noise, len(references), len(model.emitters))
         self._tables = tables or refit_tables.build_tables(
             model, references, self.settings, drawing, volume
         )
@@ -137,7 +131,7 @@ class LiveRefit:
         """Compute what depends on the baseline and the references' places."""
         phase, noise_t = self._tables.excitation.phase, self.settings.accuracy.flux_noise_t
         self._units = NoiseUnits(self.baseline, phase, noise_t)
-        self._banks = Banks(self._tables, self.baseline, self.settings, self._row_noise)
+        self._banks = Banks(self._tables, self.baseline, self.settings)
         self._intake = Intake(self.references.channel, error=FitError)
         self._baseline_check = BaselineCheck(self.baseline)
         self._assembly = Assembly(self.model)
@@ -158,37 +152,12 @@ class LiveRefit:
         self._last_ns = 0
         self._last_model = self.model
 
-    def moved(
-        self, references: SensorTable, baseline: ComplexArray, noise: Array | None = None
-    ) -> 'LiveRefit':
-        """Return the same refit for references at other places, with what it has learnt.
-
-        Parameters
-        ----------
-        references : SensorTable
-            The same coils in the same order.
-        baseline, noise
-            As for the constructor.
-        """
-        if references.name != self.references.name:
-            raise FitError('refit: moved references must be the same coils in the same order')
-        other = copy(self)
-        other.references = references
-        other.baseline = checked_baseline(self.model, references, baseline)
-        other._row_noise = checked_noise(noise, len(references), len(self.model.emitters))
-        other._tables = self._tables.moved(references, self.settings)
-        other._prepare()
-        other._belief = copy(self._belief)
-        other._average = Average(self.settings.average_frames)
-        return other
-
     def update(
         self,
         stamp_ns: int,
         channels: NDArray[np.generic],
         flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
-        baseline: ComplexArray | None = None,
     ) -> RefitResult:
         """Take in one frame of reference fluxes and return the result of the refit.
 
@@ -202,8 +171,6 @@ class LiveRefit:
             T.
         flags : ndarray, shape (S,), optional
             Flag bits; a flagged reading is not used.
-        baseline : ndarray, shape (S, K), complex, optional
-            The baseline at this moment, in the order of the references, where some of them move.
 
         Raises
         ------
@@ -211,18 +178,10 @@ class LiveRefit:
             When shapes don't fit or a channel appears twice.
         """
         width = len(self.model.emitters)
-        return self.follow(self._intake.judge(stamp_ns, channels, flux, flags, width), baseline)
+        return self.follow(self._intake.judge(stamp_ns, channels, flux, flags, width))
 
-    def follow(self, frame: Frame, baseline: ComplexArray | None = None) -> RefitResult:
-        """Take in one frame that has been judged.
-
-        Parameters
-        ----------
-        frame : Frame
-            In the order of the references.
-        baseline : ndarray, shape (S, K), complex, optional
-            As for `update`.
-        """
+    def follow(self, frame: Frame) -> RefitResult:
+        """Take in one frame that has been judged, in the order of the references."""
         stamp_ns, ordered = frame.stamp_ns, frame.flux
         if stamp_ns < self._last_ns:
             self._noise.forget()
@@ -231,18 +190,14 @@ class LiveRefit:
             self._courses = Courses(*self.baseline.shape)
         self._last_ns = stamp_ns
         frame = self._freshness.judged(frame, self.settings.accuracy.flux_noise_t)
-        readable, reasons = self._baseline_check.read(frame, baseline)
+        readable, reasons = self._baseline_check.read(frame)
         self._watch.note(readable, reasons, self.settings.min_references, stamp_ns)
         usable = ordered if readable.all() else np.where(readable[:, None], ordered, np.nan)
         level = self._noise.update(self._watch.without_excluded(usable))
-        clean = self.baseline if baseline is None else baseline
-        self._look_for_jumps(stamp_ns, usable - clean, level)
+        self._look_for_jumps(stamp_ns, usable - self.baseline, level)
         if np.count_nonzero(self._in_use()) < self.settings.min_references:
             self._watch.wait(readable)
             return self._too_few(stamp_ns, level)
-        if baseline is not None:
-            # What is averaged is the change; the baseline moves with the coil.
-            ordered = ordered - baseline + self.baseline
         used = self._watch.without_excluded(ordered)
         mean, frames = self._average.update(used, level * self.settings.accuracy.flux_noise_t)
         if used is not ordered:
@@ -260,16 +215,15 @@ class LiveRefit:
         """Leave out coils whose change (S, K) has just jumped by itself."""
         jumps = self._courses.follow(stamp_ns, change)
         parts = self._units.of(jumps.off) / jumps.spread[:, None, None]
-        noise = level * self._row_noise[:: parts.shape[1]]
-        loud = (parts**2).mean(axis=(1, 2)) > LEAST_JUMP_POWER * noise**2
+        loud = (parts**2).mean(axis=(1, 2)) > LEAST_JUMP_POWER * level**2
         away, coils = self._courses.away(), np.flatnonzero(self._in_use())
         if not (loud.any() or away.size):
             return
         self._courses.note(jumps, away[loud[away]])
-        back = self._courses.returned(noise * self.settings.accuracy.flux_noise_t)
+        back = self._courses.returned(level * self.settings.accuracy.flux_noise_t)
         few = coils.size < self.settings.min_references or self._watch.is_outvoted
         drift, banks = self.settings.emitter_drift, self._banks.of
-        if few and are_over(self._courses, self._units, banks, level, noise, drift):
+        if few and are_over(self._courses, self._units, banks, level, drift):
             back = self._courses.forget_jumps()
         for coil in back.tolist():
             self._watch.recover(coil)
@@ -306,8 +260,7 @@ class LiveRefit:
             self._distance, self._residual = left_out(bank, seen, best)
             if len(coils) <= self.settings.min_references:
                 return bank, seen
-            loudness = noise * self._row_noise[:: bank.width][coils]
-            power = (used.reshape(len(coils), -1) ** 2).sum(axis=1) / loudness**2
+            power = (used.reshape(len(coils), -1) ** 2).sum(axis=1) / noise**2
             suspects = self._watch.suspects(self._distance, power, 2 * bank.width)
             faulty = health.find_faults(bank, seen, suspects)
             if not faulty.size:

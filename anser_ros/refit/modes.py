@@ -70,17 +70,17 @@ def error_draws(
     """
     prior, power = posterior.prior, STRENGTHS[strength]
     count = prior.draw_readings.shape[1]
-    drawn = noise * _noise_draws(count, bank.drift, bank.row_noise, part)
+    drawn = noise * _noise_draws(count, bank.drift, part)
     readings = np.sqrt(power) * prior.draw_readings[bank.rows] + drawn
     gain = power / (power * posterior.values + noise**2)
     weights = gain[:, None] * (posterior.basis.T @ readings)
     return np.asarray(np.sqrt(power) * prior.draw_moments - posterior.synthesis @ weights)
 
 
-def _noise_draws(count: int, drift: Array, noise: Array, part: int) -> Array:
+def _noise_draws(count: int, drift: Array, part: int) -> Array:
     """Return repeatable draws of the readings' noise and drift, (n, D)."""
     rng = np.random.default_rng(1 + part)
-    white = noise[:, None] * rng.standard_normal((len(drift), count))
+    white = rng.standard_normal((len(drift), count))
     return np.asarray(white + drift @ rng.standard_normal((drift.shape[1], count)))
 
 

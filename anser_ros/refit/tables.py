@@ -1,7 +1,7 @@
 """Computes a refit's tables once: driving field, layers and predictions of all clouds."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,14 +75,6 @@ class RefitTables:
     references: SensorTable
     settings: RefitSettings
     weight: Array
-
-    def moved(self, references: SensorTable, settings: RefitSettings) -> 'RefitTables':
-        """Return the tables for references at other places."""
-        priors = _priors(
-            self.hypotheses, references, self.excitation, self.frequencies_hz, settings
-        )
-        factors = _factors(self.bodies, references, self.excitation)
-        return replace(self, priors=priors, factors=factors, references=references)
 
     def body_prior(self, body: int) -> CloudPrior:
         """Return the full hypothesis of a compact body, which is computed once."""

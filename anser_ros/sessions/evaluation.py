@@ -56,7 +56,6 @@ def track_session(
     refit: bool = False,
     in_phase: bool = False,
     progress: Progress | None = None,
-    patches: dict[str, str] | None = None,
     witnesses: bool = False,
     known_metal: KnownMetal | None = None,
 ) -> Evaluation:
@@ -78,8 +77,6 @@ def track_session(
         Whether only in-phase fluxes and moments are used (the article's way).
     progress : callable, optional
         Called with the finished share, 0 to 1.
-    patches : dict of str to str, optional
-        Bodies that carry further reference coils, each with the topic of its poses in the bag.
     witnesses : bool
         Whether the refit also uses what the coils of rigid tools contradict.
     known_metal : KnownMetal, optional
@@ -107,7 +104,7 @@ def track_session(
     if known_metal is not None:
         follower = KnownMetalModels(prepared, known_metal)
     elif refit:
-        follower = ModelFollower(prepared, patches, witnesses)
+        follower = ModelFollower(prepared, witnesses)
     tracked = track(prepared, settings, follower, in_phase, progress)
     return compare(prepared, tracked)
 

@@ -12,7 +12,6 @@ from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame
 from anser_ros.nodes.field_model_parts.kept_baseline import KeptBaseline
-from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
 from anser_ros.nodes.field_model_parts.refit_start import RefitStart, warm_up
 from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
 from anser_ros.physics.sensor import SensorTable
@@ -30,8 +29,6 @@ class RefitInForce:
 
     Parameters
     ----------
-    moving : MovingCoils
-        Gets the patches of the refit.
     witnesses : ToolWitnesses
         Tells of metal what the tools read.
     pace : Pace
@@ -52,15 +49,13 @@ class RefitInForce:
 
     def __init__(
         self,
-        moving: MovingCoils,
         witnesses: ToolWitnesses,
         pace: Pace,
         count: Callable[[str], None],
         kept: KeptBaseline,
     ) -> None:
         warm_up()
-        self._moving, self._witnesses = moving, witnesses
-        self._pace, self._count, self._kept = pace, count, kept
+        self._witnesses, self._pace, self._count, self._kept = witnesses, pace, count, kept
         self._has_looked = False
         self._confirmed: RefitResult | None = None
         self._start: RefitStart | None = None
@@ -74,14 +69,13 @@ class RefitInForce:
     ) -> None:
         """Be without a refit, and begin at once with what needs no baseline for the next one."""
         self.end()
-        self.current = self.result = self._moving.patches = self._start = None
+        self.current = self.result = self._start = None
         self._has_looked = False
         self._kept.expect(setup, base)
         self._witnesses.expect(setup, base)
         if len(references):
-            bodies, folder, ahead = self._moving.bodies, self._kept.folder, self._kept.ahead
-            noise_t = self._witnesses.noise_t
-            self._start = RefitStart(setup, base, references, bodies, folder, ahead, noise_t)
+            folder, ahead, noise_t = self._kept.folder, self._kept.ahead, self._witnesses.noise_t
+            self._start = RefitStart(setup, base, references, folder, ahead, noise_t)
             if at_once:
                 self._start.prepare()
         else:
@@ -167,8 +161,7 @@ class RefitInForce:
         started = None if self._start is None else self._start.taken()
         if started is None:
             return False
-        self.current, self._moving.patches = started
-        self.result = None
+        self.current, self.result = started, None
         self._count('refit_starts')
         return True
 
@@ -206,20 +199,13 @@ class RefitInForce:
 
     def follow(self, frame: Frame) -> RefitResult | None:
         """Return the result of a frame; None where the last one was less than the pace ago."""
-        refit, patches = self.current, self._moving.patches
+        refit = self.current
         if refit is None or not self._pace.is_due(frame.stamp_ns):
             return None
         begin_s = time.monotonic()
-        if patches is None:
-            if self.result is not None:
-                self._witnesses.tell(refit, self.result.stamp_ns)
-            self.result = refit.follow(frame)
-        else:
-            moved = patches.moved_refit(refit, frame.stamp_ns)
-            if moved is not None:  # the patches' new places have been worked out
-                self.current = refit = moved
-                self._count('patch_moves')
-            self.result = patches.follow(refit, frame)
+        if self.result is not None:
+            self._witnesses.tell(refit, self.result.stamp_ns)
+        self.result = refit.follow(frame)
         self._count('refits')
         self.update_s = time.monotonic() - begin_s
         return self.result
