@@ -57,12 +57,8 @@ UNCHANGED_MODEL = FrameModel(None)
 class ModelAge:
     """Keeps the last models that the references gave, and ages the newest until the next.
 
-    Parameters
-    ----------
-    longest_s : float
-        Age, s, from which on no pose is given.
-    volume : TrackedVolume
-        Where the size of a change of the field is taken.
+    ``longest_s``: age, s, from which on no pose is given. ``volume``: where the size of a change
+    of the field is taken.
     """
 
     def __init__(self, longest_s: float, volume: TrackedVolume) -> None:
@@ -96,12 +92,8 @@ class ModelAge:
     def at(self, stamp_ns: int, why: str = '') -> FrameModel:
         """Return what a frame may be tracked with.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Of the frame.
-        why : str
-            Why the references gave no answer, where that is known.
+        ``stamp_ns``: of the frame. ``why``: why the references gave no answer, where that is
+        known.
         """
         if not self._answers:
             return FrameModel(None, Withheld(REFERENCES_LOST, why)) if why else UNCHANGED_MODEL

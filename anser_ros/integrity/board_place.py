@@ -129,10 +129,8 @@ class BoardPlace:
     def misplacement(self, flux: ComplexArray) -> Misplacement | None:
         """Return how far the model lies from the board that the references see.
 
-        Parameters
-        ----------
-        flux : ndarray, shape (R, K), complex
-            Readings of the references, T, of one frame or of many; NaN rows are passed over.
+        ``flux`` (R, K): readings of the references, T, of one frame or of many; NaN rows are
+        passed over.
 
         Returns
         -------

@@ -63,10 +63,7 @@ def change_without_gains(now: ComplexArray, before: ComplexArray) -> Array:
 
     The gains are those of most sensors: the fit gives less weight to those that changed more.
 
-    Parameters
-    ----------
-    now, before : ndarray, shape (R, K), complex
-        T; rows with NaN are not used.
+    ``now``, ``before`` (R, K): T; rows with NaN are not used.
 
     Returns
     -------
@@ -94,10 +91,7 @@ def check_steady(flux: ComplexArray) -> float | None:
     The means of `PARTS` parts are compared with each other, beside a gain of each emitter: the
     strength of an emitter may drift while there is no metal, and a refit follows it.
 
-    Parameters
-    ----------
-    flux : ndarray, shape (F, R, K), complex
-        Frames of readings, T, in the order of time; NaN where a reading is bad.
+    ``flux`` (F, R, K): frames of readings, T, in the order of time; NaN where a reading is bad.
 
     Returns
     -------

@@ -132,12 +132,7 @@ class Freshness:
     def judged(self, frame: Frame, noise_t: float) -> Frame:
         """Return the frame with its stuck readings marked.
 
-        Parameters
-        ----------
-        frame : Frame
-            The next one of a stream.
-        noise_t : float
-            Stated noise of a phasor component, T.
+        ``frame``: the next one of a stream. ``noise_t``: stated noise of a phasor component, T.
         """
         if frame.goes_back or self._ring.shape[1:] != frame.flux.shape:
             self._forget(frame.flux.shape)

@@ -28,13 +28,8 @@ class _Run:
 class Senders:
     """Distinguishes the senders of one topic.
 
-    Parameters
-    ----------
-    topic : str
-        As it is called in `complaint`.
-    is_constant : bool
-        Whether what a sender says never changes: who says otherwise is another one, whatever
-        number the message has.
+    ``topic``: as it is called in `complaint`. ``is_constant``: whether what a sender says never
+    changes: who says otherwise is another one, whatever number the message has.
 
     Attributes
     ----------

@@ -138,12 +138,8 @@ class KnownMetalFollower:
     ) -> None:
         """Take in what rigid tools read in a frame, at poses that are near theirs.
 
-        Parameters
-        ----------
-        stamp_ns : int
-        readings : sequence of ToolReading
-        near : ndarray, shape (P, 3), optional
-            Where all coils are, m, those of no rigid tool among them; by default those that read.
+        ``near`` (P, 3): where all coils are, m, those of no rigid tool among them; by default
+        those that read.
         """
         seconds = self._seconds_to(stamp_ns)
         if not readings:

@@ -184,11 +184,7 @@ class PlacedLattice:
 class Setting:
     """Places lattices in the field of some emitters.
 
-    Parameters
-    ----------
-    excitation : Excitation
-    tilt : ndarray, shape (K,)
-        Of the lattices, see `Lattice.tilt`.
+    ``tilt`` (K,): of the lattices, see `Lattice.tilt`.
     """
 
     def __init__(self, excitation: Excitation, tilt: Array) -> None:

@@ -78,10 +78,7 @@ class Geometry:
 class Assembly:
     """Assembles refitted models from the calibrated model and the hypotheses' layers.
 
-    Parameters
-    ----------
-    model : FieldModel
-        Calibrated.
+    ``model``: calibrated.
     """
 
     def __init__(self, model: FieldModel) -> None:

@@ -31,12 +31,8 @@ def begin_in_background(work: Callable[[], None]) -> None:
 class BackgroundTask(Generic[Result]):
     """Runs one piece of work in the background thread.
 
-    Parameters
-    ----------
-    work : callable
-        Must only read what nothing else changes.
-    stamp_ns : int
-        Stamp of the frame that starts it, ns.
+    ``work``: must only read what nothing else changes. ``stamp_ns``: stamp of the frame that
+    starts it, ns.
     """
 
     def __init__(self, work: Callable[[], Result], stamp_ns: int) -> None:

@@ -25,12 +25,7 @@ MOST_FRAMES = 2000
 class ReadingWindow:
     """Holds the most recent readings of a set of sensors.
 
-    Parameters
-    ----------
-    sensors : SensorTable
-    emitters : int
-    span_s : float
-        How far back readings are kept, s of their stamps.
+    ``span_s``: how far back readings are kept, s of their stamps.
 
     Raises
     ------

@@ -14,12 +14,8 @@ UNCHANGED = 0.99
 class Belief:
     """Holds probabilities of the hypotheses; the first of them is that nothing has changed.
 
-    Parameters
-    ----------
-    count : int
-        Number of hypotheses.
-    persistence : float
-        Probability that the hypothesis of one frame still holds in the next.
+    ``count``: number of hypotheses. ``persistence``: probability that the hypothesis of one frame
+    still holds in the next.
 
     Attributes
     ----------
@@ -59,12 +55,8 @@ class Belief:
     def update_by(self, names: Sequence[str], evidence: Mapping[str, float]) -> None:
         """Update the weights of the hypotheses by other evidence of the same frame.
 
-        Parameters
-        ----------
-        names : sequence of str
-            Of the hypotheses, in their order.
-        evidence : mapping of str to float
-            Log evidence by name; hypotheses that are not in it are ruled out, unless all are.
+        ``names``: of the hypotheses, in their order. ``evidence``: log evidence by name;
+        hypotheses that are not in it are ruled out, unless all are.
         """
         if not evidence:
             return

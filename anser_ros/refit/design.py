@@ -187,13 +187,7 @@ def _gains(metals: Sequence[StatedMetal], coils: Sequence[int], k: int) -> Array
 def choose(metals: Sequence[StatedMetal], count: int, k: int) -> list[Design]:
     """Return the best choices of 1 to ``count`` coils, each one found from the one before.
 
-    Parameters
-    ----------
-    metals : sequence of StatedMetal
-    count : int
-        At most the number of candidates.
-    k : int
-        Readings of a coil.
+    ``count``: at most the number of candidates. ``k``: readings of a coil.
     """
     coils: list[int] = []
     designs = []

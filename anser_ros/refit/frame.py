@@ -33,10 +33,7 @@ QUIET = 0.05
 class BaselineCheck:
     """Determines which readings can be compared with a baseline.
 
-    Parameters
-    ----------
-    baseline : ndarray, shape (S, K), complex
-        A coil whose baseline is not finite can't be used.
+    ``baseline`` (S, K): A coil whose baseline is not finite can't be used.
     """
 
     def __init__(self, baseline: ComplexArray) -> None:

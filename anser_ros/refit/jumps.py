@@ -75,10 +75,7 @@ class Courses:
     """Follows where each reference's change is on its way to, and how far those that jumped are
     off.
 
-    Parameters
-    ----------
-    count, width : int
-        References S and emitters K.
+    ``count``, ``width``: references S and emitters K.
     """
 
     def __init__(self, count: int, width: int) -> None:
@@ -164,10 +161,7 @@ class Courses:
         read what they did in the baseline: they may have gone wrong unseen, in small steps, and
         then the end of the fault was taken for a jump.
 
-        Parameters
-        ----------
-        noise_t : float
-            Of a phasor component, T.
+        ``noise_t``: of a phasor component, T.
         """
         away, size = self._is_away, np.linalg.norm(self._away, axis=1)
         calm = math.sqrt(LEAST_JUMP_POWER * 2 * self._away.shape[1]) * noise_t

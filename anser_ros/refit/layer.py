@@ -180,13 +180,7 @@ def _middle(points: Array, half: float) -> NDArray[np.int64]:
 def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
     """Return the sources of a compact body as dipoles, which are exact wherever the body is.
 
-    Parameters
-    ----------
-    region : Region
-    weight : ndarray, shape (P,)
-        `pose_weight` at ``region.volume.samples()``.
-    cloud : Cloud
-        The body's sources.
+    ``weight`` (P,): `pose_weight` at ``region.volume.samples()``. ``cloud``: the body's sources.
     """
     points = region.volume.samples()
     away = np.linalg.norm(points[:, None] - cloud.positions, axis=2).min(axis=1)
@@ -214,14 +208,8 @@ def bottom_layer(
 ) -> Layer:
     """Return the layer for clouds below the board.
 
-    Parameters
-    ----------
-    model : FieldModel
-        Calibrated; its dipoles are used again where they can stand for the sources.
-    region : Region
-    excitation : Excitation
-    sources : ndarray, shape (M, 3)
-        Sources of the cloud that is hardest to stand for, the nearest one.
+    ``model``: calibrated; its dipoles are used again where they can stand for the sources.
+    ``sources`` (M, 3): sources of the cloud that is hardest to stand for, the nearest one.
     """
     points, deep = region.volume.samples(*SAMPLES), _lattice(region, *DEEP)
     upright = np.abs(model.directions[:, 2]) > 0.999

@@ -185,12 +185,8 @@ class Bank:
     def evaluate(self, readings: Array, noise: float) -> FrameEvidence:
         """Return the evidence of every hypothesis.
 
-        Parameters
-        ----------
-        readings : ndarray, shape (n, 2)
-            Change since the baseline, real and imaginary part, in nominal noise deviations.
-        noise : float
-            Noise in units of the nominal one.
+        ``readings`` (n, 2): change since the baseline, real and imaginary part, in nominal noise
+        deviations. ``noise``: noise in units of the nominal one.
         """
         precision, log_det = self.precision(noise)
         count, n = self.spectra.shape

@@ -67,14 +67,8 @@ def locate_metal(
 ) -> Metal | None:
     """Return the sources under the most probable hypothesis with metal; None when all are zero.
 
-    Parameters
-    ----------
-    bank : Bank
-    seen : FrameEvidence
-    weights : ndarray, shape (H,)
-        Probability of each hypothesis; the first, that nothing has changed, is passed over.
-    flux_noise_t : float
-        Nominal noise, T.
+    ``weights`` (H,): probability of each hypothesis; the first, that nothing has changed, is
+    passed over. ``flux_noise_t``: nominal noise, T.
     """
     best = 1 + int(weights[1:].argmax())
     values = bank.sources(seen, best) * flux_noise_t

@@ -37,13 +37,8 @@ def _symmetric() -> Array:
 def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Single:
     """Return the readings of a body's coarse sources, a column for each tensor component.
 
-    Parameters
-    ----------
-    cloud : Cloud
-    references : SensorTable
-        Places and axes in fg.
-    excitation : ndarray, shape (COARSE, K, 3)
-        Field of the emitters at the first sources, T.
+    ``references``: places and axes in fg. ``excitation`` (COARSE, K, 3): field of the emitters at
+    the first sources, T.
 
     Returns
     -------
@@ -109,12 +104,8 @@ class BodySearch:
     def scores(self, readings: Array, noise: float) -> Array:
         """Return the approximate log evidence of every body, (L,).
 
-        Parameters
-        ----------
-        readings : ndarray, shape (n, 2)
-            Change since the baseline in nominal noise deviations, real and imaginary part.
-        noise : float
-            Noise in units of the nominal one.
+        ``readings`` (n, 2): change since the baseline in nominal noise deviations, real and
+        imaginary part. ``noise``: noise in units of the nominal one.
         """
         inside, rest, log_det = self._table(noise)
         white = np.empty((len(self.rows), 2), dtype=np.float32)

@@ -56,11 +56,7 @@ class _Look(NamedTuple):
 class BodySlots:
     """Fills the slots of a bank with the bodies that the readings support.
 
-    Parameters
-    ----------
-    bank : Bank
-        Its last `SLOTS` hypotheses are slots.
-    tables : RefitTables
+    ``bank``: its last `SLOTS` hypotheses are slots.
     """
 
     def __init__(self, bank: Bank, tables: RefitTables) -> None:

@@ -69,12 +69,7 @@ class ToolReading:
 class CoilErrors:
     """Holds what is wrong with a tool's coils: gain, place and axis of each, learnt without metal.
 
-    Parameters
-    ----------
-    table : SensorTable
-        The S coils.
-    tools : ToolSettings
-        How well they are known before.
+    ``table``: the S coils. ``tools``: how well they are known before.
     """
 
     def __init__(self, table: SensorTable, tools: ToolSettings) -> None:

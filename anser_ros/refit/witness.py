@@ -92,12 +92,8 @@ class _Errors:
         known; a contradiction shows itself by a misfit that one frame's errors do not explain.
         That there is one is no news in each of these frames either.
 
-        Parameters
-        ----------
-        metal : ndarray, shape (n, n)
-            Covariance of the readings that the metal adds.
-        off : ndarray, shape (n,)
-            By how much the readings are off.
+        ``metal`` (n, n): covariance of the readings that the metal adds. ``off`` (n,): by how much
+        the readings are off.
         """
         known = self.pose + metal
         chol = cho_factor(self.white + self.lasting * self.own + known, lower=True)

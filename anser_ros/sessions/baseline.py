@@ -200,12 +200,8 @@ def readings_of(recording: Session) -> ReferenceReadings | None:
 def baseline_flux(baseline: Session, sensors: SensorTable) -> ComplexArray:
     """Return the mean reading of each reference sensor in a recording without metal.
 
-    Parameters
-    ----------
-    baseline : Session
-        The recording.
-    sensors : SensorTable
-        The R reference sensors whose readings are wanted, in the wanted order.
+    ``baseline``: the recording. ``sensors``: the R reference sensors whose readings are wanted, in
+    the wanted order.
 
     Returns
     -------

@@ -36,12 +36,8 @@ class RefitSummary:
 class ModelFollower:
     """Refits the model to the reference sensors frame by frame, at the pace of the live node.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        With references and a baseline.
-    witnesses : bool
-        Whether what tools' coils contradict tells of metal, too.
+    ``prepared``: with references and a baseline. ``witnesses``: whether what tools' coils
+    contradict tells of metal, too.
 
     Attributes
     ----------

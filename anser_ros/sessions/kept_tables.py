@@ -51,12 +51,8 @@ class ReadAhead:
 
     Fresh memory of their size may take a third of a second, in which the graph is discovered.
 
-    Parameters
-    ----------
-    folder : Path or None
-        Where tables are kept.
-    model : FieldModel or None
-        Without one, or without a folder, nothing is read.
+    ``folder``: where tables are kept. ``model``: without one, or without a folder, nothing is
+    read.
     """
 
     def __init__(self, folder: Path | None, model: FieldModel | None) -> None:
@@ -84,14 +80,7 @@ class ReadAhead:
 class KeptTables:
     """Keeps the tables of one model, setup and set of references.
 
-    Parameters
-    ----------
-    folder : Path
-    setup : Setup
-    model : FieldModel
-    references : SensorTable
-        The tables' own.
-    ahead : ReadAhead, optional
+    ``references``: the tables' own.
     """
 
     def __init__(

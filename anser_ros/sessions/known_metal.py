@@ -28,11 +28,6 @@ FOLLOWED, SEARCHED = 'followed', 'not_found'
 class KnownMetalModels:
     """Gives each frame of a session the field with known metal where its tools say that it is.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-    known : KnownMetal
-
     Attributes
     ----------
     summary : RefitSummary

@@ -44,14 +44,8 @@ class KeptBaseline:
     ahead : ReadAhead
         Of the tables in it.
 
-    Parameters
-    ----------
-    folder : Path or None
-    node : str
-        Whole name of the node.
-    sender : callable
-        Returns what identifies the only sender of the references; empty where there is none.
-    ahead : ReadAhead, optional
+    ``node``: whole name of the node. ``sender``: returns what identifies the only sender of the
+    references; empty where there is none.
     """
 
     def __init__(

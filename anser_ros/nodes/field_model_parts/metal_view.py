@@ -25,10 +25,7 @@ VIEW_PERIOD_S = 0.2
 class MetalView:
     """Shows the operator where the metal is, a few times a second: ``metal``, ``metal/centroid``.
 
-    Parameters
-    ----------
-    node : Node
-        Publishes it.
+    ``node``: publishes it.
     """
 
     def __init__(self, node: Node) -> None:

@@ -26,12 +26,8 @@ def none_announced() -> int:
 class PlaceWatch:
     """Asks with the first frame, and again while the model was found to lie aside.
 
-    Parameters
-    ----------
-    place : BoardPlace or None
-        None where nothing can be compared.
-    announced : callable
-        How many publishers of references the graph knows.
+    ``place``: none where nothing can be compared. ``announced``: how many publishers of references
+    the graph knows.
 
     Attributes
     ----------

@@ -91,10 +91,7 @@ class RefitInForce:
         No pose is given before the first one is there, since metal may come meanwhile; one that is
         in force goes on until the next one is there.
 
-        Parameters
-        ----------
-        baseline : ndarray, shape (S, K), complex
-            T.
+        ``baseline`` (S, K): T.
 
         Raises
         ------

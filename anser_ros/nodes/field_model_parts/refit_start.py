@@ -80,10 +80,7 @@ class RefitStart:
     def begin(self, baseline: NDArray[np.complex128]) -> None:
         """Begin to make the refit to what differs from a baseline, in place of one being made.
 
-        Parameters
-        ----------
-        baseline : ndarray, shape (R, K), complex
-            Readings of the references without metal, T.
+        ``baseline`` (R, K): readings of the references without metal, T.
         """
         self.prepare()
         if self._made is not None:
