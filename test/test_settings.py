@@ -186,7 +186,7 @@ class TestEffect:
     )
     def test_the_survey_is_in_what_metal_may_look_like(self, world, usual, name):
         tables = usual._tables
-        cloud, _, layer = tables.hypotheses[0]
+        cloud, layer = tables.priors[0].cloud, tables.priors[0].layer
         covariances = [
             build_prior(
                 cloud, UPRIGHT, layer, world.references, tables.excitation.field(cloud.positions),

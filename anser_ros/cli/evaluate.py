@@ -20,7 +20,7 @@ from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.chosen_references import parse_references, with_references
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import recording_of, to_document
-from anser_ros.sessions.known_metal_file import load_known_metal
+from anser_ros.sessions.known_metal import models_of
 from anser_ros.sessions.pose_table import (
     BODIES_FILE,
     ERRORS_FILE,
@@ -148,7 +148,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None
-    known = None if args.known_metal is None else load_known_metal(args.known_metal)
+    known = None if args.known_metal is None else models_of(args.known_metal)
     make_folder(args.out)
     evaluation = track_session(
         session,
@@ -158,7 +158,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         refit=args.refit,
         in_phase=args.in_phase,
         witnesses=args.witnesses,
-        known_metal=known,
+        models=known,
         progress=lambda share: tell('tracking', share),
     )
     document = {**to_document(evaluation), 'recording': recording_of(session)}

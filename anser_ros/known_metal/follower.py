@@ -63,18 +63,8 @@ class _Track:
 class KnownMetalFollower:
     """Follows known metal by the tools alone.
 
-    Parameters
-    ----------
-    known : KnownMetal
-    model : FieldModel
-        Calibrated.
-    excitation : Excitation
-    sensors : SensorTable
-        Of the rigid tools.
-    tools : ToolSettings
-    volume : TrackedVolume
-    noise_t : float
-        Of a phasor component of the tools' readings, T.
+    ``sensors`` are those of the rigid tools, ``noise_t`` is that of a phasor component of their
+    readings, T.
     """
 
     def __init__(

@@ -1,7 +1,6 @@
 """Holds what coils read of metal, with what is known of their errors."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +11,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
-@dataclass(frozen=True)
-class CoilReadings:
+class CoilReadings(NamedTuple):
     """Holds what coils read beyond the calibrated model, and how well that is known.
 
     Attributes
@@ -30,8 +28,7 @@ class CoilReadings:
     shared: Array
 
 
-@dataclass(frozen=True)
-class MetalFrame:
+class MetalFrame(NamedTuple):
     """Holds what references and tools read of metal in one frame.
 
     Attributes

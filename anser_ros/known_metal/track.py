@@ -10,7 +10,7 @@ filter predicted from the frames before (`predicted`), so that no reading counts
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,22 +155,18 @@ class Scene:
         return (np.array(first)[:, None] + np.arange(7)).ravel()
 
 
-@dataclass(frozen=True)
-class MetalUpdate:
+class MetalUpdate(NamedTuple):
     """Holds what a frame's readings made of a state.
 
     Attributes
     ----------
     state : MetalState
-    reading : ToolReading
-        At the pose that was found with the metal.
     ratio : float
         Squared misfit to the prediction per degree of freedom; 1 is expected, or less.
     log_likelihood : float
     """
 
     state: MetalState
-    reading: ToolReading
     ratio: float
     log_likelihood: float
 
@@ -215,7 +211,7 @@ def updated(scene: Scene, state: MetalState, reading: ToolReading, step_s: float
         now = state.stepped(spread.T @ solved)
         reading = _shifted(reading, rows.pose.T @ solved)
     left = covariance - spread.T @ cho_solve(factor, spread)
-    return MetalUpdate(replace(now, covariance=0.5 * (left + left.T)), reading, ratio, likelihood)
+    return MetalUpdate(replace(now, covariance=0.5 * (left + left.T)), ratio, likelihood)
 
 
 def _posed(
@@ -254,8 +250,7 @@ def _shifted(reading: ToolReading, shift: Array) -> ToolReading:
     )
 
 
-@dataclass(frozen=True)
-class _Linearised:
+class _Linearised(NamedTuple):
     """Readings of a tool over the noise: real parts, then imaginary parts.
 
     ``left`` is what they leave of the prediction, ``design`` how they depend on the state,

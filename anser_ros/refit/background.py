@@ -12,8 +12,7 @@ from typing import Generic, TypeVar
 
 DELAY_NS = 80_000_000
 """Time from asking for a result to its use, ns: four frames at 50 Hz. The longest work takes 20 ms
-of a free processor. Shorter, and frames wait for the thread on a busy machine; longer, and the
-interim answer, with its larger uncertainty, holds for longer."""
+of a free processor, and frames wait for it on a busy one; until then the interim answer holds."""
 
 Result = TypeVar('Result')
 

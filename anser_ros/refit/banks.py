@@ -19,8 +19,7 @@ Fewer, and coils that come and go cost a bank each time; more only cost memory."
 class Banks:
     """Keeps banks of hypotheses by the coils in use, with the slots for bodies of each.
 
-    ``tables``: what belongs to the board and the references' places. ``baseline`` (S, K): readings
-    without the metal, T; NaN for a coil that has none.
+    ``baseline`` (S, K): readings without the metal, T; NaN for a coil that has none.
     """
 
     def __init__(

@@ -14,8 +14,7 @@ UNCHANGED = 0.99
 class Belief:
     """Holds probabilities of the hypotheses; the first of them is that nothing has changed.
 
-    ``count``: number of hypotheses. ``persistence``: probability that the hypothesis of one frame
-    still holds in the next.
+    ``persistence`` is the probability that the hypothesis of one frame still holds in the next.
 
     Attributes
     ----------
@@ -53,10 +52,9 @@ class Belief:
         self.weights = weights / weights.sum()
 
     def update_by(self, names: Sequence[str], evidence: Mapping[str, float]) -> None:
-        """Update the weights of the hypotheses by other evidence of the same frame.
+        """Update the weights of the named hypotheses by other evidence of the same frame.
 
-        ``names``: of the hypotheses, in their order. ``evidence``: log evidence by name;
-        hypotheses that are not in it are ruled out, unless all are.
+        Hypotheses that are not in it are ruled out, unless all are.
         """
         if not evidence:
             return

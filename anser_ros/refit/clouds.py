@@ -26,12 +26,11 @@ from anser_ros.physics.volume import TrackedVolume
 Array = NDArray[np.float64]
 
 LAYER_RATIO = 1.45
-"""Ratio of the depths of neighbouring layers of sources. Detail that sensors can tell grows with
-depth, so depths are even on a logarithmic scale. A smaller ratio takes memory and time; a larger
-one leaves depths between layers that no source stands for."""
+"""Ratio of the depths of neighbouring layers of sources: detail that sensors can tell grows with
+depth, so depths are even on a logarithmic scale."""
 SPACING_PER_DEPTH = 0.7
-"""Lateral spacing of a layer's sources over its depth. Below one, sensors as far away as the layer
-is deep can hardly tell its sources from a sheet; smaller takes memory and time."""
+"""Lateral spacing of a layer's sources over its depth: sensors as far away as the layer is deep
+can hardly tell its sources from a sheet."""
 
 BODY_SPACING = 0.6
 """Distance of neighbouring compact bodies of the lattice, in halves of the board."""

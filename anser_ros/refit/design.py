@@ -2,7 +2,7 @@
 
 For metal of a known kind and strength everything is Gaussian, so the remaining uncertainty with
 any choice of coils follows before a coil is glued on: the posterior covariance of the metal's
-coordinates (`refit.reduced`), weighted by their effect on poses. Coils are chosen one after the
+coordinates (`ReducedPrior`), weighted by their effect on poses. Coils are chosen one after the
 other, each the one that leaves the least uncertainty, and are then exchanged while that helps
 (Fedorov, Theory of Optimal Experiments, 1972).
 """
@@ -100,9 +100,8 @@ def family(
     ----------
     candidates : SensorTable
         Coils, of which some will be chosen; places and axes in fg.
-    excitation : Excitation
-        Field of the board.
-    region : Region
+    excitation, region
+        Field of the board, and its extent.
     frequencies_hz : sequence of float, length K
     settings : RefitSettings
         Noise, errors of the survey, and drift of the emitters.
@@ -132,7 +131,7 @@ def family(
             cloud, response, layer, candidates, field, np.array(frequencies_hz),
             settings.accuracy, rng,
         )  # fmt: skip
-        few = reduced(prior, response, field, np.array(frequencies_hz), rng)
+        few = reduced(prior, field, np.array(frequencies_hz), rng)
         # Per noise deviation of the readings; the metric is a sum over the samples.
         felt = few.felt * noise * per_field / np.sqrt(len(layer.points))
         strength = (error_m / float(np.linalg.norm(felt))) ** 2

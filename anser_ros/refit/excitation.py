@@ -94,7 +94,7 @@ def excitation_for(
 ) -> tuple[Excitation, Region]:
     """Return the drawing's field scaled to the model, or the model's if the drawing is another's.
 
-    ``volume`` is the tracked volume as stated; None: the default over the board.
+    ``volume`` is the tracked volume as stated; None for the default over the board.
 
     Raises
     ------

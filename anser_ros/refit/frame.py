@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from anser_ros.frames import faults
 from anser_ros.frames.intake import Frame
 from anser_ros.refit import health
-from anser_ros.refit.kernels import find_silent
 
 ComplexArray = NDArray[np.complex128]
 
@@ -31,10 +30,7 @@ QUIET = 0.05
 
 
 class BaselineCheck:
-    """Determines which readings can be compared with a baseline.
-
-    ``baseline`` (S, K): A coil whose baseline is not finite can't be used.
-    """
+    """Determines which readings can be compared with a baseline (S, K), where that is finite."""
 
     def __init__(self, baseline: ComplexArray) -> None:
         power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
@@ -43,8 +39,11 @@ class BaselineCheck:
 
     def read(self, frame: Frame) -> tuple[NDArray[np.bool_], list[str]]:
         """Return which readings (S,) of a judged frame can be used, and why others cannot."""
-        codes = frame.codes.copy()
-        find_silent(frame.flux, self._least, SILENT_CODE, NO_BASELINE_CODE, codes)
+        flux, codes = frame.flux, frame.codes
+        with np.errstate(over='ignore', invalid='ignore'):  # of readings that are absurd
+            is_silent = (flux.real**2 + flux.imag**2).sum(axis=1) < self._least
+        codes = np.where((codes == faults.GOOD) & is_silent, SILENT_CODE, codes)
+        codes = np.where(np.isnan(self._least), NO_BASELINE_CODE, codes)
         return codes == faults.GOOD, [_REASONS[code] for code in codes.tolist()]
 
 

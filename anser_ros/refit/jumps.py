@@ -10,7 +10,8 @@ not.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,21 +27,16 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 LEAST_JUMP_POWER = 5.0
-"""Power of a jump, in units of what noise makes, from which on jumps are judged. Noise of sixteen
-components is that loud once in a year; lower, and judging costs time for nothing."""
+"""Power of a jump, in units of what noise makes, from which on jumps are judged: noise of sixteen
+components is that loud once in a year."""
 FARTHEST = 3.0
-"""Steps, in units of the last one, over which a course is carried on. Farther, and the noise of
-the last step is carried on with it."""
+"""Steps, in units of the last one, over which a course is carried on, and its noise with it."""
 LARGEST_RATE = 0.05
 """Rate at which metal may take the readings off their course, as a part of the baseline's size
-each second. In recordings of an X-ray head that comes close it stays below the noise, a hundredth
-of this at 25 Hz. Larger, and faults pass for metal by the errors that a survey allows it; smaller,
-and metal that is thrown about is taken for faults."""
+each second; an X-ray head that comes close stays below the noise, a hundredth of this at 25 Hz."""
 UNPREDICTED = 0.1
-"""Share of a coil's jump, in power, that may differ from what the others predict where metal
-has appeared from one frame to the next, and share of the coils for which it may be more. Smaller,
-and metal that is described badly is taken for faults; larger, and faults that look alike pass for
-metal."""
+"""Share of a coil's jump, in power, that may differ from what the others predict where metal has
+appeared from one frame to the next, and share of the coils for which it may be more."""
 COMMON = 0.003
 """Relative step of all emitters at once from which on it is no drift of theirs. Currents drift
 slowly, each on its own; a gain that all references share, in their amplifier, steps like that."""
@@ -52,18 +48,11 @@ RETURNED = 0.1
 """Part of a jump that may be left where a reference has jumped back: metal moved meanwhile."""
 
 
-@dataclass(frozen=True)
-class Jumps:
-    """States how far a frame's readings are off their courses.
+class Jumps(NamedTuple):
+    """States how far (S, K), T, a frame's readings are off their courses; NaN for no reading.
 
-    Attributes
-    ----------
-    off : ndarray, shape (S, K), complex
-        T; NaN where there is no reading.
-    spread : ndarray, shape (S,)
-        Noise of that, in units of a reading's.
-    since_s : float
-        Time since the last reading of most references, s; infinite where there was none.
+    ``spread`` (S,) is the noise of that, in units of a reading's, and ``since_s`` the time since
+    the last reading of most references, infinite where there was none.
     """
 
     off: ComplexArray
@@ -199,9 +188,8 @@ def jumped(
 
     Parameters
     ----------
-    bank : Bank
-    seen : FrameEvidence
-        Of the jumps, as if they were a change.
+    bank, seen
+        Evidence of the jumps, as if they were a change.
     jumps : ndarray, shape (U, K, 2)
         Of the coils in use, in noise units, over their spread.
     spread : float
@@ -230,7 +218,7 @@ def jumped(
     return np.empty(0, dtype=np.int64)
 
 
-def are_over(
+def faults_have_ended(
     courses: Courses,
     units: NoiseUnits,
     bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]],
@@ -239,19 +227,10 @@ def are_over(
 ) -> bool:
     """Return whether jumps are over: metal alone explains how all has changed since before them.
 
-    Near metal a common gain can pass for metal: then the answer is no.
-
-    Parameters
-    ----------
-    courses : Courses
-        Some references must be off by jumps, and the newest frame go on from the two before it.
-    units : NoiseUnits
-    bank_of : callable
-        Returns the hypotheses for references (S,) first.
-    level : float
-        Noise of a component of a reading, in units of the nominal one.
-    drift : float
-        Prior deviation of an emitter's strength.
+    Some references must be off by jumps, and the newest frame go on from the two before it. Near
+    metal a common gain can pass for metal: then the answer is no. ``bank_of`` returns the
+    hypotheses for references (S,) first; ``level`` is the noise of a reading over the nominal one,
+    ``drift`` the prior deviation of an emitter's strength.
     """
     readable = courses.readable
     power = (units.of(courses.bend())[readable] ** 2).mean(axis=(1, 2)) / BEND_VARIANCE

@@ -180,7 +180,7 @@ def _middle(points: Array, half: float) -> NDArray[np.int64]:
 def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
     """Return the sources of a compact body as dipoles, which are exact wherever the body is.
 
-    ``weight`` (P,): `pose_weight` at ``region.volume.samples()``. ``cloud``: the body's sources.
+    ``weight`` (P,) is `pose_weight` at ``region.volume.samples()``.
     """
     points = region.volume.samples()
     away = np.linalg.norm(points[:, None] - cloud.positions, axis=2).min(axis=1)
@@ -208,8 +208,8 @@ def bottom_layer(
 ) -> Layer:
     """Return the layer for clouds below the board.
 
-    ``model``: calibrated; its dipoles are used again where they can stand for the sources.
-    ``sources`` (M, 3): sources of the cloud that is hardest to stand for, the nearest one.
+    The calibrated model's dipoles are used again where they can stand for the ``sources`` (M, 3)
+    of the cloud that is hardest to stand for, the nearest one.
     """
     points, deep = region.volume.samples(*SAMPLES), _lattice(region, *DEEP)
     upright = np.abs(model.directions[:, 2]) > 0.999

@@ -7,7 +7,6 @@ few dozen readings determine the change of the whole field. See `docs/refit.md`.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +26,17 @@ from anser_ros.refit.banks import Banks
 from anser_ros.refit.baseline import checked_baseline
 from anser_ros.refit.belief import Belief
 from anser_ros.refit.change import Average, NoiseLevel
-from anser_ros.refit.evidence import FrameEvidence
+from anser_ros.refit.evidence import FrameEvidence, median
 from anser_ros.refit.excitation import FieldFunction
 from anser_ros.refit.frame import BaselineCheck, NoiseUnits
 from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
-from anser_ros.refit.jumps import LARGEST_RATE, LEAST_JUMP_POWER, Courses, are_over, jumped
+from anser_ros.refit.jumps import (
+    LARGEST_RATE,
+    LEAST_JUMP_POWER,
+    Courses,
+    faults_have_ended,
+    jumped,
+)
 from anser_ros.refit.posterior import Bank
 from anser_ros.refit.result import (
     FEW_REFERENCES,
@@ -121,11 +126,8 @@ class LiveRefit:
         slots.warm_up(readings, 1.0)
         weights = np.zeros(len(bank.names))
         weights[1] = 1.0
-        phase = self._tables.excitation.phase
-        Assembly(self.model).model(
-            0, bank, seen, weights, np.zeros_like(phase), 1.0, phase, accuracy.flux_noise_t,
-            self.settings.error_modes,
-        )  # fmt: skip
+        no_drift = np.zeros(bank.width, dtype=complex)
+        self._new_assembly().model(0, bank, seen, weights, no_drift, 1.0)
 
     def _prepare(self) -> None:
         """Compute what depends on the baseline and the references' places."""
@@ -134,7 +136,11 @@ class LiveRefit:
         self._banks = Banks(self._tables, self.baseline, self.settings)
         self._intake = Intake(self.references.channel, error=FitError)
         self._baseline_check = BaselineCheck(self.baseline)
-        self._assembly = Assembly(self.model)
+        self._assembly = self._new_assembly()
+
+    def _new_assembly(self) -> Assembly:
+        phase, settings = self._tables.excitation.phase, self.settings
+        return Assembly(self.model, phase, settings.accuracy.flux_noise_t, settings.error_modes)
 
     def reset(self) -> None:
         """Forget all frames, so that the calibrated model is in force again."""
@@ -150,7 +156,6 @@ class LiveRefit:
         if self._witness is not None:
             self._witness.forget()
         self._last_ns = 0
-        self._last_model = self.model
 
     def update(
         self,
@@ -161,16 +166,8 @@ class LiveRefit:
     ) -> RefitResult:
         """Take in one frame of reference fluxes and return the result of the refit.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Middle of the demodulation window.
-        channels : ndarray, shape (S,)
-            Channel of each row, in any order; unknown ones are passed over.
-        flux : ndarray, shape (S, K), complex
-            T.
-        flags : ndarray, shape (S,), optional
-            Flag bits; a flagged reading is not used.
+        ``channels`` (S,) may come in any order, and unknown ones are passed over; ``flux`` (S, K)
+        is in T; a reading with ``flags`` (S,) is not used.
 
         Raises
         ------
@@ -223,7 +220,7 @@ class LiveRefit:
         back = self._courses.returned(level * self.settings.accuracy.flux_noise_t)
         few = coils.size < self.settings.min_references or self._watch.is_outvoted
         drift, banks = self.settings.emitter_drift, self._banks.of
-        if few and are_over(self._courses, self._units, banks, level, drift):
+        if few and faults_have_ended(self._courses, self._units, banks, level, drift):
             back = self._courses.forget_jumps()
         for coil in back.tolist():
             self._watch.recover(coil)
@@ -289,7 +286,7 @@ class LiveRefit:
         self._belief.update(seen.log_evidence)
         weights, moving = self._belief.weights, self._belief.may_have_changed
         best = int(weights.argmax())
-        typical = health.typical(self._distance) / (2 * bank.width)
+        typical = median(self._distance) / (2 * bank.width)
         mean, variance = bank.drifts(seen, best)
         drift = self.settings.emitter_drift * (mean @ np.array([1.0, 1.0j]))
         sure = (np.abs(mean) > DRIFT_SIGMAS * np.sqrt(np.maximum(variance, 1e-30))).any(axis=1)
@@ -302,11 +299,8 @@ class LiveRefit:
         elif self._witness is not None:
             self._witness.forget()
         if moving or sure.any():
-            phase = self._tables.excitation.phase
-            model = self._assembly.model(
-                stamp_ns, bank, seen, weights, drift, typical, phase, unit,
-                self.settings.error_modes, self._witness if moving else None,
-            )  # fmt: skip
+            witness = self._witness if moving else None
+            model = self._assembly.model(stamp_ns, bank, seen, weights, drift, typical, witness)
             state = REFIT
         if self._watch.is_outvoted:
             state = REFERENCES_DOUBTFUL
@@ -317,10 +311,11 @@ class LiveRefit:
             state = POOR_FIT
             reason = f'readings deviate {np.sqrt(typical):.1f} times as much as expected'
         metal = (lambda: locate_metal(bank, seen, weights, unit)) if moving else None
-        return self._finish(
-            stamp_ns, model, state, reason, level, log_odds=self._belief.log_odds,
-            weights=dict(zip(bank.names, weights.tolist(), strict=True)), drift=drift, find=metal,
-        )  # fmt: skip
+        by_name = dict(zip(bank.names, weights.tolist(), strict=True))
+        odds, noise_t, judge = self._belief.log_odds, level * unit, self._healths()
+        return RefitResult(
+            stamp_ns, model, state, judge, odds, by_name, noise_t, drift, reason, metal
+        )
 
     def enable_witnesses(self, flux_noise_t: float, *, ready: bool = False) -> None:
         """Use `witnessed` from now on; the noise is of the tools' components, T.
@@ -344,16 +339,6 @@ class LiveRefit:
         bank, _ = self._bank()
         self._belief.update_by(bank.names, self._witness.update(readings))
 
-    def _finish(
-        self, stamp_ns: int, model: FieldModel, state: str, reason: str, level: float, **more: Any
-    ) -> RefitResult:
-        changed, self._last_model = model is not self._last_model, model
-        noise_t = level * self.settings.accuracy.flux_noise_t
-        return RefitResult(
-            stamp_ns, model, state, changed, self._healths(), noise_t=noise_t, reason=reason,
-            **more,
-        )  # fmt: skip
-
     def _too_few(self, stamp_ns: int, level: float) -> RefitResult:
         """Return to the calibrated model, which is no answer: it is not known where metal is."""
         self._belief.forget()
@@ -365,8 +350,9 @@ class LiveRefit:
         state = REFERENCES_DOUBTFUL if self._watch.is_outvoted else FEW_REFERENCES
         reason = f'{count} usable references, {need} are needed'
         drift = np.zeros(len(self.model.emitters), dtype=complex)
-        return self._finish(
-            stamp_ns, self.model, state, reason, level, log_odds=0.0, weights={}, drift=drift
+        noise_t = level * self.settings.accuracy.flux_noise_t
+        return RefitResult(
+            stamp_ns, self.model, state, self._healths(), 0.0, {}, noise_t, drift, reason
         )
 
     def _healths(self) -> Callable[[], tuple[ReferenceHealth, ...]]:

@@ -89,17 +89,8 @@ def error_modes(
 ) -> PosteriorModes:
     """Return the principal modes of a posterior's error, weighted by its effect on poses.
 
-    It takes long and changes nothing, so any thread may do it.
-
-    Parameters
-    ----------
-    bank : Bank
-    posterior : Eigenbasis
-        From `Bank.posterior`.
-    level : ErrorLevel
-        From `error_level`.
-    count : int
-        Modes R.
+    The posterior is one of `Bank.posterior`, the level one of `error_level`; ``count`` modes are
+    kept. It takes long and changes nothing, so any thread may do it.
     """
     layer = posterior.prior.layer
     size, width = len(layer.positions), bank.width

@@ -72,10 +72,9 @@ class Bank:
         Readings in use, as rows of the priors' covariance; all K of a coil or none.
     drift : ndarray, shape (all readings, K)
         Reading that one deviation of each emitter's drift makes, in noise units.
-    slots : int
-        Hypotheses more that can be put in later, one after the other in the same place.
-    among : int
-        How many hypotheses those in the slots are chosen from: each is as much less likely.
+    slots, among : int
+        Places for hypotheses that are put in later, and how many these are chosen from: each is
+        as much less likely.
 
     Attributes
     ----------

@@ -92,8 +92,6 @@ class RefitResult:
         The model in force; the calibrated one itself while nothing has changed.
     state : str
         One of `STATES`.
-    changed : bool
-        Whether the model is another one than after the frame before.
     judge : callable
         Works out `references`.
     log_odds : float
@@ -114,7 +112,6 @@ class RefitResult:
     stamp_ns: int
     model: FieldModel
     state: str
-    changed: bool
     judge: Callable[[], tuple[ReferenceHealth, ...]] = field(repr=False)
     log_odds: float
     weights: dict[str, float]

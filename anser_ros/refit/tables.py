@@ -1,7 +1,7 @@
 """Computes a refit's tables once: driving field, layers and predictions of all clouds."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]
 Hypothesis = tuple[Cloud, Response, Layer]
+"""Where metal may be, how it answers, and what stands for its field."""
 ReportShare = Callable[[float], None]
 """Called between two pieces of the work with the share that is done."""
 
@@ -51,13 +52,12 @@ class RefitTables:
     region : Region
     layers : tuple of Layer
         Below the board, and around the volume.
-    hypotheses : tuple of (Cloud, Response, Layer)
     priors : tuple of CloudPrior
     frequencies_hz : tuple of float
     bodies : tuple of Cloud
         Compact bodies that may be put in as further hypotheses.
     factors : tuple of ndarray
-        What `refit.search` needs of each.
+        What `BodySearch` needs of each.
     references : SensorTable
     settings : RefitSettings
     weight : ndarray, shape (P,)
@@ -67,7 +67,6 @@ class RefitTables:
     excitation: Excitation
     region: Region
     layers: tuple[Layer, ...]
-    hypotheses: tuple[Hypothesis, ...]
     priors: tuple[CloudPrior, ...]
     frequencies_hz: tuple[float, ...]
     bodies: tuple[Cloud, ...]
@@ -77,30 +76,35 @@ class RefitTables:
     weight: Array
 
     def body_prior(self, body: int) -> CloudPrior:
-        """Return the full hypothesis of a compact body, which is computed once."""
+        """Return the full hypothesis of a compact body."""
         cloud = self.bodies[body]
-        return build_prior(
-            cloud,
-            BODY,
-            body_layer(self.region, self.weight, cloud),
-            self.references,
-            self.excitation.field(cloud.positions),
-            np.array(self.frequencies_hz),
-            self.settings.accuracy,
-            np.random.default_rng([self.settings.seed, body]),
-        )
+        rng = np.random.default_rng([self.settings.seed, body])
+        return self._prior(cloud, BODY, body_layer(self.region, self.weight, cloud), rng)
 
     def reduced(self, prior: CloudPrior) -> ReducedPrior:
         """Return a hypothesis of these tables, or a body of theirs, in few numbers."""
-        responses = {p.name: response for (_, response, _), p in
-                zip(self.hypotheses, self.priors, strict=True)}  # fmt: skip
-        return reduced(
-            prior,
-            responses.get(prior.name, BODY),
-            self.excitation.field(prior.cloud.positions),
-            np.array(self.frequencies_hz),
-            np.random.default_rng(self.settings.seed),
-        )
+        field = self.excitation.field(prior.cloud.positions)
+        rng = np.random.default_rng(self.settings.seed)
+        return reduced(prior, field, np.array(self.frequencies_hz), rng)
+
+    def with_priors(self, report: ReportShare) -> 'RefitTables':
+        """Return the tables with the predictions of all clouds."""
+        hypotheses = hypotheses_of(default_clouds(self.region), *self.layers)
+        sizes = np.cumsum([0, *(len(cloud.positions) for cloud, _, _ in hypotheses)])
+        rng, priors = np.random.default_rng(self.settings.seed), []
+        for hypothesis, done in zip(hypotheses, sizes[:-1].tolist(), strict=True):
+            report(START + (1.0 - START) * done / float(sizes[-1]))
+            priors.append(self._prior(*hypothesis, rng))
+        return replace(self, priors=tuple(priors))
+
+    def _prior(
+        self, cloud: Cloud, response: Response, layer: Layer, rng: np.random.Generator
+    ) -> CloudPrior:
+        field = self.excitation.field(cloud.positions)
+        return build_prior(
+            cloud, response, layer, self.references, field, np.array(self.frequencies_hz),
+            self.settings.accuracy, rng,
+        )  # fmt: skip
 
 
 def build_tables(
@@ -114,25 +118,19 @@ def build_tables(
     """Compute the tables; raises `FitError` as `excitation_for` does, and what ``report`` does."""
     excitation, region = excitation_for(model, drawing, volume)
     report(START)
-    clouds = default_clouds(region)
-    bottom = bottom_layer(model, region, excitation, clouds[0].positions)
-    box = box_layer(region, excitation)
-    hypotheses = hypotheses_of(clouds, bottom, box)
-    priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings, report)
-    around = bodies(region)
-    return RefitTables(
-        excitation,
-        region,
-        (bottom, box),
-        hypotheses,
-        priors,
-        model.frequencies_hz,
-        around,
-        _factors(around, references, excitation),
-        references,
-        settings,
-        pose_weight(region.volume.samples(), excitation),
+    nearest = default_clouds(region)[0]
+    layers = (
+        bottom_layer(model, region, excitation, nearest.positions),
+        box_layer(region, excitation),
     )
+    weight = pose_weight(region.volume.samples(), excitation)
+    around = bodies(region)
+    factors = _factors(around, references, excitation)
+    tables = RefitTables(
+        excitation, region, layers, (), model.frequencies_hz, around, factors, references,
+        settings, weight,
+    )  # fmt: skip
+    return tables.with_priors(report)
 
 
 def _factors(
@@ -154,31 +152,4 @@ def hypotheses_of(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[H
         out.append((cloud, plain, layer))
         if len(cloud.positions) <= MOST_ORIENTED:
             out.append((cloud, ORIENTED, layer))
-    return tuple(out)
-
-
-def _priors(
-    hypotheses: Sequence[Hypothesis],
-    references: SensorTable,
-    excitation: Excitation,
-    frequencies_hz: tuple[float, ...],
-    settings: RefitSettings,
-    report: ReportShare = lambda share: None,
-) -> tuple[CloudPrior, ...]:
-    rng, out = np.random.default_rng(settings.seed), []
-    sizes = np.cumsum([0, *(len(cloud.positions) for cloud, _, _ in hypotheses)])
-    for (cloud, response, layer), done in zip(hypotheses, sizes[:-1].tolist(), strict=True):
-        report(START + (1.0 - START) * done / float(sizes[-1]))
-        out.append(
-            build_prior(
-                cloud,
-                response,
-                layer,
-                references,
-                excitation.field(cloud.positions),
-                np.array(frequencies_hz),
-                settings.accuracy,
-                rng,
-            )
-        )
     return tuple(out)

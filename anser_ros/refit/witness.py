@@ -43,9 +43,8 @@ ODD = 1.5
 """Squared misfit of a tool's readings, over what is expected of one frame, from which they count
 less."""
 CONTRADICTION_S = 0.5
-"""Time over which a misfit that is odd stays the same. On simulated scenes of seed 1 that metal
-passes, two references, the correlation of what is left of the readings falls to 1/e in 0.4 to
-0.6 s."""
+"""Time over which a misfit that is odd stays the same: its correlation falls to 1/e in 0.4 to 0.6
+s (simulated scenes of seed 1 that metal passes, two references)."""
 LEAST_PROBABILITY = 1e-3
 """Probability from which on a hypothesis has a filter, which costs time. One that is less probable
 hardly changes the mean, whatever a tool says of it."""
@@ -111,15 +110,7 @@ class _Errors:
 class Witness:
     """Holds the filters of all hypotheses that count.
 
-    Parameters
-    ----------
-    tables : RefitTables
-    model : FieldModel
-        Calibrated.
-    tools : ToolSettings
-        How well the tools are known.
-    flux_noise_t : float
-        Noise of a phasor component of the tools' readings, T.
+    ``flux_noise_t`` is the noise of a phasor component of the tools' readings, T.
     """
 
     def __init__(

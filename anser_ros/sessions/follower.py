@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from anser_ros.errors import BagError, FitError
 from anser_ros.integrity.ageing import UNCHANGED_MODEL, FrameModel, ModelAge
@@ -20,6 +21,18 @@ from anser_ros.sessions.volume import stated_volume
 from anser_ros.tracking.estimate import PoseEstimate
 
 
+class FrameModels(Protocol):
+    """Gives each frame of a session the model that it is tracked with."""
+
+    summary: 'RefitSummary'
+
+    def at(self, frame: SessionFrame) -> FrameModel:
+        """Return what a frame is tracked with."""
+
+    def witnessed(self, tools: FrameReadings, found: Sequence[PoseEstimate]) -> None:
+        """Take in what a frame's tools read, and the poses that were found."""
+
+
 @dataclass
 class RefitSummary:
     """Counts in how many frames the refit was in which state, and left out which reference."""
@@ -33,11 +46,11 @@ class RefitSummary:
         self.left_out.update(result.left_out)
 
 
-class ModelFollower:
+class ModelFollower(FrameModels):
     """Refits the model to the reference sensors frame by frame, at the pace of the live node.
 
-    ``prepared``: with references and a baseline. ``witnesses``: whether what tools' coils
-    contradict tells of metal, too.
+    The session must have references and a baseline. With ``witnesses``, contradictions of the
+    tools' coils tell of metal, too.
 
     Attributes
     ----------

@@ -39,14 +39,8 @@ def learn(
 ) -> KnownMetal:
     """Learn the metal that moves in a session.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        With references, a baseline without the metal, and a tool that an optical tracker follows.
-    name : str
-        Of the metal.
-    report : callable, optional
-        Called with the stage and its share done.
+    The session must have references, a baseline without the metal, and a tool that an optical
+    tracker follows. ``report`` is called with the stage and its share done.
 
     Raises
     ------
@@ -80,17 +74,10 @@ def learn(
 def metal_frames(
     prepared: PreparedSession, refit: LiveRefit, phase: ComplexArray, count: int
 ) -> list[MetalFrame]:
-    """Return at most so many frames, spread evenly over those with metal.
+    """Return at most ``count`` frames, spread evenly over those with metal.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        With references, a baseline and optical poses of the tools.
-    refit : LiveRefit
-        To the session's references.
-    phase : ndarray, shape (K,), complex
-        Of the emitters' fields.
-    count : int
+    The session must have references, a baseline and optical poses of the tools; ``phase`` (K,) is
+    that of the emitters' fields.
 
     Raises
     ------

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 from anser_ros.errors import BagError
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.ageing import UNCHANGED_MODEL
-from anser_ros.sessions.follower import ModelFollower, RefitSummary
+from anser_ros.sessions.follower import FrameModels, ModelFollower, RefitSummary
 from anser_ros.sessions.frames import frames_of
-from anser_ros.sessions.known_metal import KnownMetalModels
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
@@ -49,7 +48,7 @@ def in_phase_model(model: FieldModel) -> FieldModel:
 def track(
     prepared: PreparedSession,
     settings: TrackerSettings | None = None,
-    follower: ModelFollower | KnownMetalModels | None = None,
+    follower: FrameModels | None = None,
     in_phase: bool = False,
     progress: Progress | None = None,
 ) -> TrackedSession:
@@ -63,8 +62,8 @@ def track(
         The session and its model.
     settings : TrackerSettings, optional
         The noise is that of the session's setup.
-    follower : ModelFollower, optional
-        Refits the model on the way.
+    follower : FrameModels, optional
+        Changes the model on the way.
     in_phase : bool
         Whether only the fluxes' in-phase parts are used, for an `in_phase_model`.
     progress : callable, optional

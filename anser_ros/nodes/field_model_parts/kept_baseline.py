@@ -26,16 +26,17 @@ from anser_ros.sessions.kept_tables import (
 from anser_ros.wire.setup import Setup
 
 BASELINE_S = 60.0
-"""How long after it was last confirmed, s, a baseline is taken up. Shorter, and a process that a
-supervisor starts again on a busy machine is too late; longer, and coils that somebody moved
-meanwhile are taken for metal."""
+"""How long after it was last confirmed, s, a baseline is taken up: a supervisor starts a process
+again sooner, and nobody moves coils meanwhile."""
 CONFIRM_S = 1.0
-"""Time from one confirmation of a baseline to the next, s. Smaller costs more; larger, and what
-the references said shortly before the process was killed is not known to the next one."""
+"""Time from one confirmation of a baseline to the next, s."""
 
 
 class KeptBaseline:
-    """Keeps the baseline of a running node.
+    """Keeps the baseline of a running node of that whole name.
+
+    ``sender`` returns what identifies the only sender of the references; empty where there is
+    none.
 
     Attributes
     ----------
@@ -43,9 +44,6 @@ class KeptBaseline:
         Where files are kept; None where they are not.
     ahead : ReadAhead
         Of the tables in it.
-
-    ``node``: whole name of the node. ``sender``: returns what identifies the only sender of the
-    references; empty where there is none.
     """
 
     def __init__(

@@ -27,16 +27,7 @@ from anser_ros.wire.setup import Setup
 class RefitInForce:
     """Keeps the refit, its last result, and what it is made from.
 
-    Parameters
-    ----------
-    witnesses : ToolWitnesses
-        Tells of metal what the tools read.
-    pace : Pace
-        How often there is to be a result.
-    count : callable
-        Counts an event by its name.
-    kept : KeptBaseline
-        What a process after this one takes up.
+    ``count`` counts an event by its name, and ``kept`` is what a process after this one takes up.
 
     Attributes
     ----------
@@ -86,12 +77,10 @@ class RefitInForce:
         self._baseline = None
 
     def begin(self, baseline: NDArray[np.complex128]) -> None:
-        """Begin to make a refit to what differs from a baseline.
+        """Begin to make a refit to what differs from a baseline, shape (S, K), T.
 
         No pose is given before the first one is there, since metal may come meanwhile; one that is
         in force goes on until the next one is there.
-
-        ``baseline`` (S, K): T.
 
         Raises
         ------

@@ -41,18 +41,9 @@ class _EndedError(Exception):
 class RefitStart:
     """Makes the refits of one model in a thread of its own.
 
-    Parameters
-    ----------
-    setup : Setup
-        An emitter that can't be drawn from it has to do with the model's own dipoles.
-    model : FieldModel
-    references : SensorTable
-    folder : Path or None
-        Where tables are kept; None where they are not.
-    ahead : ReadAhead, optional
-        Of this folder.
-    witness_noise_t : float, optional
-        Noise of a component of what tools read, T, if they are witnesses.
+    An emitter that can't be drawn from the setup has to do with the model's own dipoles. Tables
+    are kept in a ``folder``, which ``ahead`` belongs to; None where they are not. With tools as
+    witnesses, ``witness_noise_t`` is the noise of a component of what they read, T.
     """
 
     def __init__(
@@ -80,7 +71,7 @@ class RefitStart:
     def begin(self, baseline: NDArray[np.complex128]) -> None:
         """Begin to make the refit to what differs from a baseline, in place of one being made.
 
-        ``baseline`` (R, K): readings of the references without metal, T.
+        The baseline, shape (R, K), T, is what the references read without metal.
         """
         self.prepare()
         if self._made is not None:

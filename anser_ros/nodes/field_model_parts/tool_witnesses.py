@@ -32,15 +32,8 @@ for a busy machine. Fewer, and what comes late witnesses nothing; more only take
 class ToolWitnesses:
     """Hands the readings of rigid tools to the refit in force, once a frame.
 
-    Parameters
-    ----------
-    node : AnserNode
-    is_wanted : bool
-        Whether tools are witnesses; nothing is subscribed to otherwise.
-    frame_id : callable
-        The frame of the board.
-    refuse : callable
-        Gets a counter's name and the error of what is refused.
+    Nothing is subscribed to unless it ``is_wanted``. ``frame_id`` returns the frame of the board,
+    and ``refuse`` gets a counter's name and the error of what is refused.
 
     Attributes
     ----------
