@@ -1,6 +1,6 @@
 """Ages a model that followed the references while they are silent, and then gives it up.
 
-Metal continues to move when no references report it. So the uncertainty of the model in force
+Metal continues to move when no references report it. So the uncertainty of the active model
 grows from frame to frame, by the change of the field while the metal was still observed. Beyond a
 bound it no longer describes the field.
 """
@@ -38,7 +38,7 @@ class FrameModel:
     Attributes
     ----------
     model : FieldModel or None
-        None if the references never gave a model: the model in force stays unchanged.
+        None if the references never gave a model: the active model stays unchanged.
     withheld : Withheld or None
         Why no pose may be given; None where it may.
     """
@@ -70,7 +70,7 @@ class ModelAge:
         return self._answers[-1][0] if self._answers else 0
 
     def forget(self) -> None:
-        """Drop all answers: the model in force is no answer of the references."""
+        """Drop all answers: the active model is no answer of the references."""
         self._answers.clear()
         self._aged = None
 

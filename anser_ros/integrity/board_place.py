@@ -43,7 +43,7 @@ INNER = 0.5
 SIDE = 4
 """Points along a side of that part; three readings each."""
 EFFECTIVE_READINGS = 40.0
-"""So many of these readings count, about one in five: neighbouring points tell the same."""
+"""So many of these readings count, about one in five: neighbouring points say the same."""
 PRIOR_M, PRIOR_RAD = 5e-3, 0.02
 """Standard deviations of how far a model lies aside before anything is known, m and rad: a board
 that was put down again by hand."""

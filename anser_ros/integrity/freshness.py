@@ -42,9 +42,9 @@ HOPELESS = -60.0
 def _fill_terms(now, least, terms):  # type: ignore[no-untyped-def]
     """Write what makes the odds of a repetition of ``now`` (K,): a place and four numbers a row.
 
-    The weakest emitter comes first: it tells most of noise, and mostly ends the comparison. The
+    The weakest emitter comes first: it shows noise best, and mostly ends the comparison. The
     rows hold, exactly and but for the currents, the odds of no difference at all, and by how much
-    they fall with a squared difference. Returns how many emitters tell anything.
+    they fall with a squared difference. Returns how many emitters count.
     """
     count, weakest, smallest = 0, 0, math.inf
     for k in range(now.shape[0]):
@@ -106,7 +106,7 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
 
 
 class Freshness:
-    """Tells readings that repeat an earlier one.
+    """Finds readings that repeat an earlier one.
 
     Attributes
     ----------

@@ -43,11 +43,11 @@ class Senders:
         self.complaint = ''
 
     def forget(self) -> None:
-        """Forget all that was heard."""
+        """Forget all that was received."""
         self._runs, self.complaint = [], ''
 
     def continues(self, number: int | None) -> bool:
-        """Return whether a message is the next one of the only sender that is heard."""
+        """Return whether a message is the next one of the only sender that is received."""
         return len(self._runs) == 1 and number == self._runs[0].number + 1
 
     def take(
@@ -90,7 +90,7 @@ class Senders:
         """Drop the runs that have ended.
 
         A lasting message outlives its sender's silence. When one of several senders has gone, it
-        is unknown which, so their messages stay in force until they are forgotten and requested
+        is unknown which, so their messages stay valid until they are forgotten and requested
         again.
         """
         self._runs = [
@@ -100,7 +100,7 @@ class Senders:
         ]
 
     def _is_ended(self, lasting: Hashable, now_s: float) -> bool:
-        """Return whether silence tells that a sender has gone, to whom another one may succeed.
+        """Return whether silence shows that a sender has gone, to whom another one may succeed.
 
         It does not where what was said holds on: the graph may not know the second one yet.
         """

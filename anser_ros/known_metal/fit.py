@@ -57,7 +57,7 @@ def learn_metal(
 ) -> KnownMetal:
     """Learn the metal that is in some frames.
 
-    Every other one of the frames, in the order of time, takes no part, and tells what is left
+    Every other one of the frames, in the order of time, takes no part, and shows what is left
     unexplained. ``noise_t`` is that of a phasor component of the readings, T; ``report`` is called
     with the stage and its share done.
 
@@ -179,9 +179,9 @@ class _Fit:
             flux = self._setting.flux(lattice, placed, reading.coils)
             # The size is that of the readings where they don't contain errors of a pose.
             size = flux if reading.shared.size else reading.change
-            loud = np.sqrt((np.abs(size) ** 2).mean(axis=1) / 2.0)
+            size_t = np.sqrt((np.abs(size) ** 2).mean(axis=1) / 2.0)
             noise = np.tile(
-                np.repeat(np.hypot(self._noise, self._allowed * loud), len(flux[0])), 2
+                np.repeat(np.hypot(self._noise, self._allowed * size_t), len(flux[0])), 2
             )
             parts = [real_parts((reading.change - flux).ravel())[:, None]]
             if with_columns:

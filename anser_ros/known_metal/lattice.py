@@ -164,7 +164,7 @@ class PlacedLattice:
     turn: Array
     driving: Array
 
-    def heard(self, coils: Coils) -> Array:
+    def received(self, coils: Coils) -> Array:
         """Return the fluxes (S, 3n) of unit moments along the body's axes, T."""
         basis = vector_basis(coils.at, coils.axes, coils.lengths, self.points) @ self.turn
         return np.asarray(basis.reshape(len(coils.at), -1))
@@ -205,14 +205,14 @@ class Setting:
 
     def flux(self, lattice: Lattice, placed: PlacedLattice, coils: Coils) -> ComplexArray:
         """Return what coils read of a lattice, (S, K), in the emitters' phases, T."""
-        return np.asarray(placed.heard(coils) @ lattice.moments(placed.driving, self.tilt).T)
+        return np.asarray(placed.received(coils) @ lattice.moments(placed.driving, self.tilt).T)
 
     def fluxes(self, lattice: Lattice, poses: Array, coils: Coils) -> ComplexArray:
         """Return what coils read of a lattice at each of some poses (P, 6), (P, S, K), T."""
         placed = self.all_placed(lattice, poses)
         moments = lattice.moments(np.array([one.driving for one in placed]), self.tilt)
         pairs = zip(placed, moments, strict=True)
-        return np.array([one.heard(coils) @ raised.T for one, raised in pairs])
+        return np.array([one.received(coils) @ raised.T for one, raised in pairs])
 
     def pose_columns(self, lattice: Lattice, pose: Array, coils: Coils) -> ComplexArray:
         """Return the derivative (S, K, 6) of the flux by a step of the lattice, see `moved`."""
@@ -227,9 +227,9 @@ class Setting:
         """Return the derivative (S, K, 4n) of the flux by the `Lattice.parameters`."""
         out, _, into = lattice.scattering
         n = len(lattice)
-        heard = (placed.heard(coils) @ out).reshape(len(coils.at), n, 3)
+        received = (placed.received(coils) @ out).reshape(len(coils.at), n, 3)
         felt = (placed.driving @ into.T).reshape(len(placed.driving), n, 3)
-        by = lattice.unit * np.einsum('snj,knj->skn', heard, felt, optimize=True)
+        by = lattice.unit * np.einsum('snj,knj->skn', received, felt, optimize=True)
         tilted = self.tilt[None, :, None] * by
         return np.concatenate([by, 1j * by, tilted, 1j * tilted], axis=2)
 

@@ -24,7 +24,7 @@ from anser_ros.nodes.field_model_parts.kept_baseline import CONFIRM_S, KeptBasel
 from anser_ros.nodes.field_model_parts.metal_view import MetalView
 from anser_ros.nodes.field_model_parts.model_output import ModelOutput
 from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
-from anser_ros.nodes.field_model_parts.refit_in_force import RefitInForce
+from anser_ros.nodes.field_model_parts.refit_in_force import ActiveRefit
 from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status, main
@@ -79,10 +79,10 @@ class FieldModelNode(AnserNode):
         self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
         name = self.get_fully_qualified_name()
         folder = kept_folder(table.keep_state)
-        ahead = ReadAhead(folder, self._file_model) if table.refit else None
-        kept = KeptBaseline(folder, name, self._fluxes.sender, ahead)
+        ahead = ReadAhead(folder, self._file_model if table.refit else None)
+        kept = KeptBaseline(folder, name, self._fluxes.sender)
         witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)
-        self._refit = RefitInForce(witnesses, self._pace, self.count, kept)
+        self._refit = ActiveRefit(witnesses, self._pace, self.count, kept, ahead)
         self._sources = [setups, self._fluxes, *witnesses.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
@@ -168,7 +168,7 @@ class FieldModelNode(AnserNode):
     def _update(self, frame: Frame) -> None:
         """Let the model follow the references, not more often than wanted.
 
-        Every frame is answered with the model in force for it, even if that is unchanged: so the
+        Every frame is answered with its active model, even if that is unchanged: so the
         tracker knows the model for each frame, and gives the same poses as offline.
         """
         result, model = self._refit.follow(frame), self._model
@@ -200,7 +200,7 @@ class FieldModelNode(AnserNode):
     # The model and its baseline -----------------------------------------------------------
 
     def _serve(self, model: FieldModel, stamp_ns: int, withheld: str = '') -> None:
-        """Put a model in force under a stamp that the last one did not have.
+        """Activate a model under a stamp that the last one did not have.
 
         The model of a frame of readings has their stamp, which may be of another day. ``withheld``
         is the state for which trackers should publish no poses, at once or soon.
@@ -246,7 +246,7 @@ class FieldModelNode(AnserNode):
         self._announce_changes()
 
     def _announce_changes(self) -> None:
-        """Let receivers know of another state than the one that they were told."""
+        """Let receivers know of another state than the one that they received."""
         if self._model is not None and self._announced != self._state:
             withheld = self._refit.withheld if self._follows else ''
             self._serve(self._model, self.get_clock().now().nanoseconds, withheld)
@@ -261,12 +261,12 @@ class FieldModelNode(AnserNode):
         self.count('baselines')
 
     def _take_refit(self) -> None:
-        """Use a refit that has been made meanwhile, and tell of it."""
+        """Use a refit that has been made meanwhile, and report it."""
         try:
             if not self._refit.take():
                 return
             self._received_s = time.monotonic()
-            self.get_logger().info(refit_status.IN_FORCE)
+            self.get_logger().info(refit_status.ACTIVE)
         except FitError as error:
             self._refuse_baseline(error)
         self._announce_changes()
@@ -338,7 +338,7 @@ class FieldModelNode(AnserNode):
         response.message = f'baseline of {good} references over {len(self._window)} frames'
         return response
 
-    # What is told -------------------------------------------------------------------------
+    # What is reported -------------------------------------------------------------------------
 
     def _refuse(self, counter: str, error: AnserError) -> None:
         self._trouble.say(str(error), time.monotonic())
@@ -352,7 +352,7 @@ class FieldModelNode(AnserNode):
         self._announce_changes()
 
     def status(self) -> Status:
-        """Return which model is in force, where it comes from, and what the refit does."""
+        """Return which model is active, where it comes from, and what the refit does."""
         model = self._model
         values: dict[str, object] = {'last_refusal': self._trouble.last}
         conflict = sender_words(self._sources)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 UNCHANGED = 0.99
-"""Probability of no change from which on the calibrated model is in force."""
+"""Probability of no change from which on the calibrated model is active."""
 
 
 class Belief:

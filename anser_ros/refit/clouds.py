@@ -47,7 +47,7 @@ class Region:
     centre : ndarray, shape (2,)
         x and y of the board's middle, m.
     half : float
-        Half of the board's larger side, m; sizes and spacings of clouds and layers are told in it.
+        Half of the board's larger side, m; the unit of sizes and spacings of clouds and layers.
     stated : TrackedVolume or None
         The volume as the setup states it; None: the default over such a board.
     """

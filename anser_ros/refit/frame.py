@@ -12,7 +12,7 @@ from anser_ros.refit import health
 ComplexArray = NDArray[np.complex128]
 
 SILENT_CODE, NO_BASELINE_CODE = len(faults.FAULTS), len(faults.FAULTS) + 1
-"""Codes of what only a baseline tells, after those of `frames.faults`."""
+"""Codes of what only a baseline shows, after those of `frames.faults`."""
 _OF_KIND = {
     'missing': health.MISSING,
     'not_finite': health.NOT_FINITE,

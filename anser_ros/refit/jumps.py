@@ -28,7 +28,7 @@ ComplexArray = NDArray[np.complex128]
 
 LEAST_JUMP_POWER = 5.0
 """Power of a jump, in units of what noise makes, from which on jumps are judged: noise of sixteen
-components is that loud once in a year."""
+components is that large once in a year."""
 FARTHEST = 3.0
 """Steps, in units of the last one, over which a course is carried on, and its noise with it."""
 LARGEST_RATE = 0.05

@@ -45,7 +45,7 @@ AT_ONCE = 64
 """Sources whose field at the samples is worked out at once, 5 MB: with many more, the time goes
 into waiting for memory, with many fewer, into starting again."""
 MOST_MIDDLE = 60
-"""Samples in the middle that tell what the uncertainty's modes leave."""
+"""Samples in the middle that show what the uncertainty's modes leave."""
 LEAST_SAMPLE_DISTANCE = 0.35
 """Samples nearer to a body's sources than this part of its radius don't count."""
 INNER = 0.83

@@ -143,7 +143,7 @@ class LiveRefit:
         return Assembly(self.model, phase, settings.accuracy.flux_noise_t, settings.error_modes)
 
     def reset(self) -> None:
-        """Forget all frames, so that the calibrated model is in force again."""
+        """Forget all frames, so that the calibrated model is active again."""
         settings = self.settings
         self._noise = NoiseLevel(settings.accuracy.flux_noise_t)
         self._average = Average(settings.average_frames)
@@ -212,11 +212,11 @@ class LiveRefit:
         """Leave out coils whose change (S, K) has just jumped by itself."""
         jumps = self._courses.follow(stamp_ns, change)
         parts = self._units.of(jumps.off) / jumps.spread[:, None, None]
-        loud = (parts**2).mean(axis=(1, 2)) > LEAST_JUMP_POWER * level**2
+        jumping = (parts**2).mean(axis=(1, 2)) > LEAST_JUMP_POWER * level**2
         away, coils = self._courses.away(), np.flatnonzero(self._in_use())
-        if not (loud.any() or away.size):
+        if not (jumping.any() or away.size):
             return
-        self._courses.note(jumps, away[loud[away]])
+        self._courses.note(jumps, away[jumping[away]])
         back = self._courses.returned(level * self.settings.accuracy.flux_noise_t)
         few = coils.size < self.settings.min_references or self._watch.is_outvoted
         drift, banks = self.settings.emitter_drift, self._banks.of
@@ -226,7 +226,7 @@ class LiveRefit:
             self._watch.recover(coil)
         # The first frame has no course, and the second only the noise that was stated: metal may
         # be there, and `_judged` asks who disagrees.
-        if not (loud[coils].any() and self._noise.is_measured and math.isfinite(jumps.since_s)):
+        if not (jumping[coils].any() and self._noise.is_measured and math.isfinite(jumps.since_s)):
             return
         bank, _ = self._bank()
         seen = bank.evaluate(parts[coils].reshape(-1, 2), level)

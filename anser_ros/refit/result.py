@@ -33,7 +33,7 @@ WITHHELD = {
     POOR_FIT: REFERENCES_DOUBTFUL,
     REFERENCES_DOUBTFUL: REFERENCES_DOUBTFUL,
 }
-"""What trackers are told in states whose model is none to give poses by."""
+"""State that trackers receive in states whose model is none to give poses by."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class RefitResult:
     ----------
     stamp_ns : int
     model : FieldModel
-        The model in force; the calibrated one itself while nothing has changed.
+        The active model; the calibrated one itself while nothing has changed.
     state : str
         One of `STATES`.
     judge : callable
@@ -127,7 +127,7 @@ class RefitResult:
 
     @property
     def is_answer(self) -> bool:
-        """Return whether the references told this frame's model; else it is the last resort."""
+        """Return whether the references gave this frame's model; else it is the last resort."""
         return not self.withheld
 
     @cached_property

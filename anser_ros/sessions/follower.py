@@ -50,7 +50,7 @@ class ModelFollower(FrameModels):
     """Refits the model to the reference sensors frame by frame, at the pace of the live node.
 
     The session must have references and a baseline. With ``witnesses``, contradictions of the
-    tools' coils tell of metal, too.
+    tools' coils show metal, too.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class ModelFollower(FrameModels):
         return standing
 
     def witnessed(self, tools: FrameReadings, found: Sequence[PoseEstimate]) -> None:
-        """Let a frame's tools tell of metal, at the poses that were found for their bodies."""
+        """Let a frame's tools show metal, at the poses that were found for their bodies."""
         if not self._uses_witnesses or self._refit is None:
             return
         poses = {

@@ -68,7 +68,7 @@ class KnownMetalModels(FrameModels):
             known, prepared.model, excitation, sensors, session.setup.refit.tools,
             prepared.volume, tracking_noise(session.setup),
         )  # fmt: skip
-        # Where a pose is withheld, a tracker that withholds none tells where the tool is, nearly.
+        # Where a pose is withheld, a tracker that withholds none shows where the tool is, nearly.
         settings = settings_for(session.setup, TrackerSettings(gate=NO_GATE))
         self._rough = Tracker(
             prepared.model, prepared.sensors, replace(settings, volume=prepared.volume)

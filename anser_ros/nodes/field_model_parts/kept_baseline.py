@@ -18,7 +18,6 @@ from anser_ros.field.model import FieldModel
 from anser_ros.fingerprint import fingerprint_of
 from anser_ros.sessions.kept_tables import (
     DAMAGED,
-    ReadAhead,
     read_arrays,
     used_s,
     write_arrays,
@@ -42,19 +41,10 @@ class KeptBaseline:
     ----------
     folder : Path or None
         Where files are kept; None where they are not.
-    ahead : ReadAhead
-        Of the tables in it.
     """
 
-    def __init__(
-        self,
-        folder: Path | None,
-        node: str,
-        sender: Callable[[], str],
-        ahead: ReadAhead | None = None,
-    ) -> None:
+    def __init__(self, folder: Path | None, node: str, sender: Callable[[], str]) -> None:
         self.folder, self._node, self._sender = folder, node, sender
-        self.ahead = ahead or ReadAhead(None, None)
         self._of: tuple[str, ...] = ()
         self._kept: Path | None = None
 
@@ -98,7 +88,7 @@ class KeptBaseline:
             os.utime(path)
 
     def drop(self) -> None:
-        """Keep none: another one is in force, or something speaks against it."""
+        """Keep none: another one is active, or something speaks against it."""
         if self._kept is not None:
             self._kept.unlink(missing_ok=True)
         self._kept = None

@@ -57,7 +57,7 @@ class PlaceWatch:
 
     @property
     def is_open(self) -> bool:
-        """Return whether references could tell, and none has been received."""
+        """Return whether references could show it, and none has been received."""
         return self._place is not None and not self._has_frame
 
     @property

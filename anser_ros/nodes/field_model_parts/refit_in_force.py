@@ -20,14 +20,16 @@ from anser_ros.refit.change import Pace
 from anser_ros.refit.health import DISAGREES
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
+from anser_ros.sessions.kept_tables import ReadAhead
 from anser_ros.stamps import is_live
 from anser_ros.wire.setup import Setup
 
 
-class RefitInForce:
+class ActiveRefit:
     """Keeps the refit, its last result, and what it is made from.
 
-    ``count`` counts an event by its name, and ``kept`` is what a process after this one takes up.
+    ``count`` counts an event by its name, ``kept`` is what a process after this one takes up, and
+    ``ahead`` what is read of it before references and setup are known.
 
     Attributes
     ----------
@@ -44,9 +46,11 @@ class RefitInForce:
         pace: Pace,
         count: Callable[[str], None],
         kept: KeptBaseline,
+        ahead: ReadAhead,
     ) -> None:
         warm_up()
-        self._witnesses, self._pace, self._count, self._kept = witnesses, pace, count, kept
+        self._witnesses, self._pace, self._count = witnesses, pace, count
+        self._kept, self._ahead = kept, ahead
         self._has_looked = False
         self._confirmed: RefitResult | None = None
         self._start: RefitStart | None = None
@@ -65,12 +69,12 @@ class RefitInForce:
         self._kept.expect(setup, base)
         self._witnesses.expect(setup, base)
         if len(references):
-            folder, ahead, noise_t = self._kept.folder, self._kept.ahead, self._witnesses.noise_t
-            self._start = RefitStart(setup, base, references, folder, ahead, noise_t)
+            folder, noise_t = self._kept.folder, self._witnesses.noise_t
+            self._start = RefitStart(setup, base, references, folder, self._ahead, noise_t)
             if at_once:
                 self._start.prepare()
         else:
-            self._kept.ahead.drop()
+            self._ahead.drop()
 
     def forget_baseline(self) -> None:
         """Drop the baseline: the readings are to be others."""
@@ -80,7 +84,7 @@ class RefitInForce:
         """Begin to make a refit to what differs from a baseline, shape (S, K), T.
 
         No pose is given before the first one is there, since metal may come meanwhile; one that is
-        in force goes on until the next one is there.
+        active goes on until the next one is there.
 
         Raises
         ------
@@ -137,7 +141,7 @@ class RefitInForce:
             self._start.wait()
 
     def take(self) -> bool:
-        """Put a refit in force that has been made meanwhile; return whether there was one.
+        """Activate a refit that has been made meanwhile; return whether there was one.
 
         Raises
         ------
@@ -190,7 +194,7 @@ class RefitInForce:
             return None
         begin_s = time.monotonic()
         if self.result is not None:
-            self._witnesses.tell(refit, self.result.stamp_ns)
+            self._witnesses.pass_on(refit, self.result.stamp_ns)
         self.result = refit.follow(frame)
         self._count('refits')
         self.update_s = time.monotonic() - begin_s
