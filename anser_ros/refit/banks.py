@@ -23,10 +23,7 @@ class Banks:
     """
 
     def __init__(
-        self,
-        tables: RefitTables,
-        baseline: NDArray[np.complex128],
-        settings: RefitSettings,
+        self, tables: RefitTables, baseline: NDArray[np.complex128], settings: RefitSettings
     ) -> None:
         self._tables = tables
         self._width = k = baseline.shape[1]

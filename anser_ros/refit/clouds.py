@@ -101,13 +101,8 @@ def below(region: Region, standoff: float) -> Cloud:
         x, y = np.meshgrid(side + region.centre[0], side + region.centre[1], indexing='ij')
         positions.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, -depth)], axis=1))
         volumes.append(np.full(x.size, thickness * (side[1] - side[0]) ** 2))
-    return Cloud(
-        f'below {1e3 * standoff:.0f} mm',
-        standoff,
-        False,
-        np.concatenate(positions),
-        np.concatenate(volumes),
-    )
+    name = f'below {1e3 * standoff:.0f} mm'
+    return Cloud(name, standoff, False, np.concatenate(positions), np.concatenate(volumes))
 
 
 def overhead(region: Region, standoff: float) -> Cloud:
@@ -125,13 +120,8 @@ def overhead(region: Region, standoff: float) -> Cloud:
         positions.append(shell)
         volumes.append(np.full(len(shell), spacing**3))
         inner = outer
-    return Cloud(
-        f'around {1e3 * standoff:.0f} mm',
-        standoff,
-        True,
-        np.concatenate(positions),
-        np.concatenate(volumes),
-    )
+    name = f'around {1e3 * standoff:.0f} mm'
+    return Cloud(name, standoff, True, np.concatenate(positions), np.concatenate(volumes))
 
 
 def _shell(region: Region, inner: float, outer: float, spacing: float) -> Array:

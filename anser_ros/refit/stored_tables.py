@@ -62,15 +62,13 @@ def tables_of(
         )
         for i, (cloud, response, layer) in enumerate(hypotheses)
     )
-    around = bodies(region)
     return RefitTables(
         excitation,
         region,
         (bottom, box),
         priors,
         model.frequencies_hz,
-        around,
-        tuple(arrays[f'factor{i}'] for i in range(len(around))),
+        tuple(arrays[f'factor{i}'] for i in range(len(bodies(region)))),
         references,
         settings,
         arrays['weight'],

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,21 +12,8 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import Cloud, Region, bodies, default_clouds
 from anser_ros.refit.excitation import Excitation, FieldFunction, excitation_for
-from anser_ros.refit.layer import (
-    Layer,
-    body_layer,
-    bottom_layer,
-    box_layer,
-    pose_weight,
-)
-from anser_ros.refit.prior import (
-    BODY,
-    ORIENTED,
-    UPRIGHT,
-    CloudPrior,
-    Response,
-    build_prior,
-)
+from anser_ros.refit.layer import Layer, body_layer, bottom_layer, box_layer, pose_weight
+from anser_ros.refit.prior import BODY, ORIENTED, UPRIGHT, CloudPrior, Response, build_prior
 from anser_ros.refit.reduced import ReducedPrior, reduced
 from anser_ros.refit.search import COARSE, body_factor
 from anser_ros.settings import RefitSettings
@@ -54,10 +42,8 @@ class RefitTables:
         Below the board, and around the volume.
     priors : tuple of CloudPrior
     frequencies_hz : tuple of float
-    bodies : tuple of Cloud
-        Compact bodies that may be put in as further hypotheses.
     factors : tuple of ndarray
-        What `BodySearch` needs of each.
+        What `BodySearch` needs of each of the `bodies`.
     references : SensorTable
     settings : RefitSettings
     weight : ndarray, shape (P,)
@@ -69,11 +55,15 @@ class RefitTables:
     layers: tuple[Layer, ...]
     priors: tuple[CloudPrior, ...]
     frequencies_hz: tuple[float, ...]
-    bodies: tuple[Cloud, ...]
     factors: tuple[NDArray[np.float32], ...]
     references: SensorTable
     settings: RefitSettings
     weight: Array
+
+    @cached_property
+    def bodies(self) -> tuple[Cloud, ...]:
+        """Return the compact bodies that may be put in as further hypotheses."""
+        return bodies(self.region)
 
     def body_prior(self, body: int) -> CloudPrior:
         """Return the full hypothesis of a compact body."""
@@ -123,13 +113,17 @@ def build_tables(
         bottom_layer(model, region, excitation, nearest.positions),
         box_layer(region, excitation),
     )
-    weight = pose_weight(region.volume.samples(), excitation)
-    around = bodies(region)
-    factors = _factors(around, references, excitation)
     tables = RefitTables(
-        excitation, region, layers, (), model.frequencies_hz, around, factors, references,
-        settings, weight,
-    )  # fmt: skip
+        excitation,
+        region,
+        layers,
+        (),
+        model.frequencies_hz,
+        _factors(bodies(region), references, excitation),
+        references,
+        settings,
+        pose_weight(region.volume.samples(), excitation),
+    )
     return tables.with_priors(report)
 
 

@@ -11,11 +11,7 @@ from anser_ros.errors import BagError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.reference_readings import ReferenceReadings
 from anser_ros.integrity.board_place import BoardPlace
-from anser_ros.integrity.clean_references import (
-    check_as_calibrated,
-    check_as_drawn,
-    check_steady,
-)
+from anser_ros.integrity.clean_references import check_as_calibrated, check_as_drawn, check_steady
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.sessions.drawing import Drawing

@@ -12,13 +12,7 @@ from anser_ros.known_metal.rows import CoilReadings, MetalFrame, real_parts
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.tables import build_tables
-from anser_ros.refit.tool_readings import (
-    FREE_M,
-    FREE_RAD,
-    ToolReading,
-    coil_spread,
-    linearised,
-)
+from anser_ros.refit.tool_readings import FREE_M, FREE_RAD, ToolReading, coil_spread, linearised
 from anser_ros.sessions.prepared import PreparedSession, correct
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.settings import Accuracy, ToolSettings

@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
 from anser_ros.fingerprint import fingerprint_of
-from anser_ros.sessions.kept_tables import (
-    DAMAGED,
-    read_arrays,
-    used_s,
-    write_arrays,
-)
+from anser_ros.sessions.kept_tables import DAMAGED, read_arrays, used_s, write_arrays
 from anser_ros.wire.setup import Setup
 
 BASELINE_S = 60.0
