@@ -33,14 +33,9 @@ may turn aside."""
 
 @dataclass(frozen=True)
 class FrameModel:
-    """Holds the model that a frame may be tracked with.
+    """Holds the model that a frame may be tracked with, and why no pose may be given, if so.
 
-    Attributes
-    ----------
-    model : FieldModel or None
-        None if the references never gave a model: the active model stays unchanged.
-    withheld : Withheld or None
-        Why no pose may be given; None where it may.
+    The model is None if the references never gave one: the active model stays unchanged.
     """
 
     model: FieldModel | None

@@ -56,14 +56,9 @@ WEIGHT_ROUNDS = 12
 class Misplacement:
     """States how far a model's board lies from where the references have it.
 
-    Attributes
-    ----------
-    shift_m, turn_rad : ndarray, shape (3,)
-        Along and about x, y and z of fg, in the middle of the volume.
-    sigma_m : ndarray, shape (3,)
-        Standard deviations of the shift.
-    misfit : float
-        Of the typical reference with that, in what survey and manufacture allow.
+    The shift (3,), m, its standard deviations, and the turn (3,), rad, are along and about x, y
+    and z of fg, in the middle of the volume; ``misfit`` is that of the typical reference with
+    these, in what survey and manufacture allow.
     """
 
     shift_m: Array

@@ -150,14 +150,8 @@ class Lattice:
 class PlacedLattice:
     """Holds a lattice at a pose in the emitters' field.
 
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3)
-        m, frame fg.
-    turn : ndarray, shape (3, 3)
-        From the body's axes to fg.
-    driving : ndarray, shape (K, 3n)
-        The emitters' fields at the points, in the body's axes, T.
+    Its points (n, 3) are in m, frame fg; ``turn`` (3, 3) is from the body's axes to fg;
+    ``driving`` (K, 3n), T, are the emitters' fields at the points, in the body's axes.
     """
 
     points: Array

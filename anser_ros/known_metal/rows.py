@@ -12,15 +12,9 @@ ComplexArray = NDArray[np.complex128]
 
 
 class CoilReadings(NamedTuple):
-    """Holds what coils read beyond the calibrated model, and how well that is known.
+    """Holds what coils read beyond the calibrated model, (S, K), T, in the emitters' phases.
 
-    Attributes
-    ----------
-    coils : Coils
-    change : ndarray, shape (S, K), complex
-        In the emitters' phases, T.
-    shared : ndarray, shape (2 S K, m)
-        Effect of errors of unit variance, T: real parts, then imaginary parts.
+    ``shared`` (2 S K, m) is the effect of errors of unit variance, T: real parts, then imaginary.
     """
 
     coils: Coils
@@ -29,16 +23,10 @@ class CoilReadings(NamedTuple):
 
 
 class MetalFrame(NamedTuple):
-    """Holds what references and tools read of metal in one frame.
+    """Holds what references and tools read of metal in one frame, at a time in s.
 
-    Attributes
-    ----------
-    time : float
-        s.
-    readings : tuple of CoilReadings
-        Of the references, then of each tool with a pose.
-    place : ndarray, shape (3,)
-        Where the refit sees the metal, m.
+    The readings are those of the references, then of each tool with a pose; ``place`` (3,), m, is
+    where the refit sees the metal.
     """
 
     time: float

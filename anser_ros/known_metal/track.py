@@ -156,14 +156,10 @@ class Scene:
 
 
 class MetalUpdate(NamedTuple):
-    """Holds what a frame's readings made of a state.
+    """Holds what a frame's readings made of a state, and their log likelihood.
 
-    Attributes
-    ----------
-    state : MetalState
-    ratio : float
-        Squared misfit to the prediction per degree of freedom; 1 is expected, or less.
-    log_likelihood : float
+    ``ratio`` is the squared misfit to the prediction per degree of freedom; 1 is expected, or
+    less.
     """
 
     state: MetalState

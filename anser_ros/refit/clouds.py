@@ -42,14 +42,9 @@ BODY_RADIUS = 0.45
 class Region:
     """Describes the board's extent, and the volume over it in which the field must be right.
 
-    Attributes
-    ----------
-    centre : ndarray, shape (2,)
-        x and y of the board's middle, m.
-    half : float
-        Half of the board's larger side, m; the unit of sizes and spacings of clouds and layers.
-    stated : TrackedVolume or None
-        The volume as the setup states it; None: the default over such a board.
+    The board's middle is at ``centre`` (x, y), m, and ``half`` is half of its larger side, m, the
+    unit of sizes and spacings of clouds and layers. The volume is as the setup states it, or else
+    the default.
     """
 
     centre: Array
@@ -64,19 +59,10 @@ class Region:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Holds candidate sources of one hypothesis.
+    """Holds candidate sources of one hypothesis at positions (M, 3), m, frame fg.
 
-    Attributes
-    ----------
-    name : str
-    standoff_m : float
-        Distance of the nearest source from the board (or from the tracked volume), m.
-    overhead : bool
-        Whether the sources are around and over the volume, not below the board.
-    positions : ndarray, shape (M, 3)
-        m, frame fg.
-    volumes : ndarray, shape (M,)
-        Volume that each source stands for, m^3.
+    The nearest source is ``standoff_m`` from the board, or from the tracked volume where the cloud
+    is ``overhead``, around and over it. Each source stands for a volume, (M,), m^3.
     """
 
     name: str

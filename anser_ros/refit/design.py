@@ -37,15 +37,9 @@ MOST_EXCHANGES = 3
 class StatedMetal:
     """States one metal of the family, for C candidate coils.
 
-    Attributes
-    ----------
-    name : str
-    cross : ndarray, shape (D, C K)
-        Covariance of what poses feel of the metal, m, with the readings, in noise deviations.
-    covariance : ndarray, shape (C K, C K)
-        Of the readings, noise and drift included.
-    error_m : float
-        Error of poses while it is not corrected, root mean square.
+    ``cross`` (D, C K) is the covariance of what poses feel of the metal, m, with the readings, in
+    noise deviations, ``covariance`` (C K, C K) that of the readings, noise and drift included.
+    While it is not corrected, poses have the error ``error_m``, root mean square.
     """
 
     name: str
@@ -56,14 +50,9 @@ class StatedMetal:
 
 @dataclass(frozen=True)
 class Design:
-    """Holds a choice of coils.
+    """Holds a choice of coils, rows of the candidates in the order in which they were chosen.
 
-    Attributes
-    ----------
-    coils : tuple of int
-        Rows of the candidates, in the order in which they were chosen.
-    errors_m : ndarray, shape (metals,)
-        Expected error of poses that they leave, of each metal.
+    ``errors_m`` is the expected error of poses that they leave, of each metal.
     """
 
     coils: tuple[int, ...]

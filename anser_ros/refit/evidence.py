@@ -19,7 +19,7 @@ STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
 
 @dataclass(frozen=True)
 class FrameEvidence:
-    """Holds the evidence of one frame for the hypotheses.
+    """Holds the evidence of one frame for H hypotheses, at a noise in units of the nominal one.
 
     Attributes
     ----------
@@ -31,7 +31,6 @@ class FrameEvidence:
     strength : ndarray, shape (H, 2, A)
         Probability of each strength.
     noise : float
-        Noise in units of the nominal one.
     """
 
     projected: Single

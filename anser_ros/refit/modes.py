@@ -39,13 +39,9 @@ class ErrorLevel:
 class PosteriorModes:
     """Holds the error of a hypothesis' posterior in units of the noise.
 
-    Attributes
-    ----------
-    moments : ndarray, shape (R, N, K), complex
-        Of the hypothesis' layer; the error is a sum of these with independent normal factors.
-    rest : float
-        Standard deviation of a phasor component of what they leave, in the middle of the volume.
-        Without it a pose would trust the directions that no mode points in.
+    It is a sum of moments (R, N, K) of the hypothesis' layer with independent normal factors. What
+    they leave has the standard deviation ``rest`` of a phasor component in the middle of the
+    volume: without it a pose would trust the directions that no mode points in.
     """
 
     moments: ComplexArray

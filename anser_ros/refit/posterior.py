@@ -43,17 +43,10 @@ def make_room(table: dict[Any, Any], most: int) -> None:
 
 @dataclass(frozen=True)
 class Eigenbasis:
-    """States what a prior's covariance is made of, for the readings in use.
+    """States what a prior's covariance is made of, for the n readings in use.
 
-    Attributes
-    ----------
-    prior : CloudPrior
-    values : ndarray, shape (n,)
-        Eigenvalues, whitened readings.
-    basis : ndarray, shape (n, n)
-        Eigenvectors in columns, from readings.
-    synthesis : ndarray, shape (N K, n)
-        From coordinates in the eigenvectors to the layer's moments, single precision.
+    Its eigenvalues (n,) and eigenvectors (n, n), in columns, of whitened readings, and the map (N
+    K, n) from coordinates in these to the layer's moments.
     """
 
     prior: CloudPrior

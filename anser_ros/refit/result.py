@@ -49,7 +49,7 @@ class Metal:
     volumes : ndarray, shape (M,)
         Volume that each source stands for, m^3.
     centroid : ndarray, shape (3,)
-        Mean of the space, weighted by the squared magnitude of the polarisability's density. It
+        Mean of the space, weighted by the squared magnitude of the polarisability's density: it
         leans towards the part of the metal that the emitters reach best.
     standoff_m : float
         The cloud's distance from the board.
@@ -91,9 +91,9 @@ class RefitResult:
     model : FieldModel
         The active model; the calibrated one itself while nothing has changed.
     state : str
-        One of `STATES`.
-    judge : callable
-        Works out `references`.
+        One of `STATES`, and the `reason` why.
+    judge, find : callable
+        Work out `references` and `metal`.
     log_odds : float
         Natural logarithm of the odds that something has changed.
     weights : mapping of str to float
@@ -104,9 +104,6 @@ class RefitResult:
         Relative change of each emitter's strength; where nothing else changes, zero unless it is
         significant.
     reason : str
-        Why the state is what it is.
-    find : callable, optional
-        Works out `metal`.
     """
 
     stamp_ns: int

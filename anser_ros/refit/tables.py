@@ -34,20 +34,8 @@ MOST_ORIENTED = 1000
 class RefitTables:
     """Holds the precomputed tables of a refit.
 
-    Attributes
-    ----------
-    excitation : Excitation
-    region : Region
-    layers : tuple of Layer
-        Below the board, and around the volume.
-    priors : tuple of CloudPrior
-    frequencies_hz : tuple of float
-    factors : tuple of ndarray
-        What `BodySearch` needs of each of the `bodies`.
-    references : SensorTable
-    settings : RefitSettings
-    weight : ndarray, shape (P,)
-        `pose_weight` of the region's samples.
+    ``layers`` are those below the board and around the volume; ``factors`` is what `BodySearch`
+    needs of each of the `bodies`; ``weight`` (P,) is the `pose_weight` of the region's samples.
     """
 
     excitation: Excitation
