@@ -77,16 +77,7 @@ class Accuracy(_Stated):
     reference_axis_rad: float = _value(
         math.radians(0.3), "error of a reference sensor's surveyed axis, rad a tangent", 0.0, 1.0
     )
-    # Of the coils of patches too.
     reference_gain: float = _value(0.004, "relative error of a reference sensor's gain", 0.0, 1.0)
-    patch_position_m: float = _value(
-        0.15e-3, "error of a patch's tracked position along each axis, m", 0.0, 0.1
-    )
-    patch_rotation_rad: float = _value(
-        2e-3, "error of a patch's tracked orientation about each axis, rad", 0.0, 1.0
-    )
-    # A tool at a speed v is where its pose says to v times this. The default is that of a line
-    # which delivers in frames of 1 ms, as USB does: a delay spread evenly over a frame.
     stamp_sigma_s: float = _value(0.3e-3, 'error of a flux stamp, s', 0.0, 0.1)
 
     @property

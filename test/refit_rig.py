@@ -13,14 +13,10 @@ from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
 HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
 FIRST_NS = 1_750_000_000_000_000_000
 STEP_NS = 20_000_000
-PATCH_COILS = (
-    ((0.01, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    ((-0.01, 0.0, 0.0), (1.0, 0.0, 0.0)),
-)
 
 
 def setup_text(world):
-    """The test's world as a setup document, with a patch of two coils."""
+    """The test's world as a setup document."""
     names, tones = world.board.names, world.board.frequencies_hz
     coils = tuple(
         Coil(name, (x * 1e-3, y * 1e-3, 0.0), turn, tone)
@@ -34,8 +30,6 @@ def setup_text(world):
             table.length, strict=True,
         )
     ]  # fmt: skip
-    for i, (place, axis) in enumerate(PATCH_COILS):
-        sensors.append(SensorSpec(40 + i, f'patch/{i}', 'patch', place, axis, 0.0))
     emitter = Emitter('square_spiral_pcb', GEOMETRY, coils)
     return dump_setup(Setup('fg', 50.0, emitter, tuple(sensors)))
 

@@ -5,6 +5,7 @@ import re
 from contextlib import redirect_stdout
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from io import StringIO
 from types import SimpleNamespace
 
@@ -35,6 +36,7 @@ from anser_ros.pose_states import MODEL_DOUBTFUL
 from anser_ros.sessions import metal_frames
 from anser_ros.sessions.chosen_references import with_references
 from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.known_metal import KnownMetalModels
 from anser_ros.sessions.known_metal_file import load_known_metal, save_known_metal
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.prepared import prepare
@@ -381,7 +383,7 @@ class TestLearning:
             reading, *tools = frame.readings
             signs = rng.choice([-1.0, 1.0], reading.change.shape)
             torn.append(
-                replace(frame, readings=(replace(reading, change=reading.change * signs), *tools))
+                frame._replace(readings=(reading._replace(change=reading.change * signs), *tools))
             )
         given = world.excitation(), certain_model().frequencies_hz, volume_of(bags), NOISE_T
         with pytest.raises(FitError, match=r'^no rigid piece of metal .* \d+% of it is left'):
@@ -596,7 +598,7 @@ class TestTracking:
 
     def test_its_poses_are_as_good_as_without_metal_and_honest(self, known):
         session, model = world.session(world.APPROACH, world.lump(), 50, 3), certain_model()
-        tracked = track_session(session, model, known_metal=known)
+        tracked = track_session(session, model, models=partial(KnownMetalModels, known=known))
         frozen = track_session(session, model)
         late = np.arange(50) > 25
         score, error = body_errors(tracked)
@@ -611,7 +613,9 @@ class TestTracking:
 
     def test_metal_that_jumps_is_caught_up_with_and_its_poses_are_honest(self, known):
         session = world.session(jumping, world.lump(), 50, 11)
-        score, error = body_errors(track_session(session, certain_model(), known_metal=known))
+        score, error = body_errors(
+            track_session(session, certain_model(), models=partial(KnownMetalModels, known=known))
+        )
         good = np.isfinite(error)
         assert good[:30].all() and good[-8:].all()
         assert score[good].max() < 3.0
@@ -622,7 +626,7 @@ class TestTracking:
     def test_without_the_metal_all_is_as_with_the_calibrated_model(self, known, metal):
         lump = None if metal is None else world.lump(*metal)
         session, model = world.session(world.APPROACH, lump, 12, 12), certain_model()
-        tracked = track_session(session, model, known_metal=known)
+        tracked = track_session(session, model, models=partial(KnownMetalModels, known=known))
         frozen = track_session(session, model)
         assert tracked.refit.states == {'not_found': 12}
         both = {**tracked.bodies, **tracked.sensors}

@@ -22,7 +22,7 @@ def metals():
     """The family of metals, for ten coils around the board."""
     world = anser_world(32)
     whole = region_of(world.board.field)
-    excitation = Excitation('board', np.ones(K), np.ones(K, dtype=complex), world.board.field)
+    excitation = Excitation('board', np.ones(K, dtype=complex), world.board.field)
     return family(
         world.references.select(np.arange(0, 30, 3)), excitation,
         Region(whole.centre, whole.half), world.model.frequencies_hz, RefitSettings(),

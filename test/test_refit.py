@@ -35,7 +35,7 @@ def test_nothing_changed_leaves_the_calibrated_model_itself(refit):
     for frame in range(40):
         result = run(refit, world, 0.0, frames=1, seed=frame, start=1 + frame)
         assert result.model is world.model
-        assert (result.state, result.changed, result.left_out) == ('frozen', False, ())
+        assert (result.state, result.left_out) == ('frozen', ())
         assert result.metal is None
     assert result.noise_t == pytest.approx(NOISE_T, rel=0.15)
 
@@ -44,7 +44,7 @@ def test_metal_is_seen_at_once_and_its_field_is_taken_off(refit):
     world = anser_world()
     run(refit, world, 0.0)
     result = run(refit, world, world.metal(HEAD), frames=1, start=10)
-    assert (result.state, result.changed) == ('refit', True)
+    assert result.state == 'refit'
     assert result.log_odds > 10
     before, after, _, _ = errors(world, result.model, HEAD)
     assert before > 1e-9
@@ -195,23 +195,6 @@ def test_a_drawing_of_another_board_is_not_believed(refit):
         LiveRefit(world.model, world.references, world.baseline, drawing=other.board.field)
 
 
-@pytest.mark.long
-def test_references_that_move(refit):
-    world = anser_world()
-    result = run(refit, world, world.metal(HEAD))
-    shifted = world.references.with_geometry(world.references.position + [0.0, 0.0, 0.02])
-    there = np.einsum('pka,pa->pk', world.board.field(shifted.position), shifted.axis)
-    moved = refit.moved(shifted, there.astype(complex))
-    flux = there + world.metal(HEAD, shifted) + world.noise(np.random.default_rng(5))
-    again = moved.update(100 * STEP_NS, shifted.channel, flux)
-    places, axes = volume_points()
-    step = again.model.flux(places, axes) - result.model.flux(places, axes)
-    change = result.model.flux(places, axes) - world.model.flux(places, axes)
-    assert rms(step) < 0.03 * rms(change)
-    with pytest.raises(FitError, match='the same coils'):
-        refit.moved(shifted.select(range(5)), there[:5])
-
-
 def test_a_change_that_nothing_explains_is_a_state_not_a_confident_model(refit):
     world, rng = anser_world(), np.random.default_rng(8)
     strange = 0.4 * world.baseline * rng.normal(size=world.baseline.shape)
@@ -242,8 +225,6 @@ def test_what_does_not_fit_is_refused(refit):
         LiveRefit(world.model, table, baseline[:, :3])
     with pytest.raises(FitError, match='twice in the references'):
         LiveRefit(world.model, table.select([0, 0]), baseline[[0, 0]])
-    with pytest.raises(FitError, match='noise must be'):
-        LiveRefit(world.model, table, baseline, noise=np.zeros(len(table)))
     with pytest.raises(FitError, match='the model has 8 emitters, the fluxes 2'):
         refit.update(1, table.channel, baseline[:, :2])
     with pytest.raises(FitError, match='twice in the frame'):

@@ -1,16 +1,14 @@
-"""The refit inside its node: marker, centroid, health with names, services, moving patches."""
+"""The refit inside its node: marker, centroid, health with names, services."""
 
 import re
-import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from refit_rig import HEAD, PATCH_COILS, STEP_NS, Rig, setup_text
-from refit_world import anser_world, metal_block
+from refit_rig import HEAD, STEP_NS, Rig, setup_text
+from refit_world import metal_block
 
-from anser_ros.errors import FitError, FrameError, ModelFileError, ParameterError
+from anser_ros.errors import FitError, FrameError, ModelFileError
 from anser_ros.nodes.runtime.diagnostics import Level
 from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, code_of
 from anser_ros.refit.result import Metal
@@ -262,103 +260,24 @@ def test_every_frame_is_answered_under_its_own_stamp(make):
     assert [stamp_of(m) for m in got[-13:-1]] == answered
 
 
-def pose_message(stamp_ns, position, frame='fg'):
+def pose_message(position, frame='fg'):
     from geometry_msgs.msg import PoseStamped
 
     message = PoseStamped()
     message.header.frame_id = frame
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
     p = message.pose.position
     p.x, p.y, p.z = (float(v) for v in position)
     message.pose.orientation.w = 1.0
     return message
 
 
-def test_coils_on_a_patch_take_part_where_the_pose_says(make):
-    rig = make(patches=['patch=/optical/patch/pose'], refit_rate_hz=1000.0)
-    rig.start()
-    world, place = rig.world, np.array([0.02, 0.05, 0.16])
-    offsets = np.array([c[0] for c in PATCH_COILS])
-    axes = np.array([c[1] for c in PATCH_COILS])
-    take = rig.node._moving.pose_taker('patch')
+def test_a_pose_in_another_frame_or_of_nothing_is_refused(ros):
+    from anser_ros.nodes.field_model_parts.pose_messages import pose_in
 
-    def frame(change, shift=0.0, lost=False):
-        points = place + offsets + [0.0, 0.0, shift]
-        if not lost:
-            take(pose_message(rig.stamp_ns + STEP_NS, place + [0.0, 0.0, shift]))
-        flux = world.model.flux(points, axes) + world.noise(rig.rng)[:2]
-        if change:
-            table = world.references.select([0, 1]).with_geometry(points, axes, np.zeros(2))
-            flux = flux + world.metal(HEAD, table)
-        rig.stamp_ns += STEP_NS
-        rig.node._moving.on_flux(rig.message([40, 41], flux))
-        rig.stamp_ns -= STEP_NS
-        rig.say(world.metal(HEAD) if change else 0.0)
-        time.sleep(0.002)
-
-    def left_out():
-        return rig.node._refit.result.left_out
-
-    frame(False)
-    assert left_out() == ('patch/0', 'patch/1'), 'nothing was worked out for that place yet'
-    end = time.monotonic() + 60.0
-    while rig.node.counters['patch_moves'] < 1:
-        assert time.monotonic() < end
-        frame(False)
-        time.sleep(0.01)
-    for _ in range(40):
-        frame(False)
-    assert left_out() == ()
-    assert rig.node._refit.result.state == 'frozen'
-    for _ in range(3):
-        frame(True)
-    assert rig.node._refit.result.state == 'refit'
-    assert left_out() == ()
-    # Moved by a millimetre it goes on; far away it waits; without a pose it is left out.
-    frame(True, shift=1e-3)
-    assert left_out() == ()
-    frame(True, shift=0.03)
-    assert left_out() == ('patch/0', 'patch/1')
-    for _ in range(15):
-        frame(True, lost=True)
-    assert left_out() == ('patch/0', 'patch/1')
-    assert rig.node._refit.result.state == 'refit'
-
-
-def test_what_is_no_patch_is_refused(make):
-    from anser_ros.nodes.field_model_parts.patches import Patches
-    from anser_ros.sessions.patches import parse_patches
-
-    assert parse_patches(['a=/x', 'b=/y']) == {'a': '/x', 'b': '/y'}
-    for wrong in (['a'], ['=x'], ['a='], ['a=x', 'a=y']):
-        with pytest.raises(ParameterError, match='must be BODY=TOPIC'):
-            parse_patches(wrong)
-    patches = Patches(anser_world().references.select([0]), np.empty((0, 8), complex), 'fg')
     with pytest.raises(FrameError, match="in 'camera', not 'fg'"):
-        patches.take_pose('fg', pose_message(1, [0, 0, 0], 'camera'))
+        pose_in(pose_message([0, 0, 0], 'camera'), 'fg', 'tool')
     with pytest.raises(FrameError, match='is not finite'):
-        patches.take_pose('fg', pose_message(1, [np.nan, 0, 0]))
-
-
-def test_a_patch_leaves_no_thread_when_its_refit_is_worked_out(ros):
-    from anser_ros.nodes.field_model_parts.patches import WORKER, Patches
-
-    def workers():
-        return [t for t in threading.enumerate() if t.name.startswith(WORKER)]
-
-    world, position, axis = anser_world(), *np.array(PATCH_COILS[0])[:, None]
-    coil = world.references.select([0]).with_geometry(position, axis)
-    patches = Patches(replace(coil, channel=np.array([40]), body=('patch',)), world.baseline, 'fg')
-    refit = patches.started(world.model, world.references)
-    patches.take_pose('patch', pose_message(1, [0.02, 0.05, 0.16]))
-    assert patches.moved_refit(refit, 1) is None and workers()
-    end = time.monotonic() + 20.0
-    while patches.moved_refit(refit, 1) is None:
-        assert time.monotonic() < end
-        time.sleep(0.01)
-    for thread in workers():
-        thread.join(timeout=5.0)
-    assert not workers()
+        pose_in(pose_message([np.nan, 0, 0]), 'fg', 'tool')
 
 
 def test_markers_of_nothing_and_of_one_source(ros):

@@ -167,7 +167,7 @@ def test_tables_that_nobody_wants_any_more_are_given_up(ros, monkeypatch):
 
     monkeypatch.setattr(tables, 'build_tables', endless)
     setup = parse_setup(setup_text(world))
-    start = RefitStart(setup, world.model, world.references, ())
+    start = RefitStart(setup, world.model, world.references)
     start.begin(np.zeros((16, 8), complex))
     assert start.taken() is None and start.is_making
     assert begun.wait(20.0)

@@ -19,7 +19,6 @@ from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelP
 from anser_ros.nodes.runtime.stated_parameters import stated_by
 from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters
 from anser_ros.nodes.watcher import WatcherParameters
-from anser_ros.refit.patches import PatchCoils, clean_reading
 from anser_ros.refit.prior import UPRIGHT, build_prior
 from anser_ros.sessions.diagnosis import spread_of
 from anser_ros.sessions.evaluation import track_session
@@ -52,8 +51,6 @@ OTHER = {
     'reference_position_m': 1e-3,
     'reference_axis_rad': 0.02,
     'reference_gain': 0.02,
-    'patch_position_m': 1e-3,
-    'patch_rotation_rad': 0.02,
     'stamp_sigma_s': 2e-3,
     'emitter_drift': 0.05,
     'min_references': 8,
@@ -189,7 +186,7 @@ class TestEffect:
     )
     def test_the_survey_is_in_what_metal_may_look_like(self, world, usual, name):
         tables = usual._tables
-        cloud, _, layer = tables.hypotheses[0]
+        cloud, layer = tables.priors[0].cloud, tables.priors[0].layer
         covariances = [
             build_prior(
                 cloud, UPRIGHT, layer, world.references, tables.excitation.field(cloud.positions),
@@ -233,17 +230,6 @@ class TestEffect:
         usual.reset()
         odds = [refit.update(1, channels, flux).log_odds for refit in (usual, brief)]
         assert odds[0] != odds[1]
-
-    @pytest.mark.parametrize('name', ['patch_position_m', 'patch_rotation_rad', 'reference_gain'])
-    def test_patches(self, world, name):
-        coils = world.references.select(range(2))
-        settings = settings_from({name: OTHER[name]})
-        kept = PatchCoils(coils, world.baseline, settings)
-        sigma = [
-            clean_reading(world.model, coils, accuracy)[1]
-            for accuracy in (Accuracy(), kept.settings.accuracy)
-        ]
-        assert (sigma[1] > 1.05 * sigma[0]).all()
 
     def test_the_diagnosis(self):
         session = load_session(BAGS / 'moving.mcap')
@@ -328,7 +314,7 @@ class TestNodes:
             ),
             (
                 WatcherParameters,
-                [n for n in SECTIONS['accuracy'] if not n.startswith(('patch', 'stamp'))],
+                [n for n in SECTIONS['accuracy'] if not n.startswith('stamp')],
             ),
             (
                 TrackerParameters,

@@ -64,7 +64,7 @@ def test_readings_and_poses_of_one_frame_come_together_in_any_order(witnesses):
     found(pose(200, 0.02))  # the next frame is here before the references of this one
     witnesses._on_flux(flux(200, 2e-9))
     for stamp_ns in (100, 100, 200, 300):
-        witnesses.tell(refit, stamp_ns)
+        witnesses.pass_on(refit, stamp_ns)
     assert len(refit.given) == 2, 'no frame twice, none without readings'
     for (reading,), x, level in zip(refit.given, (0.01, 0.02), (1e-9, 2e-9), strict=True):
         assert reading.position[0] == x and np.array_equal(reading.rotation, np.eye(3))
@@ -80,7 +80,7 @@ def test_what_has_no_partner_is_forgotten_and_an_earlier_recording_is_taken(witn
     assert len(witnesses._frames) < 10 and len(witnesses._poses) < 10
     found(pose(5, 0.03))
     witnesses._on_flux(flux(5, 3e-9))
-    witnesses.tell(refit, 5)
+    witnesses.pass_on(refit, 5)
     assert refit.given[0][0].position[0] == 0.03
 
 
@@ -88,7 +88,7 @@ def test_poses_of_another_frame_are_refused(witnesses):
     refit = Refit()
     witnesses._on_flux(flux(100, 1e-9))
     witnesses._pose_taker('tool_a')(pose(100, 0.01, 'world'))
-    witnesses.tell(refit, 100)
+    witnesses.pass_on(refit, 100)
     assert not refit.given
     ((counter, error),) = witnesses.refused
     assert counter == 'tool_poses_refused' and "'world'" in str(error)
@@ -104,7 +104,7 @@ def test_a_body_whose_poses_have_two_publishers_witnesses_nothing(ros, witnesses
     witnesses._on_flux(flux(100, 1e-9))
     witnesses._pose_taker('tool_a')(pose(100, 0.01))
     assert spin_until(stranger, lambda: not witnesses._has_one_source('tool_a'))
-    witnesses.tell(refit, 100)
+    witnesses.pass_on(refit, 100)
     assert not refit.given
     for publisher in publishers:
         stranger.destroy_publisher(publisher)

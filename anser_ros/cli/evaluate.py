@@ -13,7 +13,6 @@ from anser_ros.cli.session_kinds import add_session_kinds, named_kind, need_mode
 from anser_ros.cli.session_runs import perform, runs_of, summed_up
 from anser_ros.cli.stated_values import (
     add_json,
-    add_list,
     add_session_options,
     stated_values,
 )
@@ -21,14 +20,13 @@ from anser_ros.errors import ParameterError
 from anser_ros.sessions.chosen_references import parse_references, with_references
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import recording_of, to_document
-from anser_ros.sessions.known_metal_file import load_known_metal
-from anser_ros.sessions.patches import parse_patches
+from anser_ros.sessions.known_metal import models_of
 from anser_ros.sessions.pose_table import write_tables
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
 
-ALONE = ('refit', 'baseline', 'patch', 'references', 'witnesses', 'in_phase', *SESSION_KINDS)
+ALONE = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', *SESSION_KINDS)
 """Options that do not go together with ``--known-metal``."""
 
 
@@ -69,10 +67,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         '--known-metal', type=Path, metavar='FILE',
         help='metal that anser known_metal has learnt: let the model follow it by the tools, '
         'without references',
-    )  # fmt: skip
-    add_list(
-        parser, '--patch', metavar='BODY=TOPIC',
-        help='body that carries reference coils too, and the topic of its poses in the bag',
     )  # fmt: skip
     parser.add_argument(
         '--in-phase', action='store_true', help="use in-phase fluxes only, the article's way"
@@ -118,12 +112,12 @@ def _one(args: argparse.Namespace, tell: Tell) -> Result:
         session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None
-    known = None if args.known_metal is None else load_known_metal(args.known_metal)
+    known = None if args.known_metal is None else models_of(args.known_metal)
     make_folder(args.out)
     evaluation = track_session(
         session, model, TrackerSettings(gate=args.gate), baseline=baseline, refit=args.refit,
-        in_phase=args.in_phase, patches=parse_patches(args.patch), witnesses=args.witnesses,
-        known_metal=known, progress=lambda share: tell('tracking', share),
+        in_phase=args.in_phase, witnesses=args.witnesses, models=known,
+        progress=lambda share: tell('tracking', share),
     )  # fmt: skip
     document = {**to_document(evaluation), 'recording': recording_of(session)}
     written = list(write_files(args.out, {'evaluation.json': document}))
@@ -137,7 +131,7 @@ def _one(args: argparse.Namespace, tell: Tell) -> Result:
         shown.append(_refit_line(document['refit'], known is not None))
     notes = (
         *snapshot_notes(args.model, model), *loss_notes(args.session, session.lost),
-        *(_few_notes(session) if args.refit and not args.patch else ()),
+        *(_few_notes(session) if args.refit else ()),
     )  # fmt: skip
     return Result(document, notes, tuple(shown), tuple(written))
 

@@ -128,7 +128,7 @@ def propose(
             f'--references {count}: there are {len(candidates)} coils to choose from'
         )
     k = len(setup.emitter_names)
-    excitation = Excitation('board', np.ones(k), np.ones(k, dtype=complex), field)
+    excitation = Excitation('board', np.ones(k, dtype=complex), field)
     progress('metals', 0.0)
     metals = family(
         candidates, excitation, region, setup.frequencies_hz, setup.refit, kinds, error_m

@@ -56,15 +56,6 @@ class Frame:
         found = (FAULTS[code] for code in self.codes.tolist())
         return Counter(fault.kind for fault in found if fault is not None)
 
-    def joined(self, channels: Integers, flux: ComplexArray) -> 'Frame':
-        """Return the frame with the readings of further channels, (P,) and (P, K), at its end."""
-        return replace(
-            self,
-            channels=np.concatenate([self.channels, channels]),
-            flux=np.concatenate([self.flux, flux]),
-            codes=np.concatenate([self.codes, faults.value_codes(flux)]),
-        )
-
 
 class Intake:
     """Puts frames into a table's order and judges them.

@@ -1,6 +1,6 @@
 """Ages a model that followed the references while they are silent, and then gives it up.
 
-Metal continues to move when no references report it. So the uncertainty of the model in force
+Metal continues to move when no references report it. So the uncertainty of the active model
 grows from frame to frame, by the change of the field while the metal was still observed. Beyond a
 bound it no longer describes the field.
 """
@@ -18,32 +18,24 @@ from anser_ros.pose_states import REFERENCES_LOST, Withheld
 from anser_ros.stamps import NANO
 
 SPEED_S = 0.3
-"""Time over which the last speed of the metal is taken, s. Shorter, and the noise of the refit is
-taken for speed; longer, and metal that comes near counts as slow: its effect grows with the sixth
-power of its distance, as it is driven less and heard less from afar."""
+"""Time, s, over which the last speed of metal is taken: long against the refit's noise, short as
+the effect of metal that comes near grows with the sixth power of its distance."""
 AGE_STEPS = 10
-"""Steps that a model ages in, from fresh to given up. More make trackers lay the model out again
-more often; fewer make it older than it is."""
+"""Steps that a model ages in, from fresh to given up; for each, trackers lay it out again."""
 FASTER = 2.0
-"""How many times as fast as before metal may move on. With 1, metal that comes nearer is not
-covered, since its effect grows faster than its way; more makes poses uncertain for nothing."""
+"""How many times as fast as before metal may move on: its effect grows faster than its way."""
 SAMPLES = 3, 3
 """Points across and up the volume at which the size of a change is taken: enough for a mean."""
 ELSEWHERE = 0.5
-"""Part of the field's expected change that may have any other shape than the last one, since
-metal may turn aside. With 0 that is not covered; more makes poses uncertain for nothing."""
+"""Part of the field's expected change that may have any other shape than the last one, since metal
+may turn aside."""
 
 
 @dataclass(frozen=True)
 class FrameModel:
-    """Holds the model that a frame may be tracked with.
+    """Holds the model that a frame may be tracked with, and why no pose may be given, if so.
 
-    Attributes
-    ----------
-    model : FieldModel or None
-        None if the references never gave a model: the model in force stays unchanged.
-    withheld : Withheld or None
-        Why no pose may be given; None where it may.
+    The model is None if the references never gave one: the active model stays unchanged.
     """
 
     model: FieldModel | None
@@ -57,12 +49,8 @@ UNCHANGED_MODEL = FrameModel(None)
 class ModelAge:
     """Keeps the last models that the references gave, and ages the newest until the next.
 
-    Parameters
-    ----------
-    longest_s : float
-        Age, s, from which on no pose is given.
-    volume : TrackedVolume
-        Where the size of a change of the field is taken.
+    From an age of ``longest_s`` on no pose is given. The size of a change of the field is taken in
+    the ``volume``.
     """
 
     def __init__(self, longest_s: float, volume: TrackedVolume) -> None:
@@ -77,7 +65,7 @@ class ModelAge:
         return self._answers[-1][0] if self._answers else 0
 
     def forget(self) -> None:
-        """Drop all answers: the model in force is no answer of the references."""
+        """Drop all answers: the active model is no answer of the references."""
         self._answers.clear()
         self._aged = None
 
@@ -94,14 +82,8 @@ class ModelAge:
         self._aged = None
 
     def at(self, stamp_ns: int, why: str = '') -> FrameModel:
-        """Return what a frame may be tracked with.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Of the frame.
-        why : str
-            Why the references gave no answer, where that is known.
+        """Return what a frame may be tracked with; ``why`` states why the references gave no
+        answer.
         """
         if not self._answers:
             return FrameModel(None, Withheld(REFERENCES_LOST, why)) if why else UNCHANGED_MODEL

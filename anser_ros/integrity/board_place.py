@@ -25,61 +25,40 @@ ComplexArray = NDArray[np.complex128]
 
 FAR_M = 5e-4
 """Distance between the model's board and the references' from which on the model is refused: half
-of the error that a pose may have beside three of its sigmas. A survey's 0.2 mm a sensor is a tenth
-of that among 32 of them. Smaller refuses models for errors of the survey; larger lets poses be
-wrong by as much, all alike."""
+of the error that a pose may have beside three of its sigmas."""
 FAR_SIGMAS = 5.0
 """The same in standard deviations of that distance, for few sensors or a poor survey: a correct
-model is farther off once in 65 000 times. Smaller refuses correct models for what the survey's
-errors make; larger lets a board that lies elsewhere pass where sensors are few."""
+model is farther off once in 65 000 times."""
 EXPLAINED = 1.0
 """Misfit of the typical reference, in what survey and manufacture allow, up to which the distance
-is believed: it is 1 where these are as they are stated, and was 0.04 and 0.5 on two simulated
-boards. Metal is no board that lies elsewhere, and is left to others to judge. Smaller leaves a
-board that lies aside to them when its survey is a little worse than stated; larger takes metal for
-a board that lies aside."""
+is believed (0.04 and 0.5 on two simulated boards): more is metal, which others judge."""
 MODEL_SHARE = 2e-3
 """Error of a calibrated model's field relative to itself, in the middle of the volume, that
-drawing and shift need not explain: on two simulated boards they left a sixth of it and less.
-Smaller takes the model's error for a shift; larger hides small shifts. Half and twice as much move
-the distance of a model 1 mm aside by 5 um at most."""
+drawing and shift need not explain. Half and twice as much move the distance by 5 um at most."""
 DRAWN_SHARE = 2e-3
 """Error of a drawn field with its coils moved, relative to itself, at the references: tracks are
-not where they are drawn either, and this is 0.07 mm at 10 cm. Smaller and larger do as they do for
-`MODEL_SHARE`; half and twice as much move the distance by 14 um at most."""
+not where they are drawn, which is 0.07 mm at 10 cm."""
 INNER = 0.5
-"""Part of the volume, from its middle, in which the model is asked: scans reach that far. Smaller
-asks where all is alike; larger, where the model was never measured. Half of it and the whole
-volume move the distance by 20 and 45 um."""
+"""Part of the volume, from its middle, in which the model is asked: scans reach that far."""
 SIDE = 4
-"""Points along a side of that part; three readings each. Fewer leave one bad place much weight;
-more tell the same again and cost time: three and six move the distance by 2 um at most."""
+"""Points along a side of that part; three readings each."""
 EFFECTIVE_READINGS = 40.0
-"""So many of these readings count, about one in five: neighbouring points tell the same. Smaller
-lets the readings of references decide alone; larger makes the model too sure of itself. Half and
-twice as many move the distance by 4 um at most."""
+"""So many of these readings count, about one in five: neighbouring points say the same."""
 PRIOR_M, PRIOR_RAD = 5e-3, 0.02
 """Standard deviations of how far a model lies aside before anything is known, m and rad: a board
-that was put down again by hand. Smaller pulls the distance towards nothing; larger lets noise find
-one where few references are read. With 32 references half and twice as much move it by 2 um."""
+that was put down again by hand."""
 WEIGHT_ROUNDS = 12
-"""Rounds in which sensors that do not fit lose weight. Fewer leave a sensor that is off some say
-in where the board lies; more cost time and change nothing: from the sixth on the distance stays
-within 1 um."""
+"""Rounds in which sensors that do not fit lose weight; from the sixth on the distance stays within
+1 um."""
 
 
 @dataclass(frozen=True)
 class Misplacement:
     """States how far a model's board lies from where the references have it.
 
-    Attributes
-    ----------
-    shift_m, turn_rad : ndarray, shape (3,)
-        Along and about x, y and z of fg, in the middle of the volume.
-    sigma_m : ndarray, shape (3,)
-        Standard deviations of the shift.
-    misfit : float
-        Of the typical reference with that, in what survey and manufacture allow.
+    The shift (3,), m, its standard deviations, and the turn (3,), rad, are along and about x, y
+    and z of fg, in the middle of the volume; ``misfit`` is that of the typical reference with
+    these, in what survey and manufacture allow.
     """
 
     shift_m: Array
@@ -98,20 +77,8 @@ class Misplacement:
 class BoardPlace:
     """Compares where a calibrated model and the references have the drawn board.
 
-    Parameters
-    ----------
-    model : FieldModel
-        Calibrated.
-    field : callable
-        The drawn field of its K coils.
-    centres : ndarray, shape (K, 3)
-        Centres of the coils, m.
-    volume : TrackedVolume
-        Where the model is good.
-    sensors : SensorTable
-        The R references at their stated places.
-    accuracy : Accuracy
-        Of the survey and the readings.
+    ``field`` is the drawn field of the K coils at ``centres`` (K, 3), m; ``volume`` is where the
+    model is good; ``sensors`` are the references at their stated places.
     """
 
     def __init__(
@@ -129,15 +96,8 @@ class BoardPlace:
     def misplacement(self, flux: ComplexArray) -> Misplacement | None:
         """Return how far the model lies from the board that the references see.
 
-        Parameters
-        ----------
-        flux : ndarray, shape (R, K), complex
-            Readings of the references, T, of one frame or of many; NaN rows are passed over.
-
-        Returns
-        -------
-        Misplacement or None
-            None where too few references have readings.
+        ``flux`` (R, K), T, are readings of one frame or of many; NaN rows are passed over. None
+        where too few references have readings.
         """
         good = np.isfinite(flux).all(axis=1)
         if good.sum() < FEWEST_SENSORS:

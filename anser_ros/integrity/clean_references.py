@@ -23,12 +23,10 @@ ComplexArray = NDArray[np.complex128]
 
 STABLE_SHARE = 0.25
 """Share of `Accuracy.reference_gain` that a sensor's reading may change by from one day to
-another: what it is known by at all is worse than how it keeps. Smaller, and a warm amplifier is
-taken for metal; larger, and metal that moves poses by a tenth of a millimetre is not noticed."""
+another: more than a warm amplifier does, less than metal that moves poses by 0.1 mm."""
 CERTAIN = 4.0
-"""Changes below so many times their noise do not count: it is that of a sensor's readings of all
-emitters together, which noise alone hardly takes past twice what it usually is. Smaller takes
-noise for metal; larger misses metal that weak readings see."""
+"""Changes below so many times their noise do not count; noise alone hardly passes twice its usual
+size, as it is that of readings of all emitters together."""
 FEWEST_SENSORS = RefitSettings.min_references
 """Sensors that have to be known: with fewer, the emitters' strengths explain what metal does."""
 PARTS = 3
@@ -36,42 +34,30 @@ PARTS = 3
 FEWEST_FRAMES_OF_CHANGE = 12
 """Frames in which a change is looked for: four a part. In fewer, noise hides it."""
 NOTICEABLE = 2e-4
-"""Change of a reading during a recording that counts, as a share of its size. Smaller refuses what
-moves poses by less than they jitter; larger lets metal into a baseline."""
+"""Change of a reading during a recording that counts, as a share of its size: it moves poses by
+more than they jitter."""
 MOST_SENSORS = 0.9
-"""Part of the sensors (0 to 1) that must not change by more. On the simulated board with 32
-references, metal at the limit moves poses by 0.09 mm in the median of 53 places (0.7 mm for one in
-ten); with half of the sensors, by 1.1 mm (7 mm). Larger, and a single bad sensor refuses a
-baseline."""
+"""Part of the sensors (0 to 1) that must not change by more: on the simulated board metal at the
+limit moves poses by 0.09 mm (median of 53 places), and by 1.1 mm with half of the sensors."""
 SAME_PLACE_M = 1e-4
-"""Farthest that a sensor may be from where it was at the calibration, m. A new survey tells of
-another place, where the old reading is worth nothing."""
+"""Farthest that a sensor may be from where it was at the calibration, m: else its old reading is
+worth nothing."""
 STRENGTH_STEPS = 25
-"""Steps in which sensors that changed most lose their say in the emitters' strengths. Fewer leave
-sensors beside metal some say; with a quarter of 32 sensors changed by up to 20 % the others seem
-to change by 5e-3 after 10 steps, and by 2e-5 after these, a tenth of what counts."""
+"""Steps in which sensors that changed most lose their say in the emitters' strengths: beside 8 of
+32 that changed by 20 % the others seem to change by 2e-5, and by 5e-3 after 10 steps."""
 DRAWN_GATE = 3.0
 """Root mean square of all readings' differences from the drawn board, in units of what survey and
-manufacture allow, from which on there is metal. It is 1 where these are stated as they are.
-Smaller, and a board that was made less well is refused; larger, and more metal passes."""
+manufacture allow (then it is 1), from which on there is metal."""
 DRAWING_ERROR = 1e-4
 """Error of a drawn field relative to itself: turns and leads are not drawn to less."""
 
 
 def change_without_gains(now: ComplexArray, before: ComplexArray) -> Array:
-    """Return by how much each sensor's readings changed, apart from a gain of each emitter.
+    """Return by how much each sensor's readings (R, K), T, changed, apart from a gain of each
+    emitter.
 
-    The gains are those of most sensors: the fit gives less weight to those that changed more.
-
-    Parameters
-    ----------
-    now, before : ndarray, shape (R, K), complex
-        T; rows with NaN are not used.
-
-    Returns
-    -------
-    ndarray, shape (R,)
-        Norm of the change over that of the reading; NaN where one is not known.
+    The norm of the change over that of the reading, (R,); NaN where one is not known. The gains
+    are those of most sensors: the fit gives less weight to those that changed more.
     """
     change = np.full(len(now), np.nan)
     known = np.isfinite(now).all(axis=1) & np.isfinite(before).all(axis=1)
@@ -94,10 +80,7 @@ def check_steady(flux: ComplexArray) -> float | None:
     The means of `PARTS` parts are compared with each other, beside a gain of each emitter: the
     strength of an emitter may drift while there is no metal, and a refit follows it.
 
-    Parameters
-    ----------
-    flux : ndarray, shape (F, R, K), complex
-        Frames of readings, T, in the order of time; NaN where a reading is bad.
+    ``flux`` (F, R, K): frames of readings, T, in the order of time; NaN where a reading is bad.
 
     Returns
     -------
@@ -143,18 +126,7 @@ def check_as_calibrated(
 ) -> bool:  # fmt: skip
     """Refuse readings that are not those of the calibration; return whether they were compared.
 
-    Parameters
-    ----------
-    known : ReferenceReadings
-        Of the calibration.
-    sensors : SensorTable
-        The R sensors now.
-    flux : ndarray, shape (R, K), complex
-        Their readings, T.
-    sigma_t : float
-        Noise of a component, T.
-    accuracy : Accuracy
-        How well a sensor's gain is known.
+    ``flux`` (R, K), T, are readings of the sensors now, with the noise ``sigma_t`` of a component.
 
     Raises
     ------
@@ -208,20 +180,8 @@ def check_as_drawn(
     """Refuse readings that the drawn board, its tolerances and the survey do not explain.
 
     It detects only large amounts of metal: a plate near the board, but not a piece of a hand's
-    breadth at the side.
-
-    Parameters
-    ----------
-    field : callable
-        The drawn field.
-    centres : ndarray, shape (K, 3)
-        Centres of the coils, m.
-    sensors : SensorTable
-        The R sensors.
-    flux : ndarray, shape (R, K), complex
-        Their readings, T; NaN rows are passed over.
-    accuracy : Accuracy
-        Of the survey and the readings.
+    breadth at the side. ``centres`` (K, 3), m, are those of the coils; ``flux`` (R, K), T, may
+    have NaN rows, which are passed over.
 
     Raises
     ------

@@ -14,27 +14,22 @@ from typing import NamedTuple
 from anser_ros.stamps import NANO
 
 STREAM_GAP_S = 0.5
-"""Frames further apart than this, s, are single points and no stream. Smaller, and a stream with
-gaps loses its memory; larger, and points that a robot visits once a second are taken for one."""
+"""Frames further apart than this, s, are single points and no stream, as of a robot that stops
+once a second."""
 RECORD_S = 1.0
-"""How far back refusals count, s. Smaller, and poses that slip through from time to time are taken
-for good ones; larger, and a tool is long without a pose after a distortion has ended."""
+"""How far back refusals count, s; after a distortion has ended a tool waits as long."""
 MOST_REFUSED = 0.5
-"""Share (0 to 1) of refused frames in the record from which on a good one needs confirmation. From
-the majority on a pass is more likely chance than not. Smaller withholds good poses after a few
-refusals; larger publishes the chance passes of a tool that is mostly refused."""
+"""Share (0 to 1) of refused frames in the record from which on a good one needs confirmation: a
+pass is then more likely chance than not."""
 START_FRAMES = 3
-"""Fewest consecutive frames, the last one included, that confirm a pose: 60 ms at 50 Hz. Fewer,
-and two wrong poses that pass one after the other are published; more, and a tool that appears is
-shown later."""
+"""Fewest consecutive frames, the last one included, that confirm a pose: 60 ms at 50 Hz. Two wrong
+ones may agree."""
 LONGEST_RUN_S = 0.25
-"""Longest run that is asked for, s; the run is as long as the refusal before it up to this.
-It is 12 frames at 50 Hz, which all pass by chance once in 5e5 times where a third do. Shorter lets
-wrong poses that agree for a moment pass; longer keeps a tool without poses after a disturbance."""
+"""Longest run that is asked for, s; the run is as long as the refusal before it up to this: 12
+frames at 50 Hz all pass by chance once in 5e5 times where a third do."""
 SIGMAS = 3.0
-"""Allowance for the poses' own errors, in units of `Place.sigma_m`, when they are compared with
-the bounds of the motion. Smaller, and an uncertain pose at rest counts as a jump; larger, and the
-leaps of uncertain poses pass."""
+"""Allowance for the poses' own errors, in units of `Place.sigma_m`, beside the bounds of the
+motion."""
 
 
 class MotionBounds(NamedTuple):

@@ -21,18 +21,11 @@ current that is 10 % off is another fault."""
 
 @dataclass(frozen=True)
 class DrawnReadings:
-    """Holds in-phase fluxes of S sensors over a drawn board of K coils, with their derivatives.
+    """Holds in-phase fluxes (S, K), T, of S sensors over a drawn board of K coils, with
+    derivatives.
 
-    Attributes
-    ----------
-    points, axes : ndarray, shape (S, 3)
-        Places (m) and unit axes of the sensors, frame fg.
-    flux : ndarray, shape (S, K)
-        T.
-    by_place : ndarray, shape (3, S, K)
-        Derivative by the place, T/m.
-    by_axis : ndarray, shape (3, S, K)
-        Derivative by the axis' vector, T.
+    The sensors are at points (S, 3), m, with unit axes (S, 3), frame fg; the derivatives (3, S, K)
+    are by the place, T/m, and by the axis' vector, T.
     """
 
     points: Array

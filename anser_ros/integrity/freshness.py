@@ -20,24 +20,20 @@ from anser_ros.kernel_cache import kernel
 from anser_ros.stamps import NANO
 
 LEAST_NOISE = 0.1
-"""The noise of a reading is at least so many times the stated one. Larger, and a lab that states
-its noise several times too large has readings called stuck that are quiet; smaller, and a stuck
-column whose current is still measured needs longer to be seen."""
+"""The noise of a reading is at least so many times the stated one, which a lab may state several
+times too large."""
 CURRENT_NOISE = 2e-5
-"""Relative change of a stuck column's flux by the noise of the current that it is divided by. It
-is some times that of a 16-bit converter over 20 ms. Smaller, and a stuck column of a unit with
-noisier currents passes for new; larger, and a weak column takes longer to be told from it."""
+"""Relative change of a stuck column's flux by the noise of the current that it is divided by: some
+times that of a 16-bit converter over 20 ms."""
 ROUNDING = 2.0**-21
 """Relative difference of two readings of the same samples: fluxes travel as float32, rounded to
-2^-24, after a fit to tones of another phase. Larger, and readings of little noise near the board
-look like copies; smaller, and copies look new."""
+2^-24, after a fit to tones of another phase."""
 CERTAIN = 35.0
-"""Logarithm of the odds from which on a reading is stuck. A comparison is wrong with a probability
-of exp(-35) = 6e-16 at most: with 100 channels at 50 Hz, once in a century.
-Smaller, and a still tool is called stuck; larger, and a few emitters need a longer run."""
+"""Logarithm of the odds from which on a reading is stuck: wrong with a probability of exp(-35) =
+6e-16, with 100 channels at 50 Hz once in a century."""
 DEPTH = 100
-"""Readings that are kept of each channel: two seconds at 50 Hz, so the copies of a buffer of up to
-that length are found. Fewer, and a longer buffer passes; more, and each frame costs more."""
+"""Readings that are kept of each channel, two seconds at 50 Hz: the longest buffer whose copies
+are found."""
 HOPELESS = -60.0
 """Logarithm of the odds of one comparison below which the rest of it is not worked out."""
 
@@ -46,9 +42,9 @@ HOPELESS = -60.0
 def _fill_terms(now, least, terms):  # type: ignore[no-untyped-def]
     """Write what makes the odds of a repetition of ``now`` (K,): a place and four numbers a row.
 
-    The weakest emitter comes first: it tells most of noise, and mostly ends the comparison. The
+    The weakest emitter comes first: it shows noise best, and mostly ends the comparison. The
     rows hold, exactly and but for the currents, the odds of no difference at all, and by how much
-    they fall with a squared difference. Returns how many emitters tell anything.
+    they fall with a squared difference. Returns how many emitters count.
     """
     count, weakest, smallest = 0, 0, math.inf
     for k in range(now.shape[0]):
@@ -110,7 +106,7 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
 
 
 class Freshness:
-    """Tells readings that repeat an earlier one.
+    """Finds readings that repeat an earlier one.
 
     Attributes
     ----------
@@ -130,14 +126,9 @@ class Freshness:
         self._filled, self._newest = 0, -1
 
     def judged(self, frame: Frame, noise_t: float) -> Frame:
-        """Return the frame with its stuck readings marked.
+        """Return the next frame of a stream with its stuck readings marked.
 
-        Parameters
-        ----------
-        frame : Frame
-            The next one of a stream.
-        noise_t : float
-            Stated noise of a phasor component, T.
+        ``noise_t`` is the stated noise of a phasor component, T.
         """
         if frame.goes_back or self._ring.shape[1:] != frame.flux.shape:
             self._forget(frame.flux.shape)

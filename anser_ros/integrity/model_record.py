@@ -15,19 +15,16 @@ RECORD_S = 2.0
 """How far back readings count, s. Smaller, and metal that passes makes the model doubtful; larger,
 and a wrong model gives poses for longer."""
 DOUBTFUL = 0.8
-"""Share of refused readings from which on the model is doubtful. Smaller, and metal near a part of
-the tools takes the poses of the others; larger, and a model that is a little wrong, of which every
-third pose passes, is believed."""
+"""Share of refused readings from which on the model is doubtful; by chance every third pose passes
+a model that is a little wrong."""
 FEWEST_JUDGED_READINGS = 6
-"""Readings that a share is made of at least. Fewer, and a single bad coil is the whole chain."""
+"""Readings that a share is made of at least: a single bad coil is not the whole chain."""
 GOOD_SHARE = 0.2
-"""Share (0 to 1) of refused readings up to which a frame speaks for the model. It is one bad coil
-of five. Smaller lets that coil keep a correct model doubtful; larger believes a model again that
-is still wrong for part of the tools."""
+"""Share (0 to 1) of refused readings up to which a frame speaks for the model: one bad coil of
+five."""
 RECOVERY_S = 0.5
-"""For so long, s, all frames must speak for a doubtful model before it gives poses again. Smaller,
-and a model that is wrong somewhere gives poses where it happens to fit; larger, and poses come
-later after metal has gone."""
+"""For so long, s, all frames must speak for a doubtful model before it gives poses again: where it
+happens to fit, it is not yet right."""
 
 
 class ModelRecord:
@@ -50,16 +47,9 @@ class ModelRecord:
         return self._refused / max(self._total, 1)
 
     def add(self, stamp_ns: int, refused: int, total: int, residual: float) -> None:
-        """Take in a frame.
+        """Take in a frame: how many of its readings the model did not explain.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Of the frame.
-        refused, total : int
-            Readings that the model did not explain, and readings that there were.
-        residual : float
-            Typical residual of the refused ones in units of the expected one; NaN for none.
+        ``residual`` is the typical one of these in units of the expected one; NaN for none.
         """
         last_ns = self._last_ns
         if not last_ns or not 0 < stamp_ns - last_ns <= STREAM_GAP_S / NANO:

@@ -23,28 +23,25 @@ from anser_ros.physics.tangent import fill_tangent
 Array = NDArray[np.float64]
 
 SELDOM = 1e-6
-"""Probability that a sound coil contradicts its body. Larger, and good poses are lost; smaller,
-and a coil has to be further away to be noticed."""
+"""Probability that a sound coil contradicts its body."""
 GATE = float(chdtri(5, SELDOM))
 """Squared Mahalanobis distance (three of the position, two of the axis) from which on a coil
 contradicts its body; 36, six sigma in one direction."""
 
 
 HARMFUL_M = 1e-3
-"""An error of a pose that does harm, m, where the pose's own sigma does not say it. Smaller, and
-good poses are lost to the survey's errors; larger, and who relies on a millimetre is misled."""
-SIGMAS = 3.0
+"""An error of a pose that does harm, m, where the pose's own sigma does not say it."""
+BODY_SIGMAS = 3.0
 """How many of its sigmas a pose may be away from where its body says. An error of a sound pose is
 that large once in 10^5 frames: sigma is that of all three directions together."""
 SURVEYS = 6.0
 """How many times the stated error of the survey, an axis, a coil may be away, if that is more: one
-of 1e7 coils is, if the survey is as stated. Smaller loses good poses of bodies that were surveyed
-poorly; larger lets a coil that has moved pass."""
+of 1e7 coils is, if the survey is as stated."""
 
 
 def allowed_m(sigma_m: float, survey_m: float) -> float:
     """Return how far, m, a coil may be off its place in the body by its sigma and the survey's."""
-    return max(SIGMAS * sigma_m, HARMFUL_M, SURVEYS * survey_m)
+    return max(BODY_SIGMAS * sigma_m, HARMFUL_M, SURVEYS * survey_m)
 
 
 @dataclass(frozen=True)
@@ -115,7 +112,10 @@ def distances(
     took_part: NDArray[np.bool_],
     survey: SurveyErrors,
 ) -> Array:
-    """Return how far each coil's own pose is from its place in the body, m.
+    """Return how far each coil's own pose is from its place in the body, (3, S).
+
+    The squared Mahalanobis distance, to be compared with `GATE`; the distance, m; the angle
+    between the axes, rad.
 
     Parameters
     ----------
@@ -128,12 +128,6 @@ def distances(
     took_part : ndarray of bool, shape (S,)
         Whether the body's pose made use of the coil.
     survey : SurveyErrors
-
-    Returns
-    -------
-    ndarray, shape (3, S)
-        The squared Mahalanobis distance, to be compared with `GATE`; the distance, m; the angle
-        between the axes, rad.
     """
     found = np.empty((3, len(offsets)))
     survey_errors = np.array([survey.position_m, survey.axis_rad, survey.gain])

@@ -12,8 +12,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 
 SILENT_S = 1.0
-"""A sender of a stream that said nothing for this time, s, counts as gone. Smaller, and two that
-send in turns pass for one; larger, and a sender that was started again is taken later."""
+"""A sender of a stream that said nothing for this time, s, counts as gone."""
 
 
 @dataclass
@@ -28,18 +27,13 @@ class _Run:
 class Senders:
     """Distinguishes the senders of one topic.
 
-    Parameters
-    ----------
-    topic : str
-        As it is called in `complaint`.
-    is_constant : bool
-        Whether what a sender says never changes: who says otherwise is another one, whatever
-        number the message has.
+    With ``is_constant`` what a sender says never changes: who says otherwise is another one,
+    whatever number the message has.
 
     Attributes
     ----------
     complaint : str
-        Why the topic can't be believed now; empty while it has one sender.
+        Why the topic, by its name, can't be believed now; empty while it has one sender.
     """
 
     def __init__(self, topic: str, is_constant: bool = False) -> None:
@@ -49,11 +43,11 @@ class Senders:
         self.complaint = ''
 
     def forget(self) -> None:
-        """Forget all that was heard."""
+        """Forget all that was received."""
         self._runs, self.complaint = [], ''
 
     def continues(self, number: int | None) -> bool:
-        """Return whether a message is the next one of the only sender that is heard."""
+        """Return whether a message is the next one of the only sender that is received."""
         return len(self._runs) == 1 and number == self._runs[0].number + 1
 
     def take(
@@ -61,17 +55,9 @@ class Senders:
     ) -> bool:
         """Take a message; return whether it may be believed.
 
-        Parameters
-        ----------
-        number : int or None
-            Its sender's number for it; None where the middleware gives none.
-        publishers : int
-            How many the graph knows.
-        now_s : float
-            Monotonic time.
-        lasting : hashable, optional
-            What it says, where that holds until the sender says otherwise. Senders that say the
-            same do not contradict each other.
+        ``number`` is its sender's number for it, None where the middleware gives none;
+        ``publishers`` is how many the graph knows. ``lasting`` is what it says, where that holds
+        until the sender says otherwise: senders that say the same do not contradict each other.
         """
         self._is_numbered = number is not None
         if number is not None:
@@ -104,7 +90,7 @@ class Senders:
         """Drop the runs that have ended.
 
         A lasting message outlives its sender's silence. When one of several senders has gone, it
-        is unknown which, so their messages stay in force until they are forgotten and requested
+        is unknown which, so their messages stay valid until they are forgotten and requested
         again.
         """
         self._runs = [
@@ -114,10 +100,9 @@ class Senders:
         ]
 
     def _is_ended(self, lasting: Hashable, now_s: float) -> bool:
-        """Whether silence tells that a sender has gone, to whom another one may succeed.
+        """Return whether silence shows that a sender has gone, to whom another one may succeed.
 
-        It does not where what was said holds on: a graph of one publisher may not know the second
-        one yet, whose message says something else.
+        It does not where what was said holds on: the graph may not know the second one yet.
         """
         (run,) = self._runs
         if run.lasting is not None:

@@ -7,7 +7,6 @@ where the metal is. How large the lattice is decides what it predicts in frames 
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +25,8 @@ Report = Callable[[str, float], None]
 TRIAL_FRAMES = 14
 """Frames that the size of a lattice is tried with."""
 COUNTS, SPACINGS_M = (9, 9, 2), (0.015, 0.025, 0.035, 0.045)
-"""Points across and up, and the spacings that are tried: bodies of 14 to 40 cm. A lattice smaller
-than the body makes its path too short and carries badly to other places; a finer one costs time
-with the cube of its points."""
+"""Points across and up, and the spacings that are tried: bodies of 14 to 40 cm. A smaller lattice
+than the body carries badly to other places; time grows with the cube of the points."""
 MISFITS = (0.3, 0.1, 0.05, 0.02)
 """Relative error of a lattice's readings that each stage of the fit allows: with the last one from
 the start, frames near the metal decide before their pose is known, and the fit gets stuck."""
@@ -59,20 +57,9 @@ def learn_metal(
 ) -> KnownMetal:
     """Learn the metal that is in some frames.
 
-    Parameters
-    ----------
-    frames : sequence of MetalFrame
-        In the order of time; every other one takes no part, and tells what is left unexplained.
-    excitation : Excitation
-    frequencies_hz : tuple of float
-        Of the emitters.
-    volume : TrackedVolume
-    noise_t : float
-        Noise of a phasor component of the readings, T.
-    name : str
-        Of the metal.
-    report : callable, optional
-        Called with the stage and its share done.
+    Every other one of the frames, in the order of time, takes no part, and shows what is left
+    unexplained. ``noise_t`` is that of a phasor component of the readings, T; ``report`` is called
+    with the stage and its share done.
 
     Raises
     ------
@@ -115,14 +102,6 @@ def learn_metal(
         fit.poses[:, :3].min(axis=0), fit.poses[:, :3].max(axis=0),
         fit.poses[len(fit.poses) // 2, 3:],
     )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _FrameRows:
-    """Whitened readings of a frame: what is left, and columns by answers and pose."""
-
-    left: Array
-    columns: Array
 
 
 class _Fit:
@@ -186,23 +165,23 @@ class _Fit:
         cost += float((((poses - self._starts) / self._pose_sigma) ** 2).sum())
         cost += float(((np.diff(poses, axis=0) / self._move_sigma) ** 2).sum())
         for frame, pose in zip(self._frames, poses, strict=True):
-            rows = self._rows(frame, lattice, pose, with_columns=False)
-            cost += float(rows.left @ rows.left)
+            off, _ = self._rows(frame, lattice, pose, with_columns=False)
+            cost += float(off @ off)
         return cost
 
     def _rows(
         self, frame: MetalFrame, lattice: Lattice, pose: Array, *, with_columns: bool = True
-    ) -> _FrameRows:
-        """Return whitened readings of a frame."""
+    ) -> tuple[Array, Array]:
+        """Return whitened readings of a frame: what is left, and columns by answers and pose."""
         placed = self._setting.placed(lattice, pose)
         left, columns = [], []
         for reading in frame.readings:
             flux = self._setting.flux(lattice, placed, reading.coils)
             # The size is that of the readings where they don't contain errors of a pose.
             size = flux if reading.shared.size else reading.change
-            loud = np.sqrt((np.abs(size) ** 2).mean(axis=1) / 2.0)
+            size_t = np.sqrt((np.abs(size) ** 2).mean(axis=1) / 2.0)
             noise = np.tile(
-                np.repeat(np.hypot(self._noise, self._allowed * loud), len(flux[0])), 2
+                np.repeat(np.hypot(self._noise, self._allowed * size_t), len(flux[0])), 2
             )
             parts = [real_parts((reading.change - flux).ravel())[:, None]]
             if with_columns:
@@ -218,22 +197,22 @@ class _Fit:
                 table /= noise[:, None]
             left.append(table[:, 0])
             columns.append(table[:, 1:])
-        return _FrameRows(np.concatenate(left), np.concatenate(columns))
+        return np.concatenate(left), np.concatenate(columns)
 
     def _normal(self) -> tuple[Array, Array]:
         """Return the normal matrix and right side of answers (4n), then poses (6 a frame)."""
         m, count = 4 * len(self.lattice), len(self._frames)
         normal, pull = np.zeros((m + 6 * count, m + 6 * count)), np.zeros(m + 6 * count)
         for f, (frame, pose) in enumerate(zip(self._frames, self.poses, strict=True)):
-            rows = self._rows(frame, self.lattice, pose)
-            answers, own = rows.columns[:, :m], rows.columns[:, m:]
+            off, columns = self._rows(frame, self.lattice, pose)
+            answers, own = columns[:, :m], columns[:, m:]
             at = slice(m + 6 * f, m + 6 * f + 6)
             normal[:m, :m] += answers.T @ answers
             normal[:m, at] = answers.T @ own
             normal[at, :m] = normal[:m, at].T
             normal[at, at] = own.T @ own
-            pull[:m] += answers.T @ rows.left
-            pull[at] = own.T @ rows.left
+            pull[:m] += answers.T @ off
+            pull[at] = own.T @ off
         which = np.arange(m)
         normal[which, which] += self._prior**-2.0
         pull[:m] -= self.lattice.parameters / self._prior**2
@@ -259,10 +238,10 @@ class _Fit:
         for frame in frames:
             pose = np.array([np.interp(frame.time, times, self.poses[:, i]) for i in range(6)])
             for _ in range(3):
-                rows = self._rows(frame, self.lattice, pose)
-                own = rows.columns[:, 4 * len(self.lattice) :]
+                off, columns = self._rows(frame, self.lattice, pose)
+                own = columns[:, 4 * len(self.lattice) :]
                 normal = own.T @ own + np.diag(self._pose_sigma**-2.0)
-                pose = moved(pose, np.asarray(np.linalg.solve(normal, own.T @ rows.left)))
+                pose = moved(pose, np.asarray(np.linalg.solve(normal, own.T @ off)))
             reading = frame.readings[0]
             placed = self._setting.placed(self.lattice, pose)
             flux = self._setting.flux(self.lattice, placed, reading.coils)

@@ -63,18 +63,8 @@ class _Track:
 class KnownMetalFollower:
     """Follows known metal by the tools alone.
 
-    Parameters
-    ----------
-    known : KnownMetal
-    model : FieldModel
-        Calibrated.
-    excitation : Excitation
-    sensors : SensorTable
-        Of the rigid tools.
-    tools : ToolSettings
-    volume : TrackedVolume
-    noise_t : float
-        Of a phasor component of the tools' readings, T.
+    ``sensors`` are those of the rigid tools, ``noise_t`` is that of a phasor component of their
+    readings, T.
     """
 
     def __init__(
@@ -138,12 +128,8 @@ class KnownMetalFollower:
     ) -> None:
         """Take in what rigid tools read in a frame, at poses that are near theirs.
 
-        Parameters
-        ----------
-        stamp_ns : int
-        readings : sequence of ToolReading
-        near : ndarray, shape (P, 3), optional
-            Where all coils are, m, those of no rigid tool among them; by default those that read.
+        ``near`` (P, 3): where all coils are, m, those of no rigid tool among them; by default
+        those that read.
         """
         seconds = self._seconds_to(stamp_ns)
         if not readings:

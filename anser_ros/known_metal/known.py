@@ -66,15 +66,7 @@ def directions_of(
 ) -> Array:
     """Return the `DIRECTIONS` in which answers may be wrong that the field in a volume feels most.
 
-    Parameters
-    ----------
-    lattice : Lattice
-    covariance : ndarray, shape (4n, 4n)
-        Of its parameters.
-    setting : Setting
-    poses : ndarray, shape (F, 6)
-        Where its field is looked at.
-    volume : TrackedVolume
+    ``covariance`` (4n, 4n): of its parameters. ``poses`` (F, 6): where its field is looked at.
     """
     coils = Coils(*along_each_axis(volume.samples(*SAMPLES)), None)
     rows = []

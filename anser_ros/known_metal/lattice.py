@@ -150,21 +150,15 @@ class Lattice:
 class PlacedLattice:
     """Holds a lattice at a pose in the emitters' field.
 
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3)
-        m, frame fg.
-    turn : ndarray, shape (3, 3)
-        From the body's axes to fg.
-    driving : ndarray, shape (K, 3n)
-        The emitters' fields at the points, in the body's axes, T.
+    Its points (n, 3) are in m, frame fg; ``turn`` (3, 3) is from the body's axes to fg;
+    ``driving`` (K, 3n), T, are the emitters' fields at the points, in the body's axes.
     """
 
     points: Array
     turn: Array
     driving: Array
 
-    def heard(self, coils: Coils) -> Array:
+    def received(self, coils: Coils) -> Array:
         """Return the fluxes (S, 3n) of unit moments along the body's axes, T."""
         basis = vector_basis(coils.at, coils.axes, coils.lengths, self.points) @ self.turn
         return np.asarray(basis.reshape(len(coils.at), -1))
@@ -184,11 +178,7 @@ class PlacedLattice:
 class Setting:
     """Places lattices in the field of some emitters.
 
-    Parameters
-    ----------
-    excitation : Excitation
-    tilt : ndarray, shape (K,)
-        Of the lattices, see `Lattice.tilt`.
+    ``tilt`` (K,): of the lattices, see `Lattice.tilt`.
     """
 
     def __init__(self, excitation: Excitation, tilt: Array) -> None:
@@ -209,14 +199,14 @@ class Setting:
 
     def flux(self, lattice: Lattice, placed: PlacedLattice, coils: Coils) -> ComplexArray:
         """Return what coils read of a lattice, (S, K), in the emitters' phases, T."""
-        return np.asarray(placed.heard(coils) @ lattice.moments(placed.driving, self.tilt).T)
+        return np.asarray(placed.received(coils) @ lattice.moments(placed.driving, self.tilt).T)
 
     def fluxes(self, lattice: Lattice, poses: Array, coils: Coils) -> ComplexArray:
         """Return what coils read of a lattice at each of some poses (P, 6), (P, S, K), T."""
         placed = self.all_placed(lattice, poses)
         moments = lattice.moments(np.array([one.driving for one in placed]), self.tilt)
         pairs = zip(placed, moments, strict=True)
-        return np.array([one.heard(coils) @ raised.T for one, raised in pairs])
+        return np.array([one.received(coils) @ raised.T for one, raised in pairs])
 
     def pose_columns(self, lattice: Lattice, pose: Array, coils: Coils) -> ComplexArray:
         """Return the derivative (S, K, 6) of the flux by a step of the lattice, see `moved`."""
@@ -231,9 +221,9 @@ class Setting:
         """Return the derivative (S, K, 4n) of the flux by the `Lattice.parameters`."""
         out, _, into = lattice.scattering
         n = len(lattice)
-        heard = (placed.heard(coils) @ out).reshape(len(coils.at), n, 3)
+        received = (placed.received(coils) @ out).reshape(len(coils.at), n, 3)
         felt = (placed.driving @ into.T).reshape(len(placed.driving), n, 3)
-        by = lattice.unit * np.einsum('snj,knj->skn', heard, felt, optimize=True)
+        by = lattice.unit * np.einsum('snj,knj->skn', received, felt, optimize=True)
         tilted = self.tilt[None, :, None] * by
         return np.concatenate([by, 1j * by, tilted, 1j * tilted], axis=2)
 

@@ -1,7 +1,6 @@
 """Holds what coils read of metal, with what is known of their errors."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +11,10 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
-@dataclass(frozen=True)
-class CoilReadings:
-    """Holds what coils read beyond the calibrated model, and how well that is known.
+class CoilReadings(NamedTuple):
+    """Holds what coils read beyond the calibrated model, (S, K), T, in the emitters' phases.
 
-    Attributes
-    ----------
-    coils : Coils
-    change : ndarray, shape (S, K), complex
-        In the emitters' phases, T.
-    shared : ndarray, shape (2 S K, m)
-        Effect of errors of unit variance, T: real parts, then imaginary parts.
+    ``shared`` (2 S K, m) is the effect of errors of unit variance, T: real parts, then imaginary.
     """
 
     coils: Coils
@@ -30,18 +22,11 @@ class CoilReadings:
     shared: Array
 
 
-@dataclass(frozen=True)
-class MetalFrame:
-    """Holds what references and tools read of metal in one frame.
+class MetalFrame(NamedTuple):
+    """Holds what references and tools read of metal in one frame, at a time in s.
 
-    Attributes
-    ----------
-    time : float
-        s.
-    readings : tuple of CoilReadings
-        Of the references, then of each tool with a pose.
-    place : ndarray, shape (3,)
-        Where the refit sees the metal, m.
+    The readings are those of the references, then of each tool with a pose; ``place`` (3,), m, is
+    where the refit sees the metal.
     """
 
     time: float

@@ -42,15 +42,7 @@ def likely_starts(
 ) -> tuple[list[Array], float]:
     """Return poses (6,) of the metal that explain a tool's readings best, the best first, apart.
 
-    Parameters
-    ----------
-    scene : Scene
-    tools : ToolSettings
-    reading : ToolReading
-        At a pose that is right to some centimetres.
-    places : ndarray, shape (P, 3)
-        To be tried, m.
-    most : int
+    ``reading``: at a pose that is right to some centimetres. ``places`` (P, 3): to be tried, m.
 
     Returns
     -------

@@ -10,7 +10,7 @@ filter predicted from the frames before (`predicted`), so that no reading counts
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,16 +104,8 @@ class MetalState:
 class Scene:
     """Holds what does not change: known metal, the calibrated model, and the tools' coils.
 
-    Parameters
-    ----------
-    known : KnownMetal
-    model : FieldModel
-    excitation : Excitation
-    sensors : SensorTable
-        Of all rigid tools.
-    tools : ToolSettings
-    noise_t : float
-        Noise of a phasor component of what tools read, T.
+    ``sensors``: of all rigid tools. ``noise_t``: noise of a phasor component of what tools read,
+    T.
     """
 
     def __init__(
@@ -163,22 +155,14 @@ class Scene:
         return (np.array(first)[:, None] + np.arange(7)).ravel()
 
 
-@dataclass(frozen=True)
-class MetalUpdate:
-    """Holds what a frame's readings made of a state.
+class MetalUpdate(NamedTuple):
+    """Holds what a frame's readings made of a state, and their log likelihood.
 
-    Attributes
-    ----------
-    state : MetalState
-    reading : ToolReading
-        At the pose that was found with the metal.
-    ratio : float
-        Squared misfit to the prediction per degree of freedom; 1 is expected, or less.
-    log_likelihood : float
+    ``ratio`` is the squared misfit to the prediction per degree of freedom; 1 is expected, or
+    less.
     """
 
     state: MetalState
-    reading: ToolReading
     ratio: float
     log_likelihood: float
 
@@ -201,14 +185,7 @@ def predicted(state: MetalState, seconds: float) -> MetalState:
 def updated(scene: Scene, state: MetalState, reading: ToolReading, step_s: float) -> MetalUpdate:
     """Take in what a tool reads, at a pose that is near its own.
 
-    Parameters
-    ----------
-    scene : Scene
-    state : MetalState
-        As predicted for the frame.
-    reading : ToolReading
-    step_s : float
-        Time between frames, s.
+    ``state``: as predicted for the frame. ``step_s``: time between frames, s.
     """
     lasting = 1.0 + MEMORY_S / step_s
     covariance, columns = state.covariance, scene.own_columns(reading.table)
@@ -230,7 +207,7 @@ def updated(scene: Scene, state: MetalState, reading: ToolReading, step_s: float
         now = state.stepped(spread.T @ solved)
         reading = _shifted(reading, rows.pose.T @ solved)
     left = covariance - spread.T @ cho_solve(factor, spread)
-    return MetalUpdate(replace(now, covariance=0.5 * (left + left.T)), reading, ratio, likelihood)
+    return MetalUpdate(replace(now, covariance=0.5 * (left + left.T)), ratio, likelihood)
 
 
 def _posed(
@@ -248,14 +225,8 @@ def posed(
 ) -> ToolReading:
     """Return a reading at the pose that fits with a model.
 
-    Parameters
-    ----------
-    scene : Scene
-    model : FieldModel
-    reading : ToolReading
-        At a pose that is right to some centimetres.
-    errors, spread : ndarray, shapes (7 S,), (7 S, 7 S)
-        Mean and covariance of the errors of its coils, as `CoilErrors`.
+    ``reading``: at a pose that is right to some centimetres. ``errors``, ``spread`` (7 S,), (7 S,
+    7 S): mean and covariance of the errors of its coils, as `CoilErrors`.
     """
     for _ in range(POSE_ROUNDS):
         rows = linearised(reading, model, model.moments, scene.turn)
@@ -275,8 +246,7 @@ def _shifted(reading: ToolReading, shift: Array) -> ToolReading:
     )
 
 
-@dataclass(frozen=True)
-class _Linearised:
+class _Linearised(NamedTuple):
     """Readings of a tool over the noise: real parts, then imaginary parts.
 
     ``left`` is what they leave of the prediction, ``design`` how they depend on the state,
@@ -318,15 +288,8 @@ def field_of(
 ) -> tuple[FieldModel, PlacedLattice]:
     """Return the field with the metal of a state, and its uncertainty as modes.
 
-    Parameters
-    ----------
-    scene : Scene
-    state : MetalState
-    near : ndarray, shape (P, 3)
-        Where tools are, m: the modes are right there.
-    modes : int
-    growth : float
-        Factor on the variance of all that is uncertain.
+    ``near`` (P, 3): where tools are, m: the modes are right there. ``growth``: factor on the
+    variance of all that is uncertain.
     """
     setting, lattice = scene.setting, scene.lattice(state.answers)
     placed = setting.placed(lattice, state.pose)

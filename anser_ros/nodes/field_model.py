@@ -15,7 +15,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from anser_ros import pose_states as states
-from anser_ros.errors import AnserError, FitError, ModelFileError, ParameterError
+from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.nodes.field_model_parts import refit_status
@@ -23,9 +23,8 @@ from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelP
 from anser_ros.nodes.field_model_parts.kept_baseline import CONFIRM_S, KeptBaseline
 from anser_ros.nodes.field_model_parts.metal_view import MetalView
 from anser_ros.nodes.field_model_parts.model_output import ModelOutput
-from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
 from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
-from anser_ros.nodes.field_model_parts.refit_in_force import RefitInForce
+from anser_ros.nodes.field_model_parts.refit_in_force import ActiveRefit
 from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
@@ -40,7 +39,6 @@ from anser_ros.refit.change import Pace
 from anser_ros.sessions.baseline import clean_flux, clean_mean
 from anser_ros.sessions.kept_tables import ReadAhead, kept_folder
 from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, save_model
-from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import is_nominal, model_of, starting_model
 from anser_ros.stamps import is_live
@@ -80,17 +78,13 @@ class FieldModelNode(AnserNode):
         self._metal = MetalView(self)
         setups = setup_source(self, self._on_setup)
         self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
-        topics = parse_patches(table.patches)
-        self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)
         name = self.get_fully_qualified_name()
         folder = kept_folder(table.keep_state)
-        ahead = ReadAhead(folder, self._file_model) if table.refit else None
-        kept = KeptBaseline(folder, name, self._fluxes.sender, ahead)
-        if table.witnesses and topics:
-            raise ParameterError('witnesses: tools cannot be witnesses where patches move')
+        ahead = ReadAhead(folder, self._file_model if table.refit else None)
+        kept = KeptBaseline(folder, name, self._fluxes.sender)
         witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)
-        self._refit = RefitInForce(self._moving, witnesses, self._pace, self.count, kept)
-        self._sources = [setups, self._fluxes, *self._moving.sources, *witnesses.sources]
+        self._refit = ActiveRefit(witnesses, self._pace, self.count, kept, ahead)
+        self._sources = [setups, self._fluxes, *witnesses.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)
@@ -175,7 +169,7 @@ class FieldModelNode(AnserNode):
     def _update(self, frame: Frame) -> None:
         """Let the model follow the references, not more often than wanted.
 
-        Every frame is answered with the model in force for it, even if that is unchanged: so the
+        Every frame is answered with its active model, even if that is unchanged: so the
         tracker knows the model for each frame, and gives the same poses as offline.
         """
         result, model = self._refit.follow(frame), self._model
@@ -207,7 +201,7 @@ class FieldModelNode(AnserNode):
     # The model and its baseline -----------------------------------------------------------
 
     def _serve(self, model: FieldModel, stamp_ns: int, withheld: str = '') -> None:
-        """Put a model in force under a stamp that the last one did not have.
+        """Activate a model under a stamp that the last one did not have.
 
         The model of a frame of readings has their stamp, which may be of another day. ``withheld``
         is the state for which trackers should publish no poses, at once or soon.
@@ -253,7 +247,7 @@ class FieldModelNode(AnserNode):
         self._announce_changes()
 
     def _announce_changes(self) -> None:
-        """Let receivers know of another state than the one that they were told."""
+        """Let receivers know of another state than the one that they received."""
         if self._model is not None and self._announced != self._state:
             withheld = self._refit.withheld if self._follows else ''
             self._serve(self._model, self.get_clock().now().nanoseconds, withheld)
@@ -268,12 +262,12 @@ class FieldModelNode(AnserNode):
         self.count('baselines')
 
     def _take_refit(self) -> None:
-        """Use a refit that has been made meanwhile, and tell of it."""
+        """Use a refit that has been made meanwhile, and report it."""
         try:
             if not self._refit.take():
                 return
             self._received_s = time.monotonic()
-            self.get_logger().info(refit_status.IN_FORCE)
+            self.get_logger().info(refit_status.ACTIVE)
         except FitError as error:
             self._refuse_baseline(error)
         self._announce_changes()
@@ -345,7 +339,7 @@ class FieldModelNode(AnserNode):
         response.message = f'baseline of {good} references over {len(self._window)} frames'
         return response
 
-    # What is told -------------------------------------------------------------------------
+    # What is reported -------------------------------------------------------------------------
 
     def _refuse(self, counter: str, error: AnserError) -> None:
         self._trouble.say(str(error), time.monotonic())
@@ -359,7 +353,7 @@ class FieldModelNode(AnserNode):
         self._announce_changes()
 
     def status(self) -> Status:
-        """Return which model is in force, where it comes from, and what the refit does."""
+        """Return which model is active, where it comes from, and what the refit does."""
         model = self._model
         values: dict[str, object] = {'last_refusal': self._trouble.last}
         conflict = sender_words(self._sources)

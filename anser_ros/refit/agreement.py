@@ -21,12 +21,8 @@ how far behind the best a hypothesis may be to be worked out so: a verdict turns
 def left_out(bank: Bank, seen: FrameEvidence, hypothesis: int) -> tuple[Array, Array]:
     """Return how far each coil's readings are from what all others predict.
 
-    Returns
-    -------
-    chi2 : ndarray, shape (S,)
-        Squared distance in units of the prediction's covariance; 2 K degrees of freedom.
-    residual : ndarray, shape (S, K, 2)
-        Measured minus predicted, in noise units.
+    First the squared distances (S,) in units of the prediction's covariance, of 2 K degrees of
+    freedom; then measured minus predicted (S, K, 2), in noise units.
     """
     precision, _ = bank.precision(seen.noise)
     n, (real, imaginary) = len(bank.rows), seen.strength[hypothesis].argmax(axis=1).tolist()
@@ -47,16 +43,8 @@ def evidence_without(
     """Return the evidence without the first of some coils, the first two, and so on to all Q.
 
     By the rules of the conditional normal distribution no matrix is decomposed again. The change
-    of the evidence is taken from the likelihood of the most likely strengths.
-
-    Parameters
-    ----------
-    bank : Bank
-        Of the coils in use.
-    seen : FrameEvidence
-        What they say of the frame.
-    coils : ndarray of int, shape (Q,)
-        Numbers of the coils among those in use.
+    of the evidence is taken from the likelihood of the most likely strengths. ``coils`` (Q,) are
+    numbers among the coils in use.
 
     Returns
     -------
@@ -94,30 +82,15 @@ def distance_of(
 ) -> float:
     """Return how far readings of an excluded coil are from what those in use predict.
 
-    Parameters
-    ----------
-    bank : Bank
-        Of the coils in use.
-    seen : FrameEvidence
-        What they say of the frame.
-    hypothesis : int
-        Number of the hypothesis that predicts.
-    rows : ndarray of int, shape (K,)
-        Rows of the priors' covariance.
-    readings : ndarray, shape (K, 2)
-    noise : float
-        Of these readings, which are not averaged, in units of the nominal one.
-
-    Returns
-    -------
-    float
-        Squared distance in units of the prediction's covariance; 2 K degrees of freedom.
+    The squared distance in units of the prediction's covariance, of 2 K degrees of freedom.
+    ``rows`` (K,) are the coil's rows of the priors' covariance; its ``readings`` (K, 2) are not
+    averaged, so their ``noise`` is not that of the evidence.
     """
     precision, _ = bank.precision(seen.noise)
     basis, variance = bank.bases[hypothesis], seen.noise**2
     ahead = bank.all_drift[rows]
     shared = variance * (ahead @ bank.drift.T)
-    own = np.diag((noise * bank.all_noise[rows]) ** 2) + variance * (ahead @ ahead.T)
+    own = noise**2 * np.eye(len(rows)) + variance * (ahead @ ahead.T)
     total = 0.0
     for part in range(2):
         strength = int(seen.strength[hypothesis, part].argmax())

@@ -1,8 +1,8 @@
 """Assembles the refitted model: calibrated dipoles, the layer's moments, their uncertainty."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,75 +35,25 @@ RIVAL = 0.05
 """Probability from which on a second hypothesis adds what it disagrees about."""
 
 
-@dataclass(frozen=True)
-class Geometry:
-    """Holds dipoles of the calibrated model and of some layers.
-
-    Attributes
-    ----------
-    positions, directions : ndarray, shape (N, 3)
-    layer_rows : mapping of str to ndarray
-        Rows of each layer's dipoles, by the layer's name.
-    """
-
-    positions: Array
-    directions: Array
-    layer_rows: dict[str, NDArray[np.int64]]
-
-    @property
-    def name(self) -> tuple[str, ...]:
-        """Return names of the layers, which are equal for the same dipoles."""
-        return tuple(self.layer_rows)
-
-    @classmethod
-    def of(cls, base: FieldModel, layers: Sequence[Layer]) -> 'Geometry':
-        """Join a model and layers; a layer that uses dipoles of the model adds only the others."""
-        positions, directions = [base.positions], [base.directions]
-        rows: dict[str, NDArray[np.int64]] = {}
-        size = len(base.positions)
-        for layer in layers:
-            own = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
-            added = len(layer.positions) - own.size
-            rows[layer.name] = np.concatenate([own, np.arange(size, size + added)])
-            positions.append(layer.positions[own.size :])
-            directions.append(layer.directions[own.size :])
-            size += added
-        return cls(np.concatenate(positions), np.concatenate(directions), rows)
-
-    def rows(self, bank: Bank, hypothesis: int) -> NDArray[np.int64]:
-        """Return the rows of the dipoles of a hypothesis' layer."""
-        return self.layer_rows[bank.prior(hypothesis).layer.name]
-
-
 class Assembly:
     """Assembles refitted models from the calibrated model and the hypotheses' layers.
 
-    Parameters
-    ----------
-    model : FieldModel
-        Calibrated.
+    ``phase`` (K,) is that of the emitters' own field, ``unit`` the T of a noise unit.
     """
 
-    def __init__(self, model: FieldModel) -> None:
-        self.base = model
+    def __init__(self, model: FieldModel, phase: ComplexArray, unit: float, n_modes: int) -> None:
+        self.base, self._scale, self._n_modes = model, phase * unit, n_modes
         self._modes: dict[tuple[object, ...], PosteriorModes] = {}
         self._coming: dict[tuple[object, ...], BackgroundTask[PosteriorModes]] = {}
         self._last: _ErrorBefore | None = None
         self._interim: tuple[object, Uncertainty] | None = None
         self._whole: dict[tuple[object, ...], tuple[int, Uncertainty]] = {}
         self._count = 0
-        self._geometry: Geometry | None = None
+        self._place: _Dipoles | None = None
 
     def forget(self) -> None:
         """Forget the last error: the next frame is of another time."""
         self._last = self._interim = None
-
-    def _place(self, layers: Sequence[Layer]) -> Geometry:
-        """Return the dipoles with some layers, in the same arrays while the layers stay."""
-        geometry = self._geometry
-        if geometry is None or geometry.name != tuple(layer.name for layer in layers):
-            geometry = self._geometry = Geometry.of(self.base, layers)
-        return geometry
 
     def model(
         self,
@@ -113,9 +63,6 @@ class Assembly:
         weights: Array,
         drift: ComplexArray,
         typical: float,
-        phase: ComplexArray,
-        unit: float,
-        n_modes: int,
         witness: Witness | None = None,
     ) -> FieldModel:
         """Return the refitted model of one frame.
@@ -132,27 +79,21 @@ class Assembly:
             Relative change of the emitters' strength.
         typical : float
             Left-out chi-square per degree of freedom of the typical coil.
-        phase : ndarray, shape (K,), complex
-            Of the emitters' own field.
-        unit : float
-            T of a noise unit.
-        n_modes : int
         witness : Witness, optional
-            What tools told of the hypotheses' errors.
+            What tools know of the hypotheses' errors.
         """
         active = [h for h in np.flatnonzero(weights > NEGLIGIBLE).tolist() if h > 0]
-        layers = {layer.name: layer for layer in (bank.prior(h).layer for h in active)}
-        place = self._place(list(layers.values()))
-        moments = np.zeros((len(place.positions), len(phase)), dtype=complex)
+        place = self._dipoles_of([bank.prior(h).layer for h in active])
+        moments = np.zeros((len(place.positions), len(drift)), dtype=complex)
         moments[: len(self.base.moments)] = self.base.moments * (1.0 + drift)
-        scale = phase * unit
+        scale = self._scale
         parts = {h: bank.moments(seen, h) * scale for h in active}
         if witness is not None:
             parts |= {h: part + witness.moments(bank, h) * scale for h, part in parts.items()}
-        for h, part in parts.items():
-            moments[place.rows(bank, h)] += weights[h] * part
         change = _Change(stamp_ns, bank, seen, weights, parts, scale, place)
-        modes, rest = self._uncertainty(change, typical, n_modes, witness)
+        for h, part in parts.items():
+            moments[change.rows(h)] += weights[h] * part
+        modes, rest = self._uncertainty(change, typical, witness)
         return replace(
             self.base,
             positions=place.positions,
@@ -162,11 +103,30 @@ class Assembly:
             flux_error_t=rest,
         )
 
+    def _dipoles_of(self, given: list[Layer]) -> '_Dipoles':
+        """Return the dipoles with some layers, in the same arrays while the layers stay."""
+        layers = {layer.name: layer for layer in given}
+        if self._place is not None and [*self._place.rows] == [*layers]:
+            return self._place
+        positions, directions = [self.base.positions], [self.base.directions]
+        rows: dict[str, NDArray[np.int64]] = {}
+        size = len(self.base.positions)
+        for name, layer in layers.items():
+            # A layer that uses dipoles of the model adds only the others.
+            own = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
+            added = len(layer.positions) - own.size
+            rows[name] = np.concatenate([own, np.arange(size, size + added)])
+            positions.append(layer.positions[own.size :])
+            directions.append(layer.directions[own.size :])
+            size += added
+        self._place = _Dipoles(np.concatenate(positions), np.concatenate(directions), rows)
+        return self._place
+
     def _uncertainty(
-        self, change: '_Change', typical: float, n_modes: int, witness: Witness | None = None
+        self, change: '_Change', typical: float, witness: Witness | None
     ) -> Uncertainty:
         """Return all modes and the remaining error, unchanged for a while to spare receivers."""
-        bank, place, weights = change.bank, change.place, change.weights
+        bank, weights, n_modes = change.bank, change.weights, self._n_modes
         ranked = sorted(change.parts, key=lambda h: -float(weights[h]))
         if not ranked:
             return self._with_base(np.zeros((0, *change.shape), dtype=complex), 0.0)
@@ -175,41 +135,42 @@ class Assembly:
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
         level = error_level(change.seen, best)
         names = tuple(bank.prior(h).name for h in ranked[:1] + ([] if rival is None else [rival]))
-        key = (bank.rows.tobytes(), names, level, steps, place.name)
+        key = (bank.rows.tobytes(), names, level, steps, *change.place.rows)
         self._count += 1
         kept = self._whole.get(key)
         if witness is None and kept is not None and self._count - kept[0] < KEEP_FRAMES:
             return kept[1]
         inflation = INFLATION_STEP**steps
-        if witness is not None:
-            own, rest = change.modes(witness.modes(bank, best, n_modes - 1), best, n_modes)
-            own, rest = own * inflation, rest * inflation
-            if rival is not None:
-                own[-1] += np.sqrt(weights[best] * weights[rival]) * change.between(best, rival)
-            return self._with_base(own, rest)
-        errors = self._error(change, best, level, n_modes - 1)
+        errors = (
+            self._error(change, best, level, n_modes - 1)
+            if witness is None
+            else witness.modes(bank, best, n_modes - 1)
+        )
         if errors is None:
             if self._interim is None or self._interim[0] != key:
                 own, rest = self._until_known(change, best, level, n_modes)
                 self._interim = key, self._with_base(own * inflation, rest * inflation)
             return self._interim[1]
-        self._last = _ErrorBefore(bank.rows.tobytes(), best, names[0], level, errors)
-        self._interim = None
         own, rest = change.modes(errors, best, n_modes)
         own, rest = own * inflation, rest * inflation
         if rival is not None:
             own[-1] += np.sqrt(weights[best] * weights[rival]) * change.between(best, rival)
         whole = self._with_base(own, rest)
-        make_room(self._whole, MOST_MODES)
-        self._whole[key] = (self._count, whole)
+        if witness is None:
+            self._last = _ErrorBefore(bank.rows.tobytes(), best, names[0], level, errors)
+            self._interim = None
+            make_room(self._whole, MOST_MODES)
+            self._whole[key] = (self._count, whole)
         return whole
 
     def _with_base(self, own: ComplexArray, rest: float) -> Uncertainty:
         """Join the error of the change with that of the calibrated model."""
         base = self.base.modes
-        parts = [] if base is None else [_padded(base, own.shape[1])]
-        modes = np.concatenate([*parts, own]) if parts or len(own) else None
-        return modes, float(np.hypot(self.base.flux_error_t, rest))
+        if base is not None:  # with rows of zeros for the dipoles that were added
+            padded = np.zeros((len(base), *own.shape[1:]), dtype=complex)
+            padded[:, : base.shape[1]] = base
+            own = np.concatenate([padded, own])
+        return own if len(own) else None, float(np.hypot(self.base.flux_error_t, rest))
 
     def _error(
         self, change: '_Change', hypothesis: int, level: ErrorLevel, count: int
@@ -251,6 +212,14 @@ class Assembly:
         return own, float(np.hypot(rest, change.size(best, own[-1])))
 
 
+class _Dipoles(NamedTuple):
+    """The dipoles (N, 3) of a model with some layers, and the rows of each layer by its name."""
+
+    positions: Array
+    directions: Array
+    rows: dict[str, NDArray[np.int64]]
+
+
 @dataclass(frozen=True)
 class _Change:
     """One frame's hypotheses and what each of them adds to the calibrated model, A m^2."""
@@ -261,7 +230,7 @@ class _Change:
     weights: Array
     parts: dict[int, ComplexArray]
     scale: ComplexArray
-    place: Geometry
+    place: _Dipoles
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -270,7 +239,7 @@ class _Change:
 
     def rows(self, hypothesis: int) -> NDArray[np.int64]:
         """Return the rows of the dipoles of a hypothesis' layer."""
-        return self.place.rows(self.bank, hypothesis)
+        return self.place.rows[self.bank.prior(hypothesis).layer.name]
 
     def modes(
         self, errors: PosteriorModes, hypothesis: int, n_modes: int
@@ -295,9 +264,8 @@ class _Change:
         return float(np.sqrt(np.mean(np.abs(field) ** 2) / 2.0))
 
     def _part(self, hypothesis: int) -> ComplexArray:
-        if hypothesis in self.parts:
-            return self.parts[hypothesis]
-        return self.bank.moments(self.seen, hypothesis) * self.scale
+        known = self.parts.get(hypothesis)
+        return self.bank.moments(self.seen, hypothesis) * self.scale if known is None else known
 
 
 @dataclass(frozen=True)
@@ -316,12 +284,5 @@ class _ErrorBefore:
         return (
             self.coils == bank.rows.tobytes()
             and bank.names[self.hypothesis] == self.name
-            and bank.prior(self.hypothesis).layer.name in change.place.layer_rows
+            and bank.prior(self.hypothesis).layer.name in change.place.rows
         )
-
-
-def _padded(modes: ComplexArray, size: int) -> ComplexArray:
-    """Return modes (R, N, K) with rows of zeros for the dipoles that were added."""
-    out = np.zeros((modes.shape[0], size, modes.shape[2]), dtype=complex)
-    out[:, : modes.shape[1]] = modes
-    return out

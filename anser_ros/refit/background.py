@@ -12,8 +12,7 @@ from typing import Generic, TypeVar
 
 DELAY_NS = 80_000_000
 """Time from asking for a result to its use, ns: four frames at 50 Hz. The longest work takes 20 ms
-of a free processor. Shorter, and frames wait for the thread on a busy machine; longer, and the
-interim answer, with its larger uncertainty, holds for longer."""
+of a free processor, and frames wait for it on a busy one; until then the interim answer holds."""
 
 Result = TypeVar('Result')
 
@@ -31,12 +30,8 @@ def begin_in_background(work: Callable[[], None]) -> None:
 class BackgroundTask(Generic[Result]):
     """Runs one piece of work in the background thread.
 
-    Parameters
-    ----------
-    work : callable
-        Must only read what nothing else changes.
-    stamp_ns : int
-        Stamp of the frame that starts it, ns.
+    ``work``: must only read what nothing else changes. ``stamp_ns``: stamp of the frame that
+    starts it, ns.
     """
 
     def __init__(self, work: Callable[[], Result], stamp_ns: int) -> None:

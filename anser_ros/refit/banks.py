@@ -19,25 +19,13 @@ Fewer, and coils that come and go cost a bank each time; more only cost memory."
 class Banks:
     """Keeps banks of hypotheses by the coils in use, with the slots for bodies of each.
 
-    Parameters
-    ----------
-    tables : RefitTables
-        What belongs to the board and the references' places.
-    baseline : ndarray, shape (S, K), complex
-        Readings without the metal, T; NaN for a coil that has none.
-    settings : RefitSettings
-    row_noise : ndarray, shape (S K,)
-        Noise of every reading over the nominal one.
+    ``baseline`` (S, K): readings without the metal, T; NaN for a coil that has none.
     """
 
     def __init__(
-        self,
-        tables: RefitTables,
-        baseline: NDArray[np.complex128],
-        settings: RefitSettings,
-        row_noise: Array,
+        self, tables: RefitTables, baseline: NDArray[np.complex128], settings: RefitSettings
     ) -> None:
-        self._tables, self._row_noise = tables, row_noise
+        self._tables = tables
         self._width = k = baseline.shape[1]
         turned = baseline * tables.excitation.phase.conj()
         scale = settings.emitter_drift / settings.accuracy.flux_noise_t
@@ -55,9 +43,7 @@ class Banks:
             if len(self._known) >= MOST_BANKS:
                 del self._known[next(iter(self._known))]
             tables = self._tables
-            bank = Bank(
-                tables.priors, rows, self._drift, self._row_noise, SLOTS, len(tables.bodies)
-            )
+            bank = Bank(tables.priors, rows, self._drift, SLOTS, len(tables.bodies))
             self._known[key] = (bank, BodySlots(bank, tables))
             begin_in_background(bank.make_ready)
         return self._known[key]

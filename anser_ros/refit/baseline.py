@@ -25,12 +25,7 @@ MOST_FRAMES = 2000
 class ReadingWindow:
     """Holds the most recent readings of a set of sensors.
 
-    Parameters
-    ----------
-    sensors : SensorTable
-    emitters : int
-    span_s : float
-        How far back readings are kept, s of their stamps.
+    ``span_s``: how far back readings are kept, s of their stamps.
 
     Raises
     ------
@@ -145,13 +140,3 @@ def checked_baseline(
     if len(set(references.channel.tolist())) != len(references):
         raise FitError('refit: a channel appears twice in the references')
     return given
-
-
-def checked_noise(
-    noise: NDArray[np.float64] | None, count: int, width: int
-) -> NDArray[np.float64]:
-    """Return the noise of every reading, (S K,), from that of every coil."""
-    given = np.ones(count) if noise is None else np.asarray(noise, dtype=np.float64)
-    if given.shape != (count,) or not (given >= 1.0).all() or not np.isfinite(given).all():
-        raise FitError(f'refit: noise must be {count} finite numbers of at least 1, got {given}')
-    return np.repeat(given, width)

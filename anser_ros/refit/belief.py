@@ -8,18 +8,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 UNCHANGED = 0.99
-"""Probability of no change from which on the calibrated model is in force."""
+"""Probability of no change from which on the calibrated model is active."""
 
 
 class Belief:
     """Holds probabilities of the hypotheses; the first of them is that nothing has changed.
 
-    Parameters
-    ----------
-    count : int
-        Number of hypotheses.
-    persistence : float
-        Probability that the hypothesis of one frame still holds in the next.
+    ``persistence`` is the probability that the hypothesis of one frame still holds in the next.
 
     Attributes
     ----------
@@ -57,14 +52,9 @@ class Belief:
         self.weights = weights / weights.sum()
 
     def update_by(self, names: Sequence[str], evidence: Mapping[str, float]) -> None:
-        """Update the weights of the hypotheses by other evidence of the same frame.
+        """Update the weights of the named hypotheses by other evidence of the same frame.
 
-        Parameters
-        ----------
-        names : sequence of str
-            Of the hypotheses, in their order.
-        evidence : mapping of str to float
-            Log evidence by name; hypotheses that are not in it are ruled out, unless all are.
+        Hypotheses that are not in it are ruled out, unless all are.
         """
         if not evidence:
             return

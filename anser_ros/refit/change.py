@@ -6,15 +6,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.kernels import bend_power
+from anser_ros.refit.evidence import median
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MEMORY_FRAMES = 50
-"""Frames over which the ratio of measured to expected noise is averaged. As long as there are
-fewer, more noise than expected is averaged over those there are: by a ratio that is too small all
-references seem to jump."""
+"""Frames over which the ratio of measured to expected noise is averaged; as long as there are
+fewer, over these where it rises: by a ratio that is too small all references seem to jump."""
 STEP = 1.1
 """Noise levels are rounded to powers of this, so that tables made for one serve for a while."""
 
@@ -69,10 +68,12 @@ class NoiseLevel:
         What is left out is NaN: noise may be its fault, which must not raise that of the others.
         """
         if len(self._previous) == 2:
-            # The median over coils, so that a coil that jumps does not count.
-            now = bend_power(flux, self._previous[1], self._previous[0])
-            if math.isfinite(now):
-                now = min(now / (12.0 * self.nominal_t**2), 4.0 * self._ratio)
+            bend = flux - 2.0 * self._previous[1] + self._previous[0]
+            power = (bend.real**2 + bend.imag**2).mean(axis=1)
+            power = power[np.isfinite(power)]
+            if power.size:
+                # The median over coils, so that a coil that jumps does not count.
+                now = min(median(power) / (12.0 * self.nominal_t**2), 4.0 * self._ratio)
                 self._known = min(self._known + 1, MEMORY_FRAMES)
                 frames = self._known if now > self._ratio else MEMORY_FRAMES
                 self._ratio += (now - self._ratio) / frames

@@ -26,12 +26,11 @@ from anser_ros.physics.volume import TrackedVolume
 Array = NDArray[np.float64]
 
 LAYER_RATIO = 1.45
-"""Ratio of the depths of neighbouring layers of sources. Detail that sensors can tell grows with
-depth, so depths are even on a logarithmic scale. A smaller ratio takes memory and time; a larger
-one leaves depths between layers that no source stands for."""
+"""Ratio of the depths of neighbouring layers of sources: detail that sensors can tell grows with
+depth, so depths are even on a logarithmic scale."""
 SPACING_PER_DEPTH = 0.7
-"""Lateral spacing of a layer's sources over its depth. Below one, sensors as far away as the layer
-is deep can hardly tell its sources from a sheet; smaller takes memory and time."""
+"""Lateral spacing of a layer's sources over its depth: sensors as far away as the layer is deep
+can hardly tell its sources from a sheet."""
 
 BODY_SPACING = 0.6
 """Distance of neighbouring compact bodies of the lattice, in halves of the board."""
@@ -43,14 +42,9 @@ BODY_RADIUS = 0.45
 class Region:
     """Describes the board's extent, and the volume over it in which the field must be right.
 
-    Attributes
-    ----------
-    centre : ndarray, shape (2,)
-        x and y of the board's middle, m.
-    half : float
-        Half of the board's larger side, m; sizes and spacings of clouds and layers are told in it.
-    stated : TrackedVolume or None
-        The volume as the setup states it; None: the default over such a board.
+    The board's middle is at ``centre`` (x, y), m, and ``half`` is half of its larger side, m, the
+    unit of sizes and spacings of clouds and layers. The volume is as the setup states it, or else
+    the default.
     """
 
     centre: Array
@@ -65,19 +59,10 @@ class Region:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Holds candidate sources of one hypothesis.
+    """Holds candidate sources of one hypothesis at positions (M, 3), m, frame fg.
 
-    Attributes
-    ----------
-    name : str
-    standoff_m : float
-        Distance of the nearest source from the board (or from the tracked volume), m.
-    overhead : bool
-        Whether the sources are around and over the volume, not below the board.
-    positions : ndarray, shape (M, 3)
-        m, frame fg.
-    volumes : ndarray, shape (M,)
-        Volume that each source stands for, m^3.
+    The nearest source is ``standoff_m`` from the board, or from the tracked volume where the cloud
+    is ``overhead``, around and over it. Each source stands for a volume, (M,), m^3.
     """
 
     name: str
@@ -102,13 +87,8 @@ def below(region: Region, standoff: float) -> Cloud:
         x, y = np.meshgrid(side + region.centre[0], side + region.centre[1], indexing='ij')
         positions.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, -depth)], axis=1))
         volumes.append(np.full(x.size, thickness * (side[1] - side[0]) ** 2))
-    return Cloud(
-        f'below {1e3 * standoff:.0f} mm',
-        standoff,
-        False,
-        np.concatenate(positions),
-        np.concatenate(volumes),
-    )
+    name = f'below {1e3 * standoff:.0f} mm'
+    return Cloud(name, standoff, False, np.concatenate(positions), np.concatenate(volumes))
 
 
 def overhead(region: Region, standoff: float) -> Cloud:
@@ -126,13 +106,8 @@ def overhead(region: Region, standoff: float) -> Cloud:
         positions.append(shell)
         volumes.append(np.full(len(shell), spacing**3))
         inner = outer
-    return Cloud(
-        f'around {1e3 * standoff:.0f} mm',
-        standoff,
-        True,
-        np.concatenate(positions),
-        np.concatenate(volumes),
-    )
+    name = f'around {1e3 * standoff:.0f} mm'
+    return Cloud(name, standoff, True, np.concatenate(positions), np.concatenate(volumes))
 
 
 def _shell(region: Region, inner: float, outer: float, spacing: float) -> Array:

@@ -2,7 +2,7 @@
 
 For metal of a known kind and strength everything is Gaussian, so the remaining uncertainty with
 any choice of coils follows before a coil is glued on: the posterior covariance of the metal's
-coordinates (`refit.reduced`), weighted by their effect on poses. Coils are chosen one after the
+coordinates (`ReducedPrior`), weighted by their effect on poses. Coils are chosen one after the
 other, each the one that leaves the least uncertainty, and are then exchanged while that helps
 (Fedorov, Theory of Optimal Experiments, 1972).
 """
@@ -37,15 +37,9 @@ MOST_EXCHANGES = 3
 class StatedMetal:
     """States one metal of the family, for C candidate coils.
 
-    Attributes
-    ----------
-    name : str
-    cross : ndarray, shape (D, C K)
-        Covariance of what poses feel of the metal, m, with the readings, in noise deviations.
-    covariance : ndarray, shape (C K, C K)
-        Of the readings, noise and drift included.
-    error_m : float
-        Error of poses while it is not corrected, root mean square.
+    ``cross`` (D, C K) is the covariance of what poses feel of the metal, m, with the readings, in
+    noise deviations, ``covariance`` (C K, C K) that of the readings, noise and drift included.
+    While it is not corrected, poses have the error ``error_m``, root mean square.
     """
 
     name: str
@@ -56,14 +50,9 @@ class StatedMetal:
 
 @dataclass(frozen=True)
 class Design:
-    """Holds a choice of coils.
+    """Holds a choice of coils, rows of the candidates in the order in which they were chosen.
 
-    Attributes
-    ----------
-    coils : tuple of int
-        Rows of the candidates, in the order in which they were chosen.
-    errors_m : ndarray, shape (metals,)
-        Expected error of poses that they leave, of each metal.
+    ``errors_m`` is the expected error of poses that they leave, of each metal.
     """
 
     coils: tuple[int, ...]
@@ -100,9 +89,8 @@ def family(
     ----------
     candidates : SensorTable
         Coils, of which some will be chosen; places and axes in fg.
-    excitation : Excitation
-        Field of the board.
-    region : Region
+    excitation, region
+        Field of the board, and its extent.
     frequencies_hz : sequence of float, length K
     settings : RefitSettings
         Noise, errors of the survey, and drift of the emitters.
@@ -132,7 +120,7 @@ def family(
             cloud, response, layer, candidates, field, np.array(frequencies_hz),
             settings.accuracy, rng,
         )  # fmt: skip
-        few = reduced(prior, response, field, np.array(frequencies_hz), rng)
+        few = reduced(prior, field, np.array(frequencies_hz), rng)
         # Per noise deviation of the readings; the metric is a sum over the samples.
         felt = few.felt * noise * per_field / np.sqrt(len(layer.points))
         strength = (error_m / float(np.linalg.norm(felt))) ** 2
@@ -187,13 +175,7 @@ def _gains(metals: Sequence[StatedMetal], coils: Sequence[int], k: int) -> Array
 def choose(metals: Sequence[StatedMetal], count: int, k: int) -> list[Design]:
     """Return the best choices of 1 to ``count`` coils, each one found from the one before.
 
-    Parameters
-    ----------
-    metals : sequence of StatedMetal
-    count : int
-        At most the number of candidates.
-    k : int
-        Readings of a coil.
+    ``count``: at most the number of candidates. ``k``: readings of a coil.
     """
     coils: list[int] = []
     designs = []

@@ -40,22 +40,15 @@ class Excitation:
     ----------
     source : {'board', 'model'}
         Where it comes from.
-    strength : ndarray, shape (K,)
-        Factor on ``raw``.
     phase : ndarray, shape (K,), complex
         Unit phasor of each emitter's field; readings are turned back by it.
-    raw : callable
-        Field before ``strength``.
+    field : callable
+        From points (P, 3), m, to the field there, (P, K, 3), T.
     """
 
     source: str
-    strength: Array
     phase: ComplexArray
-    raw: FieldFunction
-
-    def field(self, points: Array) -> Array:
-        """Return the field at points (P, 3), m, shape (P, K, 3), T."""
-        return np.asarray(self.raw(points) * self.strength[None, :, None])
+    field: FieldFunction
 
 
 def model_field(model: FieldModel, points: Array) -> ComplexArray:
@@ -94,7 +87,7 @@ def excitation_for(
 ) -> tuple[Excitation, Region]:
     """Return the drawing's field scaled to the model, or the model's if the drawing is another's.
 
-    ``volume`` is the tracked volume as stated; None: the default over the board.
+    ``volume`` is the tracked volume as stated; None for the default over the board.
 
     Raises
     ------
@@ -120,7 +113,12 @@ def excitation_for(
         gain = (drawn * measured).sum(axis=(0, 2)) / np.maximum(power, 1e-300)
         size = np.sqrt(power * (np.abs(measured) ** 2).sum(axis=(0, 2)))
         if (np.abs(gain) * power >= AGREEMENT * size).all():
-            return Excitation('board', np.abs(gain), gain / np.abs(gain), drawing), region
+            strength = np.abs(gain)
+
+            def scaled(points: Array) -> Array:
+                return np.asarray(drawing(points) * strength[None, :, None])
+
+            return Excitation('board', gain / strength, scaled), region
         region = replace(region_of(own), stated=volume)
     square = (measured**2).sum(axis=(0, 2))
     phase = np.exp(0.5j * np.angle(square))
@@ -128,4 +126,4 @@ def excitation_for(
     def turned(points: Array) -> Array:
         return np.asarray((own(points) * phase.conj()[None, :, None]).real)
 
-    return Excitation('model', np.ones(len(phase)), phase, turned), region
+    return Excitation('model', phase, turned), region

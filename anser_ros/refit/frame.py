@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 from anser_ros.frames import faults
 from anser_ros.frames.intake import Frame
 from anser_ros.refit import health
-from anser_ros.refit.kernels import find_silent
 
 ComplexArray = NDArray[np.complex128]
 
 SILENT_CODE, NO_BASELINE_CODE = len(faults.FAULTS), len(faults.FAULTS) + 1
-"""Codes of what only a baseline tells, after those of `frames.faults`."""
+"""Codes of what only a baseline shows, after those of `frames.faults`."""
 _OF_KIND = {
     'missing': health.MISSING,
     'not_finite': health.NOT_FINITE,
@@ -31,34 +30,21 @@ QUIET = 0.05
 
 
 class BaselineCheck:
-    """Determines which readings can be compared with a baseline.
-
-    Parameters
-    ----------
-    baseline : ndarray, shape (S, K), complex
-        A coil whose baseline is not finite can't be used.
-    """
+    """Determines which readings can be compared with a baseline (S, K), where that is finite."""
 
     def __init__(self, baseline: ComplexArray) -> None:
-        self._least = _least_power(baseline)
+        power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
+        # T^2, below which a coil is silent; NaN without a baseline.
+        self._least = np.where(np.isfinite(power), QUIET**2 * power, np.nan)
 
-    def read(
-        self, frame: Frame, baseline: ComplexArray | None = None
-    ) -> tuple[NDArray[np.bool_], list[str]]:
-        """Return which readings (S,) of a judged frame can be used, and why others cannot.
-
-        ``baseline`` (S, K) is the baseline of this frame, where coils move.
-        """
-        least = self._least if baseline is None else _least_power(baseline)
-        codes = frame.codes.copy()
-        find_silent(frame.flux, least, SILENT_CODE, NO_BASELINE_CODE, codes)
+    def read(self, frame: Frame) -> tuple[NDArray[np.bool_], list[str]]:
+        """Return which readings (S,) of a judged frame can be used, and why others cannot."""
+        flux, codes = frame.flux, frame.codes
+        with np.errstate(over='ignore', invalid='ignore'):  # of readings that are absurd
+            is_silent = (flux.real**2 + flux.imag**2).sum(axis=1) < self._least
+        codes = np.where((codes == faults.GOOD) & is_silent, SILENT_CODE, codes)
+        codes = np.where(np.isnan(self._least), NO_BASELINE_CODE, codes)
         return codes == faults.GOOD, [_REASONS[code] for code in codes.tolist()]
-
-
-def _least_power(baseline: ComplexArray) -> NDArray[np.float64]:
-    """Return the power (S,), T^2, below which a coil is silent, with NaN without a baseline."""
-    power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
-    return np.where(np.isfinite(power), QUIET**2 * power, np.nan)
 
 
 class NoiseUnits:

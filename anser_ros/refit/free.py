@@ -27,13 +27,7 @@ ComplexArray = NDArray[np.complex128]
 class FreeDipoles:
     """Follows a change with independent dipoles for every emitter.
 
-    Parameters
-    ----------
-    model : FieldModel
-    references : SensorTable
-    baseline : ndarray, shape (S, K), complex
-    drawing : callable, optional
-        Only says where the board is.
+    ``baseline`` (S, K) complex. ``drawing``: only says where the board is.
     """
 
     def __init__(

@@ -9,7 +9,6 @@ returns when it has agreed with the others for a while.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from anser_ros.integrity.continuity import STREAM_GAP_S
 from anser_ros.refit.agreement import evidence_without
-from anser_ros.refit.evidence import FrameEvidence, log_sum
+from anser_ros.refit.evidence import FrameEvidence, log_sum, median
 from anser_ros.refit.posterior import Bank
 from anser_ros.stamps import NANO
 
@@ -40,10 +39,8 @@ FAULT_SCALES = 10.0 ** np.arange(0.0, 6.1, 0.5)
 SUSPECT_CHI2 = 2.8
 """Left-out chi-square per degree of freedom from which on a fault is considered."""
 FAULT_ODDS = 100.0
-"""Logarithm of the odds that a coil is at fault from which on it is left out.
-
-Metal that the clouds describe badly reaches 70 in recordings; faults that matter begin at 100.
-"""
+"""Logarithm of the odds that a coil is at fault from which on it is left out. Metal that the
+clouds describe badly reaches 70 in recordings; faults that matter begin at 100."""
 SEEN = 10.0
 """Log odds, by the other coils alone, from which on a compact body counts as seen by them."""
 AGREEMENT_CHI2 = 2.5
@@ -52,12 +49,10 @@ RETRY_FRAMES = 25
 """Frames after which an excluded coil is looked at again."""
 HOLD_S = 0.5
 """Time, s, of agreement after which an excluded coil is used again where that is sooner than its
-number of frames, as in slow streams. Shorter, and a loose plug comes and goes; longer, and all are
-without poses for more than a second after a fault of all references has ended."""
+number of frames, as in slow streams: a loose plug comes and goes."""
 FEWEST_HELD = 12
 """Frames of agreement that are asked for at any rate, or the stated ones if these are fewer: noise
-that passes half of the time passes so many once in four thousand. Fewer, and it is believed; more,
-and slow streams wait."""
+that passes half of the time passes so many once in four thousand."""
 OUTSTANDING = 8.0
 """A change this many times the median coil's is looked at as a possible fault."""
 MOST_AT_ONCE = 4
@@ -71,8 +66,7 @@ class ReferenceHealth(NamedTuple):
     ----------
     name : str
     state : str
-        ``ok``, or why it was left out: ``flagged``, ``not finite``, ``missing``, ``no baseline``,
-        ``silent``, ``absurd``, ``stuck``, ``disagrees``, ``recovering``.
+        `OK`, or why it was left out, by the names above.
     residual_t : float
         Root mean square of measured minus predicted by all others, T a component; NaN where the
         coil has no reading.
@@ -96,28 +90,14 @@ def judge_references(
 ) -> tuple[ReferenceHealth, ...]:
     """Return the health of every reference in one frame.
 
-    Parameters
-    ----------
-    names, reasons : sequence of str, length S
-        The references, and ``ok`` or why each is left out.
-    used : ndarray of bool, shape (S,)
-    chi2, residual : ndarray, shape (U,) and (U, K, 2)
-        From `agreement.left_out`, for the coils in use; empty where they were not compared.
-    flux_noise_t : float
-        Nominal noise, T, in whose units the residuals are.
+    ``chi2`` (U,) and ``residual`` (U, K, 2) are those of `left_out` for the coils that
+    are ``used`` (S,), empty where they were not compared; ``flux_noise_t`` is the residuals' unit.
     """
     size, apart = np.full(len(used), np.nan), np.full(len(used), np.nan)
     if len(chi2):
         size[used] = np.sqrt((residual**2).mean(axis=(1, 2))) * flux_noise_t
         apart[used] = np.sqrt(chi2 / (2 * residual.shape[1]))
     return tuple(map(ReferenceHealth, names, reasons, size.tolist(), apart.tolist()))
-
-
-def typical(values: Array) -> float:
-    """Return the median of values."""
-    ordered = sorted(values.tolist())
-    middle = len(ordered) // 2
-    return float(0.5 * (ordered[middle] + ordered[-1 - middle]))
 
 
 def fault_odds(bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]) -> list[float]:
@@ -154,40 +134,29 @@ def find_faults(
     return best
 
 
-@dataclass
 class ReferenceWatch:
     """Keeps account of the excluded coils and of the time for which they are excluded.
 
+    A coil must be readable and agree for ``hold_frames`` before it is used again, at low rates for
+    fewer, see `HOLD_S`.
+
     Attributes
     ----------
-    count : int
-        Reference coils S.
-    hold_frames : int
-        Frames for which a coil must be readable and agree before it is used again; at low rates
-        fewer, see `HOLD_S`.
     excluded : ndarray of bool, shape (S,)
         Which are not used.
     reason : list of str, length S
         Why, in a word; of the others that they are in order.
     """
 
-    count: int
-    hold_frames: int
-    excluded: NDArray[np.bool_] = field(init=False)
-    reason: list[str] = field(init=False)
-    _good: NDArray[np.int64] = field(init=False)
-    _before: tuple[NDArray[np.bool_], list[str], NDArray[np.int64]] | None = field(
-        init=False, default=None
-    )
-    _dismissed: tuple[float, int] = field(init=False, default=(0.0, 0))
-    _since: int = field(init=False, default=0)
-    _last_ns: int = field(init=False, default=0)
-    _gap_s: float = field(init=False, default=math.inf)
-
-    def __post_init__(self) -> None:
-        self.excluded = np.zeros(self.count, dtype=bool)
-        self.reason = [OK] * self.count
-        self._good = np.zeros(self.count, dtype=np.int64)
+    def __init__(self, count: int, hold_frames: int) -> None:
+        self.count, self.hold_frames = count, hold_frames
+        self.excluded = np.zeros(count, dtype=bool)
+        self.reason = [OK] * count
+        self._good = np.zeros(count, dtype=np.int64)
+        self._before: tuple[NDArray[np.bool_], list[str], NDArray[np.int64]] | None = None
+        self._dismissed = 0.0, 0
+        self._since = self._last_ns = 0
+        self._gap_s = math.inf
 
     def note(
         self,
@@ -209,9 +178,7 @@ class ReferenceWatch:
         if readable.sum() < least:
             self._before = self.excluded.copy(), self.reason.copy(), self._good.copy()
         for coil in np.flatnonzero(~readable):
-            self.excluded[coil] = True
-            self.reason[coil] = reasons[coil]
-            self._good[coil] = 0
+            self.excluded[coil], self.reason[coil], self._good[coil] = True, reasons[coil], 0
 
     def _take_pace(self, stamp_ns: int) -> None:
         """Follow the time between frames; one that was lost, or points one by one, don't count."""
@@ -276,17 +243,11 @@ class ReferenceWatch:
         wrong at once hide each other, so those whose readings stand out are suspected together. A
         suspicion that was just dismissed is tested again when it has grown, or after a while.
 
-        Parameters
-        ----------
-        chi2 : ndarray, shape (S,)
-            Left-out chi-square.
-        power : ndarray, shape (S,)
-            Squared change of each coil's readings, noise units.
-        freedom : int
-            Readings a coil.
+        ``chi2`` (S,) is each coil's left-out chi-square, ``power`` (S,) its squared change in
+        noise units, of ``freedom`` readings.
         """
         self._since += 1
-        level = OUTSTANDING**2 * max(typical(power), freedom)
+        level = OUTSTANDING**2 * max(median(power), freedom)
         if chi2.max() <= SUSPECT_CHI2 * freedom and power.max() <= level:
             return []
         order = np.argsort(-chi2)[:3]

@@ -10,7 +10,8 @@ not.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,21 +27,16 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 LEAST_JUMP_POWER = 5.0
-"""Power of a jump, in units of what noise makes, from which on jumps are judged. Noise of sixteen
-components is that loud once in a year; lower, and judging costs time for nothing."""
+"""Power of a jump, in units of what noise makes, from which on jumps are judged: noise of sixteen
+components is that large once in a year."""
 FARTHEST = 3.0
-"""Steps, in units of the last one, over which a course is carried on. Farther, and the noise of
-the last step is carried on with it."""
+"""Steps, in units of the last one, over which a course is carried on, and its noise with it."""
 LARGEST_RATE = 0.05
 """Rate at which metal may take the readings off their course, as a part of the baseline's size
-each second. In recordings of an X-ray head that comes close it stays below the noise, a hundredth
-of this at 25 Hz. Larger, and faults pass for metal by the errors that a survey allows it; smaller,
-and metal that is thrown about is taken for faults."""
+each second; an X-ray head that comes close stays below the noise, a hundredth of this at 25 Hz."""
 UNPREDICTED = 0.1
-"""Share of a coil's jump, in power, that may differ from what the others predict where metal
-has appeared from one frame to the next, and share of the coils for which it may be more. Smaller,
-and metal that is described badly is taken for faults; larger, and faults that look alike pass for
-metal."""
+"""Share of a coil's jump, in power, that may differ from what the others predict where metal has
+appeared from one frame to the next, and share of the coils for which it may be more."""
 COMMON = 0.003
 """Relative step of all emitters at once from which on it is no drift of theirs. Currents drift
 slowly, each on its own; a gain that all references share, in their amplifier, steps like that."""
@@ -52,18 +48,11 @@ RETURNED = 0.1
 """Part of a jump that may be left where a reference has jumped back: metal moved meanwhile."""
 
 
-@dataclass(frozen=True)
-class Jumps:
-    """States how far a frame's readings are off their courses.
+class Jumps(NamedTuple):
+    """States how far (S, K), T, a frame's readings are off their courses; NaN for no reading.
 
-    Attributes
-    ----------
-    off : ndarray, shape (S, K), complex
-        T; NaN where there is no reading.
-    spread : ndarray, shape (S,)
-        Noise of that, in units of a reading's.
-    since_s : float
-        Time since the last reading of most references, s; infinite where there was none.
+    ``spread`` (S,) is the noise of that, in units of a reading's, and ``since_s`` the time since
+    the last reading of most references, infinite where there was none.
     """
 
     off: ComplexArray
@@ -75,10 +64,7 @@ class Courses:
     """Follows where each reference's change is on its way to, and how far those that jumped are
     off.
 
-    Parameters
-    ----------
-    count, width : int
-        References S and emitters K.
+    ``count``, ``width``: references S and emitters K.
     """
 
     def __init__(self, count: int, width: int) -> None:
@@ -157,22 +143,19 @@ class Courses:
         self._away[away], self._farthest[away] = 0.0, 0.0
         return away
 
-    def returned(self, noise: Array) -> NDArray[np.int64]:
+    def returned(self, noise_t: float) -> NDArray[np.int64]:
         """Return the references that are no longer off by jumps, which is then forgotten.
 
         One has jumped back when little of its jump is left. All have that jumped when all of them
         read what they did in the baseline: they may have gone wrong unseen, in small steps, and
         then the end of the fault was taken for a jump.
 
-        Parameters
-        ----------
-        noise : ndarray, shape (S,)
-            Of a phasor component of each, T.
+        ``noise_t``: of a phasor component, T.
         """
         away, size = self._is_away, np.linalg.norm(self._away, axis=1)
-        calm = math.sqrt(LEAST_JUMP_POWER * 2 * self._away.shape[1]) * noise
+        calm = math.sqrt(LEAST_JUMP_POWER * 2 * self._away.shape[1]) * noise_t
         back = away & (size < np.maximum(RETURNED * self._farthest, calm))
-        if (np.linalg.norm(self._last[away], axis=1) < calm[away]).all():
+        if (np.linalg.norm(self._last[away], axis=1) < calm).all():
             back = away
         self._away[back], self._farthest[back] = 0.0, 0.0
         return np.flatnonzero(back)
@@ -190,7 +173,7 @@ def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
 def _is_predicted(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
     """Return whether each coil's jump is what the others predict, as when metal is put down."""
     _, residual = left_out(bank, seen, int(seen.log_evidence.argmax()))
-    noise = LEAST_JUMP_POWER * jumps[0].size * (seen.noise * bank.row_noise[:: bank.width]) ** 2
+    noise = LEAST_JUMP_POWER * jumps[0].size * seen.noise**2
     off = (residual**2).sum(axis=(1, 2))
     size = (jumps**2).sum(axis=(1, 2)) + ((jumps - residual) ** 2).sum(axis=(1, 2))
     concerned = size > noise
@@ -205,9 +188,8 @@ def jumped(
 
     Parameters
     ----------
-    bank : Bank
-    seen : FrameEvidence
-        Of the jumps, as if they were a change.
+    bank, seen
+        Evidence of the jumps, as if they were a change.
     jumps : ndarray, shape (U, K, 2)
         Of the coils in use, in noise units, over their spread.
     spread : float
@@ -218,12 +200,12 @@ def jumped(
         Size of the readings' change, noise units, that metal may have made since the last frame.
     """
     free, seen = seen, _bounded(bank, seen, largest)
-    freedom, noise = bank.width, bank.row_noise[:: bank.width, None]
+    freedom = bank.width
     # In phase and quadrature apart: most faults are in one of the two.
-    power = (jumps**2).sum(axis=1) / noise**2
-    quiet = -0.5 * power / seen.noise**2 - freedom * np.log(seen.noise * noise)
+    power = (jumps**2).sum(axis=1)
+    quiet = -0.5 * power / seen.noise**2 - freedom * np.log(seen.noise)
     scales = FAULT_SCALES[:, None, None]
-    curve = -0.5 * power / scales**2 - freedom * np.log(scales * noise)
+    curve = -0.5 * power / scales**2 - freedom * np.log(scales)
     top = curve.max(axis=0)
     broad = top + np.log(np.exp(curve - top).mean(axis=0))
     apart = np.maximum(quiet, broad)
@@ -236,35 +218,25 @@ def jumped(
     return np.empty(0, dtype=np.int64)
 
 
-def are_over(
+def faults_have_ended(
     courses: Courses,
     units: NoiseUnits,
     bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]],
     level: float,
-    noise: Array,
     drift: float,
 ) -> bool:
     """Return whether jumps are over: metal alone explains how all has changed since before them.
 
-    Near metal a common gain can pass for metal: then the answer is no.
-
-    Parameters
-    ----------
-    courses : Courses
-        Some references must be off by jumps, and the newest frame go on from the two before it.
-    units : NoiseUnits
-    bank_of : callable
-        Returns the hypotheses for references (S,) first.
-    level, noise : float and ndarray, shape (S,)
-        Noise of a usual reference and of each, of a component, in units of the nominal one.
-    drift : float
-        Prior deviation of an emitter's strength.
+    Some references must be off by jumps, and the newest frame go on from the two before it. Near
+    metal a common gain can pass for metal: then the answer is no. ``bank_of`` returns the
+    hypotheses for references (S,) first; ``level`` is the noise of a reading over the nominal one,
+    ``drift`` the prior deviation of an emitter's strength.
     """
     readable = courses.readable
     power = (units.of(courses.bend())[readable] ** 2).mean(axis=(1, 2)) / BEND_VARIANCE
     if not courses.away().size or not power.size:
         return False
-    if (power > LEAST_JUMP_POWER * noise[readable] ** 2).any():
+    if (power > LEAST_JUMP_POWER * level**2).any():
         return False
     change, seconds = courses.since_sound()
     spread = math.sqrt(2.0)

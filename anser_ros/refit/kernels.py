@@ -66,7 +66,7 @@ def _fill_probabilities(curve, probability):  # type: ignore[no-untyped-def]
 def fill_evidence(  # type: ignore[no-untyped-def]
     analysis, readings, precision, log_det, there, projected, curve, strength, log_evidence
 ):  # fmt: skip
-    """Write what readings (2, n) say about all hypotheses; see `refit.evidence.FrameEvidence`.
+    """Write what readings (2, n) say about all hypotheses; see `FrameEvidence`.
 
     ``analysis`` (H n, n), ``precision`` (H, A, n), ``log_det`` (H, A); ``there`` (H,) is False for
     empty slots.
@@ -130,7 +130,7 @@ def fill_left_out(  # type: ignore[no-untyped-def]
     analysis, projected, real_precision, imaginary_precision, real_block, imaginary_block, chi2,
     residual,
 ):  # fmt: skip
-    """Write how far each coil is from what the others predict; see `refit.agreement`.
+    """Write how far each coil is from what the others predict; see `left_out`.
 
     ``analysis`` (n, n): a row an eigenvector; ``projected`` (n, 2); blocks (S, K, K).
     """
@@ -272,40 +272,6 @@ def fill_without(  # type: ignore[no-untyped-def]
                     gain[h, q] -= curve[h, start, part]
             if not is_walk:
                 best = np.maximum(best, log_evidence[h] + gain[h])
-
-
-@kernel
-def bend_power(flux, previous, before):  # type: ignore[no-untyped-def]
-    """Return the median over coils of the mean squared second difference of fluxes (S, K)."""
-    power, count = np.empty(flux.shape[0]), 0
-    for s in range(flux.shape[0]):
-        total = 0.0
-        for k in range(flux.shape[1]):
-            bend = flux[s, k] - 2.0 * previous[s, k] + before[s, k]
-            total += bend.real * bend.real + bend.imag * bend.imag
-        if math.isfinite(total):
-            power[count] = total / flux.shape[1]
-            count += 1
-    return np.median(power[:count]) if count else math.nan
-
-
-@kernel
-def find_silent(flux, least, silent, no_baseline, codes):  # type: ignore[no-untyped-def]
-    """Write which good readings (S, K) are silent, and which have no baseline.
-
-    ``least`` (S,): power (T^2) below which a coil hears nothing; NaN without a baseline.
-    ``codes`` (S,): 0 for a good reading; the codes ``silent`` and ``no_baseline`` are put in.
-    """
-    for s in range(flux.shape[0]):
-        if math.isnan(least[s]):
-            codes[s] = no_baseline
-        elif codes[s] == 0:
-            power = 0.0
-            for k in range(flux.shape[1]):
-                value = flux[s, k]
-                power += value.real * value.real + value.imag * value.imag
-            if power < least[s]:
-                codes[s] = silent
 
 
 @kernel

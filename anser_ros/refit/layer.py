@@ -45,7 +45,7 @@ AT_ONCE = 64
 """Sources whose field at the samples is worked out at once, 5 MB: with many more, the time goes
 into waiting for memory, with many fewer, into starting again."""
 MOST_MIDDLE = 60
-"""Samples in the middle that tell what the uncertainty's modes leave."""
+"""Samples in the middle that show what the uncertainty's modes leave."""
 LEAST_SAMPLE_DISTANCE = 0.35
 """Samples nearer to a body's sources than this part of its radius don't count."""
 INNER = 0.83
@@ -180,13 +180,7 @@ def _middle(points: Array, half: float) -> NDArray[np.int64]:
 def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
     """Return the sources of a compact body as dipoles, which are exact wherever the body is.
 
-    Parameters
-    ----------
-    region : Region
-    weight : ndarray, shape (P,)
-        `pose_weight` at ``region.volume.samples()``.
-    cloud : Cloud
-        The body's sources.
+    ``weight`` (P,) is `pose_weight` at ``region.volume.samples()``.
     """
     points = region.volume.samples()
     away = np.linalg.norm(points[:, None] - cloud.positions, axis=2).min(axis=1)
@@ -214,14 +208,8 @@ def bottom_layer(
 ) -> Layer:
     """Return the layer for clouds below the board.
 
-    Parameters
-    ----------
-    model : FieldModel
-        Calibrated; its dipoles are used again where they can stand for the sources.
-    region : Region
-    excitation : Excitation
-    sources : ndarray, shape (M, 3)
-        Sources of the cloud that is hardest to stand for, the nearest one.
+    The calibrated model's dipoles are used again where they can stand for the ``sources`` (M, 3)
+    of the cloud that is hardest to stand for, the nearest one.
     """
     points, deep = region.volume.samples(*SAMPLES), _lattice(region, *DEEP)
     upright = np.abs(model.directions[:, 2]) > 0.999

@@ -7,8 +7,6 @@ few dozen readings determine the change of the whole field. See `docs/refit.md`.
 
 import math
 from collections.abc import Callable, Sequence
-from copy import copy
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +23,20 @@ from anser_ros.refit import tables as refit_tables
 from anser_ros.refit.agreement import distance_of, evidence_without, left_out
 from anser_ros.refit.assembly import Assembly
 from anser_ros.refit.banks import Banks
-from anser_ros.refit.baseline import checked_baseline, checked_noise
+from anser_ros.refit.baseline import checked_baseline
 from anser_ros.refit.belief import Belief
 from anser_ros.refit.change import Average, NoiseLevel
-from anser_ros.refit.evidence import FrameEvidence
+from anser_ros.refit.evidence import FrameEvidence, median
 from anser_ros.refit.excitation import FieldFunction
 from anser_ros.refit.frame import BaselineCheck, NoiseUnits
 from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
-from anser_ros.refit.jumps import LARGEST_RATE, LEAST_JUMP_POWER, Courses, are_over, jumped
+from anser_ros.refit.jumps import (
+    LARGEST_RATE,
+    LEAST_JUMP_POWER,
+    Courses,
+    faults_have_ended,
+    jumped,
+)
 from anser_ros.refit.posterior import Bank
 from anser_ros.refit.result import (
     FEW_REFERENCES,
@@ -73,13 +77,10 @@ class LiveRefit:
     drawing : callable, optional
         Field of the board as drawn (`physics.board.Board.field`): points (P, 3) to (P, K, 3), T.
         Without it the model's own dipoles drive the metal, which is much less accurate.
-    noise : ndarray, shape (S,), optional
-        Noise of each reference over the nominal one, at least 1; more for coils whose place is
-        only known from a tracker (see `refit.patches`).
     volume : TrackedVolume, optional
         Where the field must be right; by default the volume over such a board.
     tables : RefitTables, optional
-        Of all these but the baseline and the noise, where they are there already.
+        Of all these but the baseline, where they are there already.
 
     Raises
     ------
@@ -94,14 +95,12 @@ class LiveRefit:
         baseline: ComplexArray,
         settings: RefitSettings | None = None,
         drawing: FieldFunction | None = None,
-        noise: Array | None = None,
         volume: TrackedVolume | None = None,
         tables: refit_tables.RefitTables | None = None,
     ) -> None:
         self.model, self.references = model, references
         self.settings = settings or RefitSettings()
         self.baseline = checked_baseline(model, references, baseline)
-        self._row_noise = checked_noise(noise, len(references), len(model.emitters))
         self._tables = tables or refit_tables.build_tables(
             model, references, self.settings, drawing, volume
         )
@@ -127,23 +126,24 @@ class LiveRefit:
         slots.warm_up(readings, 1.0)
         weights = np.zeros(len(bank.names))
         weights[1] = 1.0
-        phase = self._tables.excitation.phase
-        Assembly(self.model).model(
-            0, bank, seen, weights, np.zeros_like(phase), 1.0, phase, accuracy.flux_noise_t,
-            self.settings.error_modes,
-        )  # fmt: skip
+        no_drift = np.zeros(bank.width, dtype=complex)
+        self._new_assembly().model(0, bank, seen, weights, no_drift, 1.0)
 
     def _prepare(self) -> None:
         """Compute what depends on the baseline and the references' places."""
         phase, noise_t = self._tables.excitation.phase, self.settings.accuracy.flux_noise_t
         self._units = NoiseUnits(self.baseline, phase, noise_t)
-        self._banks = Banks(self._tables, self.baseline, self.settings, self._row_noise)
+        self._banks = Banks(self._tables, self.baseline, self.settings)
         self._intake = Intake(self.references.channel, error=FitError)
         self._baseline_check = BaselineCheck(self.baseline)
-        self._assembly = Assembly(self.model)
+        self._assembly = self._new_assembly()
+
+    def _new_assembly(self) -> Assembly:
+        phase, settings = self._tables.excitation.phase, self.settings
+        return Assembly(self.model, phase, settings.accuracy.flux_noise_t, settings.error_modes)
 
     def reset(self) -> None:
-        """Forget all frames, so that the calibrated model is in force again."""
+        """Forget all frames, so that the calibrated model is active again."""
         settings = self.settings
         self._noise = NoiseLevel(settings.accuracy.flux_noise_t)
         self._average = Average(settings.average_frames)
@@ -156,31 +156,6 @@ class LiveRefit:
         if self._witness is not None:
             self._witness.forget()
         self._last_ns = 0
-        self._last_model = self.model
-
-    def moved(
-        self, references: SensorTable, baseline: ComplexArray, noise: Array | None = None
-    ) -> 'LiveRefit':
-        """Return the same refit for references at other places, with what it has learnt.
-
-        Parameters
-        ----------
-        references : SensorTable
-            The same coils in the same order.
-        baseline, noise
-            As for the constructor.
-        """
-        if references.name != self.references.name:
-            raise FitError('refit: moved references must be the same coils in the same order')
-        other = copy(self)
-        other.references = references
-        other.baseline = checked_baseline(self.model, references, baseline)
-        other._row_noise = checked_noise(noise, len(references), len(self.model.emitters))
-        other._tables = self._tables.moved(references, self.settings)
-        other._prepare()
-        other._belief = copy(self._belief)
-        other._average = Average(self.settings.average_frames)
-        return other
 
     def update(
         self,
@@ -188,22 +163,11 @@ class LiveRefit:
         channels: NDArray[np.generic],
         flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
-        baseline: ComplexArray | None = None,
     ) -> RefitResult:
         """Take in one frame of reference fluxes and return the result of the refit.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Middle of the demodulation window.
-        channels : ndarray, shape (S,)
-            Channel of each row, in any order; unknown ones are passed over.
-        flux : ndarray, shape (S, K), complex
-            T.
-        flags : ndarray, shape (S,), optional
-            Flag bits; a flagged reading is not used.
-        baseline : ndarray, shape (S, K), complex, optional
-            The baseline at this moment, in the order of the references, where some of them move.
+        ``channels`` (S,) may come in any order, and unknown ones are passed over; ``flux`` (S, K)
+        is in T; a reading with ``flags`` (S,) is not used.
 
         Raises
         ------
@@ -211,18 +175,10 @@ class LiveRefit:
             When shapes don't fit or a channel appears twice.
         """
         width = len(self.model.emitters)
-        return self.follow(self._intake.judge(stamp_ns, channels, flux, flags, width), baseline)
+        return self.follow(self._intake.judge(stamp_ns, channels, flux, flags, width))
 
-    def follow(self, frame: Frame, baseline: ComplexArray | None = None) -> RefitResult:
-        """Take in one frame that has been judged.
-
-        Parameters
-        ----------
-        frame : Frame
-            In the order of the references.
-        baseline : ndarray, shape (S, K), complex, optional
-            As for `update`.
-        """
+    def follow(self, frame: Frame) -> RefitResult:
+        """Take in one frame that has been judged, in the order of the references."""
         stamp_ns, ordered = frame.stamp_ns, frame.flux
         if stamp_ns < self._last_ns:
             self._noise.forget()
@@ -231,18 +187,14 @@ class LiveRefit:
             self._courses = Courses(*self.baseline.shape)
         self._last_ns = stamp_ns
         frame = self._freshness.judged(frame, self.settings.accuracy.flux_noise_t)
-        readable, reasons = self._baseline_check.read(frame, baseline)
+        readable, reasons = self._baseline_check.read(frame)
         self._watch.note(readable, reasons, self.settings.min_references, stamp_ns)
         usable = ordered if readable.all() else np.where(readable[:, None], ordered, np.nan)
         level = self._noise.update(self._watch.without_excluded(usable))
-        clean = self.baseline if baseline is None else baseline
-        self._look_for_jumps(stamp_ns, usable - clean, level)
+        self._look_for_jumps(stamp_ns, usable - self.baseline, level)
         if np.count_nonzero(self._in_use()) < self.settings.min_references:
             self._watch.wait(readable)
             return self._too_few(stamp_ns, level)
-        if baseline is not None:
-            # What is averaged is the change; the baseline moves with the coil.
-            ordered = ordered - baseline + self.baseline
         used = self._watch.without_excluded(ordered)
         mean, frames = self._average.update(used, level * self.settings.accuracy.flux_noise_t)
         if used is not ordered:
@@ -260,22 +212,21 @@ class LiveRefit:
         """Leave out coils whose change (S, K) has just jumped by itself."""
         jumps = self._courses.follow(stamp_ns, change)
         parts = self._units.of(jumps.off) / jumps.spread[:, None, None]
-        noise = level * self._row_noise[:: parts.shape[1]]
-        loud = (parts**2).mean(axis=(1, 2)) > LEAST_JUMP_POWER * noise**2
+        jumping = (parts**2).mean(axis=(1, 2)) > LEAST_JUMP_POWER * level**2
         away, coils = self._courses.away(), np.flatnonzero(self._in_use())
-        if not (loud.any() or away.size):
+        if not (jumping.any() or away.size):
             return
-        self._courses.note(jumps, away[loud[away]])
-        back = self._courses.returned(noise * self.settings.accuracy.flux_noise_t)
+        self._courses.note(jumps, away[jumping[away]])
+        back = self._courses.returned(level * self.settings.accuracy.flux_noise_t)
         few = coils.size < self.settings.min_references or self._watch.is_outvoted
         drift, banks = self.settings.emitter_drift, self._banks.of
-        if few and are_over(self._courses, self._units, banks, level, noise, drift):
+        if few and faults_have_ended(self._courses, self._units, banks, level, drift):
             back = self._courses.forget_jumps()
         for coil in back.tolist():
             self._watch.recover(coil)
         # The first frame has no course, and the second only the noise that was stated: metal may
         # be there, and `_judged` asks who disagrees.
-        if not (loud[coils].any() and self._noise.is_measured and math.isfinite(jumps.since_s)):
+        if not (jumping[coils].any() and self._noise.is_measured and math.isfinite(jumps.since_s)):
             return
         bank, _ = self._bank()
         seen = bank.evaluate(parts[coils].reshape(-1, 2), level)
@@ -306,8 +257,7 @@ class LiveRefit:
             self._distance, self._residual = left_out(bank, seen, best)
             if len(coils) <= self.settings.min_references:
                 return bank, seen
-            loudness = noise * self._row_noise[:: bank.width][coils]
-            power = (used.reshape(len(coils), -1) ** 2).sum(axis=1) / loudness**2
+            power = (used.reshape(len(coils), -1) ** 2).sum(axis=1) / noise**2
             suspects = self._watch.suspects(self._distance, power, 2 * bank.width)
             faulty = health.find_faults(bank, seen, suspects)
             if not faulty.size:
@@ -336,7 +286,7 @@ class LiveRefit:
         self._belief.update(seen.log_evidence)
         weights, moving = self._belief.weights, self._belief.may_have_changed
         best = int(weights.argmax())
-        typical = health.typical(self._distance) / (2 * bank.width)
+        typical = median(self._distance) / (2 * bank.width)
         mean, variance = bank.drifts(seen, best)
         drift = self.settings.emitter_drift * (mean @ np.array([1.0, 1.0j]))
         sure = (np.abs(mean) > DRIFT_SIGMAS * np.sqrt(np.maximum(variance, 1e-30))).any(axis=1)
@@ -349,11 +299,8 @@ class LiveRefit:
         elif self._witness is not None:
             self._witness.forget()
         if moving or sure.any():
-            phase = self._tables.excitation.phase
-            model = self._assembly.model(
-                stamp_ns, bank, seen, weights, drift, typical, phase, unit,
-                self.settings.error_modes, self._witness if moving else None,
-            )  # fmt: skip
+            witness = self._witness if moving else None
+            model = self._assembly.model(stamp_ns, bank, seen, weights, drift, typical, witness)
             state = REFIT
         if self._watch.is_outvoted:
             state = REFERENCES_DOUBTFUL
@@ -364,10 +311,11 @@ class LiveRefit:
             state = POOR_FIT
             reason = f'readings deviate {np.sqrt(typical):.1f} times as much as expected'
         metal = (lambda: locate_metal(bank, seen, weights, unit)) if moving else None
-        return self._finish(
-            stamp_ns, model, state, reason, level, log_odds=self._belief.log_odds,
-            weights=dict(zip(bank.names, weights.tolist(), strict=True)), drift=drift, find=metal,
-        )  # fmt: skip
+        by_name = dict(zip(bank.names, weights.tolist(), strict=True))
+        odds, noise_t, judge = self._belief.log_odds, level * unit, self._healths()
+        return RefitResult(
+            stamp_ns, model, state, judge, odds, by_name, noise_t, drift, reason, metal
+        )
 
     def enable_witnesses(self, flux_noise_t: float, *, ready: bool = False) -> None:
         """Use `witnessed` from now on; the noise is of the tools' components, T.
@@ -391,16 +339,6 @@ class LiveRefit:
         bank, _ = self._bank()
         self._belief.update_by(bank.names, self._witness.update(readings))
 
-    def _finish(
-        self, stamp_ns: int, model: FieldModel, state: str, reason: str, level: float, **more: Any
-    ) -> RefitResult:
-        changed, self._last_model = model is not self._last_model, model
-        noise_t = level * self.settings.accuracy.flux_noise_t
-        return RefitResult(
-            stamp_ns, model, state, changed, self._healths(), noise_t=noise_t, reason=reason,
-            **more,
-        )  # fmt: skip
-
     def _too_few(self, stamp_ns: int, level: float) -> RefitResult:
         """Return to the calibrated model, which is no answer: it is not known where metal is."""
         self._belief.forget()
@@ -412,8 +350,9 @@ class LiveRefit:
         state = REFERENCES_DOUBTFUL if self._watch.is_outvoted else FEW_REFERENCES
         reason = f'{count} usable references, {need} are needed'
         drift = np.zeros(len(self.model.emitters), dtype=complex)
-        return self._finish(
-            stamp_ns, self.model, state, reason, level, log_odds=0.0, weights={}, drift=drift
+        noise_t = level * self.settings.accuracy.flux_noise_t
+        return RefitResult(
+            stamp_ns, self.model, state, self._healths(), 0.0, {}, noise_t, drift, reason
         )
 
     def _healths(self) -> Callable[[], tuple[ReferenceHealth, ...]]:

@@ -39,13 +39,9 @@ class ErrorLevel:
 class PosteriorModes:
     """Holds the error of a hypothesis' posterior in units of the noise.
 
-    Attributes
-    ----------
-    moments : ndarray, shape (R, N, K), complex
-        Of the hypothesis' layer; the error is a sum of these with independent normal factors.
-    rest : float
-        Standard deviation of a phasor component of what they leave, in the middle of the volume.
-        Without it a pose would trust the directions that no mode points in.
+    It is a sum of moments (R, N, K) of the hypothesis' layer with independent normal factors. What
+    they leave has the standard deviation ``rest`` of a phasor component in the middle of the
+    volume: without it a pose would trust the directions that no mode points in.
     """
 
     moments: ComplexArray
@@ -70,17 +66,17 @@ def error_draws(
     """
     prior, power = posterior.prior, STRENGTHS[strength]
     count = prior.draw_readings.shape[1]
-    drawn = noise * _noise_draws(count, bank.drift, bank.row_noise, part)
+    drawn = noise * _noise_draws(count, bank.drift, part)
     readings = np.sqrt(power) * prior.draw_readings[bank.rows] + drawn
     gain = power / (power * posterior.values + noise**2)
     weights = gain[:, None] * (posterior.basis.T @ readings)
     return np.asarray(np.sqrt(power) * prior.draw_moments - posterior.synthesis @ weights)
 
 
-def _noise_draws(count: int, drift: Array, noise: Array, part: int) -> Array:
+def _noise_draws(count: int, drift: Array, part: int) -> Array:
     """Return repeatable draws of the readings' noise and drift, (n, D)."""
     rng = np.random.default_rng(1 + part)
-    white = noise[:, None] * rng.standard_normal((len(drift), count))
+    white = rng.standard_normal((len(drift), count))
     return np.asarray(white + drift @ rng.standard_normal((drift.shape[1], count)))
 
 
@@ -89,17 +85,8 @@ def error_modes(
 ) -> PosteriorModes:
     """Return the principal modes of a posterior's error, weighted by its effect on poses.
 
-    It takes long and changes nothing, so any thread may do it.
-
-    Parameters
-    ----------
-    bank : Bank
-    posterior : Eigenbasis
-        From `Bank.posterior`.
-    level : ErrorLevel
-        From `error_level`.
-    count : int
-        Modes R.
+    The posterior is one of `Bank.posterior`, the level one of `error_level`; ``count`` modes are
+    kept. It takes long and changes nothing, so any thread may do it.
     """
     layer = posterior.prior.layer
     size, width = len(layer.positions), bank.width

@@ -43,17 +43,10 @@ def make_room(table: dict[Any, Any], most: int) -> None:
 
 @dataclass(frozen=True)
 class Eigenbasis:
-    """States what a prior's covariance is made of, for the readings in use.
+    """States what a prior's covariance is made of, for the n readings in use.
 
-    Attributes
-    ----------
-    prior : CloudPrior
-    values : ndarray, shape (n,)
-        Eigenvalues, whitened readings.
-    basis : ndarray, shape (n, n)
-        Eigenvectors in columns, from readings.
-    synthesis : ndarray, shape (N K, n)
-        From coordinates in the eigenvectors to the layer's moments, single precision.
+    Its eigenvalues (n,) and eigenvectors (n, n), in columns, of whitened readings, and the map (N
+    K, n) from coordinates in these to the layer's moments.
     """
 
     prior: CloudPrior
@@ -72,12 +65,9 @@ class Bank:
         Readings in use, as rows of the priors' covariance; all K of a coil or none.
     drift : ndarray, shape (all readings, K)
         Reading that one deviation of each emitter's drift makes, in noise units.
-    noise : ndarray, shape (all readings,), optional
-        Noise of each reading over the others' (1 where not given).
-    slots : int
-        Hypotheses more that can be put in later, one after the other in the same place.
-    among : int
-        How many hypotheses those in the slots are chosen from: each is as much less likely.
+    slots, among : int
+        Places for hypotheses that are put in later, and how many these are chosen from: each is
+        as much less likely.
 
     Attributes
     ----------
@@ -90,8 +80,6 @@ class Bank:
     log_prior : ndarray, shape (H,)
         Natural logarithm of the probability before data; minus infinity for an empty slot.
     is_slot : ndarray of bool, shape (H,)
-    row_noise : ndarray, shape (n,)
-        Noise of the readings in use, over the nominal one.
     """
 
     def __init__(
@@ -99,7 +87,6 @@ class Bank:
         priors: Sequence[CloudPrior],
         rows: NDArray[np.int64],
         drift: Array,
-        noise: Array | None = None,
         slots: int = 0,
         among: int = 0,
     ) -> None:
@@ -107,9 +94,7 @@ class Bank:
         self.rows, self.width = rows, drift.shape[1]
         self.all_drift = drift
         self.drift = drift[rows]
-        self.all_noise = np.ones(len(drift)) if noise is None else noise
-        self.row_noise = self.all_noise[rows]
-        self.whitening = _whitening(self.drift, self.row_noise)
+        self.whitening = _whitening(self.drift)
         count, n = 1 + len(self.priors), len(rows)
         self.spectra, self.bases = np.zeros((count, n)), np.zeros((count, n, n))
         self.analysis = np.zeros((count * n, n), dtype=np.float32)
@@ -192,12 +177,8 @@ class Bank:
     def evaluate(self, readings: Array, noise: float) -> FrameEvidence:
         """Return the evidence of every hypothesis.
 
-        Parameters
-        ----------
-        readings : ndarray, shape (n, 2)
-            Change since the baseline, real and imaginary part, in nominal noise deviations.
-        noise : float
-            Noise in units of the nominal one.
+        ``readings`` (n, 2): change since the baseline, real and imaginary part, in nominal noise
+        deviations. ``noise``: noise in units of the nominal one.
         """
         precision, log_det = self.precision(noise)
         count, n = self.spectra.shape
@@ -278,15 +259,14 @@ def _rows(columns: Array) -> Single:
     return np.ascontiguousarray(columns.T, dtype=np.float32)
 
 
-def _whitening(drift: Array, noise: Array) -> Array:
-    """Return a matrix W with ``W^T (diag(noise)^2 + drift drift^T) W = 1``.
+def _whitening(drift: Array) -> Array:
+    """Return a matrix W with ``W^T (1 + drift drift^T) W = 1``.
 
     The columns of ``drift`` are one emitter's readings each, so they are orthogonal.
     """
-    scaled = drift / noise[:, None]
     out = np.eye(len(drift))
-    norm = np.linalg.norm(scaled, axis=0)
+    norm = np.linalg.norm(drift, axis=0)
     for column in np.flatnonzero(norm > 0.0):
-        unit = scaled[:, column] / norm[column]
+        unit = drift[:, column] / norm[column]
         out -= np.outer(unit, unit) * (1.0 - 1.0 / np.sqrt(1.0 + norm[column] ** 2))
-    return np.asarray(out / noise[:, None])
+    return out

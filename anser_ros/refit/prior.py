@@ -71,11 +71,11 @@ class CloudPrior:
     name : str
     cloud : Cloud
     layer : Layer
+    response : Response
+        Of its sources.
     coupling : ndarray, shape (S K, M)
         Covariance of each reading with each source's mean polarisability (a third of the tensor's
         trace, A m^2 / T), normalised like ``covariance``.
-    tilt : ndarray, shape (K,)
-        `FREQUENCY_SLOPE` times log(f_k / f_mean).
     covariance : ndarray, shape (S K, S K)
         Of the readings, survey errors included, normalised to a mean variance of 1.
     transfer : ndarray, shape (N K, S K)
@@ -91,8 +91,8 @@ class CloudPrior:
     name: str
     cloud: Cloud
     layer: Layer
+    response: Response
     coupling: Array
-    tilt: Array
     covariance: Array
     transfer: Array
     draw_readings: Array
@@ -200,20 +200,8 @@ def build_prior(
 ) -> CloudPrior:
     """Compute a hypothesis for a set of references.
 
-    Parameters
-    ----------
-    cloud : Cloud
-    response : Response
-    layer : Layer
-    references : SensorTable
-        Places and axes in fg.
-    excitation : ndarray, shape (M, K, 3)
-        Field of the emitters at the sources, T.
-    frequencies_hz : ndarray, shape (K,)
-    accuracy : Accuracy
-        Of the references' survey.
-    rng : numpy Generator
-        For the draws.
+    ``excitation`` (M, K, 3) is the field of the emitters at the sources, T; ``accuracy`` that of
+    the references' survey; ``rng`` is for the draws.
     """
     n_refs, k = len(references), excitation.shape[1]
     sources = _Sources(cloud, excitation, response)
@@ -236,17 +224,10 @@ def build_prior(
     factors = np.linalg.cholesky(blocks + np.eye(k) * 1e-12 * scale)
     readings = readings + (factors @ errors).reshape(n_refs * k, N_SAMPLES)
     name = f'{cloud.name}, {response.name}' if response.name else cloud.name
+    coupling, transfer = sources.coupling(basis) / scale, transfer.reshape(-1, n_refs * k)
+    drawn = readings / np.sqrt(scale), moments / np.sqrt(scale)
     return CloudPrior(
-        name,
-        cloud,
-        layer,
-        sources.coupling(basis) / scale,
-        tilt,
-        covariance / scale,
-        transfer.reshape(-1, n_refs * k),
-        readings / np.sqrt(scale),
-        moments / np.sqrt(scale),
-        scale,
+        name, cloud, layer, response, coupling, covariance / scale, transfer, *drawn, scale
     )
 
 

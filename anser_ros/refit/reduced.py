@@ -13,9 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.clouds import Cloud
-from anser_ros.refit.layer import Layer
-from anser_ros.refit.prior import CloudPrior, Response, frequency_tilt
+from anser_ros.refit.prior import CloudPrior, frequency_tilt
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -34,53 +32,30 @@ class ReducedPrior:
 
     Attributes
     ----------
-    prior : CloudPrior
     basis : ndarray, shape (N, K D), single precision
         Moments of the layer by unit coordinates; metal of strength a has coordinates of variance
         a, independent of each other.
-    analysis : ndarray, shape (D, N K)
-        From moments of the layer to coordinates.
     cross : ndarray, shape (D, S K)
         Covariance of the coordinates with all readings of the references.
     felt : ndarray, shape (D,)
         What poses feel of unit coordinates (`Layer.metric`); no two feel alike.
-    middle : ndarray, shape (D,)
-        Power of a field component that unit coordinates make in the middle of the volume, T^2.
     """
 
-    prior: CloudPrior
     basis: Single
-    analysis: Array
     cross: Array
     felt: Array
-    middle: Array
 
 
 def reduced(
-    prior: CloudPrior,
-    response: Response,
-    excitation: Array,
-    frequencies_hz: Array,
-    rng: np.random.Generator,
+    prior: CloudPrior, excitation: Array, frequencies_hz: Array, rng: np.random.Generator
 ) -> ReducedPrior:
     """Return the coordinates of a hypothesis.
 
-    Parameters
-    ----------
-    prior : CloudPrior
-    response : Response
-        Of its sources.
-    excitation : ndarray, shape (M, K, 3)
-        Field of the emitters at its sources, T.
-    frequencies_hz : ndarray, shape (K,)
-    rng : numpy Generator
-        For the search of the directions.
+    ``excitation`` (M, K, 3): field of the emitters at its sources, T. ``rng``: for the search of
+    the directions.
     """
     layer, k = prior.layer, excitation.shape[1]
     n = len(layer.positions)
-
-    def columns() -> Iterator[Single]:
-        return _columns(prior.cloud, layer, response, excitation, frequencies_hz)
 
     def felt(moments: Array) -> Array:
         """What poses feel of moments (N K, R)."""
@@ -88,35 +63,29 @@ def reduced(
 
     wanted = DIRECTIONS + OVERSAMPLED
     sketch = np.zeros((n * k, wanted))
-    for part in columns():
+    for part in _columns(prior, excitation, frequencies_hz):
         sketch += part @ rng.standard_normal((part.shape[1], wanted)).astype(np.float32)
     frame, _ = np.linalg.qr(felt(sketch))
     # Transposed metric: rows of the layer, emitter by emitter.
     seen = (layer.metric.T @ frame.reshape(n, -1)).reshape(n * k, -1)
     moments = np.zeros((n * k, frame.shape[1]))
     small = seen.astype(np.float32)
-    for part in columns():
+    for part in _columns(prior, excitation, frequencies_hz):
         moments += part @ (part.T @ small)
     values, vectors = np.linalg.eigh(frame.T @ felt(moments))
     values, vectors = values[::-1][:DIRECTIONS], vectors[:, ::-1][:, :DIRECTIONS]
     keep = values > 1e-12 * values[0]
     root, vectors = np.sqrt(values[keep]), vectors[:, keep]
     scale = np.sqrt(prior.scale)
-    basis = moments @ vectors / (root * scale)
+    basis = (moments @ vectors / (root * scale)).reshape(n, -1).astype(np.float32)
+    # From moments of the layer to coordinates.
     analysis = (seen @ vectors / root).T * scale
-    cross = analysis @ prior.transfer
-    field = layer.middle @ basis.reshape(n, -1)
-    middle = (field**2).reshape(-1, k, basis.shape[1]).mean(axis=(0, 1))
-    return ReducedPrior(
-        prior, basis.reshape(n, -1).astype(np.float32), analysis, np.asarray(cross),
-        root / scale, np.asarray(middle),
-    )  # fmt: skip
+    return ReducedPrior(basis, np.asarray(analysis @ prior.transfer), root / scale)
 
 
-def _columns(
-    cloud: Cloud, layer: Layer, response: Response, excitation: Array, frequencies_hz: Array
-) -> Iterator[Single]:
+def _columns(prior: CloudPrior, excitation: Array, frequencies_hz: Array) -> Iterator[Single]:
     """Yield the layer's moments (N K, C) by each free number of the sources' polarisabilities."""
+    cloud, layer, response = prior.cloud, prior.layer, prior.response
     tilt = frequency_tilt(frequencies_hz)
     projected = layer.project(cloud.positions).reshape(len(layer.positions), -1, 3)
     for start in range(0, len(cloud.positions), AT_ONCE):

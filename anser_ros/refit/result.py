@@ -33,7 +33,7 @@ WITHHELD = {
     POOR_FIT: REFERENCES_DOUBTFUL,
     REFERENCES_DOUBTFUL: REFERENCES_DOUBTFUL,
 }
-"""What trackers are told in states whose model is none to give poses by."""
+"""State that trackers receive in states whose model is none to give poses by."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Metal:
     volumes : ndarray, shape (M,)
         Volume that each source stands for, m^3.
     centroid : ndarray, shape (3,)
-        Mean of the space, weighted by the squared magnitude of the polarisability's density. It
+        Mean of the space, weighted by the squared magnitude of the polarisability's density: it
         leans towards the part of the metal that the emitters reach best.
     standoff_m : float
         The cloud's distance from the board.
@@ -67,14 +67,8 @@ def locate_metal(
 ) -> Metal | None:
     """Return the sources under the most probable hypothesis with metal; None when all are zero.
 
-    Parameters
-    ----------
-    bank : Bank
-    seen : FrameEvidence
-    weights : ndarray, shape (H,)
-        Probability of each hypothesis; the first, that nothing has changed, is passed over.
-    flux_noise_t : float
-        Nominal noise, T.
+    ``weights`` (H,): probability of each hypothesis; the first, that nothing has changed, is
+    passed over. ``flux_noise_t``: nominal noise, T.
     """
     best = 1 + int(weights[1:].argmax())
     values = bank.sources(seen, best) * flux_noise_t
@@ -95,13 +89,11 @@ class RefitResult:
     ----------
     stamp_ns : int
     model : FieldModel
-        The model in force; the calibrated one itself while nothing has changed.
+        The active model; the calibrated one itself while nothing has changed.
     state : str
-        One of `STATES`.
-    changed : bool
-        Whether the model is another one than after the frame before.
-    judge : callable
-        Works out `references`.
+        One of `STATES`, and the `reason` why.
+    judge, find : callable
+        Work out `references` and `metal`.
     log_odds : float
         Natural logarithm of the odds that something has changed.
     weights : mapping of str to float
@@ -112,15 +104,11 @@ class RefitResult:
         Relative change of each emitter's strength; where nothing else changes, zero unless it is
         significant.
     reason : str
-        Why the state is what it is.
-    find : callable, optional
-        Works out `metal`.
     """
 
     stamp_ns: int
     model: FieldModel
     state: str
-    changed: bool
     judge: Callable[[], tuple[ReferenceHealth, ...]] = field(repr=False)
     log_odds: float
     weights: dict[str, float]
@@ -136,7 +124,7 @@ class RefitResult:
 
     @property
     def is_answer(self) -> bool:
-        """Return whether the references told this frame's model; else it is the last resort."""
+        """Return whether the references gave this frame's model; else it is the last resort."""
         return not self.withheld
 
     @cached_property

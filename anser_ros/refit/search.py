@@ -37,18 +37,8 @@ def _symmetric() -> Array:
 def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Single:
     """Return the readings of a body's coarse sources, a column for each tensor component.
 
-    Parameters
-    ----------
-    cloud : Cloud
-    references : SensorTable
-        Places and axes in fg.
-    excitation : ndarray, shape (COARSE, K, 3)
-        Field of the emitters at the first sources, T.
-
-    Returns
-    -------
-    ndarray, shape (S K, 6 COARSE)
-        Scaled so that the readings have a mean variance of 1.
+    Of shape (S K, 6 COARSE), scaled so that the readings have a mean variance of 1.
+    ``excitation`` (COARSE, K, 3) is the field of the emitters at the first sources, T.
     """
     basis = vector_basis(
         references.position, references.axis, references.length, cloud.positions[:COARSE]
@@ -107,14 +97,8 @@ class BodySearch:
         return self._tables[noise]
 
     def scores(self, readings: Array, noise: float) -> Array:
-        """Return the approximate log evidence of every body, (L,).
-
-        Parameters
-        ----------
-        readings : ndarray, shape (n, 2)
-            Change since the baseline in nominal noise deviations, real and imaginary part.
-        noise : float
-            Noise in units of the nominal one.
+        """Return the approximate log evidence of every body, (L,); arguments as in
+        `Bank.evaluate`.
         """
         inside, rest, log_det = self._table(noise)
         white = np.empty((len(self.rows), 2), dtype=np.float32)

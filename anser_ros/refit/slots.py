@@ -21,25 +21,19 @@ Array = NDArray[np.float64]
 
 SLOTS = 3
 """Compact bodies that are full hypotheses at a time: two that explain the readings alike, and one
-more that may be better. Fewer forget one of the two; each more costs the posterior of a source in
-every frame."""
+more that may be better. Each costs the posterior of a source in every frame."""
 SLOT_EVIDENCE = 3.0
 """Gain of approximate log evidence for which a body takes another's slot: odds of twenty to one,
-so that two that explain alike do not take turns. Smaller, and bodies change places with the noise;
-larger, and a body that has become the likely one waits for frames."""
+so that two that explain alike do not take turns."""
 EVERY = 4
 """Frames from one look at all bodies to the next. In 80 ms at 50 Hz metal in a hand moves some 2
-cm, a third of the distance between neighbouring bodies (`clouds.BODY_SPACING`). Fewer cost time in
-every frame; more, and a new body is seen some hundredths of a second later."""
+cm, a third of the distance between neighbouring bodies (`clouds.BODY_SPACING`)."""
 MOST_BODIES = 16
-"""Bodies whose hypotheses are kept once they have been worked out, 3 MB each with 32 references:
-metal that goes to and fro, or stays where it was before, asks for the same ones again, and each
-costs 17 ms of a processor. Of a disc that comes half a metre near and goes, again and again, 16
-answer two thirds of the requests, 12 half of them and 24 no more."""
+"""Bodies whose hypotheses are kept once worked out, 3 MB and 17 ms each: of a disc that comes and
+goes, again and again, 16 answer two thirds of the requests, and 24 no more."""
 PRESENT = 1.15
-"""Ratio of the readings' power to that of the noise below which no body is looked for. Noise of 32
-references and eight emitters is 2.4 standard deviations below it, and exceeds it in one frame of
-100. Smaller looks for bodies in noise; larger misses the first of a body that comes."""
+"""Ratio of the readings' power to that of the noise below which no body is looked for: noise of 32
+references and eight emitters exceeds it in one frame of 100."""
 
 
 Choice = tuple[int, int] | None
@@ -56,11 +50,7 @@ class _Look(NamedTuple):
 class BodySlots:
     """Fills the slots of a bank with the bodies that the readings support.
 
-    Parameters
-    ----------
-    bank : Bank
-        Its last `SLOTS` hypotheses are slots.
-    tables : RefitTables
+    ``bank``: its last `SLOTS` hypotheses are slots.
     """
 
     def __init__(self, bank: Bank, tables: RefitTables) -> None:
@@ -86,16 +76,7 @@ class BodySlots:
         """Take in one frame; every few frames a body may be replaced by a better one.
 
         All bodies are compared, and the hypothesis of the chosen one is computed, in parallel with
-        the frames; it takes its slot in a later frame.
-
-        Parameters
-        ----------
-        readings : ndarray, shape (n, 2)
-            Change since the baseline in nominal noise deviations, real and imaginary part.
-        noise : float
-            Noise in units of the nominal one.
-        stamp_ns : int
-            Of the frame.
+        the frames; it takes its slot in a later frame. The arguments are those of `Bank.evaluate`.
         """
         self._put_in(stamp_ns)
         if float((readings**2).mean()) < PRESENT * noise**2:

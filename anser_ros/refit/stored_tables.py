@@ -57,19 +57,18 @@ def tables_of(
     bottom, box = (Layer(**_given(f'layer{i}', Layer, arrays)) for i in range(2))
     hypotheses = hypotheses_of(default_clouds(region), bottom, box)
     priors = tuple(
-        CloudPrior(cloud=cloud, layer=layer, **_given(f'prior{i}', CloudPrior, arrays))
-        for i, (cloud, _, layer) in enumerate(hypotheses)
+        CloudPrior(
+            cloud=cloud, response=response, layer=layer, **_given(f'prior{i}', CloudPrior, arrays)
+        )
+        for i, (cloud, response, layer) in enumerate(hypotheses)
     )
-    around = bodies(region)
     return RefitTables(
         excitation,
         region,
         (bottom, box),
-        hypotheses,
         priors,
         model.frequencies_hz,
-        around,
-        tuple(arrays[f'factor{i}'] for i in range(len(around))),
+        tuple(arrays[f'factor{i}'] for i in range(len(bodies(region)))),
         references,
         settings,
         arrays['weight'],
@@ -97,7 +96,7 @@ def _given(prefix: str, kind: type[Layer | CloudPrior], arrays: Arrays) -> dict[
     return out
 
 
-NOT_STORED = 'cloud', 'layer', '_projected'
+NOT_STORED = 'cloud', 'response', 'layer', '_projected'
 """Fields that are worked out anew."""
 MAY_BE_NONE = 'rows', 'inverse'
 """Fields of a layer that only some have."""

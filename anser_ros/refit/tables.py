@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,27 +12,15 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import Cloud, Region, bodies, default_clouds
 from anser_ros.refit.excitation import Excitation, FieldFunction, excitation_for
-from anser_ros.refit.layer import (
-    Layer,
-    body_layer,
-    bottom_layer,
-    box_layer,
-    pose_weight,
-)
-from anser_ros.refit.prior import (
-    BODY,
-    ORIENTED,
-    UPRIGHT,
-    CloudPrior,
-    Response,
-    build_prior,
-)
+from anser_ros.refit.layer import Layer, body_layer, bottom_layer, box_layer, pose_weight
+from anser_ros.refit.prior import BODY, ORIENTED, UPRIGHT, CloudPrior, Response, build_prior
 from anser_ros.refit.reduced import ReducedPrior, reduced
 from anser_ros.refit.search import COARSE, body_factor
 from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]
 Hypothesis = tuple[Cloud, Response, Layer]
+"""Where metal may be, how it answers, and what stands for its field."""
 ReportShare = Callable[[float], None]
 """Called between two pieces of the work with the share that is done."""
 
@@ -45,70 +34,55 @@ MOST_ORIENTED = 1000
 class RefitTables:
     """Holds the precomputed tables of a refit.
 
-    Attributes
-    ----------
-    excitation : Excitation
-    region : Region
-    layers : tuple of Layer
-        Below the board, and around the volume.
-    hypotheses : tuple of (Cloud, Response, Layer)
-    priors : tuple of CloudPrior
-    frequencies_hz : tuple of float
-    bodies : tuple of Cloud
-        Compact bodies that may be put in as further hypotheses.
-    factors : tuple of ndarray
-        What `refit.search` needs of each.
-    references : SensorTable
-    settings : RefitSettings
-    weight : ndarray, shape (P,)
-        `pose_weight` of the region's samples.
+    ``layers`` are those below the board and around the volume; ``factors`` is what `BodySearch`
+    needs of each of the `bodies`; ``weight`` (P,) is the `pose_weight` of the region's samples.
     """
 
     excitation: Excitation
     region: Region
     layers: tuple[Layer, ...]
-    hypotheses: tuple[Hypothesis, ...]
     priors: tuple[CloudPrior, ...]
     frequencies_hz: tuple[float, ...]
-    bodies: tuple[Cloud, ...]
     factors: tuple[NDArray[np.float32], ...]
     references: SensorTable
     settings: RefitSettings
     weight: Array
 
-    def moved(self, references: SensorTable, settings: RefitSettings) -> 'RefitTables':
-        """Return the tables for references at other places."""
-        priors = _priors(
-            self.hypotheses, references, self.excitation, self.frequencies_hz, settings
-        )
-        factors = _factors(self.bodies, references, self.excitation)
-        return replace(self, priors=priors, factors=factors, references=references)
+    @cached_property
+    def bodies(self) -> tuple[Cloud, ...]:
+        """Return the compact bodies that may be put in as further hypotheses."""
+        return bodies(self.region)
 
     def body_prior(self, body: int) -> CloudPrior:
-        """Return the full hypothesis of a compact body, which is computed once."""
+        """Return the full hypothesis of a compact body."""
         cloud = self.bodies[body]
-        return build_prior(
-            cloud,
-            BODY,
-            body_layer(self.region, self.weight, cloud),
-            self.references,
-            self.excitation.field(cloud.positions),
-            np.array(self.frequencies_hz),
-            self.settings.accuracy,
-            np.random.default_rng([self.settings.seed, body]),
-        )
+        rng = np.random.default_rng([self.settings.seed, body])
+        return self._prior(cloud, BODY, body_layer(self.region, self.weight, cloud), rng)
 
     def reduced(self, prior: CloudPrior) -> ReducedPrior:
         """Return a hypothesis of these tables, or a body of theirs, in few numbers."""
-        responses = {p.name: response for (_, response, _), p in
-                zip(self.hypotheses, self.priors, strict=True)}  # fmt: skip
-        return reduced(
-            prior,
-            responses.get(prior.name, BODY),
-            self.excitation.field(prior.cloud.positions),
-            np.array(self.frequencies_hz),
-            np.random.default_rng(self.settings.seed),
-        )
+        field = self.excitation.field(prior.cloud.positions)
+        rng = np.random.default_rng(self.settings.seed)
+        return reduced(prior, field, np.array(self.frequencies_hz), rng)
+
+    def with_priors(self, report: ReportShare) -> 'RefitTables':
+        """Return the tables with the predictions of all clouds."""
+        hypotheses = hypotheses_of(default_clouds(self.region), *self.layers)
+        sizes = np.cumsum([0, *(len(cloud.positions) for cloud, _, _ in hypotheses)])
+        rng, priors = np.random.default_rng(self.settings.seed), []
+        for hypothesis, done in zip(hypotheses, sizes[:-1].tolist(), strict=True):
+            report(START + (1.0 - START) * done / float(sizes[-1]))
+            priors.append(self._prior(*hypothesis, rng))
+        return replace(self, priors=tuple(priors))
+
+    def _prior(
+        self, cloud: Cloud, response: Response, layer: Layer, rng: np.random.Generator
+    ) -> CloudPrior:
+        field = self.excitation.field(cloud.positions)
+        return build_prior(
+            cloud, response, layer, self.references, field, np.array(self.frequencies_hz),
+            self.settings.accuracy, rng,
+        )  # fmt: skip
 
 
 def build_tables(
@@ -122,25 +96,23 @@ def build_tables(
     """Compute the tables; raises `FitError` as `excitation_for` does, and what ``report`` does."""
     excitation, region = excitation_for(model, drawing, volume)
     report(START)
-    clouds = default_clouds(region)
-    bottom = bottom_layer(model, region, excitation, clouds[0].positions)
-    box = box_layer(region, excitation)
-    hypotheses = hypotheses_of(clouds, bottom, box)
-    priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings, report)
-    around = bodies(region)
-    return RefitTables(
+    nearest = default_clouds(region)[0]
+    layers = (
+        bottom_layer(model, region, excitation, nearest.positions),
+        box_layer(region, excitation),
+    )
+    tables = RefitTables(
         excitation,
         region,
-        (bottom, box),
-        hypotheses,
-        priors,
+        layers,
+        (),
         model.frequencies_hz,
-        around,
-        _factors(around, references, excitation),
+        _factors(bodies(region), references, excitation),
         references,
         settings,
         pose_weight(region.volume.samples(), excitation),
     )
+    return tables.with_priors(report)
 
 
 def _factors(
@@ -162,31 +134,4 @@ def hypotheses_of(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[H
         out.append((cloud, plain, layer))
         if len(cloud.positions) <= MOST_ORIENTED:
             out.append((cloud, ORIENTED, layer))
-    return tuple(out)
-
-
-def _priors(
-    hypotheses: Sequence[Hypothesis],
-    references: SensorTable,
-    excitation: Excitation,
-    frequencies_hz: tuple[float, ...],
-    settings: RefitSettings,
-    report: ReportShare = lambda share: None,
-) -> tuple[CloudPrior, ...]:
-    rng, out = np.random.default_rng(settings.seed), []
-    sizes = np.cumsum([0, *(len(cloud.positions) for cloud, _, _ in hypotheses)])
-    for (cloud, response, layer), done in zip(hypotheses, sizes[:-1].tolist(), strict=True):
-        report(START + (1.0 - START) * done / float(sizes[-1]))
-        out.append(
-            build_prior(
-                cloud,
-                response,
-                layer,
-                references,
-                excitation.field(cloud.positions),
-                np.array(frequencies_hz),
-                settings.accuracy,
-                rng,
-            )
-        )
     return tuple(out)

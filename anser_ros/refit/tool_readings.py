@@ -48,16 +48,9 @@ def surroundings(points: Array) -> Array:
 
 @dataclass(frozen=True)
 class ToolReading:
-    """Holds what the coils of one rigid tool read at a pose that was found for it.
+    """Holds what the S coils of one rigid tool read at a pose that was found for it.
 
-    Attributes
-    ----------
-    table : SensorTable
-        The S coils in the tool's frame.
-    flux : ndarray, shape (S, K), complex
-        T.
-    position, rotation : ndarray, shapes (3,), (3, 3)
-        Of the tool, m, frame fg.
+    ``flux`` (S, K) is in T; position (3,), m, and rotation (3, 3) are those of the tool in fg.
     """
 
     table: SensorTable
@@ -69,12 +62,7 @@ class ToolReading:
 class CoilErrors:
     """Holds what is wrong with a tool's coils: gain, place and axis of each, learnt without metal.
 
-    Parameters
-    ----------
-    table : SensorTable
-        The S coils.
-    tools : ToolSettings
-        How well they are known before.
+    ``table``: the S coils. ``tools``: how well they are known before.
     """
 
     def __init__(self, table: SensorTable, tools: ToolSettings) -> None:
@@ -105,16 +93,9 @@ class CoilErrors:
 class ToolRows:
     """Holds a tool's readings linearised at a pose, in noise units turned to the emitters' phases.
 
-    Attributes
-    ----------
-    at, axes : ndarray, shape (S, 3)
-        Places and axes of the coils, frame fg.
-    left : ndarray, shape (S K,), complex
-        What they read beyond the model.
-    pose : ndarray, shape (S K, 6), complex
-        By a large step or turn of the tool.
-    own : ndarray, shape (S K, 7 S), complex
-        By the errors of the coils, in the order of `CoilErrors`.
+    The coils have places and axes (S, 3) in fg; ``left`` (S K,) is what they read beyond the
+    model, ``pose`` (S K, 6) the effect of a large step or turn of the tool, and ``own`` (S K, 7 S)
+    that of the errors of the coils, in the order of `CoilErrors`.
     """
 
     at: Array

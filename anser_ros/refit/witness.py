@@ -13,7 +13,7 @@ with a memory of `MEMORY_S`; the references of every frame bound its size again.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,13 @@ from anser_ros.refit.posterior import Bank
 from anser_ros.refit.prior import CloudPrior
 from anser_ros.refit.reduced import ReducedPrior
 from anser_ros.refit.tables import RefitTables
-from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised, surroundings
+from anser_ros.refit.tool_readings import (
+    CoilErrors,
+    ToolReading,
+    ToolRows,
+    linearised,
+    surroundings,
+)
 from anser_ros.settings import ToolSettings
 from anser_ros.stamps import NANO
 
@@ -43,16 +49,15 @@ ODD = 1.5
 """Squared misfit of a tool's readings, over what is expected of one frame, from which they count
 less."""
 CONTRADICTION_S = 0.5
-"""Time over which a misfit that is odd stays the same. On simulated scenes of seed 1 that metal
-passes, two references, the correlation of what is left of the readings falls to 1/e in 0.4 to
-0.6 s."""
+"""Time over which a misfit that is odd stays the same: its correlation falls to 1/e in 0.4 to 0.6
+s (simulated scenes of seed 1 that metal passes, two references)."""
 LEAST_PROBABILITY = 1e-3
 """Probability from which on a hypothesis has a filter, which costs time. One that is less probable
 hardly changes the mean, whatever a tool says of it."""
 ELSEWHERE = 0.1
 """Weight of the whole volume beside the surroundings of the tools, where modes are chosen."""
 FIRST_SAMPLE_STEP = 30
-"""Every so many of a layer's samples stand for the volume before a tool was seen, and tell the
+"""Every so many of a layer's samples stand for the volume before a tool was seen, and give the
 size of an error until it is known: thirty points, a millisecond's work at the most."""
 
 
@@ -65,18 +70,12 @@ class _Filter:
     prior: Array
 
 
-@dataclass(frozen=True)
-class _Errors:
+class _Errors(NamedTuple):
     """What changes one part of a tool's readings beside the metal: covariances (n, n).
 
-    Attributes
-    ----------
-    white : ndarray, shape (n, n)
-        Noise, another one in every frame.
-    own, pose : ndarray, shape (n, n)
-        By the errors of the coils, and by a step or turn of the tool.
-    lasting, repeated : float
-        Frames in which the errors of the coils, and a contradiction, stay the same.
+    ``white`` is noise, another one in every frame; ``own`` is by the errors of the coils, and
+    ``pose`` by a step or turn of the tool. ``lasting`` and ``repeated`` are the frames in which
+    the errors of the coils, and a contradiction, stay the same.
     """
 
     white: Array
@@ -92,12 +91,8 @@ class _Errors:
         known; a contradiction shows itself by a misfit that one frame's errors do not explain.
         That there is one is no news in each of these frames either.
 
-        Parameters
-        ----------
-        metal : ndarray, shape (n, n)
-            Covariance of the readings that the metal adds.
-        off : ndarray, shape (n,)
-            By how much the readings are off.
+        ``metal`` (n, n): covariance of the readings that the metal adds. ``off`` (n,): by how much
+        the readings are off.
         """
         known = self.pose + metal
         chol = cho_factor(self.white + self.lasting * self.own + known, lower=True)
@@ -115,15 +110,7 @@ class _Errors:
 class Witness:
     """Holds the filters of all hypotheses that count.
 
-    Parameters
-    ----------
-    tables : RefitTables
-    model : FieldModel
-        Calibrated.
-    tools : ToolSettings
-        How well the tools are known.
-    flux_noise_t : float
-        Noise of a phasor component of the tools' readings, T.
+    ``flux_noise_t`` is the noise of a phasor component of the tools' readings, T.
     """
 
     def __init__(
@@ -253,59 +240,59 @@ class Witness:
     def update(self, readings: Sequence[ToolReading]) -> dict[str, float]:
         """Take in what tools read in the frame of the last references.
 
-        Returns
-        -------
-        dict of str to float
-            Logarithm of the readings' likelihood under each hypothesis that has a filter, and
-            where nothing has changed.
+        Returns the logarithm of the readings' likelihood by the names of the hypotheses that have
+        a filter, and where nothing has changed.
         """
         if self._frame is None or not readings:
             return {}
-        bank, seen, drift = self._frame
-        evidence = dict.fromkeys(self._filters, 0.0)
-        names = {name: h for h, name in enumerate(bank.names)}
-        evidence[bank.names[0]] = 0.0
+        bank, _, drift = self._frame
+        moments = self._model.moments * (1.0 + drift)
+        evidence = dict.fromkeys((bank.names[0], *self._filters), 0.0)
+        near = []
+        for reading in readings:
+            rows = linearised(reading, self._model, moments, self._turn)
+            self._take(reading, rows, evidence)
+            near.append(surroundings(rows.at))
+        self._near = np.concatenate(near)
+        return evidence
+
+    def _take(self, reading: ToolReading, rows: ToolRows, evidence: dict[str, float]) -> None:
+        """Update the filters with what one tool reads, and add to the evidence by names."""
+        assert self._frame is not None
+        bank, seen, _ = self._frame
         # What stays wrong for as long as the memory lasts may count once in it, not every frame;
         # what stays so for a shorter time counts as often as its correlation in time allows.
         lasting = 1.0 + MEMORY_S / self._step_s
         repeated = 1.0 + 2.0 * CONTRADICTION_S / self._step_s
-        near = []
-        for reading in readings:
-            moments = self._model.moments * (1.0 + drift)
-            rows = linearised(reading, self._model, moments, self._turn)
-            learnt = self._errors(reading)
-            mean, covariance = learnt.posterior
-            white = self._noise_of(len(rows.left))
-            owns = [rows.own.real, rows.own.imag]
-            errors = [
-                _Errors(white, own @ covariance @ own.T, pose @ pose.T, lasting, repeated)
-                for own, pose in zip(owns, (rows.pose.real, rows.pose.imag), strict=True)
-            ]
-            left = (rows.left.real, rows.left.imag)
-            for error, own, values in zip(errors, owns, left, strict=True):
-                nothing = np.zeros_like(white)
-                evidence[bank.names[0]] += error.weighed(nothing, values - own @ mean)[1]
-            known = []
-            for name, state in self._filters.items():
-                h = names[name]
-                layer, length = bank.prior(h).layer, reading.table.length
-                basis = flux_basis(rows.at, rows.axes, length, layer.positions, layer.directions)
-                rest = rows.left - (basis @ bank.moments(seen, h)).ravel()
-                design = basis @ self._reduced_of(bank.prior(h)).basis.astype(np.float64)
-                design = design.reshape(rest.size, len(state.mean))
-                for i, (values, own) in enumerate(zip((rest.real, rest.imag), owns, strict=True)):
-                    if name == self._best:
-                        open_metal = lasting * design @ state.covariance[i] @ design.T
-                        factor = np.linalg.cholesky(white + open_metal + errors[i].pose)
-                        known.append(
-                            _whitened(factor, own, np.asarray(values - design @ state.mean[:, i]))
-                        )
-                    evidence[name] += _kalman(state, i, errors[i], design, values - own @ mean)
-            for rows_of_errors, values in known:
-                learnt.learn(rows_of_errors, values)
-            near.append(surroundings(rows.at))
-        self._near = np.concatenate(near)
-        return evidence
+        learnt = self._errors(reading)
+        mean, covariance = learnt.posterior
+        white = self._noise_of(len(rows.left))
+        owns = [rows.own.real, rows.own.imag]
+        errors = [
+            _Errors(white, own @ covariance @ own.T, pose @ pose.T, lasting, repeated)
+            for own, pose in zip(owns, (rows.pose.real, rows.pose.imag), strict=True)
+        ]
+        left = (rows.left.real, rows.left.imag)
+        for error, own, values in zip(errors, owns, left, strict=True):
+            nothing = np.zeros_like(white)
+            evidence[bank.names[0]] += error.weighed(nothing, values - own @ mean)[1]
+        known = []
+        for name, state in self._filters.items():
+            h = bank.names.index(name)
+            layer, length = bank.prior(h).layer, reading.table.length
+            basis = flux_basis(rows.at, rows.axes, length, layer.positions, layer.directions)
+            rest = rows.left - (basis @ bank.moments(seen, h)).ravel()
+            design = basis @ self._reduced_of(bank.prior(h)).basis.astype(np.float64)
+            design = design.reshape(rest.size, len(state.mean))
+            for i, (values, own) in enumerate(zip((rest.real, rest.imag), owns, strict=True)):
+                if name == self._best:
+                    open_metal = lasting * design @ state.covariance[i] @ design.T
+                    factor = np.linalg.cholesky(white + open_metal + errors[i].pose)
+                    off = np.asarray(values - design @ state.mean[:, i])
+                    known.append(_whitened(factor, own, off))
+                evidence[name] += _kalman(state, i, errors[i], design, values - own @ mean)
+        for rows_of_errors, values in known:
+            learnt.learn(rows_of_errors, values)
 
     def _errors(self, reading: ToolReading) -> CoilErrors:
         names = reading.table.name

@@ -11,11 +11,7 @@ from anser_ros.errors import BagError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.reference_readings import ReferenceReadings
 from anser_ros.integrity.board_place import BoardPlace
-from anser_ros.integrity.clean_references import (
-    check_as_calibrated,
-    check_as_drawn,
-    check_steady,
-)
+from anser_ros.integrity.clean_references import check_as_calibrated, check_as_drawn, check_steady
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.sessions.drawing import NominalBoard
@@ -27,23 +23,15 @@ from anser_ros.wire.setup import Setup
 ComplexArray = NDArray[np.complex128]
 
 SAME_PLACE_M = 0.005
-"""Farthest that a reference sensor may be in the baseline from where the session has it, m.
-
-A fresh survey of the same setup moves a coil by its own error, a millimetre or less; a coil that
-is farther away belongs to another setup, whose readings would be taken for metal.
-"""
+"""Farthest that a reference sensor may be in the baseline from where the session has it, m: a
+fresh survey moves a coil by a millimetre or less."""
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """Holds clean readings of a session's reference sensors.
+    """Holds clean readings (R, K), T, of a session's reference sensors, NaN for one that has none.
 
-    Attributes
-    ----------
-    path : str
-        The recording that they are from.
-    flux : ndarray, shape (R, K), complex
-        Mean reading of each reference sensor, T; NaN where it has none.
+    ``path`` is the recording that they are from.
     """
 
     path: str
@@ -81,19 +69,8 @@ def check_clean(
 
     The expected readings are those at the calibration, or else those of the drawing; references
     and model must also agree about the place of the board. A model that contains metal found by a
-    diagnosis, and no such readings, is not compared.
-
-    Parameters
-    ----------
-    model : FieldModel
-    sensors : SensorTable
-        The R references.
-    flux : ndarray, shape (R, K), complex
-        Their readings, T.
-    sigma_t : float
-        Noise of a component of these, T.
-    setup : Setup
-        Of the board.
+    diagnosis, and no such readings, is not compared. ``flux`` (R, K), T, are the sensors'
+    readings, with the noise ``sigma_t`` of a component.
     """
     known = model.references
     compared = known is not None and check_as_calibrated(
@@ -198,19 +175,9 @@ def readings_of(recording: Session) -> ReferenceReadings | None:
 
 
 def baseline_flux(baseline: Session, sensors: SensorTable) -> ComplexArray:
-    """Return the mean reading of each reference sensor in a recording without metal.
+    """Return the mean reading of each of R reference sensors in a recording without metal.
 
-    Parameters
-    ----------
-    baseline : Session
-        The recording.
-    sensors : SensorTable
-        The R reference sensors whose readings are wanted, in the wanted order.
-
-    Returns
-    -------
-    ndarray, shape (R, K), complex
-        T; NaN for a sensor without a good reading.
+    (R, K), T, in the order of the sensors; NaN for one without a good reading.
 
     Raises
     ------

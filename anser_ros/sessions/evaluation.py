@@ -4,7 +4,7 @@ The stages are `prepare`, `track` and `compare`; each can be called alone, and `
 all of them. `evaluation_document` and `pose_table` write their results.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,10 +12,8 @@ import numpy as np
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.symmetry import symmetry_axis
-from anser_ros.known_metal.known import KnownMetal
 from anser_ros.sessions.baseline import check_place
-from anser_ros.sessions.follower import ModelFollower, RefitSummary
-from anser_ros.sessions.known_metal import KnownMetalModels
+from anser_ros.sessions.follower import FrameModels, ModelFollower, RefitSummary
 from anser_ros.sessions.pose_errors import PoseSeries, pose_series
 from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
 from anser_ros.sessions.session import Session
@@ -59,41 +57,37 @@ def track_session(
     refit: bool = False,
     in_phase: bool = False,
     progress: Progress | None = None,
-    patches: dict[str, str] | None = None,
     witnesses: bool = False,
-    known_metal: KnownMetal | None = None,
+    models: Callable[[PreparedSession], FrameModels] | None = None,
 ) -> Evaluation:
     """Track every tool sensor and body of a session at every frame, and compare with the optics.
 
     A baseline is a distortion-free recording of the same board. With ``refit`` the model follows
-    the references as it does live, with further ones on patches (bodies with the topic of their
-    poses in the bag), and with witnesses also what the coils of rigid tools contradict; known
-    metal is followed by the tools alone, instead. In phase, only these fluxes and moments are used
-    (the article's way). Progress gets the finished share, 0 to 1.
+    the references as it does live, with witnesses also what the coils of rigid tools contradict;
+    ``models`` gives each frame's model in another way, instead of a refit. In phase, only these
+    fluxes and moments are used (the article's way). Progress gets the finished share, 0 to 1.
 
     Raises
     ------
     BagError
         When the session has no tool fluxes, or a refit lacks references or a baseline.
     ParameterError
-        When known metal is to be followed beside a refit, or by one phase of the fluxes.
+        When such models are to be used beside a refit, or with one phase of the fluxes.
     ModelFileError
         When the model's emitters are not the session's, or the session's references locate the
         board elsewhere. With the gate switched off the latter is not checked.
     """
-    if known_metal is not None and (refit or in_phase):
+    if models is not None and (refit or in_phase):
         raise ParameterError(
-            'known metal is followed without a refit, by both phases of the fluxes'
+            "models of their own are used without a refit, with both of the fluxes' phases"
         )
     if settings is None or settings.has_gate:
         check_place(model, session)
     used = in_phase_model(model) if in_phase else model
     prepared = prepare(session, used, baseline if refit else None)
-    follower: ModelFollower | KnownMetalModels | None = None
-    if known_metal is not None:
-        follower = KnownMetalModels(prepared, known_metal)
-    elif refit:
-        follower = ModelFollower(prepared, patches, witnesses)
+    follower = None if models is None else models(prepared)
+    if refit:
+        follower = ModelFollower(prepared, witnesses)
     tracked = track(prepared, settings, follower, in_phase, progress)
     return compare(prepared, tracked)
 

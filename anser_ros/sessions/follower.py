@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from anser_ros.errors import BagError, FitError
 from anser_ros.integrity.ageing import UNCHANGED_MODEL, FrameModel, ModelAge
@@ -13,12 +14,23 @@ from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.baseline import Baseline
 from anser_ros.sessions.frames import FrameReadings, SessionFrame
-from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.session import tracking_noise
 from anser_ros.sessions.tool_readings import tool_readings
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.tracking.estimate import PoseEstimate
+
+
+class FrameModels(Protocol):
+    """Gives each frame of a session the model that it is tracked with."""
+
+    summary: 'RefitSummary'
+
+    def at(self, frame: SessionFrame) -> FrameModel:
+        """Return what a frame is tracked with."""
+
+    def witnessed(self, tools: FrameReadings, found: Sequence[PoseEstimate]) -> None:
+        """Take in what a frame's tools read, and the poses that were found."""
 
 
 @dataclass
@@ -34,17 +46,11 @@ class RefitSummary:
         self.left_out.update(result.left_out)
 
 
-class ModelFollower:
+class ModelFollower(FrameModels):
     """Refits the model to the reference sensors frame by frame, at the pace of the live node.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        With references and a baseline.
-    patches : dict of str to str, optional
-        Bodies that carry further reference coils, each with the topic of its poses in the bag.
-    witnesses : bool
-        Whether what tools' coils contradict tells of metal, too.
+    The session must have references and a baseline. With ``witnesses``, contradictions of the
+    tools' coils show metal, too.
 
     Attributes
     ----------
@@ -54,16 +60,11 @@ class ModelFollower:
     Raises
     ------
     BagError
-        When the session has no reference fluxes, when there is no baseline or one of too few
-        sensors, or when the session lacks what a patch needs.
+        When the session has no reference fluxes, or there is no baseline or one of too few
+        sensors.
     """
 
-    def __init__(
-        self,
-        prepared: PreparedSession,
-        patches: dict[str, str] | None = None,
-        witnesses: bool = False,
-    ) -> None:
+    def __init__(self, prepared: PreparedSession, witnesses: bool = False) -> None:
         session, baseline = prepared.session, prepared.baseline
         if session.reference is None:
             raise BagError(f'{session.path}: a refit needs reference fluxes, the session has none')
@@ -76,13 +77,14 @@ class ModelFollower:
             check_enough(baseline.flux, fewest)
         except FitError as error:
             raise BagError(f'{baseline.path}: {error}') from error
-        self._patches = PatchFollower(prepared, patches) if patches else None
-        self._refit = self._patches or _refit_of(prepared, baseline)
+        self._refit = _refit_of(prepared, baseline)
         self._prepared, self._uses_witnesses = prepared, witnesses
         if witnesses:
-            if not isinstance(self._refit, LiveRefit):
-                why = 'patches move' if patches else 'there are no reference sensors'
-                raise BagError(f'{session.path}: tools cannot be witnesses where {why}')
+            if self._refit is None:
+                raise BagError(
+                    f'{session.path}: tools cannot be witnesses where there are no reference '
+                    'sensors'
+                )
             self._refit.enable_witnesses(tracking_noise(session.setup))
         self._pace = Pace()
         self._age = ModelAge(session.setup.refit.references_age_s, prepared.volume)
@@ -91,9 +93,6 @@ class ModelFollower:
 
     def at(self, frame: SessionFrame) -> FrameModel:
         """Return what a frame is tracked with: its references' model, or the last one, aged."""
-        if self._patches is not None and frame.tools is not None:
-            tools = frame.tools
-            self._patches.take_flux(frame.stamp_ns, tools.channels, tools.flux, tools.flags)
         if self._refit is None:
             return UNCHANGED_MODEL  # as live: there is nothing to follow, the checks decide
         if frame.reference is not None:
@@ -105,8 +104,8 @@ class ModelFollower:
         return standing
 
     def witnessed(self, tools: FrameReadings, found: Sequence[PoseEstimate]) -> None:
-        """Let a frame's tools tell of metal, at the poses that were found for their bodies."""
-        if not self._uses_witnesses or not isinstance(self._refit, LiveRefit):
+        """Let a frame's tools show metal, at the poses that were found for their bodies."""
+        if not self._uses_witnesses or self._refit is None:
             return
         poses = {
             one.name: (one.position, one.rotation)

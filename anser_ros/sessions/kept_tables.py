@@ -50,13 +50,7 @@ class ReadAhead:
     """Reads the tables of a model that were used last, before references and setup are known.
 
     Fresh memory of their size may take a third of a second, in which the graph is discovered.
-
-    Parameters
-    ----------
-    folder : Path or None
-        Where tables are kept.
-    model : FieldModel or None
-        Without one, or without a folder, nothing is read.
+    Without a folder or a model nothing is read.
     """
 
     def __init__(self, folder: Path | None, model: FieldModel | None) -> None:
@@ -82,17 +76,7 @@ class ReadAhead:
 
 
 class KeptTables:
-    """Keeps the tables of one model, setup and set of references.
-
-    Parameters
-    ----------
-    folder : Path
-    setup : Setup
-    model : FieldModel
-    references : SensorTable
-        The tables' own.
-    ahead : ReadAhead, optional
-    """
+    """Keeps the tables of one model, setup and set of references, which are the tables' own."""
 
     def __init__(
         self,

@@ -1,7 +1,9 @@
 """Lets the field model follow known metal through a recorded session, by its tools."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -11,8 +13,9 @@ from anser_ros.known_metal.follower import KnownMetalFollower
 from anser_ros.known_metal.known import KnownMetal
 from anser_ros.pose_states import OK
 from anser_ros.refit.excitation import excitation_for
-from anser_ros.sessions.follower import RefitSummary
+from anser_ros.sessions.follower import FrameModels, RefitSummary
 from anser_ros.sessions.frames import FrameReadings, SessionFrame
+from anser_ros.sessions.known_metal_file import load_known_metal
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.session import tracking_noise
 from anser_ros.sessions.tool_readings import tool_readings
@@ -25,13 +28,13 @@ FOLLOWED, SEARCHED = 'followed', 'not_found'
 """States in the summary."""
 
 
-class KnownMetalModels:
-    """Gives each frame of a session the field with known metal where its tools say that it is.
+def models_of(path: str | os.PathLike[str]) -> Callable[[PreparedSession], FrameModels]:
+    """Return what follows the metal of a file through a session; raises as `load_known_metal`."""
+    return partial(KnownMetalModels, known=load_known_metal(path))
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-    known : KnownMetal
+
+class KnownMetalModels(FrameModels):
+    """Gives each frame of a session the field with known metal where its tools say that it is.
 
     Attributes
     ----------
@@ -65,7 +68,7 @@ class KnownMetalModels:
             known, prepared.model, excitation, sensors, session.setup.refit.tools,
             prepared.volume, tracking_noise(session.setup),
         )  # fmt: skip
-        # Where a pose is withheld, a tracker that withholds none tells where the tool is, nearly.
+        # Where a pose is withheld, a tracker that withholds none shows where the tool is, nearly.
         settings = settings_for(session.setup, TrackerSettings(gate=NO_GATE))
         self._rough = Tracker(
             prepared.model, prepared.sensors, replace(settings, volume=prepared.volume)

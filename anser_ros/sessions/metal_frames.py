@@ -12,13 +12,7 @@ from anser_ros.known_metal.rows import CoilReadings, MetalFrame, real_parts
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.tables import build_tables
-from anser_ros.refit.tool_readings import (
-    FREE_M,
-    FREE_RAD,
-    ToolReading,
-    coil_spread,
-    linearised,
-)
+from anser_ros.refit.tool_readings import FREE_M, FREE_RAD, ToolReading, coil_spread, linearised
 from anser_ros.sessions.prepared import PreparedSession, correct
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.settings import Accuracy, ToolSettings
@@ -39,14 +33,8 @@ def learn(
 ) -> KnownMetal:
     """Learn the metal that moves in a session.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        With references, a baseline without the metal, and a tool that an optical tracker follows.
-    name : str
-        Of the metal.
-    report : callable, optional
-        Called with the stage and its share done.
+    The session must have references, a baseline without the metal, and a tool that an optical
+    tracker follows. ``report`` is called with the stage and its share done.
 
     Raises
     ------
@@ -80,17 +68,10 @@ def learn(
 def metal_frames(
     prepared: PreparedSession, refit: LiveRefit, phase: ComplexArray, count: int
 ) -> list[MetalFrame]:
-    """Return at most so many frames, spread evenly over those with metal.
+    """Return at most ``count`` frames, spread evenly over those with metal.
 
-    Parameters
-    ----------
-    prepared : PreparedSession
-        With references, a baseline and optical poses of the tools.
-    refit : LiveRefit
-        To the session's references.
-    phase : ndarray, shape (K,), complex
-        Of the emitters' fields.
-    count : int
+    The session must have references, a baseline and optical poses of the tools; ``phase`` (K,) is
+    that of the emitters' fields.
 
     Raises
     ------

@@ -22,16 +22,8 @@ def tool_readings(
 ) -> list[ToolReading]:
     """Return what the usable coils of each body with a pose read.
 
-    Parameters
-    ----------
-    correction : Correction
-        Of the tools' sensors, by the effects of the model.
-    channels : ndarray, shape (S,)
-    flux : ndarray, shape (S, K), complex
-        T, as measured.
-    flags : ndarray, shape (S,)
-    poses : mapping
-        By body; bodies without a coil in the frame are left out.
+    ``flux`` (S, K), T, is as measured; the correction is that of the tools' sensors, by the
+    effects of the model. Bodies without a coil in the frame are left out.
     """
     if correction.changes_flux:
         # The time matters to a recorded drift alone, which references follow where there are any.

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 from anser_ros.errors import BagError
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.ageing import UNCHANGED_MODEL
-from anser_ros.sessions.follower import ModelFollower, RefitSummary
+from anser_ros.sessions.follower import FrameModels, ModelFollower, RefitSummary
 from anser_ros.sessions.frames import frames_of
-from anser_ros.sessions.known_metal import KnownMetalModels
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
@@ -45,7 +44,7 @@ def in_phase_model(model: FieldModel) -> FieldModel:
 def track(
     prepared: PreparedSession,
     settings: TrackerSettings | None = None,
-    follower: ModelFollower | KnownMetalModels | None = None,
+    follower: FrameModels | None = None,
     in_phase: bool = False,
     progress: Progress | None = None,
 ) -> TrackedSession:

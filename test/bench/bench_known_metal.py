@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from anser_ros.field.model import FieldModel  # noqa: E402
 from anser_ros.known_metal.known import KnownMetal  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
 from anser_ros.sessions.evaluation import track_session  # noqa: E402
+from anser_ros.sessions.known_metal import KnownMetalModels  # noqa: E402
 from anser_ros.sessions.metal_frames import learn  # noqa: E402
 from anser_ros.sessions.prepared import prepare  # noqa: E402
 from anser_ros.sessions.session import Session, load_session  # noqa: E402
@@ -71,7 +73,7 @@ def of_following(
     """Rows about a session in which it is followed."""
     session = thinned(session, EVERY)
     began_s = time.perf_counter()
-    found = track_session(session, model, known_metal=known)
+    found = track_session(session, model, models=partial(KnownMetalModels, known=known))
     spent_s = (time.perf_counter() - began_s) / len(session.tools[0].time)
     for what, series in (('coils', found.sensors), ('body', found.bodies)):
         figures = judged(list(series.values()), JITTER_M)

@@ -177,7 +177,8 @@ def detection() -> list[dict[str, Any]]:
     alarms = 0
     for frame in range(500):
         flux = world.baseline + world.noise(rng)
-        alarms += refit.update(1 + frame, world.references.channel, flux).changed
+        found = refit.update(1 + frame, world.references.channel, flux)
+        alarms += found.model is not refit.model
     change = world.metal(metal_block([0.03, -0.02, -0.2], [0.1, 0.12, 0.06]))
     delay, state = 0, 'frozen'
     while state == 'frozen' and delay < 100:

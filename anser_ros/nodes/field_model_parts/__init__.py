@@ -1,1 +1,1 @@
-"""Holds the parts of the field_model node: the refit in force, its start, its two topics."""
+"""Holds the parts of the field_model node: the active refit, its start, its two topics."""

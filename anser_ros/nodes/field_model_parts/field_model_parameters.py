@@ -38,9 +38,6 @@ class FieldModelParameters:
     refit_rate_hz: float = parameter(
         MOST_RATE_HZ, 'most refits a second, by the stamps', minimum=2.0, maximum=1000.0, live=True
     )
-    patches: tuple[str, ...] = parameter(
-        (), 'reference coils that move: entries body=topic, the topic a PoseStamped of that body'
-    )
     witnesses: bool = parameter(
         False, 'whether contradictions among the coils of rigid tools tell of metal, too'
     )
@@ -51,8 +48,6 @@ class FieldModelParameters:
     reference_position_m: float = stated('reference_position_m')
     reference_axis_rad: float = stated('reference_axis_rad')
     reference_gain: float = stated('reference_gain')
-    patch_position_m: float = stated('patch_position_m')
-    patch_rotation_rad: float = stated('patch_rotation_rad')
     emitter_drift: float = stated('emitter_drift')
     min_references: int = stated('min_references')
     average_frames: int = stated('average_frames')

@@ -16,53 +16,30 @@ from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
 from anser_ros.fingerprint import fingerprint_of
-from anser_ros.sessions.kept_tables import (
-    DAMAGED,
-    ReadAhead,
-    read_arrays,
-    used_s,
-    write_arrays,
-)
+from anser_ros.sessions.kept_tables import DAMAGED, read_arrays, used_s, write_arrays
 from anser_ros.wire.setup import Setup
 
 BASELINE_S = 60.0
-"""How long after it was last confirmed, s, a baseline is taken up. Shorter, and a process that a
-supervisor starts again on a busy machine is too late; longer, and coils that somebody moved
-meanwhile are taken for metal."""
+"""How long after it was last confirmed, s, a baseline is taken up: a supervisor starts a process
+again sooner, and nobody moves coils meanwhile."""
 CONFIRM_S = 1.0
-"""Time from one confirmation of a baseline to the next, s. Smaller costs more; larger, and what
-the references said shortly before the process was killed is not known to the next one."""
+"""Time from one confirmation of a baseline to the next, s."""
 
 
 class KeptBaseline:
-    """Keeps the baseline of a running node.
+    """Keeps the baseline of a running node of that whole name.
+
+    ``sender`` returns what identifies the only sender of the references; empty where there is
+    none.
 
     Attributes
     ----------
     folder : Path or None
         Where files are kept; None where they are not.
-    ahead : ReadAhead
-        Of the tables in it.
-
-    Parameters
-    ----------
-    folder : Path or None
-    node : str
-        Whole name of the node.
-    sender : callable
-        Returns what identifies the only sender of the references; empty where there is none.
-    ahead : ReadAhead, optional
     """
 
-    def __init__(
-        self,
-        folder: Path | None,
-        node: str,
-        sender: Callable[[], str],
-        ahead: ReadAhead | None = None,
-    ) -> None:
+    def __init__(self, folder: Path | None, node: str, sender: Callable[[], str]) -> None:
         self.folder, self._node, self._sender = folder, node, sender
-        self.ahead = ahead or ReadAhead(None, None)
         self._of: tuple[str, ...] = ()
         self._kept: Path | None = None
 
@@ -106,7 +83,7 @@ class KeptBaseline:
             os.utime(path)
 
     def drop(self) -> None:
-        """Keep none: another one is in force, or something speaks against it."""
+        """Keep none: another one is active, or something speaks against it."""
         if self._kept is not None:
             self._kept.unlink(missing_ok=True)
         self._kept = None

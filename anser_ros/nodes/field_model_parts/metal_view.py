@@ -23,13 +23,7 @@ VIEW_PERIOD_S = 0.2
 
 
 class MetalView:
-    """Shows the operator where the metal is, a few times a second: ``metal``, ``metal/centroid``.
-
-    Parameters
-    ----------
-    node : Node
-        Publishes it.
-    """
+    """Shows where the metal is, a few times a second: ``metal``, ``metal/centroid``."""
 
     def __init__(self, node: Node) -> None:
         self._markers = node.create_publisher(MarkerArray, 'metal', qos.LATCHED)

@@ -13,9 +13,8 @@ from anser_ros.sessions.baseline import board_place_of
 from anser_ros.wire.setup import Setup
 
 DISCOVERY_S = 1.0
-"""Time, s, in which whoever sends the references is found in the graph. Smaller, and a model is
-trusted that the references would have refused a moment later; larger, and a chain without
-references has its first pose as much later."""
+"""Time, s, in which whoever sends the references is found in the graph; a chain without references
+has its first pose as much later."""
 
 
 def none_announced() -> int:
@@ -26,12 +25,8 @@ def none_announced() -> int:
 class PlaceWatch:
     """Asks with the first frame, and again while the model was found to lie aside.
 
-    Parameters
-    ----------
-    place : BoardPlace or None
-        None where nothing can be compared.
-    announced : callable
-        How many publishers of references the graph knows.
+    ``place`` is None where nothing can be compared; ``announced`` returns how many publishers of
+    references the graph knows.
 
     Attributes
     ----------
@@ -62,7 +57,7 @@ class PlaceWatch:
 
     @property
     def is_open(self) -> bool:
-        """Return whether references could tell, and none has been received."""
+        """Return whether references could show it, and none has been received."""
         return self._place is not None and not self._has_frame
 
     @property

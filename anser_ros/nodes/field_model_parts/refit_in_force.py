@@ -12,7 +12,6 @@ from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame
 from anser_ros.nodes.field_model_parts.kept_baseline import KeptBaseline
-from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
 from anser_ros.nodes.field_model_parts.refit_start import RefitStart, warm_up
 from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
 from anser_ros.physics.sensor import SensorTable
@@ -21,25 +20,16 @@ from anser_ros.refit.change import Pace
 from anser_ros.refit.health import DISAGREES
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
+from anser_ros.sessions.kept_tables import ReadAhead
 from anser_ros.stamps import is_live
 from anser_ros.wire.setup import Setup
 
 
-class RefitInForce:
+class ActiveRefit:
     """Keeps the refit, its last result, and what it is made from.
 
-    Parameters
-    ----------
-    moving : MovingCoils
-        Gets the patches of the refit.
-    witnesses : ToolWitnesses
-        Tells of metal what the tools read.
-    pace : Pace
-        How often there is to be a result.
-    count : callable
-        Counts an event by its name.
-    kept : KeptBaseline
-        What a process after this one takes up.
+    ``count`` counts an event by its name, ``kept`` is what a process after this one takes up, and
+    ``ahead`` what is read of it before references and setup are known.
 
     Attributes
     ----------
@@ -52,15 +42,15 @@ class RefitInForce:
 
     def __init__(
         self,
-        moving: MovingCoils,
         witnesses: ToolWitnesses,
         pace: Pace,
         count: Callable[[str], None],
         kept: KeptBaseline,
+        ahead: ReadAhead,
     ) -> None:
         warm_up()
-        self._moving, self._witnesses = moving, witnesses
-        self._pace, self._count, self._kept = pace, count, kept
+        self._witnesses, self._pace, self._count = witnesses, pace, count
+        self._kept, self._ahead = kept, ahead
         self._has_looked = False
         self._confirmed: RefitResult | None = None
         self._start: RefitStart | None = None
@@ -74,33 +64,27 @@ class RefitInForce:
     ) -> None:
         """Be without a refit, and begin at once with what needs no baseline for the next one."""
         self.end()
-        self.current = self.result = self._moving.patches = self._start = None
+        self.current = self.result = self._start = None
         self._has_looked = False
         self._kept.expect(setup, base)
         self._witnesses.expect(setup, base)
         if len(references):
-            bodies, folder, ahead = self._moving.bodies, self._kept.folder, self._kept.ahead
-            noise_t = self._witnesses.noise_t
-            self._start = RefitStart(setup, base, references, bodies, folder, ahead, noise_t)
+            folder, noise_t = self._kept.folder, self._witnesses.noise_t
+            self._start = RefitStart(setup, base, references, folder, self._ahead, noise_t)
             if at_once:
                 self._start.prepare()
         else:
-            self._kept.ahead.drop()
+            self._ahead.drop()
 
     def forget_baseline(self) -> None:
         """Drop the baseline: the readings are to be others."""
         self._baseline = None
 
     def begin(self, baseline: NDArray[np.complex128]) -> None:
-        """Begin to make a refit to what differs from a baseline.
+        """Begin to make a refit to what differs from a baseline, shape (S, K), T.
 
         No pose is given before the first one is there, since metal may come meanwhile; one that is
-        in force goes on until the next one is there.
-
-        Parameters
-        ----------
-        baseline : ndarray, shape (S, K), complex
-            T.
+        active goes on until the next one is there.
 
         Raises
         ------
@@ -157,7 +141,7 @@ class RefitInForce:
             self._start.wait()
 
     def take(self) -> bool:
-        """Put a refit in force that has been made meanwhile; return whether there was one.
+        """Activate a refit that has been made meanwhile; return whether there was one.
 
         Raises
         ------
@@ -167,8 +151,7 @@ class RefitInForce:
         started = None if self._start is None else self._start.taken()
         if started is None:
             return False
-        self.current, self._moving.patches = started
-        self.result = None
+        self.current, self.result = started, None
         self._count('refit_starts')
         return True
 
@@ -206,20 +189,13 @@ class RefitInForce:
 
     def follow(self, frame: Frame) -> RefitResult | None:
         """Return the result of a frame; None where the last one was less than the pace ago."""
-        refit, patches = self.current, self._moving.patches
+        refit = self.current
         if refit is None or not self._pace.is_due(frame.stamp_ns):
             return None
         begin_s = time.monotonic()
-        if patches is None:
-            if self.result is not None:
-                self._witnesses.tell(refit, self.result.stamp_ns)
-            self.result = refit.follow(frame)
-        else:
-            moved = patches.moved_refit(refit, frame.stamp_ns)
-            if moved is not None:  # the patches' new places have been worked out
-                self.current = refit = moved
-                self._count('patch_moves')
-            self.result = patches.follow(refit, frame)
+        if self.result is not None:
+            self._witnesses.pass_on(refit, self.result.stamp_ns)
+        self.result = refit.follow(frame)
         self._count('refits')
         self.update_s = time.monotonic() - begin_s
         return self.result

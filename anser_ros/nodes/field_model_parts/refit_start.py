@@ -14,23 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
-from anser_ros.nodes.field_model_parts.patches import Patches
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.tracks import loop_field
 from anser_ros.refit import tables
 from anser_ros.refit.live_refit import LiveRefit
-from anser_ros.refit.patches import start_table
 from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.kept_tables import KeptTables, ReadAhead
-from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.setup import Setup
 
 WORKER = 'refit_start'
 """Name of the thread that makes a refit."""
-Started = tuple[LiveRefit, Patches | None]
-"""A refit, and the patches that its last coils are on; None where no sensor is on a body that
-moves."""
 
 
 def warm_up() -> None:
@@ -47,21 +41,9 @@ class _EndedError(Exception):
 class RefitStart:
     """Makes the refits of one model in a thread of its own.
 
-    Parameters
-    ----------
-    setup : Setup
-        An emitter that can't be drawn from it has to do with the model's own dipoles.
-    model : FieldModel
-    references : SensorTable
-        The fixed ones.
-    bodies : tuple of str
-        Bodies whose coils are further references, while their poses are known.
-    folder : Path or None
-        Where tables are kept; None where they are not.
-    ahead : ReadAhead, optional
-        Of this folder.
-    witness_noise_t : float, optional
-        Noise of a component of what tools read, T, if they are witnesses.
+    An emitter that can't be drawn from the setup has to do with the model's own dipoles. Tables
+    are kept in a ``folder``, which ``ahead`` belongs to; None where they are not. With tools as
+    witnesses, ``witness_noise_t`` is the noise of a component of what they read, T.
     """
 
     def __init__(
@@ -69,18 +51,15 @@ class RefitStart:
         setup: Setup,
         model: FieldModel,
         references: SensorTable,
-        bodies: tuple[str, ...],
         folder: Path | None = None,
         ahead: ReadAhead | None = None,
         witness_noise_t: float | None = None,
     ) -> None:
-        self._setup, self._model, self._fixed = setup, model, references
+        self._setup, self._model, self._references = setup, model, references
         self._folder, self._ahead, self._witness_noise_t = folder, ahead, witness_noise_t
-        moving = tuple(s for s in setup.tool_sensors if s.body in bodies)
-        self._moving = sensor_table(moving) if moving else None
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=WORKER)
         self._tables: Future[tables.RefitTables] | None = None
-        self._made: Future[Started] | None = None
+        self._made: Future[LiveRefit] | None = None
         self._kept: Future[None] | None = None
         self._share, self._is_over = 0.0, False
 
@@ -92,10 +71,7 @@ class RefitStart:
     def begin(self, baseline: NDArray[np.complex128]) -> None:
         """Begin to make the refit to what differs from a baseline, in place of one being made.
 
-        Parameters
-        ----------
-        baseline : ndarray, shape (R, K), complex
-            Readings of the fixed references without metal, T.
+        The baseline, shape (R, K), T, is what the references read without metal.
         """
         self.prepare()
         if self._made is not None:
@@ -104,7 +80,7 @@ class RefitStart:
         if self._kept is None and self._folder is not None:
             self._kept = self._worker.submit(self._keep, self._folder)  # nobody waits for it
 
-    def taken(self) -> Started | None:
+    def taken(self) -> LiveRefit | None:
         """Return the refit once, as soon as it is made.
 
         Raises
@@ -142,12 +118,6 @@ class RefitStart:
         going_on = [work for work in works if work is not None and not work.done()]
         return not wait(going_on, longest_s).not_done
 
-    @property
-    def _references(self) -> SensorTable:
-        """The fixed references and those that move, where tables begin with them."""
-        fixed, moving = self._fixed, self._moving
-        return fixed if moving is None else fixed.joined(start_table(moving))
-
     def _file(self, folder: Path) -> KeptTables:
         return KeptTables(folder, self._setup, self._model, self._references, self._ahead)
 
@@ -171,15 +141,12 @@ class RefitStart:
             raise _EndedError
         self._share = share
 
-    def _make(self, baseline: NDArray[np.complex128]) -> Started:
-        setup, model, references = self._setup, self._model, self._fixed
+    def _make(self, baseline: NDArray[np.complex128]) -> LiveRefit:
         assert self._tables is not None
         made = self._tables.result()
         self._share = 1.0
-        if self._moving is None:
-            refit = LiveRefit(model, references, baseline, setup.refit, tables=made)
-            if self._witness_noise_t is not None:
-                refit.enable_witnesses(self._witness_noise_t, ready=True)
-            return refit, None
-        patches = Patches(self._moving, baseline, setup.frame_id, setup.refit)
-        return patches.started(model, references, tables=made), patches
+        settings = self._setup.refit
+        refit = LiveRefit(self._model, self._references, baseline, settings, tables=made)
+        if self._witness_noise_t is not None:
+            refit.enable_witnesses(self._witness_noise_t, ready=True)
+        return refit

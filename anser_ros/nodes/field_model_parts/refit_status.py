@@ -3,7 +3,7 @@
 import numpy as np
 
 from anser_ros.field.model import FieldModel
-from anser_ros.nodes.field_model_parts.refit_in_force import RefitInForce
+from anser_ros.nodes.field_model_parts.refit_in_force import ActiveRefit
 from anser_ros.nodes.runtime.node import Level, Status
 from anser_ros.refit.result import WITHHELD, RefitResult
 
@@ -13,7 +13,7 @@ PREPARING = (
     'a baseline is there, the refit is being prepared: until it is in force there are no poses '
     '(state references_lost), as metal may come meanwhile'
 )
-IN_FORCE = 'the refit is in force: the model follows the references'
+ACTIVE = 'the refit is in force: the model follows the references'
 
 
 def no_baseline(namespace: str) -> str:
@@ -26,7 +26,7 @@ def no_baseline(namespace: str) -> str:
 
 
 def model_values(model: FieldModel, name: str) -> dict[str, object]:
-    """Return the figures of the model in force; ``name`` is told where its source is not known."""
+    """Return the figures of the active model; ``name`` stands where its source is not known."""
     return {
         'source': model.provenance.get('source', name),
         'dipoles': len(model.positions),
@@ -54,7 +54,7 @@ def refit_values(result: RefitResult | None) -> dict[str, object]:
 def refit_words(result: RefitResult | None, refused: str = '', making: str = '') -> str:
     """Return what the refit did in this frame, and why where something was in its way.
 
-    ``refused`` is why a baseline that was requested since then is not in force, ``making`` the
+    ``refused`` is why a baseline that was requested since then is not active, ``making`` the
     progress of the refit to another one.
     """
     words = f'; a new baseline was refused: {refused}' if refused else ''
@@ -76,7 +76,7 @@ def rest_words(is_held: bool, is_wanted: bool, no_baseline: str, making: str = '
 
 
 def activity(
-    refit: RefitInForce, is_held: bool, is_wanted: bool, refused: str, values: dict[str, object]
+    refit: ActiveRefit, is_held: bool, is_wanted: bool, refused: str, values: dict[str, object]
 ) -> str:
     """Return what the refit does, and add its figures to the values."""
     result, making = refit.result, refit.words

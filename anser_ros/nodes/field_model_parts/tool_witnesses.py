@@ -30,17 +30,10 @@ for a busy machine. Fewer, and what comes late witnesses nothing; more only take
 
 
 class ToolWitnesses:
-    """Hands the readings of rigid tools to the refit in force, once a frame.
+    """Hands the readings of rigid tools to the active refit, once a frame.
 
-    Parameters
-    ----------
-    node : AnserNode
-    is_wanted : bool
-        Whether tools are witnesses; nothing is subscribed to otherwise.
-    frame_id : callable
-        The frame of the board.
-    refuse : callable
-        Gets a counter's name and the error of what is refused.
+    Nothing is subscribed to unless it ``is_wanted``. ``frame_id`` returns the frame of the board,
+    and ``refuse`` gets a counter's name and the error of what is refused.
 
     Attributes
     ----------
@@ -88,7 +81,7 @@ class ToolWitnesses:
         """Return the noise of a component of what the tools read, T; None without witnesses."""
         return None if self._correction is None else self._noise
 
-    def tell(self, refit: LiveRefit, stamp_ns: int) -> None:
+    def pass_on(self, refit: LiveRefit, stamp_ns: int) -> None:
         """Give the refit what the tools read in its last frame, of the stamp given, once."""
         points, poses = self._frames.pop(stamp_ns, None), self._poses.pop(stamp_ns, None)
         correction = self._correction
