@@ -22,7 +22,7 @@ from anser_ros.diagnosis.decisions import (
     SOMETHING_LEFT,
     TIME_PARTS,
 )
-from anser_ros.diagnosis.fit import Fit, misfit
+from anser_ros.diagnosis.fit import Fit
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
 from anser_ros.diagnosis.whitening import parts
 from anser_ros.effects.effect import INEXACT, Family
@@ -99,7 +99,7 @@ def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmati
     without = evaluate(problem, rest)
     power = without.sum_of_squares - fit.state.sum_of_squares
     left = max(fit.state.sum_of_squares - noise * fit.state.count, 0.0)
-    left_tools = left if misfit(fit) > SOMETHING_LEFT * noise else 0.0
+    left_tools = left if fit.misfit > SOMETHING_LEFT * noise else 0.0
     columns = fit.state.design(term)
     varying = max(
         _by_time(fit.state, columns, noise),

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import SOMETHING_LEFT
+from anser_ros.diagnosis.engine import Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter
 from anser_ros.diagnosis.moving_start import course_of
 from anser_ros.diagnosis.outlying import without_outliers
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.rich_modes import rich_modes
-from anser_ros.diagnosis.scoring import Scorer
 from anser_ros.diagnosis.shaping import Shaping
 from anser_ros.effects.body_term import Richness
 from anser_ros.effects.departed_metal import DepartedMetal, DepartedTerm
@@ -139,7 +139,7 @@ def departure(problem: Problem, rest_s: float) -> Departure | None:
     if not known:
         return None
     fitter = Fitter(some, blocks, DEPARTURE_STEPS)
-    best = Shaping(fitter, BODY).with_freer_course(min(known, key=fitter.held_out), 0)
+    best = Shaping(fitter, BODY).with_freer_course(min(known, key=Fit.held_out), 0)
     cleaned = without_outliers(problem, evaluate(problem, best.terms))
     last = Fitter(cleaned.in_blocks(blocks).thinned(MANY_FRAMES), blocks, DEPARTURE_STEPS)
     fit = last.fit(best.terms)

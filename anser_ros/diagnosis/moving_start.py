@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import LEAST_MOTION_GAIN, LEAST_OF_EXCESS, LEAST_PATH_GAIN
-from anser_ros.diagnosis.problem import Problem
-from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
+from anser_ros.diagnosis.engine import Score, Scorer
+from anser_ros.diagnosis.problem import Problem, State
+from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.effect import Effect
 from anser_ros.effects.registry import all_effects
 from anser_ros.effects.term import Term
@@ -25,7 +26,7 @@ NO_PRIOR = 1e6
 def moving_starts(
     problem: Problem,
     scored: Sequence[tuple[Term, Score]],
-    scorer: Scorer,
+    scorer: Scorer[State],
     blocks: NDArray[np.int64],
 ) -> list[tuple[float, Term]]:
     """Return expected gain and start values of effects that are another one at a place for each
@@ -54,7 +55,7 @@ def _starts(
     effect: Effect[Term],
     scored: Sequence[tuple[Term, Score]],
     problem: Problem,
-    scorer: Scorer,
+    scorer: Scorer[State],
     blocks: NDArray[np.int64],
 ) -> list[tuple[float, Term]]:
     """Starts of one effect along the places of the effect that it is at rest."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.engine import JointState
 from anser_ros.diagnosis.whitening import Spread, Whitener, parts, pose_jacobian
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import Remedy
@@ -120,32 +121,19 @@ class Part:
 
 
 @dataclass(frozen=True)
-class State:
-    """Holds a problem with a list of effects in force."""
+class State(JointState[Term, Part]):
+    """Holds a problem of fluxes with a list of active effects."""
 
     problem: Problem
-    terms: tuple[Term, ...]
-    parts: tuple[Part, ...]
-
-    @property
-    def white(self) -> Array:
-        """Return all whitened residuals in one vector."""
-        return np.concatenate([part.white.ravel() for part in self.parts])
-
-    @property
-    def sum_of_squares(self) -> float:
-        """Return the sum of squares of the whitened residuals."""
-        return float(sum(np.sum(part.white**2) for part in self.parts))
 
     @property
     def penalty(self) -> float:
         """Return what the freedom that fluctuating effects leave to each frame costs."""
         return float(sum(part.whitener.penalty for part in self.parts))
 
-    @property
-    def count(self) -> int:
-        """Return the number of values that have a weight, over all parts."""
-        return sum(part.count for part in self.parts)
+    def moved(self, terms: Sequence[Term]) -> 'State':
+        """Return the state of the same problem with other terms."""
+        return evaluate(self.problem, terms)
 
     def design(self, term: Term, probe: bool = False) -> list[Array | None]:
         """Return whitened columns of a term, one array (F, n, q) a part, None for no columns."""

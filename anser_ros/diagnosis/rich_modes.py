@@ -72,7 +72,7 @@ def rich_modes(
     vectors = vectors[:, leading]
     group = _both_phases(few, unit, widest[:, None] * vectors)
     columns, prior = known
-    sums = block_sums(few, joined([columns, group]), blocks)
+    sums = block_sums(few.parts, joined([columns, group]), blocks)
     width, count = prior.size, leading.size
     bare = sums.columns(np.arange(width))
     best: tuple[float, Array] = (bare.held_out(prior, TIME_FOLDS), np.zeros((0, 0)))

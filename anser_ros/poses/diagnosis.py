@@ -10,17 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.term import Term
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
-from anser_ros.poses.effect import (
-    PoseResiduals,
-    Role,
-    Sensing,
-    effect_of,
-    is_of,
-)
+from anser_ros.poses.effect import PoseResiduals, PoseTerm, Role, Sensing
 from anser_ros.poses.fit import (
     PoseFit,
     fit_poses,
@@ -207,7 +200,7 @@ def _confirmed(search: PoseSearch, problem: PoseProblem, test: NDArray[np.int64]
     """The search without effects of place that positions do not confirm."""
     fit = search.fit
     for index, term in enumerate(fit.terms):
-        if not effect_of(term).blocks_in_space:
+        if not term.effect.blocks_in_space:
             continue
         rest = fit_poses(fit.state.problem, [t for t in fit.terms if t is not term])
         noisy = replace(problem, noise=fit.state.problem.noise)
@@ -220,7 +213,7 @@ def _confirmed(search: PoseSearch, problem: PoseProblem, test: NDArray[np.int64]
     return search
 
 
-def unconfirmed(rest: PoseFit, fit: PoseFit, term: Term, unseen: PoseProblem) -> str:
+def unconfirmed(rest: PoseFit, fit: PoseFit, term: PoseTerm, unseen: PoseProblem) -> str:
     """Return why an effect of place is not believed beside the rest; empty where it is.
 
     ``rest`` is the fit without it, and ``unseen`` the held-out poses.
@@ -232,14 +225,14 @@ def unconfirmed(rest: PoseFit, fit: PoseFit, term: Term, unseen: PoseProblem) ->
     if _square(unseen.state(rest.terms), term) < _square(unseen.state(fit.terms), term):
         return 'held-out poses are worse with it'
     taken = _square(rest.state, term) - _square(fit.state, term)
-    if is_of(term, Role.MAP) and taken < LEAST_MAP_M**2:
+    if term.role is Role.MAP and taken < LEAST_MAP_M**2:
         return f'takes less than {1e3 * LEAST_MAP_M:g} mm off the errors of positions'
     return ''
 
 
-def _square(state: PoseState, term: Term) -> float:
+def _square(state: PoseState, term: PoseTerm) -> float:
     """Mean squared error of the positions, m^2, of the sensors that a term is about."""
-    parts = [p for p in state.parts if effect_of(term).acts_on(term, p.view.sensor)]
+    parts = [p for p in state.parts if term.acts_on(p.view.sensor)]
     total = sum(float(np.sum(p.residual[p.used, :3] ** 2)) for p in parts)
     return total / max(sum(np.count_nonzero(p.used) for p in parts), 1)
 
@@ -266,4 +259,4 @@ def _residuals(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> Po
     # What stands out of this fit, and not of the one before it: every pose is used or out.
     weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
     sensings = tuple(_sensings(replace(every, weight=weight).state(whole.terms), out))
-    return PoseResiduals(session, problem.setting, sensings, problem.blocks)
+    return PoseResiduals(session, problem.setting, sensings)

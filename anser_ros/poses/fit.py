@@ -2,17 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from anser_ros.calibration.blocks import FOLDS
-from anser_ros.diagnosis.fit import descended, stepped
-from anser_ros.diagnosis.scoring import BlockSums
-from anser_ros.effects.term import Term
-from anser_ros.poses.effect import Role, effect_of, is_of
+from anser_ros.diagnosis.engine import JointFit, descended, stepped
+from anser_ros.poses.effect import PoseTerm, Role
 from anser_ros.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
 from anser_ros.poses.stamp_step import stamp_step
 
@@ -53,35 +51,24 @@ LARGEST_STAMP_S = 0.1
 
 
 @dataclass(frozen=True)
-class PoseFit:
-    """Holds terms at their joint optimum.
-
-    Attributes
-    ----------
-    state : PoseState
-    sums : BlockSums
-    prior : ndarray, shape (q,)
-    """
-
-    state: PoseState
-    sums: BlockSums
-    prior: Array
+class PoseFit(JointFit[PoseState]):
+    """Holds the terms of poses at their joint optimum."""
 
     @property
-    def terms(self) -> tuple[Term, ...]:
+    def terms(self) -> tuple[PoseTerm, ...]:
         """Return all terms with their fitted parameters."""
         return self.state.terms
 
-    @property
-    def misfit(self) -> float:
-        """Return the mean square of the whitened residuals; one where only noise is left."""
-        return self.state.sum_of_squares / max(self.state.count, 1)
-
     def held_out(self, in_space: bool = False) -> float:
         """Return the cross-validated sum of squares over blocks of time, or of space."""
-        sums = self.state.sums(in_space=True) if in_space else self.sums
-        return sums.held_out(self.prior, FOLDS)
+        return self._held_out_in_space if in_space else super().held_out()
 
+    @cached_property
+    def _held_out_in_space(self) -> float:
+        state = self.state.in_space
+        return state.sums(state.numbers).held_out(self.prior, state.folds)
+
+    @cached_property
     def covariance(self) -> Array:
         """Return the covariance of all parameters, as `BlockSums.covariance`.
 
@@ -90,17 +77,17 @@ class PoseFit:
         errors. What it adds to the poses' own noise is slow, and is seen in the slow course of the
         blocks' scores (by sine tapers); the quick course is where teeth end in blocks.
         """
-        filtered = any(is_of(term, Role.FILTER) for term in self.terms)
-        sums = self.state.sums(filter_slopes=True) if filtered else self.sums
+        filtered = any(term.role is Role.FILTER for term in self.terms)
+        sums = self.state.sums_with(filter_slopes=True) if filtered else self.sums
         whole = sums.covariance(self.prior, self.misfit)
         clocks = np.repeat(
-            [effect_of(t).role.is_clock for t in self.terms], [t.theta.size for t in self.terms]
+            [t.role.is_clock for t in self.terms], [t.theta.size for t in self.terms]
         )
         blocks = sums.squares.size
         if not clocks.any() or blocks <= FEWEST_BLOCKS or not self._is_polled():
             return whole
         formal = sums.solve(self.prior)[1][clocks]
-        exact = self.state.sums(filter_slopes=filtered, stamps_exact=True).normal.sum(axis=0)
+        exact = self.state.sums_with(filtered, stamps_exact=True).normal.sum(axis=0)
         exact += np.diag(1 / self.prior**2)
         least = np.einsum('ci,ij,cj->c', formal, exact, formal) * max(self.misfit, 1.0)
         course = np.outer(np.arange(1, SLOW + 1), np.arange(1, blocks + 1))
@@ -116,53 +103,33 @@ class PoseFit:
         sensors = zip(self.state.problem.sensors, self.state.parts, strict=True)
         return any(part.noise.stamp_s and stamp_step(poses.time) for poses, part in sensors)
 
-    def covariance_of(self, index: int, whole: Array | None = None) -> Array:
-        """Return the covariance of one term's parameters."""
-        sizes = np.cumsum([0] + [t.theta.size for t in self.terms])
-        rows = slice(sizes[index], sizes[index + 1])
-        return (self.covariance() if whole is None else whole)[rows, rows]
 
-
-def fit_poses(problem: PoseProblem, terms: Sequence[Term], iterations: int = 10) -> PoseFit:
-    """Fit all parameters of all terms together.
-
-    Parameters
-    ----------
-    problem : PoseProblem
-    terms : sequence of Term
-        Start values, the two frames among them.
-    iterations : int
-        At most.
-    """
-    prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
-    state, sums, _ = descended(
-        problem.state(terms),
-        lambda state: (state.sums(), prior),
-        lambda state, step: problem.state(stepped(state.terms, step)),
-        iterations,
-    )
-    return PoseFit(state, sums, prior)
+def fit_poses(problem: PoseProblem, terms: Sequence[PoseTerm], iterations: int = 10) -> PoseFit:
+    """Fit all parameters of all terms together, the two frames among them, from their values."""
+    state = problem.state(terms)
+    return PoseFit(*descended(state, state.numbers, iterations))
 
 
 def with_time_constants(fit: PoseFit) -> PoseFit:
     """Return the fit with the time constants of filters, which lie near, fitted by their slopes.
 
-    Positions alone tell them (`PoseState.sums`), so that steps need not lower the sum of squares.
+    Positions alone tell them (`PoseState.sums_with`), so that steps need not lower the sum of
+    squares.
     """
-    filters = [i for i, term in enumerate(fit.terms) if is_of(term, Role.FILTER)]
+    filters = [i for i, term in enumerate(fit.terms) if term.role is Role.FILTER]
     if not filters:
         return fit
     state = fit.state
     for _ in range(FILTER_STEPS):
-        terms = stepped(state.terms, state.sums(filter_slopes=True).step(fit.prior, 0.0))
+        terms = stepped(state.terms, state.sums_with(filter_slopes=True).step(fit.prior, 0.0))
         moved = [float(terms[i].theta[0] / fit.terms[i].theta[0]) for i in filters]
         if not all(1 / NEAR_TAU < factor < NEAR_TAU for factor in moved):
             return fit
-        state = state.problem.state(terms)
-    return PoseFit(state, state.sums(), fit.prior)
+        state = state.moved(terms)
+    return PoseFit(state, state.sums(state.numbers), fit.prior)
 
 
-def robust_fit(problem: PoseProblem, terms: Sequence[Term]) -> PoseFit:
+def robust_fit(problem: PoseProblem, terms: Sequence[PoseTerm]) -> PoseFit:
     """Fit with poses weighted by how far they are off, and with the spread that they show."""
     problem = replace(problem, noise=tuple(_spread(p) for p in problem.state(terms).parts))
     fit = fit_poses(problem, terms, 4)

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.term import Term
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
-from anser_ros.poses.effect import Role, effect_of, frames_of, is_of
+from anser_ros.poses.effect import PoseTerm, Role, frames_of
 from anser_ros.poses.fit import PoseFit, fit_poses
 from anser_ros.poses.lever_arms import (
     LEAST_KNOWN_M,
@@ -201,7 +200,7 @@ def _sigma(fit: PoseFit, index: int) -> float:
 
 def _clock(fit: PoseFit, role: Role, scale: float) -> tuple[float, float] | None:
     for index, term in enumerate(fit.terms):
-        if is_of(term, role):
+        if term.role is role:
             return scale * float(term.theta[0]), scale * _sigma(fit, index)
     return None
 
@@ -217,15 +216,14 @@ def _described(
     assert reference is not None
     # Pairs are not in the order of a motion, so their differences tell no jitter.
     shaking = 0.0 if pairs else turn_jitter(reference)
-    covariance = fit.covariance()
-    spreads = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
-    (base,) = (i for i, t in enumerate(fit.terms) if is_of(t, Role.REGISTRATION))
+    spreads = [fit.covariance_of(i) for i in range(len(fit.terms))]
+    (base,) = (i for i, t in enumerate(fit.terms) if t.role is Role.REGISTRATION)
     frames = frames_of(fit.terms, '')
     sensors, words = {}, []
     for index, term in enumerate(fit.terms):
-        if not is_of(term, Role.MOUNT):
+        if term.role is not Role.MOUNT:
             continue
-        name = str(effect_of(term).sensor_of(term))
+        name = str(term.sensor)
         frames = frames_of(fit.terms, name)
         part = next(p for p in fit.state.parts if p.view.sensor == name)
         record = hand_eye_record(
@@ -265,10 +263,10 @@ def _described(
     )  # fmt: skip
 
 
-def _middle(terms: tuple[Term, ...]) -> float:
+def _middle(terms: tuple[PoseTerm, ...]) -> float:
     """When the offset is the offset: at stamp zero where no rate is known."""
     for term in terms:
-        if is_of(term, Role.RATE):
+        if term.role is Role.RATE:
             return float(term.effect.record(term, np.zeros((1, 1))).parameters['middle_s'])
     return 0.0
 

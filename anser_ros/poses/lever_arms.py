@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.poses.effect import Role, effect_of, is_of
+from anser_ros.poses.effect import Role
 from anser_ros.poses.fit import PoseFit
 from anser_ros.poses.problem import PosePart
 from anser_ros.poses.sequence import PoseSequence, PoseSession
@@ -100,12 +100,12 @@ def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
     with hardly a turn, or not moved at all. Much tilt determines them once the effects are found,
     however large the error is that these make before.
     """
-    shaking, covariance = turn_jitter(reference), fit.covariance()
+    shaking = turn_jitter(reference)
     parts = {part.view.sensor: part for part in fit.state.parts}
     for index, term in enumerate(fit.terms):
-        if is_of(term, Role.MOUNT):
-            part = parts[str(effect_of(term).sensor_of(term))]
-            sigma = np.sqrt(np.maximum(np.diag(fit.covariance_of(index, covariance)), 0.0))[:3]
+        if term.role is Role.MOUNT:
+            part = parts[str(term.sensor)]
+            sigma = np.sqrt(np.maximum(np.diag(fit.covariance_of(index)), 0.0))[:3]
             is_known = (sigma < LEAST_KNOWN_M) & _is_turned_for(part, shaking, 0.0)
             turns = _turn_information(part) if part.used.any() else np.zeros((3, 3))
             tilted = np.sqrt(np.diag(turns)) > MUCH_TILT

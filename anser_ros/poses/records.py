@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.clock_records import one_clock
-from anser_ros.poses.effect import Frames, Role, effect_of, frames_of, is_of
+from anser_ros.poses.effect import Frames, Role, frames_of
 from anser_ros.poses.fit import PoseFit
 from anser_ros.poses.lever_arms import (
     LEAST_KNOWN_M,
@@ -28,15 +28,14 @@ def records_of(
     fit: PoseFit, evidence: tuple[PoseEvidence | None, ...], session: PoseSession
 ) -> list[EffectRecord]:
     """Return the hand-eye of each sensor, and the effects that were fitted."""
-    covariance = fit.covariance()
-    covariances = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
-    base = next((i for i, t in enumerate(fit.terms) if is_of(t, Role.REGISTRATION)), None)
+    covariances = [fit.covariance_of(i) for i in range(len(fit.terms))]
+    base = next((i for i, t in enumerate(fit.terms) if t.role is Role.REGISTRATION), None)
     shaking = turn_jitter(most_poses(session))
     views = [part.view for part in fit.state.parts]
     records = []
     for i, term in enumerate(fit.terms):
-        if is_of(term, Role.MOUNT):
-            name = str(effect_of(term).sensor_of(term))
+        if term.role is Role.MOUNT:
+            name = str(term.sensor)
             spread = None if base is None else covariances[base]
             part = next(p for p in fit.state.parts if p.view.sensor == name)
             is_determined = is_lever_determined(part, shaking)
@@ -46,9 +45,9 @@ def records_of(
         if one is None:
             continue
         record = term.effect.record(term, spread)
-        record = effect_of(term).seen_at(record, term, spread, views)
+        record = term.effect.seen_at(record, term, spread, views)
         words = {
-            'summary': term.effect.summary, 'advice': effect_of(term).advice,
+            'summary': term.effect.summary, 'advice': term.effect.advice,
             'remedy': term.effect.remedy.value,
             'parameters_spent': int(term.theta.size), 'held_out_gain': one.gain,
             'held_out_share': one.share,

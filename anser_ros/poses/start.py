@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.diagnosis.prepare import BLOCKS, TEST_EVERY
-from anser_ros.effects.term import Site, Term
 from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
-from anser_ros.poses.effect import PoseSetting, Role
+from anser_ros.poses.effect import PoseSetting, PoseSite, PoseTerm, Role
 from anser_ros.poses.fit import PoseFit, robust_fit
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.problem import PoseNoise, PoseProblem
@@ -299,7 +298,7 @@ def _product(left: Array, right: Array) -> Array:
     return np.array([*vector, left[3] * right[3] - left[:3] @ right[:3]])
 
 
-def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[Term]:
+def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[PoseTerm]:
     """Return both frames and an offset to start from; a known registration is the identity."""
     pairs = []
     for poses in problem.sensors:
@@ -311,15 +310,15 @@ def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> 
         shift = np.median(
             np.concatenate([p - o @ rotation.T for p, _, o, _ in pairs if len(p)]), axis=0
         )
-    terms: list[Term] = []
+    terms: list[PoseTerm] = []
     if frame is not None:
         terms.append(effect_with(Role.REGISTRATION).at_frame({}, shift, rotation))
     for poses, (_, turned, _, turn) in zip(problem.sensors, pairs, strict=True):
         mounts = Rotation.from_matrix(turn.transpose(0, 2, 1) @ (rotation.T @ turned))
         middle = _middle(mounts)
-        site: Site = {'sensor': poses.name}
+        site: PoseSite = {'sensor': poses.name}
         terms.append(effect_with(Role.MOUNT).at_frame(site, np.zeros(3), middle))
-    return [*terms, Term(effect_with(Role.OFFSET), {}, np.array([offset]))]
+    return [*terms, PoseTerm(effect_with(Role.OFFSET), {}, np.array([offset]))]
 
 
 def _middle(turns: Rotation) -> Array:

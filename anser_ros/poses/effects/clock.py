@@ -6,10 +6,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Remedy, needed, sigmas
-from anser_ros.effects.term import Site, Term
+from anser_ros.effects.base import Remedy
+from anser_ros.effects.effect import needed, sigmas
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
+from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseSite, PoseTerm, PoseView, Role
 
 Array = NDArray[np.float64]
 
@@ -25,33 +25,33 @@ class PoseTimeOffset(PoseEffect):
     remedy = Remedy.OPTICAL
     role = Role.OFFSET
 
-    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         """Try one offset for all sensors, and one per sensor."""
-        own = [Term(self, {'sensor': s}, np.zeros(1)) for s in setting.sensors]
-        return [Term(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
+        own = [PoseTerm(self, {'sensor': s}, np.zeros(1)) for s in setting.sensors]
+        return [PoseTerm(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
 
-    def prior(self, term: Term) -> Array:
+    def prior(self, term: PoseTerm) -> Array:
         """Return a prior spread of 0.3 s: offsets are some tenths of a second."""
         return np.full(1, 0.3)
 
-    def slopes(self, term: Term, view: PoseView) -> Array | None:
+    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
         """Return minus the velocity of the predicted pose, or None for other sensors."""
-        return -view.velocity[:, :, None] if self.acts_on(term, view.sensor) else None
+        return -view.velocity[:, :, None] if term.acts_on(view.sensor) else None
 
-    def clock(self, term: Term, sensor: str, time: Array) -> Array:
+    def clock(self, term: PoseTerm, sensor: str, time: Array) -> Array:
         """Return the stamps less the offset."""
-        return time - term.theta[0] if self.acts_on(term, sensor) else time
+        return time - term.theta[0] if term.acts_on(sensor) else time
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: PoseTerm, covariance: Array) -> EffectRecord:
         """Record the offset, and the sensor where it is one sensor's."""
         values = {**term.site, 'offset_s': float(term.theta[0])}
         return EffectRecord(self.name, values, {'offset_s': float(sigmas(covariance)[0])})
 
-    def term(self, record: EffectRecord) -> Term:
+    def term(self, record: EffectRecord) -> PoseTerm:
         """Read the offset, s, from a record."""
         sensor = record.parameters.get('sensor')
-        site: Site = {} if sensor is None else {'sensor': str(sensor)}
-        return Term(self, site, np.array([float(needed(record, 'offset_s'))]))
+        site: PoseSite = {} if sensor is None else {'sensor': str(sensor)}
+        return PoseTerm(self, site, np.array([float(needed(record, 'offset_s'))]))
 
 
 class PoseClockRate(PoseEffect):
@@ -67,35 +67,35 @@ class PoseClockRate(PoseEffect):
     remedy = Remedy.OPTICAL
     role = Role.RATE
 
-    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         """Return one term, as one rate holds for all sensors."""
         middle = setting.start + 0.5 * setting.duration
-        return [Term(self, {'middle_s': middle}, np.zeros(1))]
+        return [PoseTerm(self, {'middle_s': middle}, np.zeros(1))]
 
-    def prior(self, term: Term) -> Array:
+    def prior(self, term: PoseTerm) -> Array:
         """Expect rates that err by some parts in a thousand."""
         return np.full(1, 2.0)
 
-    def slopes(self, term: Term, view: PoseView) -> Array | None:
+    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
         """Return minus the velocity, the more the farther from the session's middle."""
         apart = 1e-3 * (view.time - term.site['middle_s']) / (1 + 1e-3 * term.theta[0]) ** 2
         return np.asarray(-(view.velocity * apart[:, None])[:, :, None])
 
-    def clock(self, term: Term, sensor: str, time: Array) -> Array:
+    def clock(self, term: PoseTerm, sensor: str, time: Array) -> Array:
         """Return the stamps, s, without what their clock gains: a rate of r makes times 1 + r."""
         middle = term.site['middle_s']
         return np.asarray(middle + (time - middle) / (1 + 1e-3 * term.theta[0]))
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: PoseTerm, covariance: Array) -> EffectRecord:
         """Record the rate, and the time at which the offset is the offset."""
         sigma = 1e3 * float(sigmas(covariance)[0])
         values = {'rate_ppm': 1e3 * float(term.theta[0]), 'middle_s': term.site['middle_s']}
         return EffectRecord(self.name, values, {'rate_ppm': sigma})
 
-    def term(self, record: EffectRecord) -> Term:
+    def term(self, record: EffectRecord) -> PoseTerm:
         """Read the clock's rate, ppm, from a record."""
         rate = 1e-3 * float(needed(record, 'rate_ppm'))
-        return Term(self, {'middle_s': float(needed(record, 'middle_s'))}, np.array([rate]))
+        return PoseTerm(self, {'middle_s': float(needed(record, 'middle_s'))}, np.array([rate]))
 
 
 EFFECTS = (PoseTimeOffset(), PoseClockRate())

@@ -121,7 +121,7 @@ class PoseExcessNoise(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'factor': '1'}
     makes_jitter = True
 
-    def noisier(self, factor: float) -> Sequence[EffectRecord]:
+    def more_jitter(self, factor: float) -> Sequence[EffectRecord]:
         """Return a record without a sensor: all of them jitter more."""
         if factor < GROWN:
             return ()

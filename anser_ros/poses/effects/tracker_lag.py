@@ -6,10 +6,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Remedy, needed, sigmas
-from anser_ros.effects.term import Term
+from anser_ros.effects.base import Remedy
+from anser_ros.effects.effect import needed, sigmas
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSetting, Role
+from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseTerm, Role
 from anser_ros.poses.path import OpticalPath
 
 Array = NDArray[np.float64]
@@ -34,30 +34,30 @@ class TrackerLag(PoseEffect):
     remedy = Remedy.NONE
     role = Role.FILTER
 
-    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         """Return one term for all sensors, which a tracker filters alike."""
-        return [Term(self, {}, np.array([tau])) for tau in TAUS_S]
+        return [PoseTerm(self, {}, np.array([tau])) for tau in TAUS_S]
 
-    def prior(self, term: Term) -> Array:
+    def prior(self, term: PoseTerm) -> Array:
         """Return a prior spread of 0.1 s: lags are some tenths of a second."""
         return np.full(1, 0.1)
 
-    def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
+    def filter(self, term: PoseTerm, path: OpticalPath) -> OpticalPath:
         """Return the optical path as it is behind the tracker's filter."""
         return path.filtered(float(term.theta[0]), 'two_sided' in term.site)
 
-    def rival(self, term: Term) -> Term:
+    def rival(self, term: PoseTerm) -> PoseTerm:
         """Return the same smoothing without a sense of time."""
-        return Term(self, {'two_sided': True}, term.theta)
+        return PoseTerm(self, {'two_sided': True}, term.theta)
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: PoseTerm, covariance: Array) -> EffectRecord:
         """Record the filter's time constant and its uncertainty, s."""
         sigma = float(sigmas(covariance)[0])
         return EffectRecord(self.name, {'tau_s': float(term.theta[0])}, {'tau_s': sigma})
 
-    def term(self, record: EffectRecord) -> Term:
+    def term(self, record: EffectRecord) -> PoseTerm:
         """Read the filter's time constant, s, from a record."""
-        return Term(self, {}, np.array([float(needed(record, 'tau_s'))]))
+        return PoseTerm(self, {}, np.array([float(needed(record, 'tau_s'))]))
 
 
 EFFECTS = (TrackerLag(),)
