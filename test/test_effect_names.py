@@ -32,7 +32,8 @@ ALLOWED = {
     'below the effects: a scan finds what is wrong with itself by its own fit',
 }
 GENERAL = {
-    'apparatus', 'base', 'body_term', 'correction', 'effect', 'prediction', 'registry', 'term', 'view',
+    'apparatus', 'base', 'body_term', 'correction', 'effect', 'prediction', 'registry', 'term',
+    'view',
 }  # fmt: skip
 """Modules in the room of effects that are about no single one; others may import these."""
 MAY_IMPORT = {
@@ -69,7 +70,8 @@ def members(base, package):
 
 
 NAMES = {*all_effects(), *pose_effects(), 'metal_remainder'}
-CLASSES = {name for room in ROOMS for base in (BaseEffect, BaseTerm) for name in members(base, room)}
+BASES = BaseEffect, BaseTerm
+CLASSES = {name for room in ROOMS for base in BASES for name in members(base, room)}
 
 
 def special_cases(nodes):

@@ -10,14 +10,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import TIME_FOLDS
-from anser_ros.diagnosis.scoring import BlockSums, Columns, Ints, block_sums, cross_sums, joined
-from anser_ros.diagnosis.scoring import width as width_of
+from anser_ros.diagnosis.scoring import (
+    BlockSums,
+    Columns,
+    Ints,
+    WhitePart,
+    block_sums,
+    cross_sums,
+    joined,
+    width_of,
+)
 from anser_ros.effects.base import BaseTerm
 
 Array = NDArray[np.float64]
@@ -33,25 +41,7 @@ than a standard deviation. Larger ends fits that still creep; smaller costs step
 MOST_COLUMNS = 60
 """Columns that an active term may have to be fitted again with each candidate. A term with more
 is what metal left, and no effect's rival."""
-
-
-class Part(Protocol):
-    """One body or sensor at a state."""
-
-    @property
-    def white(self) -> Array:
-        """Whitened residuals, shape (F, n)."""
-
-    @property
-    def blocks(self) -> Ints:
-        """The block that each frame is in, shape (F,)."""
-
-    @property
-    def count(self) -> int:
-        """The number of values that have a weight."""
-
-
-PartT = TypeVar('PartT', bound=Part)
+PartT = TypeVar('PartT', bound=WhitePart)
 
 
 @dataclass(frozen=True)
@@ -232,7 +222,7 @@ class Scorer(Generic[StateT]):
         return Score(left, estimate[-width:], own)
 
 
-class Selection(Generic[FitT]):
+class ForwardSelection(Generic[FitT]):
     """Adds effects one by one, the best first, while each pays for itself, and removes the others.
 
     What pays, and what is superfluous beside the others, an observation says.

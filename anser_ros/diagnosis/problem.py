@@ -22,51 +22,27 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class References:
-    """Holds reference readings as means over short bins, with their clean baseline.
+    """Holds reference readings as means over short bins, with their clean baseline."""
 
-    Attributes
-    ----------
-    readings : Measurements
-        One frame a bin; ``valid`` where the bin has any reading.
-    count : ndarray, shape (B, R)
-        Readings in each mean.
-    baseline : ndarray, shape (R, K), complex
-    """
-
-    readings: Measurements
-    count: Array
-    baseline: ComplexArray
+    readings: Measurements  # one frame a bin; ``valid`` where the bin has any reading
+    count: Array  # (B, R), readings in each mean
+    baseline: ComplexArray  # (R, K)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Holds everything that a diagnosis starts from.
+    """Holds everything that a diagnosis starts from."""
 
-    Attributes
-    ----------
-    tools : tuple of Measurements
-        Frames with a pose only.
-    blocks : tuple of ndarray of int, one per tool, shape (F,)
-        Number of the time block that each frame is in.
-    references : References or None
-    reference_blocks : ndarray of int, shape (B,)
-    fields : Fields
-    apparatus : Apparatus
-    spread : Spread
-    good : tuple of ndarray of bool, one per tool, shape (F, S)
-        Values that take part (valid, and no outliers).
-    gaps_t : tuple of ndarray, one per tool, shape (F, S)
-        By how much a modelled flux may be off where the model's scan has gaps, T a component.
-    """
-
-    tools: tuple[Measurements, ...]
-    blocks: tuple[NDArray[np.int64], ...]
+    tools: tuple[Measurements, ...]  # frames with a pose only
+    blocks: tuple[NDArray[np.int64], ...]  # (F,), number of the time block that each frame is in
     references: References | None
-    reference_blocks: NDArray[np.int64]
+    reference_blocks: NDArray[np.int64]  # (B,)
     fields: Fields
     apparatus: Apparatus
     spread: Spread
-    good: tuple[Mask, ...]
+    good: tuple[Mask, ...]  # (F, S), values that take part (valid, and no outliers)
+    # (F, S), by how much a modelled flux may be off where the model's scan has gaps, T a
+    # component.
     gaps_t: tuple[Array, ...]
 
     def frames(self, keep: Sequence[NDArray[np.generic]], bins: NDArray[np.generic]) -> 'Problem':
@@ -94,9 +70,7 @@ class Problem:
         return self.frames(keep, np.arange(self.reference_blocks.size))
 
     def in_blocks(self, wanted: NDArray[np.int64], step: int = 1) -> 'Problem':
-        """Return the problem of every ``step``-th frame of some blocks, with the bins of those
-        blocks.
-        """
+        """Return every ``step``-th frame of some blocks, with the bins of those blocks."""
         keep = []
         for blocks in self.blocks:
             rows = np.flatnonzero(np.isin(blocks, wanted))
@@ -146,7 +120,7 @@ class State(JointState[Term, Part]):
 
 
 def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
-    """Predict all readings with some effects in force, and whiten what they differ by."""
+    """Predict all readings with some active effects, and whiten what they differ by."""
     found = []
     for tool, blocks, good, gaps_t in zip(
         problem.tools, problem.blocks, problem.good, problem.gaps_t, strict=True

@@ -27,22 +27,12 @@ def moves_or_rests(
 ) -> Fit:
     """Return metal that moves, or at rest where that explains as much, alone or with one effect.
 
-    Parameters
-    ----------
-    fitter : Fitter
-    moving : Fit
-        With metal that moves for its newest effect.
-    fitted : sequence of (float, Fit)
-        All fits of the round; those with metal at rest for their newest effect are the rivals.
-    candidates : callable
-        All other effects with their scores, best first, from a scorer.
-    explained : float
-        What the metal that moves takes off the held-out sum of squares.
+    ``moving``: with metal that moves for its newest effect; ``fitted``: all fits of the round;
+    those with metal at rest for their newest effect are the rivals; ``candidates``: all other
+    effects with their scores, best first, from a scorer; ``explained``: what the metal that moves
+    takes off the held-out sum of squares.
 
-    Returns
-    -------
-    Fit
-        Settled (`anser_ros.diagnosis.refine`).
+    Returns Fit: settled (`anser_ros.diagnosis.refine`).
     """
     shaped = settled(fitter, moving.terms)
     resting = [(g, f) for g, f in fitted if f.newest.effect.family is Family.METAL_AT_REST]

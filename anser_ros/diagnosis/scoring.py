@@ -18,30 +18,24 @@ BLOCKS_A_THREAD = 4
 """Blocks that one thread sums up, half a millisecond's work."""
 
 
-class HasWhite(Protocol):
-    """Whitened residuals (F, n), and the block of each frame (F,)."""
+class WhitePart(Protocol):
+    """One body or sensor at a state: whitened residuals (F, n), and the block of each frame."""
 
     @property
     def white(self) -> Array: ...
     @property
     def blocks(self) -> Ints: ...
+    @property
+    def count(self) -> int: ...
 
 
 @dataclass(frozen=True)
 class BlockSums:
-    """Holds the normal equations of some columns and the residual, block by block.
+    """Holds the normal equations of some columns and the residual, block by block."""
 
-    Attributes
-    ----------
-    normal : ndarray, shape (B, q, q)
-    right : ndarray, shape (B, q)
-    squares : ndarray, shape (B,)
-        Sum of the squared residuals.
-    """
-
-    normal: Array
-    right: Array
-    squares: Array
+    normal: Array  # (B, q, q)
+    right: Array  # (B, q)
+    squares: Array  # (B,), sum of the squared residuals
 
     @property
     def size(self) -> int:
@@ -142,9 +136,9 @@ def spans(blocks: Ints, wanted: Ints) -> list[slice | Ints]:
     return [slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
 
 
-def block_sums(parts: Sequence[HasWhite], columns: Columns, wanted: Ints) -> BlockSums:
+def block_sums(parts: Sequence[WhitePart], columns: Columns, wanted: Ints) -> BlockSums:
     """Return sums over the blocks that are wanted; columns are one (F, n, q) or None a part."""
-    size = width(columns)
+    size = width_of(columns)
     normal = np.zeros((wanted.size, size, size))
     right = np.zeros((wanted.size, size))
     squares = np.zeros(wanted.size)
@@ -166,7 +160,7 @@ def block_sums(parts: Sequence[HasWhite], columns: Columns, wanted: Ints) -> Blo
 
 
 def cross_sums(
-    parts: Sequence[HasWhite],
+    parts: Sequence[WhitePart],
     left: Columns,
     right: Columns,
     one: BlockSums,
@@ -191,7 +185,7 @@ def joined(groups: Sequence[Columns]) -> list[Array | None]:
     """Return columns of several groups side by side; zeros where a group has none."""
     if len(groups) == 1:
         return list(groups[0])
-    widths = [width(group) for group in groups]
+    widths = [width_of(group) for group in groups]
     out: list[Array | None] = []
     for pieces in zip(*groups, strict=True):
         known = next((p for p in pieces if p is not None), None)
@@ -206,6 +200,6 @@ def joined(groups: Sequence[Columns]) -> list[Array | None]:
     return out
 
 
-def width(group: Columns) -> int:
+def width_of(group: Columns) -> int:
     """Return the number of columns of a group, 0 where it has none in any part."""
     return next((c.shape[2] for c in group if c is not None), 0)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.choice import at_floor, choose, taken_from_others
 from anser_ros.diagnosis.confirm import doubtful
-from anser_ros.diagnosis.engine import Score, Scorer, Selection, is_covered
+from anser_ros.diagnosis.engine import ForwardSelection, Score, Scorer, is_covered
 from anser_ros.diagnosis.fit import Fit, Fitter
 from anser_ros.diagnosis.fluctuating import fluctuation_of, left_over
 from anser_ros.diagnosis.moving_start import moving_starts
@@ -89,7 +89,7 @@ def search_effects(
     how = settings or SearchSettings()
     fitter = how.fitter(problem, blocks)
     search = Search(fitter.fit(start))
-    search.fit = _Selection(fitter, search, how, progress).grown(search.fit)
+    search.fit = _FluxSelection(fitter, search, how, progress).grown(search.fit)
     return search
 
 
@@ -109,7 +109,7 @@ def _may_be_the_model_s(gain: float, fit: Fit) -> bool:
     return gain < decisions.OWN_METAL * own * max(fit.misfit, 1.0)
 
 
-class _Selection(Selection[Fit]):
+class _FluxSelection(ForwardSelection[Fit]):
     """Selects the effects of a session of fluxes."""
 
     def __init__(
@@ -155,9 +155,7 @@ class _Selection(Selection[Fit]):
         return best
 
     def taken(self, fit: Fit) -> Fit:
-        """Return the fit with simpler effects, and without superfluous ones, where that is as
-        good.
-        """
+        """Return the fit with simpler effects, and fewer, where that is as good."""
         self._say(f'{fit.newest.label}: misfit {fit.misfit:.4g}')
         return self.thinned(self._simplified(fit))
 

@@ -30,17 +30,10 @@ EVERY_OTHER = 2
 
 @dataclass(frozen=True)
 class Shaping:
-    """Shapes metal that moves in a fit.
-
-    Attributes
-    ----------
-    fitter : Fitter
-    richness : Richness
-        How many modes and knots it may have.
-    """
+    """Shapes metal that moves in a fit."""
 
     fitter: Fitter
-    richness: Richness
+    richness: Richness  # how many modes and knots it may have
 
     def shaped(self, fit: Fit, index: int) -> Fit:
         """Return the fit with one moving metal shaped; the same fit for any other effect."""

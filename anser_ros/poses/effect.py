@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.base import BaseEffect, BaseTerm
+from anser_ros.effects.effect import sigmas
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.sequence import PoseSession
@@ -235,6 +236,25 @@ class PoseEffect(BaseEffect[PoseTerm]):
     def rival(self, term: PoseTerm) -> PoseTerm:
         """Return a filter's smoothing without its delay: what a noisy reference asks for."""
         return term
+
+
+class NumberEffect(PoseEffect):
+    """Changes poses by one number, theta, which a record holds as ``base + factor * theta``."""
+
+    key = ''
+    base, factor = 0.0, 1.0
+    spread = 1.0
+    """Standard deviation of theta before anything is measured."""
+
+    def prior(self, term: PoseTerm) -> Array:
+        """Return the standard deviation of theta before anything is measured, shape (1,)."""
+        return np.full(1, self.spread)
+
+    def record(self, term: PoseTerm, covariance: Array) -> EffectRecord:
+        """Return the number and its standard deviation, and the term's site."""
+        sigma = self.factor * float(sigmas(covariance)[0])
+        value = self.base + self.factor * float(term.theta[0])
+        return EffectRecord(self.name, {**term.site, self.key: value}, {self.key: sigma})
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Fits the two frames and all effects in force by Gauss-Newton, and the noise of the rest."""
+"""Fits the two frames and all active effects by Gauss-Newton, and the noise of the rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,20 +18,16 @@ Array = NDArray[np.float64]
 
 STUDENT_FREEDOM = 4.0
 """Degrees of freedom of Student's distribution by which poses are weighted in a robust fit: the
-usual compromise between the mean (infinite) and a distribution without one (1). Smaller gives far
-poses less weight and costs precision where the errors are normal; larger lets a few bad poses move
-the frames."""
+usual compromise between the mean (infinite) and a distribution without one (1)."""
 REWEIGHTINGS = 5
 """Fits of a robust fit after the first, each with the weights of the one before. Fewer leave bad
 poses some of their first weight; more cost a fit each and change weights by little."""
 STANDS_OUT, FAR_OUT = 7.0, 25.0
 """Distances of a pose from its prediction, in robust spreads of a coordinate, from which it stands
-out: where few do, and where many do. Three normal coordinates reach the first once in 1e10; what
-many poses share is something to explain, and only what no distortion makes is left out of it."""
+out: where few do (normal ones once in 1e10), and where many do, as what an effect makes."""
 FEW_SHARE = 0.03
-"""Share of a sensor's poses up to which those that stand out are few. It lies between one window
-and the two that metal must be near to be named (`episodes.WINDOWS`). Smaller takes a handful of
-reflections for something to explain; larger takes an effect of a few seconds for outliers."""
+"""Share of a sensor's poses up to which those that stand out are few: between one window and the
+two that metal must be near to be named (`episodes.WINDOWS`)."""
 SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
 FEWEST_BLOCKS = 10
 """Blocks by whose scores the variance of a time beside a poll is judged. Fewer have no slow
@@ -162,10 +158,10 @@ def _spread(part: PosePart) -> PoseNoise:
     )
 
 
-def unexplained_poses(fit: PoseFit) -> tuple[NDArray[np.bool_], ...]:
+def unexplained_poses(state: PoseState) -> tuple[NDArray[np.bool_], ...]:
     """Return the poses that nothing explains: far beyond the spread of their sensor's others."""
     found = []
-    for part in fit.state.parts:
+    for part in state.parts:
         noise = replace(_spread(part), stamp_s=part.noise.stamp_s)
         white = noise.whitened(part.residual, part.view.velocity)
         place = np.linalg.norm(white[:, :3], axis=1)

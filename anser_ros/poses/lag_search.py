@@ -9,9 +9,7 @@ from anser_ros.poses.prices import gain_of, price
 from anser_ros.poses.registry import pose_effects
 
 CHANCE_SIGMAS = 3.0
-"""Standard deviations of what chance adds to the noise that a smoother reference takes off.
-Smaller names a filter for noise in one clean session of a hundred; larger compares slight filters
-with a smoother reference."""
+"""Standard deviations of what chance adds to the noise that a smoother reference takes off."""
 LAG_STEPS = (1.4, 1.4, 1.2, 1.1, 1.05)  # factors of a time constant by which it is neared
 
 

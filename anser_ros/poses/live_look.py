@@ -35,36 +35,21 @@ FEWEST_POSES_OF_CHANGE = 20  # poses of the later half of a window by which a ch
 
 @dataclass(frozen=True)
 class PoseSighting:
-    """Holds what one look at the last seconds found.
+    """Holds what one look at the last seconds found."""
 
-    Attributes
-    ----------
-    findings : tuple of EffectRecord
-        What is wrong; empty when all is well or nothing that is known explains it.
-    poses : int
-        Tracked poses that were looked at.
-    before_m, after_m, jitter_m : float
-        Held-out error with hand-eye alone and with the findings, and what jitter makes; NaN where
-        the poses were judged by the frames of earlier.
-    misfit_m : float
-        Median distance from where the frames of earlier have the poses; NaN before there are any.
-    unexplained : float
-        Share of the squared error above the jitter that nothing explains.
-    depends_on : tuple of str
-        What that depends on.
-    remark : str
-        Why nothing is named although something is there.
-    """
-
+    # What is wrong; empty when all is well or nothing that is known explains it.
     findings: tuple[EffectRecord, ...]
-    poses: int
+    poses: int  # tracked poses that were looked at
+    # Held-out error with hand-eye alone and with the findings, and what jitter makes; NaN where
+    # the poses were judged by the frames of earlier.
     before_m: float = float('nan')
     after_m: float = float('nan')
     jitter_m: float = float('nan')
+    # Median distance from where the frames of earlier have the poses; NaN before there are any.
     misfit_m: float = float('nan')
-    unexplained: float = 0.0
-    depends_on: tuple[str, ...] = ()
-    remark: str = ''
+    unexplained: float = 0.0  # share of the squared error above the jitter that nothing explains
+    depends_on: tuple[str, ...] = ()  # what that depends on
+    remark: str = ''  # why nothing is named although something is there
 
     @property
     def is_clear(self) -> bool:
@@ -74,7 +59,7 @@ class PoseSighting:
 
 @dataclass(frozen=True)
 class _Known:
-    """The frames and effects of the first look that told them all."""
+    """The frames and effects of the first look that determined them all."""
 
     terms: tuple[PoseTerm, ...]
     misfit: dict[str, float]
@@ -84,10 +69,7 @@ class _Known:
 class PoseWatch:
     """Looks at one window after the other, and remembers the frames it learnt first.
 
-    Attributes
-    ----------
-    searches : int
-        How often effects were searched for.
+    ``searches``: how often effects were searched for.
     """
 
     def __init__(self) -> None:
@@ -97,12 +79,8 @@ class PoseWatch:
     def look(self, session: PoseSession) -> PoseSighting:
         """Look at a window whose stamps count from its own beginning.
 
-        Raises
-        ------
-        DiagnosisError
-            When there are too few poses to say anything.
-        PlausibilityError
-            When tracked and optical poses fit in no reading.
+        Raises `DiagnosisError` when there are too few poses to say anything.
+        Raises `PlausibilityError` when tracked and optical poses fit in no reading.
         """
         poses = sum(one.size for one in session.sensors.values())
         frozen, since = frozen_streams(session)

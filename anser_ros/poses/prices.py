@@ -11,15 +11,12 @@ from anser_ros.poses.problem import PosePart
 from anser_ros.poses.stamp_step import stamp_step
 
 LEAST_EXPLAINED = 0.015
-"""Share of the sum of squares that an effect must explain on blocks that it has not seen. Errors
-of trackers are alike over seconds and centimetres, and any smooth course takes a trace of them.
-Smaller names traces of smooth errors; larger misses effects that matter to a tenth of the
-error."""
+"""Share of the sum of squares that an effect must explain on unseen blocks: errors of trackers are
+alike over seconds and centimetres, and any smooth course takes a trace of them."""
 MAP_SHARE, LARGE_SHARE = 0.55, 0.3
 """Share of the squared error of positions that a map must explain, since it follows whatever is
-smooth in the places that were visited: most of it, or less where it moves poses by `LARGE_M`.
-Smaller lets a map take what is another effect; larger leaves distortions unnamed. Both were chosen
-on recordings with and without metal."""
+smooth: most, or less where it moves poses by `LARGE_M`. Chosen on recordings with and without
+metal."""
 LARGE_M = 1.5e-3
 """Error, m, that no tracker has of itself: data sheets say 0.5 to 1.4 mm. What a map takes off is
 larger then, and something is there that bends the field."""
@@ -31,10 +28,8 @@ LEAST_MAP_M = 0.5e-3
 less of itself. Smaller names what is within its accuracy."""
 
 LEAST_SCALE_SIGMAS = 5.0
-"""Standard deviations by which a scale must differ from one, or a sensor's clock from the others'.
-Of a few recordings at rest, each a block, these are uncertain themselves: of six blocks 1 in 250
-such is chance. Smaller names a scale for what ten places have in common; larger misses slight ones
-in short sessions."""
+"""Standard deviations by which a scale must differ from one, or a sensor's clock from the others':
+of six recordings at rest, each a block, 1 in 250 such is chance."""
 LEAST_CLOCK_SIGMAS = 3.0
 """The same of a clock that all sensors share: 1 in 370. Smaller names an offset that is less than
 what is known of it; larger misses slight ones of a slow tracker."""

@@ -40,9 +40,7 @@ class PoseNoise:
         return self.without_stamps(values * scale.reshape(shape), velocity)
 
     def without_stamps(self, values: Array, velocity: Array) -> Array:
-        """Return values (n, 6, ...) of unit spread apart from what errors of stamps add, without
-        that.
-        """
+        """Return values (n, 6, ...) of unit spread without what errors of stamps add."""
         if self.stamp_s == 0.0:
             return values
         scale = np.repeat([1 / self.position_m, 1 / self.orientation_rad], 3)

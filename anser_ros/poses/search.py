@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
-from anser_ros.diagnosis.engine import Scorer, Selection, is_covered
+from anser_ros.diagnosis.engine import ForwardSelection, Scorer, is_covered
 from anser_ros.errors import DiagnosisError
 from anser_ros.poses.effect import PoseTerm, Role
 from anser_ros.poses.fit import (
@@ -43,9 +43,8 @@ STAMP_GAIN = 25.0
 """Minus twice the log likelihood that an error of the stamps must take off, a sensor, to be
 believed; chance takes off one."""
 PART_OF_MAP = 2 / 3
-"""Share of what a map gains below which a scale is a part of it: a map contains the scale, and so
-gains as much where there is nothing else. Smaller calls a bent space a scale; larger takes the
-noise that a map follows for a bend."""
+"""Share of what a map gains below which a scale is a part of it: a map contains the scale, and
+gains as much where there is nothing else."""
 
 
 class PoseEvidence(NamedTuple):
@@ -72,20 +71,20 @@ def with_noise(fit: PoseFit, with_stamps: bool = True) -> PoseFit:
 
     Errors of the stamps are part of the noise where they are believed, if ``with_stamps``.
     """
-    problem = fit.state.problem
+    problem, state = fit.state.problem, fit.state
     for _ in range(NOISE_ROUNDS):
-        out = unexplained_poses(fit)
-        weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
-        cut = replace(problem, weight=weight)
+        cut = replace(problem, weight=_weights(state))
         parts = cut.state(fit.terms).parts
         noise = tuple((likely_noise(p) if with_stamps else noise_of(p, False))[0] for p in parts)
-        every = tuple(np.ones(mask.size) for mask in out)
-        judged = replace(problem, weight=every, noise=noise)
-        state = judged.state(fit.terms)
-        fit = replace(fit, state=state)
-    out = unexplained_poses(fit)
-    weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
-    return fit_poses(replace(fit.state.problem, weight=weight), fit.terms)
+        every = tuple(np.ones(weight.size) for weight in cut.weight)
+        problem = replace(problem, weight=every, noise=noise)
+        state = problem.state(fit.terms)
+    return fit_poses(replace(problem, weight=_weights(state)), fit.terms)
+
+
+def _weights(state: PoseState) -> tuple[Array, ...]:
+    """Weights of the poses of a state, none of those that stand out."""
+    return tuple(np.where(mask, 0.0, 1.0) for mask in unexplained_poses(state))
 
 
 def likely_noise(part: PosePart) -> tuple[PoseNoise, float]:
@@ -105,10 +104,7 @@ def search_effects(
     Where the motion determines no lever arm, turns that go with the place or the velocity, times a
     lever arm of any length, look like any of them. Only the clocks are tried there.
 
-    Raises
-    ------
-    DiagnosisError
-        When too few poses agree with the reference.
+    Raises `DiagnosisError` when too few poses agree with the reference.
     """
     fit = with_noise(start)
     agreeing = fit.state.count // 6
@@ -120,7 +116,7 @@ def search_effects(
     is_known = knows_levers(fit, most_poses(session))
     if not is_known:
         fit = with_noise(start, False)
-    how = _Selection(is_known, say or (lambda text: None))
+    how = _PoseSelection(is_known, say or (lambda text: None))
     fit = how.thinned(_one_map(how.grown(fit)))
     return PoseSearch(fit, tuple(how.evidence), tuple(how.refused), is_known)
 
@@ -130,7 +126,7 @@ def frame_terms(terms: Sequence[PoseTerm]) -> list[PoseTerm]:
     return [term for term in terms if term.role.is_frame]
 
 
-class _Selection(Selection[PoseFit]):
+class _PoseSelection(ForwardSelection[PoseFit]):
     """Selects the effects of a session of poses."""
 
     def __init__(self, knows_levers: bool, say: Callable[[str], None]) -> None:
@@ -139,9 +135,7 @@ class _Selection(Selection[PoseFit]):
         self.evidence: list[PoseEvidence | None] = []
 
     def addition(self, fit: PoseFit) -> PoseFit | None:
-        """Return the fit with the candidate that is worth most, or None; a lag comes at the
-        end.
-        """
+        """Return the fit with the candidate that is worth most, or None; a lag comes last."""
         self._say(f'search besides {len(fit.terms) - len(frame_terms(fit.terms))} effects')
         accepted: list[tuple[float, PoseFit]] = []
         for term in _finalists(fit, self._knows_levers):
@@ -211,8 +205,7 @@ class _Selection(Selection[PoseFit]):
 
 
 def _finalists(fit: PoseFit, knows_levers: bool) -> list[PoseTerm]:
-    """Candidates that promise most, linear about the fit: the best of each effect, and the best
-    of all."""
+    """Candidates that promise most, linear about the fit: of each effect the best, and of all."""
     state = fit.state
     scorers = [Scorer(s, s.numbers) for s in (state, state.in_space)]
     promising: list[tuple[float, PoseTerm]] = []
@@ -243,9 +236,9 @@ def _promise(scorer: Scorer[PoseState], term: PoseTerm) -> float:
     return 0.0 if score is None else scorer.held_out - score.held_out
 
 
-def _beside_scale(sites: Sequence[PoseTerm], force: Sequence[PoseTerm]) -> list[PoseTerm]:
-    """What is left of some terms beside a scale in force."""
-    if not any(term.role is Role.SCALE for term in force):
+def _beside_scale(sites: Sequence[PoseTerm], active: Sequence[PoseTerm]) -> list[PoseTerm]:
+    """What is left of some terms beside an active scale."""
+    if not any(term.role is Role.SCALE for term in active):
         return list(sites)
     return [left for t in sites if (left := t.effect.beside_scale(t)) is not None]
 

@@ -1,10 +1,10 @@
 """The tracker's map of space is bent: a smooth function of the tracked place, for a sensor."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import combinations_with_replacement
-from typing import ClassVar, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 KINDS = {0: 'scale', 1: 'linear', 2: 'quadratic', 3: 'cubic'}
 """Degrees of the polynomials of position that are tried; of degree zero is a space that shrinks or
-grows alike in all directions about a point of its own, which four numbers tell."""
+grows alike in all directions about a point of its own, which takes four numbers."""
 UNIT_M = 1e-3
 """Unit of theta, m: a coefficient is what it moves a pose at the rms distance from the middle."""
 
@@ -67,7 +67,7 @@ def _without_turn(term: PoseTerm) -> Array:
     """Return a map's coefficients without the turn in their linear part.
 
     A turn bends nothing: it is a registration of places that differs from that of rotations. A
-    body that turns about one axis tells the two hardly apart.
+    body that turns about one axis hardly distinguishes them.
     """
     bent = term.theta.reshape(-1, 3).copy()
     linear = slice(1 - _lowest(term.site), 4 - _lowest(term.site))
@@ -82,8 +82,8 @@ class FieldDistortion(PoseEffect):
     name = 'field_distortion'
     summary = "the tracker's map of space is bent: metal at rest, or its field model"
     advice = 'Take metal out of the volume and from the field generator, or apply the map.'
-    units: ClassVar[Mapping[str, str]] = {'rms_m': 'm'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'strain': (0.0, 0.2)}
+    units = {'rms_m': 'm'}
+    plausible = {'strain': (0.0, 0.2)}
     remedy = Remedy.SENSORS
     blocks_in_space = True
     role = Role.MAP

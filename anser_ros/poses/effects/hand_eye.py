@@ -22,14 +22,9 @@ FREE = 1e3
 
 @dataclass(frozen=True, kw_only=True)
 class FrameTerm(PoseTerm):
-    """Holds a frame as a start and a step from it.
+    """Holds a frame as a start and a step from it."""
 
-    Attributes
-    ----------
-    start : ndarray, shape (3, 3)
-        Rotation that theta's turn (its last three, rad) comes on top of, from the left.
-    """
-
+    # (3, 3), rotation that theta's turn (its last three, rad) comes on top of, from the left.
     start: Array
 
     @property
