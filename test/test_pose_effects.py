@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.poses.clock_records import one_clock
-from anser_ros.poses.effect import PoseSetting, Role, is_of
+from anser_ros.poses.effect import PoseSetting, Role
 from anser_ros.poses.effects.clock import PoseClockRate
 from anser_ros.poses.effects.episodes import PoseMovingMetal
 from anser_ros.poses.effects.field_distortion import FieldDistortion
@@ -224,7 +224,7 @@ def test_an_offset_of_all_sensors_that_is_less_than_known_is_doubted():
         world.offset = offset
         problem = pose_problem(world.session())
         fit = with_noise(first_fit(problem, coarse_offset(problem), False))
-        index = next(i for i, t in enumerate(fit.terms) if is_of(t, Role.OFFSET))
+        index = next(i for i, t in enumerate(fit.terms) if t.role is Role.OFFSET)
         assert bool(doubt(fit, index)) == is_doubted
 
 

@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 
 from anser_ros.diagnosis.decisions import FROM_OTHERS, NOTHING_LEFT, STEADY, as_good
-from anser_ros.diagnosis.fit import Fit, misfit
+from anser_ros.diagnosis.fit import Fit
 from anser_ros.diagnosis.structure import noise_scale
 from anser_ros.effects.effect import Family
 
 
 def at_floor(fit: Fit) -> bool:
     """Return whether a fit leaves nothing but noise."""
-    return misfit(fit) < NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
+    return fit.misfit < NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
 
 
 def taken_from_others(fit: Fit) -> float:
@@ -19,7 +19,7 @@ def taken_from_others(fit: Fit) -> float:
 
     For each of its columns, every frame loses the share of one value in the remaining residual.
     """
-    return FROM_OTHERS * fit.newest.effect.freedom(fit.newest) * max(misfit(fit) - 1.0, 0.0)
+    return FROM_OTHERS * fit.newest.effect.freedom(fit.newest) * max(fit.misfit - 1.0, 0.0)
 
 
 def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
@@ -39,7 +39,7 @@ def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
         (g, f)
         for g, f in fitted
         if f.newest.complexity < most
-        and gain - g < as_good(most - f.newest.complexity) * max(misfit(best), 1.0)
+        and gain - g < as_good(most - f.newest.complexity) * max(best.misfit, 1.0)
     ]
     simpler += [
         (g, f)

@@ -6,7 +6,7 @@ and the additional power that those fits remove is compared with the power that 
 removes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,7 @@ from anser_ros.diagnosis.decisions import (
     SOMETHING_LEFT,
     TIME_PARTS,
 )
-from anser_ros.diagnosis.fit import Fit, misfit
+from anser_ros.diagnosis.fit import Fit
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
 from anser_ros.diagnosis.whitening import parts
 from anser_ros.effects.effect import INEXACT, Family
@@ -33,53 +33,28 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Holds what speaks for an effect.
+    """Holds what speaks for an effect."""
 
-    Attributes
-    ----------
-    power : float
-        What it takes off the sum of squares.
-    variation : float
-        Share of that power that refits in parts of the data take off besides.
-    share_of_rest : float
-        Its power over the power that stays unexplained.
-    remainder : float
-        Share of its power that stays on the channels and emitters that it changes, beyond what
-        stays everywhere. Metal is exempt: its shape is never known.
-    inexact : float
-        Largest remainder that the effect may leave.
-    alike : int
-        Effects of the same name, or on the same single channel, whichever are more.
-    plausible : bool
-        Whether all parameters are in the effect's range.
-    helps : bool
-        Whether it takes something off the tools' residuals, where it acts on tools.
-    """
-
-    power: float
-    variation: float
-    share_of_rest: float
+    power: float  # what it takes off the sum of squares
+    variation: float  # share of that power that refits in parts of the data take off besides
+    share_of_rest: float  # its power over the power that stays unexplained
+    # Share of its power that stays on the channels and emitters that it changes, beyond what stays
+    # everywhere. Metal is exempt: its shape is never known.
     remainder: float = 0.0
-    inexact: float = INEXACT
-    alike: int = 1
-    plausible: bool = True
+    inexact: float = INEXACT  # largest remainder that the effect may leave
+    alike: int = 1  # effects of the same name, or on the same single channel, whichever are more
+    plausible: bool = True  # whether all parameters are in the effect's range
+    # Whether it takes something off the tools' residuals, where it acts on tools.
     helps: bool = True
 
     @property
     def holds(self) -> bool:
         """Return whether the effect may be named."""
-        return (
-            self.variation < LARGEST_VARIATION
-            and self.share_of_rest > LEAST_OF_THE_REST
-            and self.remainder < self.inexact
-            and self.alike < MANY
-            and self.plausible
-            and self.helps
-        )
+        return not self.reason
 
     @property
     def reason(self) -> str:
-        """Return why it may not be named, in words."""
+        """Return why it may not be named, in words; empty where it may."""
         if not self.plausible:
             return 'its parameters are outside their plausible range'
         if not self.helps:
@@ -90,7 +65,9 @@ class Confirmation:
             return 'too much stays unexplained where it acts'
         if self.alike >= MANY:
             return 'several effects of its kind together imitate a cause that they share'
-        return 'much more stays unexplained than it explains'
+        if self.share_of_rest <= LEAST_OF_THE_REST:
+            return 'much more stays unexplained than it explains'
+        return ''
 
 
 def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:
@@ -99,16 +76,11 @@ def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmati
     without = evaluate(problem, rest)
     power = without.sum_of_squares - fit.state.sum_of_squares
     left = max(fit.state.sum_of_squares - noise * fit.state.count, 0.0)
-    left_tools = left if misfit(fit) > SOMETHING_LEFT * noise else 0.0
+    left_tools = left if fit.misfit > SOMETHING_LEFT * noise else 0.0
     columns = fit.state.design(term)
-    varying = max(
-        _by_time(fit.state, columns, noise),
-        _by_value(fit.state, columns, noise, _emitter_of),
-        _by_value(fit.state, columns, noise, _sensor_of),
-    )
     return Confirmation(
         power,
-        varying / max(power, 1e-300),
+        _varying(fit.state, columns, noise) / max(power, 1e-300),
         power / max(left_tools, 1e-300),
         0.0
         if np.isinf(term.effect.inexact)
@@ -227,6 +199,40 @@ def _unsteady(problem: Problem, fit: Fit) -> list[tuple[Confirmation, Term]]:
     return found
 
 
+def _varying(state: State, columns: Sequence[Array | None], noise: float) -> float:
+    """Power that refits in parts of the time, or emitter by emitter, or by sensor, take off."""
+    used = [
+        (part, column)
+        for part, column in zip(state.parts, columns, strict=True)
+        if column is not None and not part.view.is_reference
+    ]
+    if not used:
+        return 0.0
+    numbers = np.unique(np.concatenate([part.blocks for part in state.parts]))
+    firsts = [group[0] for group in np.array_split(numbers, TIME_PARTS) if group.size]
+    times = [np.searchsorted(firsts, part.blocks, side='right')[:, None] for part, _ in used]
+    cells = [np.indices((2, *p.view.flux.shape[1:])).reshape(3, 1, -1) for p, _ in used]
+    kinds = (times, [cell[1] for cell in cells], [cell[2] for cell in cells])
+    return max(_refits(used, noise, labels) for labels in kinds)
+
+
+def _refits(
+    used: Sequence[tuple[Part, Array]], noise: float, labels: Sequence[NDArray[np.int64]]
+) -> float:
+    """Power beyond chance that a refit of the values of each label takes off."""
+    total = 0.0
+    for value in np.unique(np.concatenate([label.ravel() for label in labels])):
+        normal, right = 0.0, 0.0
+        for (part, column), label in zip(used, labels, strict=True):
+            chosen = np.broadcast_to(label == value, part.white.shape)
+            flat = column[chosen]
+            normal = normal + flat.T @ flat
+            right = right + flat.T @ part.white[chosen]
+        if np.any(normal):
+            total += max(_extra(np.asarray(normal), np.asarray(right), noise), 0.0)
+    return total
+
+
 def _extra(normal: Array, right: Array, noise: float) -> float:
     """Power beyond chance that a refit in one part takes off."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -234,59 +240,3 @@ def _extra(normal: Array, right: Array, noise: float) -> float:
     inverse = np.linalg.pinv(scaled, rcond=1e-8, hermitian=True)
     b = right / scale
     return float(b @ inverse @ b - noise * right.size)
-
-
-def _by_time(state: State, columns: Sequence[Array | None], noise: float) -> float:
-    numbers = np.unique(np.concatenate([part.blocks for part in state.parts]))
-    total = 0.0
-    for group in np.array_split(numbers, TIME_PARTS):
-        pieces = []
-        for part, column in zip(state.parts, columns, strict=True):
-            if column is not None and not part.view.is_reference:
-                rows = np.isin(part.blocks, group)
-                pieces.append((column[rows], part.white[rows]))
-        total += _refitted(pieces, noise)
-    return total
-
-
-def _emitter_of(part: Part) -> NDArray[np.int64]:
-    return np.asarray(np.arange(part.white.shape[1]) % part.view.flux.shape[2])
-
-
-def _sensor_of(part: Part) -> NDArray[np.int64]:
-    sensors, emitters = part.view.flux.shape[1:]
-    return np.asarray((np.arange(part.white.shape[1]) // emitters) % sensors)
-
-
-def _by_value(
-    state: State,
-    columns: Sequence[Array | None],
-    noise: float,
-    group_of: Callable[[Part], NDArray[np.int64]],
-) -> float:
-    """Power of refits emitter by emitter, or sensor by sensor."""
-    used = [
-        (part, column, group_of(part))
-        for part, column in zip(state.parts, columns, strict=True)
-        if column is not None and not part.view.is_reference
-    ]
-    total = 0.0
-    for value in range(max((int(g.max()) + 1 for _, _, g in used), default=0)):
-        pieces = [(c[:, g == value], part.white[:, g == value]) for part, c, g in used]
-        total += _refitted(pieces, noise)
-    return total
-
-
-def _refitted(pieces: Sequence[tuple[Array, Array]], noise: float) -> float:
-    """Power beyond chance that a refit on some rows takes off."""
-    if not pieces:
-        return 0.0
-    size = pieces[0][0].shape[2]
-    normal, right = np.zeros((size, size)), np.zeros(size)
-    for column, white in pieces:
-        flat = column.reshape(-1, size)
-        normal += flat.T @ flat
-        right += flat.T @ white.ravel()
-    if not np.any(normal):
-        return 0.0
-    return max(_extra(normal, right, noise), 0.0)

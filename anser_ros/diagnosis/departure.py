@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import SOMETHING_LEFT
+from anser_ros.diagnosis.engine import Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter
 from anser_ros.diagnosis.moving_start import course_of
 from anser_ros.diagnosis.outlying import without_outliers
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.rich_modes import rich_modes
-from anser_ros.diagnosis.scoring import Scorer
 from anser_ros.diagnosis.shaping import Shaping
 from anser_ros.effects.body_term import Richness
 from anser_ros.effects.departed_metal import DepartedMetal, DepartedTerm
@@ -32,65 +32,45 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 FIRST_KNOTS = 9
-"""Knots of a path to begin with: three seconds apart in half a minute of moving. Fewer cannot
-follow a way that stops for some seconds; more start the fit with parameters that few of the
-`SOME_FRAMES` determine, of which each knot now has six or seven."""
+"""Knots of a path at first, three seconds apart in half a minute: fewer cannot follow a way that
+stops for seconds, more are determined by few of the `SOME_FRAMES`."""
 FINE_KNOTS = 17
-"""Knots at last. A spline of few pieces cannot rest at its ends, where what is asked is told: with
+"""Knots at last. A spline of few pieces cannot rest at its ends, which is what is asked for: with
 nine the metal at rest was half again too strong, with 17 and with 25 right."""
 PATH_LENGTHS_M = (0.12, 0.24)
-"""Lengths of the ways that are tried, m: about a hand's way, and twice it, which is the width of
-the volume. A way between them is within a factor of 1.4 of one. Only shorter ones, and metal that
-crosses the volume is not found; only longer ones, and a start lies too far from a small
-movement."""
+"""Lengths of the ways that are tried, m: a hand's way, and the width of the volume; all between
+lie within a factor of 1.4."""
 SLOPE = 0.57
-"""Share of a way that goes down, for ways to the side, the sine of 35 deg: with the way straight
-down these are within 29 deg of every way that goes down by 15 deg or more. Metal that goes away
-does not come nearer to the tools above the board, and hardly ever goes level. Smaller, and starts
-are level; larger, and metal that is drawn aside is looked for below."""
+"""Share of a way that goes down, for ways to the side, the sine of 35 deg: metal does not come
+nearer to the tools above the board, and hardly ever goes level."""
 SIDE_DIRECTIONS = 8
 """Directions to the side in which a way is tried, one in 45 deg. Fewer may start too far from the
 true way for the fit to find it; time grows with their number."""
 FEW_FRAMES, SOME_FRAMES, MANY_FRAMES = 25, 60, 300
-"""Frames of a tool, about, on which ways are compared, refined, and fitted at last: one, two or
-three, and a dozen in each of the 25 blocks of time. Fewer are faster and noisier; more cost time
-in proportion and tell little, as neighbouring frames are alike."""
+"""Frames of a tool, about, on which ways are compared, refined, and fitted at last; neighbouring
+frames are alike, and time grows in proportion."""
 BODY = Richness(90, (25,), SOMETHING_LEFT)
 """How finely the body is shaped, and the path divided beyond `FINE_KNOTS` where much is left."""
 DEPARTURE_STEPS = 6
-"""Steps of a fit at most: it ends by itself once it has settled (`fit.SETTLED`), and a path that
-creeps for longer is judged by what it predicts. Fewer cut fits that would settle; each further
-one costs as much time as the one before."""
+"""Steps of a fit at most: it ends once it has settled (`engine.SETTLED`); a path that creeps for
+longer is judged by what it predicts."""
 EXPLAINED = 0.1
 """Share of the power in unseen blocks, beyond the noise's, that may stay. Its root, a third, is
-what then is wrong of the metal's field, as much as `KNOWN` allows; with more, the body is no
-picture of this metal, and what it does at rest would be a guess. Smaller leaves metal in the field
-that is nearly understood."""
+what is then wrong of the metal's field, as much as `KNOWN` allows."""
 NEAR_NOISE = 2.0
-"""Mean whitened square of the median frame, which noise alone brings to about one, below which
-the metal is known whatever it was before: what is then left of it is no larger than the noise.
-Smaller keeps metal in the field that hardly showed; larger takes off guesses at weak metal."""
+"""Mean whitened square of the median frame (one for noise alone) below which the metal is known
+whatever it was before."""
 KNOWN = 0.3
 """Standard deviation of what the metal does at rest, relative to that, from which on it is not
-taken off. Below it a third stays at most, typically, and taking it off makes a field worse less
-than once in a thousand times. Larger takes off guesses; smaller leaves metal in the field that was
-known well enough."""
+taken off: a third stays at most, and a field gets worse less than once in a thousand times."""
 
 
 @dataclass(frozen=True)
 class Departure:
-    """Holds metal that moved during a scan, and where it rested.
+    """Holds metal that moved during a scan, and where it rested."""
 
-    Attributes
-    ----------
-    fit : Fit
-        Its body and path.
-    before, after : float
-        Mean whitened square of the median frame in unseen blocks, without and with it.
-    """
-
-    fit: Fit
-    before: float
+    fit: Fit  # its body and path
+    before: float  # mean whitened square of the median frame in unseen blocks, without and with it
     after: float
 
     @property
@@ -116,17 +96,10 @@ class Departure:
 def departure(problem: Problem, rest_s: float) -> Departure | None:
     """Find metal that moves in a problem whose model and baseline have it at rest.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of the time in which something moves, with references.
-    rest_s : float
-        When it rests, s.
+    ``problem``: of the time in which something moves, with references; ``rest_s``: when it rests,
+    s.
 
-    Returns
-    -------
-    Departure or None
-        None without references, or where no body explains anything.
+    Returns Departure or None: None without references, or where no body explains anything.
     """
     if problem.references is None:
         return None
@@ -139,7 +112,7 @@ def departure(problem: Problem, rest_s: float) -> Departure | None:
     if not known:
         return None
     fitter = Fitter(some, blocks, DEPARTURE_STEPS)
-    best = Shaping(fitter, BODY).with_freer_course(min(known, key=fitter.held_out), 0)
+    best = Shaping(fitter, BODY).with_freer_course(min(known, key=Fit.held_out), 0)
     cleaned = without_outliers(problem, evaluate(problem, best.terms))
     last = Fitter(cleaned.in_blocks(blocks).thinned(MANY_FRAMES), blocks, DEPARTURE_STEPS)
     fit = last.fit(best.terms)
@@ -195,7 +168,7 @@ def _starts(
         for term in still.candidates(problem.apparatus)
         if (score := scorer.score(term)) is not None
     ]
-    course, solution = course_of(still, scored) or (np.zeros((0, 3)), np.zeros(2))
+    course, solution = course_of(scored) or (np.zeros((0, 3)), np.zeros(2))
     if not len(course):
         return
     time = (blocks + 0.5) * duration / (blocks.max() + 1)

@@ -42,61 +42,34 @@ on: time grows with them in proportion, and neighbouring frames say much the sam
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Holds what was found, and what speaks for it.
-
-    Attributes
-    ----------
-    findings : tuple of Finding
-    flux_rms_before_t, flux_rms_after_t, flux_rms_floor_t : float
-        Held-out residuals with the pose jitter taken out, T a phasor component.
-    unexplained : float
-        Share of the power above the floor that remains.
-    depends_on : tuple of str
-    tests_before, tests_after : tuple of StructureTest
-    model : FieldModel
-        With the effects.
-    search : Search
-    refused : tuple of (Term, Confirmation)
-        Effects that explained something but were not confirmed.
-    before, after : State
-        The held-out part.
-    terms : tuple of Term
-        All that was fitted last, also what is no finding.
-    """
+    """Holds what was found, and what speaks for it."""
 
     findings: tuple[Finding, ...]
+    # Held-out residuals with the pose jitter taken out, T a phasor component.
     flux_rms_before_t: float
     flux_rms_after_t: float
     flux_rms_floor_t: float
-    unexplained: float
+    unexplained: float  # share of the power above the floor that remains
     depends_on: tuple[str, ...]
     tests_before: tuple[StructureTest, ...]
     tests_after: tuple[StructureTest, ...]
-    model: FieldModel
+    model: FieldModel  # with the effects
     search: Search
+    # Effects that explained something but were not confirmed.
     refused: tuple[tuple[Term, Confirmation], ...]
-    before: State
+    before: State  # the held-out part
     after: State
+    # All that was fitted last, also what is no finding.
     terms: tuple[Term, ...] = field(default_factory=tuple)
 
 
 @dataclass(frozen=True)
 class Screened:
-    """Holds a problem as the search starts with it.
+    """Holds a problem as the search starts with it."""
 
-    Attributes
-    ----------
-    known : tuple of Term
-        Faults of the wiring, which are plain before any search.
-    whole : Problem
-        All frames, without the channels that hear nothing.
-    start : Problem
-        The same without values that stand out already now.
-    """
-
-    known: tuple[Term, ...]
-    whole: Problem
-    start: Problem
+    known: tuple[Term, ...]  # faults of the wiring, which are plain before any search
+    whole: Problem  # all frames, without the channels without a signal
+    start: Problem  # the same without values that stand out already now
 
     def training(self, frames: int) -> Problem:
         """Return about so many frames per tool of the blocks to choose and fit effects on."""
@@ -105,20 +78,11 @@ class Screened:
 
 @dataclass(frozen=True)
 class Confirmed:
-    """Holds the effects that are the same in all parts of the data.
+    """Holds the effects that are the same in all parts of the data."""
 
-    Attributes
-    ----------
-    fit : Fit
-        All of them together.
-    cleaned : Problem
-        All frames, without values that stand out with these effects in force.
-    refused : tuple of (Term, Confirmation)
-        Effects that explained something but were not confirmed.
-    """
-
-    fit: Fit
-    cleaned: Problem
+    fit: Fit  # all of them together
+    cleaned: Problem  # all frames, without values that stand out with these effects
+    # Effects that explained something but were not confirmed.
     refused: tuple[tuple[Term, Confirmation], ...]
 
 
@@ -130,15 +94,8 @@ def diagnose(
 ) -> Diagnosis:
     """Find what a model lacks: screen, search, confirm and conclude.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of the whole session (`anser_ros.diagnosis.prepare.build_problem`).
-    model : FieldModel
-        What the problem was built with.
-    settings : SearchSettings, optional
-    progress : callable, optional
-        Called with words on what goes on.
+    ``problem``: of the whole session (`anser_ros.diagnosis.prepare.build_problem`); ``model``:
+    what the problem was built with; ``progress``: called with words on what goes on.
     """
     how, say = settings or SearchSettings(), progress or (lambda text: None)
     screened = screen(problem)
@@ -177,7 +134,7 @@ def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirme
 
 
 def _without_dead(problem: Problem, known: Sequence[Term]) -> Problem:
-    """The problem without the channels that hear nothing."""
+    """The problem without the channels without a signal."""
     dead = [channel for term in known for channel in term.effect.silenced(term)]
     good = tuple(
         mask & ~np.isin(tool.sensors.channel, dead)
@@ -258,15 +215,3 @@ def conclude(
         after=after,
         terms=fit.terms,
     )
-
-
-__all__ = [
-    'Confirmed',
-    'Diagnosis',
-    'Screened',
-    'conclude',
-    'confirm',
-    'diagnose',
-    'screen',
-    'search_screened',
-]

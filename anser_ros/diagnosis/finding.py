@@ -14,21 +14,11 @@ from anser_ros.field.model import EffectRecord
 
 @dataclass(frozen=True)
 class Finding:
-    """Describes one effect that was named.
+    """Describes one effect that was named."""
 
-    Attributes
-    ----------
-    record : EffectRecord
-        Parameters, uncertainty and evidence.
-    term : Term or None
-        None where nothing is in force (noise, outliers).
-    flux_rms_without_t : float
-        Held-out residual with all effects but this one, T.
-    """
-
-    record: EffectRecord
-    term: Term | None
-    flux_rms_without_t: float
+    record: EffectRecord  # parameters, uncertainty and evidence
+    term: Term | None  # None where nothing is fitted (noise, outliers)
+    flux_rms_without_t: float  # held-out residual with all effects but this one, T
 
 
 def fitted_finding(fit: Fit, index: int, unseen: Problem, search: Search) -> Finding:

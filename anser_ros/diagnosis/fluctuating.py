@@ -6,8 +6,8 @@ of this freedom, and can be compared with the reduction of the held-out sum of s
 constant effect.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,48 +16,39 @@ from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.whitening import parts
 from anser_ros.effects.effect import Family
 from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 SCALES = np.geomspace(1e-3, 1.0, 7)
-"""Spreads that are tried first, as multiples of what the constant effect expects: from a
-thousandth to all of it, a factor of 3.2 apart. Coarser or fewer leave expectation-maximisation,
-which starts at the best, farther to go; more cost time."""
+"""Spreads that are tried first, as multiples of what the constant effect expects; the estimation
+starts at the best of them."""
 EXPECTATION_ROUNDS = 25
 """Rounds of expectation-maximisation. It starts at the best of seven spreads, so it has less than
 a factor of two to go."""
 
 
-@dataclass(frozen=True)
-class Open:
-    """Holds the normal equations of each frame: shapes (F, q, q) and (F, q)."""
-
-    normal: Array
-    right: Array
-
-
-def opened(state: State, term: Term) -> Open | None:
-    """Return each frame's normal equations along a fluctuation's columns; None for others."""
-    free, normal, right = term.effect.opened(term), [], []
-    if free is None:
-        return None
+def _opened(
+    state: State, columns: Callable[[View], ComplexArray | None]
+) -> tuple[Array, Array] | None:
+    """Each frame's normal equations along a fluctuation's columns, (F, q, q) and (F, q)."""
+    normal, right = [], []
     for part in state.parts:
-        raw = free.columns(part.view)
-        if raw is None:
-            continue
-        white = part.whitener(parts(raw))
-        normal.append(white.transpose(0, 2, 1) @ white)
-        right.append(np.einsum('fnq,fn->fq', white, part.white))
-    if not normal:
+        raw = columns(part.view)
+        if raw is not None:
+            white = part.whitener(parts(raw))
+            normal.append(white.transpose(0, 2, 1) @ white)
+            right.append(np.einsum('fnq,fn->fq', white, part.white))
+    if not any(np.any(one) for one in normal):
         return None
-    found = Open(np.concatenate(normal), np.concatenate(right))
-    return found if np.any(found.normal) else None
+    return np.concatenate(normal), np.concatenate(right)
 
 
-def gain_of(found: Open, spread: Array) -> float:
-    """Return what -2 log marginal likelihood falls by with this spread."""
-    inner = np.eye(spread.size) + found.normal * spread[:, None] * spread[None, :]
-    b = found.right * spread
+def _gain_of(normal: Array, right: Array, spread: Array) -> float:
+    """What -2 log marginal likelihood falls by with this spread."""
+    inner = np.eye(spread.size) + normal * spread[:, None] * spread[None, :]
+    b = right * spread
     taken = np.einsum('fq,fq->', b, np.linalg.solve(inner, b[..., None])[..., 0])
     return float(taken - np.linalg.slogdet(inner)[1].sum())
 
@@ -67,20 +58,21 @@ def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
 
     None for other effects, and if no spread improves the fit.
     """
-    free, found = term.effect.opened(term), opened(state, term)
+    free = term.effect.opened(term)
+    found = None if free is None else _opened(state, free.columns)
     if free is None or found is None:
         return None
-    unit = free.expected
-    gains = [gain_of(found, scale * unit) for scale in SCALES]
+    (normal, right), unit = found, free.expected
+    gains = [_gain_of(normal, right, scale * unit) for scale in SCALES]
     if max(gains) <= 0.0:
         return None
     spread = SCALES[int(np.argmax(gains))] * unit
     for _ in range(EXPECTATION_ROUNDS):
-        inverse = np.linalg.inv(found.normal + np.diag(1 / spread**2))
-        mean = np.einsum('fpq,fq->fp', inverse, found.right)
+        inverse = np.linalg.inv(normal + np.diag(1 / spread**2))
+        mean = np.einsum('fpq,fq->fp', inverse, right)
         variance = np.mean(mean**2 + np.einsum('fqq->fq', inverse), axis=0)
         spread = np.maximum(np.sqrt(variance), 1e-6 * unit)
-    return gain_of(found, spread), replace(free, spread=spread, frames=found.right.shape[0])
+    return _gain_of(normal, right, spread), replace(free, spread=spread, frames=len(right))
 
 
 def refit_spreads(problem: Problem, terms: Sequence[Term]) -> tuple[Term, ...]:
@@ -95,7 +87,7 @@ def refit_spreads(problem: Problem, terms: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def left_over(state: State, term: Term) -> float:
-    """Return the share of a candidate's power that the fluctuations in force leave it, or 1."""
+    """Return the share of a candidate's power that the active fluctuations leave it, or 1."""
     if not any(t.effect.family is Family.FLUCTUATION for t in state.terms):
         return 1.0
     now, before = 0.0, 0.0

@@ -6,7 +6,7 @@ sheet is fitted to the model inside the volume and to the references' clean read
 the drawn board where the setup draws one.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,21 +22,15 @@ ComplexArray = NDArray[np.complex128]
 
 VOLUME_ERROR = 1e-3
 """Relative error that the fit allows the model in the volume, a quarter of a reference's
-(`reference_gain`, 0.4 % by default): calibrated models are better than that. Smaller lets the
-sheet follow the model's own errors at the cost of the references; larger lets the references
-outvote the model."""
+(`reference_gain`): calibrated models are better than that."""
 LEAST_ERROR = 1e-5
 """Relative error that references are given at least, so that exact ones do not divide by zero."""
 DRAWING_ERROR = 0.05
 """Prior spread of the sheet's moments about the drawn ones, as a share of their rms: a coil's
-moment is off by 2 % (`nominal.Tolerances`), and a shift of half a millimetre moves a few percent
-of it to the neighbouring centimetre of the sheet. Smaller holds the sheet to the drawing where the
-data contradict it; larger leaves free what they do not
-determine, where no sensor was."""
+moment is off by 2 % (`nominal.Tolerances`), and half a millimetre moves a few percent of it."""
 
 
-@dataclass(frozen=True)
-class CleanReferences:
+class CleanReferences(NamedTuple):
     """Holds reference sensors, their clean readings, (R, K), T, and their relative gain error."""
 
     sensors: SensorTable
@@ -59,16 +53,9 @@ def fit_illumination(
 ) -> Dipoles:
     """Return a sheet of dipoles that is good in the volume, at the references and below the board.
 
-    Parameters
-    ----------
-    model : FieldModel
-        Trusted at ``points``.
-    drawn : FieldModel or None
-        The nominal model of the setup's geometry; None where it has none, and the model itself is
-        all that there is.
-    points : ndarray, shape (P, 3)
-        Some places in the volume, m.
-    references : CleanReferences or None
+    ``model``: trusted at ``points``; ``drawn``: the nominal model of the setup's geometry; None
+    where it has none, and the model itself is all that there is; ``points`` (P, 3): some places in
+    the volume, m.
     """
     if drawn is None:
         return Dipoles(model.positions, model.directions, model.moments)

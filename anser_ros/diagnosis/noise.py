@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import (
     FEWEST_OUTLIERS,
@@ -20,6 +21,8 @@ from anser_ros.effects.excess_noise import EXCESS_NOISE
 from anser_ros.effects.outliers import known_share, outliers_of
 from anser_ros.field.model import EffectRecord
 
+Array = NDArray[np.float64]
+
 
 def outlier_findings(
     whole: Problem,
@@ -30,17 +33,10 @@ def outlier_findings(
 ) -> list[Finding]:
     """Return outliers or a loose contact, where frames stand out and nothing else makes them.
 
-    Parameters
-    ----------
-    whole, cleaned : Problem
-        With and without the frames that stand out.
-    after : State
-        The held-out part with all effects.
-    excess : float
-        Power that is not explained, over the floor's.
-    known : sequence of EffectRecord
-        The model's. The share of frames that stood out in its own scan is what the optical tracker
-        always does, and no effect of a session.
+    ``whole`` and ``cleaned``: with and without the frames that stand out; ``after``: the held-out
+    part with all effects; ``excess``: power that is not explained, over the floor's; ``known``:
+    the model's. The share of frames that stood out in its own scan is what the optical tracker
+    always does, and no effect of a session.
     """
     share, channels = outlying_share(whole, cleaned)
     # A fluctuation is taken for normal: frames far out along it are its own tails.
@@ -60,40 +56,20 @@ def noise_findings(whole: Problem, after: State) -> list[Finding]:
     factor = noise_t(after) / whole.spread.noise_t
     if factor <= LEAST_NOISE_GROWTH:
         return []
-    noisy = _noisy_channels(after)
+    squares: dict[int, Array] = {}
+    for part in tool_parts(after):
+        square = part.white**2 * (part.whitener.weight > 0)
+        cells = square.reshape(-1, 2, *part.view.flux.shape[1:])
+        for row, channel in enumerate(part.view.sensors.channel.tolist()):
+            squares[channel] = cells[:, :, row]
+    noisy = [c for c, values in squares.items() if values.mean() > LEAST_NOISE_GROWTH**2]
+    if len(noisy) == len(squares):  # where no others have none, it is that of all
+        noisy = []
     count: float = after.count
     if noisy:
-        factor = _factor_of(after, noisy)
-        count = after.count * len(noisy) / len(whole.apparatus.tool_channels)
+        total = sum(float(squares[c].sum()) for c in noisy)
+        size = np.sqrt(total / sum(squares[c].size for c in noisy))
+        factor = float(size) * whole.spread.flux_t / whole.spread.noise_t
+        count *= len(noisy) / len(whole.apparatus.tool_channels)
     sigma = factor / np.sqrt(2 * max(count, 1))
-    return [plain_finding(EXCESS_NOISE.seen(factor, sigma, noisy), rms(after))]
-
-
-def _factor_of(state: State, channels: tuple[int, ...]) -> float:
-    """Noise of some channels over what it should be."""
-    squares, count = 0.0, 0
-    for part in tool_parts(state):
-        own = np.isin(part.view.sensors.channel, channels)
-        size = (part.white * (part.whitener.weight > 0)).reshape(
-            -1, 2, own.size, state.problem.fields.omega.size
-        )[:, :, own]
-        squares += float(np.sum(size**2))
-        count += size.size
-    spread = state.problem.spread
-    return float(np.sqrt(squares / max(count, 1))) * spread.flux_t / spread.noise_t
-
-
-def _noisy_channels(state: State) -> tuple[int, ...]:
-    """Channels with grown noise, where others have none."""
-    emitters = state.problem.fields.omega.size
-    noisy, sound = [], 0
-    for part in tool_parts(state):
-        squares = part.white**2 * (part.whitener.weight > 0)
-        sensors = len(part.view.sensors)
-        size = squares.reshape(-1, 2, sensors, emitters).mean(axis=(0, 1, 3))
-        for channel, value in zip(part.view.sensors.channel.tolist(), size, strict=True):
-            if value > LEAST_NOISE_GROWTH**2:
-                noisy.append(int(channel))
-            else:
-                sound += 1
-    return tuple(noisy) if sound else ()
+    return [plain_finding(EXCESS_NOISE.seen(factor, sigma, tuple(noisy)), rms(after))]

@@ -28,9 +28,7 @@ bad ones in a row are seen, and motion changes little over so many."""
 
 
 def find_outliers(state: State) -> tuple[Mask, ...]:
-    """Return the mask (F, S) of outlying readings, one per tool; a frame that stands out is out as
-    a whole.
-    """
+    """Return masks (F, S) of outlying readings, one per tool; or of whole frames."""
     masks = []
     moves = any(term.effect.family is Family.FLUCTUATION for term in state.terms)
     for part, tool, good in zip(

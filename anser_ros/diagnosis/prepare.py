@@ -53,24 +53,12 @@ def build_problem(
 ) -> Problem:
     """Set up the diagnosis of a session.
 
-    Parameters
-    ----------
-    tools : sequence of Measurements
-        Bodies without an optical pose are left out.
-    reference : Measurements or None
-    baseline : ndarray, shape (R, K), complex, or None
-        Clean readings of the reference sensors (NaN where there are none); without them the
-        references say nothing.
-    model : FieldModel
-    drawn : FieldModel or None
-        The nominal model of the setup, if its kind of emitter has one.
-    spread : Spread
+    ``tools``: bodies without an optical pose are left out; ``baseline`` (R, K): clean readings of
+    the reference sensors (NaN where there are none); without them the references say nothing;
+    ``drawn``: the nominal model of the setup, if its kind of emitter has one.
 
-    Raises
-    ------
-    DiagnosisError
-        When a sensor is a sum of windings, fewer than 30 frames have fluxes and a pose, or all
-        poses are the same.
+    Raises `DiagnosisError` when a sensor is a sum of windings, fewer than 30 frames have fluxes
+    and a pose, or all poses are the same.
     """
     for tool in tools:
         if not tool.sensors.is_single.all():

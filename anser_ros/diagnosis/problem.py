@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.engine import JointState
 from anser_ros.diagnosis.whitening import Spread, Whitener, parts, pose_jacobian
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import Remedy
@@ -21,51 +22,27 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class References:
-    """Holds reference readings as means over short bins, with their clean baseline.
+    """Holds reference readings as means over short bins, with their clean baseline."""
 
-    Attributes
-    ----------
-    readings : Measurements
-        One frame a bin; ``valid`` where the bin has any reading.
-    count : ndarray, shape (B, R)
-        Readings in each mean.
-    baseline : ndarray, shape (R, K), complex
-    """
-
-    readings: Measurements
-    count: Array
-    baseline: ComplexArray
+    readings: Measurements  # one frame a bin; ``valid`` where the bin has any reading
+    count: Array  # (B, R), readings in each mean
+    baseline: ComplexArray  # (R, K)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Holds everything that a diagnosis starts from.
+    """Holds everything that a diagnosis starts from."""
 
-    Attributes
-    ----------
-    tools : tuple of Measurements
-        Frames with a pose only.
-    blocks : tuple of ndarray of int, one per tool, shape (F,)
-        Number of the time block that each frame is in.
-    references : References or None
-    reference_blocks : ndarray of int, shape (B,)
-    fields : Fields
-    apparatus : Apparatus
-    spread : Spread
-    good : tuple of ndarray of bool, one per tool, shape (F, S)
-        Values that take part (valid, and no outliers).
-    gaps_t : tuple of ndarray, one per tool, shape (F, S)
-        By how much a modelled flux may be off where the model's scan has gaps, T a component.
-    """
-
-    tools: tuple[Measurements, ...]
-    blocks: tuple[NDArray[np.int64], ...]
+    tools: tuple[Measurements, ...]  # frames with a pose only
+    blocks: tuple[NDArray[np.int64], ...]  # (F,), number of the time block that each frame is in
     references: References | None
-    reference_blocks: NDArray[np.int64]
+    reference_blocks: NDArray[np.int64]  # (B,)
     fields: Fields
     apparatus: Apparatus
     spread: Spread
-    good: tuple[Mask, ...]
+    good: tuple[Mask, ...]  # (F, S), values that take part (valid, and no outliers)
+    # (F, S), by how much a modelled flux may be off where the model's scan has gaps, T a
+    # component.
     gaps_t: tuple[Array, ...]
 
     def frames(self, keep: Sequence[NDArray[np.generic]], bins: NDArray[np.generic]) -> 'Problem':
@@ -93,9 +70,7 @@ class Problem:
         return self.frames(keep, np.arange(self.reference_blocks.size))
 
     def in_blocks(self, wanted: NDArray[np.int64], step: int = 1) -> 'Problem':
-        """Return the problem of every ``step``-th frame of some blocks, with the bins of those
-        blocks.
-        """
+        """Return every ``step``-th frame of some blocks, with the bins of those blocks."""
         keep = []
         for blocks in self.blocks:
             rows = np.flatnonzero(np.isin(blocks, wanted))
@@ -120,32 +95,19 @@ class Part:
 
 
 @dataclass(frozen=True)
-class State:
-    """Holds a problem with a list of effects in force."""
+class State(JointState[Term, Part]):
+    """Holds a problem of fluxes with a list of active effects."""
 
     problem: Problem
-    terms: tuple[Term, ...]
-    parts: tuple[Part, ...]
-
-    @property
-    def white(self) -> Array:
-        """Return all whitened residuals in one vector."""
-        return np.concatenate([part.white.ravel() for part in self.parts])
-
-    @property
-    def sum_of_squares(self) -> float:
-        """Return the sum of squares of the whitened residuals."""
-        return float(sum(np.sum(part.white**2) for part in self.parts))
 
     @property
     def penalty(self) -> float:
         """Return what the freedom that fluctuating effects leave to each frame costs."""
         return float(sum(part.whitener.penalty for part in self.parts))
 
-    @property
-    def count(self) -> int:
-        """Return the number of values that have a weight, over all parts."""
-        return sum(part.count for part in self.parts)
+    def moved(self, terms: Sequence[Term]) -> 'State':
+        """Return the state of the same problem with other terms."""
+        return evaluate(self.problem, terms)
 
     def design(self, term: Term, probe: bool = False) -> list[Array | None]:
         """Return whitened columns of a term, one array (F, n, q) a part, None for no columns."""
@@ -158,7 +120,7 @@ class State:
 
 
 def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
-    """Predict all readings with some effects in force, and whiten what they differ by."""
+    """Predict all readings with some active effects, and whiten what they differ by."""
     found = []
     for tool, blocks, good, gaps_t in zip(
         problem.tools, problem.blocks, problem.good, problem.gaps_t, strict=True

@@ -25,13 +25,8 @@ FINE = Richness(90, (17, 25), SOMETHING_LEFT)
 def settled(fitter: Fitter, terms: Sequence[Term], richness: Richness = COARSE) -> Fit:
     """Return the joint fit of some effects, metal shaped and then held where it is.
 
-    Parameters
-    ----------
-    fitter : Fitter
-    terms : sequence of Term
-        Start values; remainders of metal among them are made again.
-    richness : Richness
-        How finely metal is shaped.
+    ``terms``: start values; remainders of metal among them are made again; ``richness``: how
+    finely metal is shaped.
     """
     plain = [term.free() for term in terms if term.effect.family is not Family.REMAINDER]
     bodies = [term.effect.body(term) for term in plain]
@@ -55,6 +50,3 @@ def _held(fit: Fit, fitter: Fitter) -> Fit:
         for index, term in enumerate(fit.terms)
     ]
     return fitter.fit(held, 1)
-
-
-__all__ = ['COARSE', 'FINE', 'settled']

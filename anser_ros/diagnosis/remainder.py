@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import SOMETHING_LEFT
 from anser_ros.diagnosis.fit import Fit, Fitter
+from anser_ros.diagnosis.residuals import tools_misfit
 from anser_ros.diagnosis.rich_modes import rich_modes, thinned
 from anser_ros.diagnosis.scoring import joined
 from anser_ros.diagnosis.structure import noise_scale
@@ -34,17 +35,10 @@ off by a tenth of a body's radius stand for it as well."""
 
 @dataclass(frozen=True)
 class Remainders:
-    """Adds what metal at rest leaves to a fit.
-
-    Attributes
-    ----------
-    fitter : Fitter
-    richness : Richness
-        How many modes it may have.
-    """
+    """Adds what metal at rest leaves to a fit."""
 
     fitter: Fitter
-    richness: Richness
+    richness: Richness  # how many modes it may have
 
     def added(self, fit: Fit, index: int) -> Fit:
         """Return the fit with what one metal at rest leaves; the same fit for any other effect."""
@@ -69,7 +63,7 @@ class Remainders:
         """The fit with a body as large as its distance, where much is left."""
         term = fit.terms[index]
         extended = _resting(term).extended
-        if not extended or _left(fit) <= SOMETHING_LEFT:
+        if not extended or tools_misfit(fit.state) <= SOMETHING_LEFT * noise_scale(fit.state) ** 2:
             return fit
         more = self._couplings(fit, term, fit.terms, extended)
         if more is None:
@@ -106,11 +100,3 @@ def _resting(term: Term) -> Resting:
     found = term.effect.resting(term)
     assert found is not None, f'{term.label} is not metal at rest'
     return found
-
-
-def _left(fit: Fit) -> float:
-    """Misfit of the tools over their noise."""
-    tools = [part for part in fit.state.parts if not part.view.is_reference]
-    squares = sum(float(np.sum(part.white**2)) for part in tools)
-    count = sum(part.count for part in tools)
-    return squares / max(count, 1) / noise_scale(fit.state) ** 2

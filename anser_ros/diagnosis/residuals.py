@@ -12,6 +12,12 @@ def tool_parts(state: State) -> list[Part]:
     return [part for part in state.parts if not part.view.is_reference]
 
 
+def tools_misfit(state: State) -> float:
+    """Return the mean square of the tools' whitened residuals."""
+    squares = sum(float(np.sum(part.white**2)) for part in tool_parts(state))
+    return squares / max(sum(part.count for part in tool_parts(state)), 1)
+
+
 def rms(state: State) -> float:
     """Return the residual of the tools with the jitter taken out, T a phasor component.
 
@@ -21,9 +27,7 @@ def rms(state: State) -> float:
     if any(gaps_t.any() for gaps_t in problem.gaps_t):
         alike = replace(problem, gaps_t=tuple(np.zeros_like(g) for g in problem.gaps_t))
         state = evaluate(alike, state.terms)
-    squares = sum(float(np.sum(part.white**2)) for part in tool_parts(state))
-    count = sum(part.count for part in tool_parts(state))
-    return float(np.sqrt(squares / max(count, 1))) * problem.spread.flux_t
+    return float(np.sqrt(tools_misfit(state))) * problem.spread.flux_t
 
 
 def expected_rms(state: State) -> float:

@@ -10,9 +10,10 @@ from anser_ros.diagnosis.decisions import (
     NO_RIVAL,
     REST_LEFT,
 )
-from anser_ros.diagnosis.fit import Fit, Fitter, misfit
+from anser_ros.diagnosis.engine import Score, Scorer
+from anser_ros.diagnosis.fit import Fit, Fitter
+from anser_ros.diagnosis.problem import State
 from anser_ros.diagnosis.refine import settled
-from anser_ros.diagnosis.scoring import Score, Scorer
 from anser_ros.effects.effect import Family
 from anser_ros.effects.term import Term
 
@@ -21,27 +22,17 @@ def moves_or_rests(
     fitter: Fitter,
     moving: Fit,
     fitted: Sequence[tuple[float, Fit]],
-    candidates: Callable[[Scorer], Sequence[tuple[Term, Score]]],
+    candidates: Callable[[Scorer[State]], Sequence[tuple[Term, Score]]],
     explained: float,
 ) -> Fit:
     """Return metal that moves, or at rest where that explains as much, alone or with one effect.
 
-    Parameters
-    ----------
-    fitter : Fitter
-    moving : Fit
-        With metal that moves for its newest effect.
-    fitted : sequence of (float, Fit)
-        All fits of the round; those with metal at rest for their newest effect are the rivals.
-    candidates : callable
-        All other effects with their scores, best first, from a scorer.
-    explained : float
-        What the metal that moves takes off the held-out sum of squares.
+    ``moving``: with metal that moves for its newest effect; ``fitted``: all fits of the round;
+    those with metal at rest for their newest effect are the rivals; ``candidates``: all other
+    effects with their scores, best first, from a scorer; ``explained``: what the metal that moves
+    takes off the held-out sum of squares.
 
-    Returns
-    -------
-    Fit
-        Settled (`anser_ros.diagnosis.refine`).
+    Returns Fit: settled (`anser_ros.diagnosis.refine`).
     """
     shaped = settled(fitter, moving.terms)
     resting = [(g, f) for g, f in fitted if f.newest.effect.family is Family.METAL_AT_REST]
@@ -50,7 +41,7 @@ def moves_or_rests(
         return shaped
     rest = settled(fitter, rest.terms)
     limit = _limit(fitter, shaped, explained)
-    if fitter.held_out(rest) < limit:
+    if rest.held_out() < limit:
         return rest
     scorer = Scorer(rest.state, fitter.blocks)
     tried: set[str] = set()
@@ -64,16 +55,16 @@ def moves_or_rests(
         tried.add(term.effect.name)
         for start in term.effect.started(term, score.solution):
             both = fitter.fit([*rest.terms, start])
-            if fitter.held_out(both) > limit:
+            if both.held_out() > limit:
                 continue
             # What is there besides helps metal that moves as much: like is compared with like.
             beside = fitter.fit([*shaped.terms, start])
-            if fitter.held_out(both) < _limit(fitter, beside, explained):
+            if both.held_out() < _limit(fitter, beside, explained):
                 return rest
     return shaped
 
 
 def _limit(fitter: Fitter, moving: Fit, explained: float) -> float:
     """Held-out sum of squares up to which metal at rest explains as much."""
-    more = ALIKE * explained + LEAST_MOTION_GAIN * max(misfit(moving), 1.0)
-    return fitter.held_out(moving) + more
+    more = ALIKE * explained + LEAST_MOTION_GAIN * max(moving.misfit, 1.0)
+    return moving.held_out() + more

@@ -42,24 +42,12 @@ def rich_modes(
 ) -> tuple[float, Array] | None:
     """Return combinations of couplings, of the size that predicts held-out blocks best.
 
-    Parameters
-    ----------
-    few : State
-        At a fit without these couplings, or with others in their place; some frames do.
-    known : Known
-        Columns of what is fitted with them, and their prior sizes.
-    unit : callable
-        Flux (F, S, K, m) of modes (c, m) in a view.
-    spreads : sequence of ndarray, shape (c,)
-        Prior sizes of the couplings that are tried.
-    blocks : as in `anser_ros.diagnosis.fit`
-    most : int
+    ``few``: at a fit without these couplings, or with others in their place; some frames do;
+    ``known``: columns of what is fitted with them, and their prior sizes; ``unit``: flux (F, S, K,
+    m) of modes (c, m) in a view; ``spreads`` (c,): prior sizes of the couplings that are tried.
 
-    Returns
-    -------
-    float, ndarray of shape (c, m); or None
-        Sum of squares of the held-out residuals, and modes of unit prior size; None where no size
-        is better than none at all.
+    Returns (c, m) sum of squares of the held-out residuals, and modes of unit prior size; None
+    where no size is better than none at all.
     """
     widest = np.max(spreads, axis=0)
     values, vectors = np.linalg.eigh(
@@ -72,7 +60,7 @@ def rich_modes(
     vectors = vectors[:, leading]
     group = _both_phases(few, unit, widest[:, None] * vectors)
     columns, prior = known
-    sums = block_sums(few, joined([columns, group]), blocks)
+    sums = block_sums(few.parts, joined([columns, group]), blocks)
     width, count = prior.size, leading.size
     bare = sums.columns(np.arange(width))
     best: tuple[float, Array] = (bare.held_out(prior, TIME_FOLDS), np.zeros((0, 0)))

@@ -1,42 +1,41 @@
-"""Scores groups of columns by cross-validation, from sums over time blocks."""
+"""Sums up columns and residuals over blocks of time or space, and cross-validates by the sums."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from anser_ros.diagnosis.decisions import TIME_FOLDS
-from anser_ros.diagnosis.problem import State
-from anser_ros.effects.term import Term
 from anser_ros.parallel import in_order, slices
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Columns = Sequence[Array | None]
 
 BLOCKS_A_THREAD = 4
 """Blocks that one thread sums up, half a millisecond's work."""
-MOST_COLUMNS = 60
-"""Columns that a term in force may have to be fitted again with each candidate. A term with more
-is what metal left, and no effect's rival."""
+
+
+class WhitePart(Protocol):
+    """One body or sensor at a state: whitened residuals (F, n), and the block of each frame."""
+
+    @property
+    def white(self) -> Array: ...
+    @property
+    def blocks(self) -> Ints: ...
+    @property
+    def count(self) -> int: ...
 
 
 @dataclass(frozen=True)
 class BlockSums:
-    """Holds the normal equations of some columns and the residual, block by block.
+    """Holds the normal equations of some columns and the residual, block by block."""
 
-    Attributes
-    ----------
-    normal : ndarray, shape (B, q, q)
-    right : ndarray, shape (B, q)
-    squares : ndarray, shape (B,)
-        Sum of the squared residuals.
-    """
-
-    normal: Array
-    right: Array
-    squares: Array
+    normal: Array  # (B, q, q)
+    right: Array  # (B, q)
+    squares: Array  # (B,), sum of the squared residuals
 
     @property
     def size(self) -> int:
@@ -128,138 +127,79 @@ def _estimate(normal: Array, right: Array, prior: Array) -> Array:
     return np.asarray(scale * cho_solve(factor, scale * right, check_finite=False))
 
 
-def spans(blocks: NDArray[np.int64], wanted: NDArray[np.int64]) -> list[slice]:
-    """Return rows of each wanted block; frames are in the order of time, so a block is one run."""
+def spans(blocks: Ints, wanted: Ints) -> list[slice | Ints]:
+    """Return the rows of each wanted block; of blocks of time, which are runs, as slices."""
+    if np.any(np.diff(blocks) < 0):
+        return [np.flatnonzero(blocks == number) for number in wanted]
     starts = np.searchsorted(blocks, wanted, side='left')
     ends = np.searchsorted(blocks, wanted, side='right')
     return [slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
 
 
-def block_sums(state: State, columns: Columns, block_numbers: NDArray[np.int64]) -> BlockSums:
-    """Sums over the blocks that are listed.
-
-    Parameters
-    ----------
-    state : State
-    columns : one array (F, n, q) or None a part of the state
-    block_numbers : ndarray, shape (B,)
-    """
-    widths = [c.shape[2] for c in columns if c is not None]
-    size = widths[0] if widths else 0
-    normal = np.zeros((block_numbers.size, size, size))
-    right = np.zeros((block_numbers.size, size))
-    squares = np.zeros(block_numbers.size)
-    rows_of = [spans(part.blocks, block_numbers) for part in state.parts]
+def block_sums(parts: Sequence[WhitePart], columns: Columns, wanted: Ints) -> BlockSums:
+    """Return sums over the blocks that are wanted; columns are one (F, n, q) or None a part."""
+    size = width_of(columns)
+    normal = np.zeros((wanted.size, size, size))
+    right = np.zeros((wanted.size, size))
+    squares = np.zeros(wanted.size)
+    whites = [part.white for part in parts]
+    rows_of = [spans(part.blocks, wanted) for part in parts]
 
     def work(mine: slice) -> None:
-        for part, column, rows in zip(state.parts, columns, rows_of, strict=True):
+        for residual, column, rows in zip(whites, columns, rows_of, strict=True):
             for i in range(mine.start, mine.stop):
-                white = part.white[rows[i]].ravel()
+                white = residual[rows[i]].ravel()
                 squares[i] += white @ white
                 if column is not None:
                     flat = column[rows[i]].reshape(-1, size)
                     normal[i] += flat.T @ flat
                     right[i] += flat.T @ white
 
-    in_order(work, slices(block_numbers.size, BLOCKS_A_THREAD))
+    in_order(work, slices(wanted.size, BLOCKS_A_THREAD))
     return BlockSums(normal, right, squares)
+
+
+def cross_sums(
+    parts: Sequence[WhitePart],
+    left: Columns,
+    right: Columns,
+    one: BlockSums,
+    other: BlockSums,
+    wanted: Ints,
+) -> BlockSums:
+    """Return the sums of two groups of columns side by side, from those of each."""
+    a, b = one.size, other.size
+    if a == 0:
+        return other
+    cross = np.zeros((wanted.size, a, b))
+    for part, first, last in zip(parts, left, right, strict=True):
+        if first is None or last is None:
+            continue
+        for i, rows in enumerate(spans(part.blocks, wanted)):
+            cross[i] += first[rows].reshape(-1, a).T @ last[rows].reshape(-1, b)
+    normal = np.block([[one.normal, cross], [cross.transpose(0, 2, 1), other.normal]])
+    return BlockSums(normal, np.concatenate([one.right, other.right], axis=1), other.squares)
 
 
 def joined(groups: Sequence[Columns]) -> list[Array | None]:
     """Return columns of several groups side by side; zeros where a group has none."""
     if len(groups) == 1:
         return list(groups[0])
+    widths = [width_of(group) for group in groups]
     out: list[Array | None] = []
     for pieces in zip(*groups, strict=True):
-        known = [p for p in pieces if p is not None]
-        if not known:
+        known = next((p for p in pieces if p is not None), None)
+        if known is None:
             out.append(None)
             continue
-        rows = known[0].shape[:2]
-        widths = [_width(group) for group in groups]
-        out.append(
-            np.concatenate(
-                [
-                    np.zeros((*rows, width)) if p is None else p
-                    for p, width in zip(pieces, widths, strict=True)
-                ],
-                axis=2,
-            )
-        )
+        filled = [
+            np.zeros((*known.shape[:2], size)) if p is None else p
+            for p, size in zip(pieces, widths, strict=True)
+        ]
+        out.append(np.concatenate(filled, axis=2))
     return out
 
 
-def _width(group: Columns) -> int:
+def width_of(group: Columns) -> int:
+    """Return the number of columns of a group, 0 where it has none in any part."""
     return next((c.shape[2] for c in group if c is not None), 0)
-
-
-@dataclass(frozen=True)
-class Score:
-    """Scores one candidate, given the effects that are in force.
-
-    Attributes
-    ----------
-    held_out : float
-        Sum of squares of the held-out residuals with the candidate.
-    solution : ndarray, shape (q,)
-        The candidate's columns' coefficients, the effects in force refitted.
-    own : BlockSums
-        Of the candidate alone.
-    """
-
-    held_out: float
-    solution: Array
-    own: BlockSums
-
-
-class Scorer:
-    """Scores candidates against one state; the sums of the effects in force are made once."""
-
-    def __init__(self, state: State, blocks: NDArray[np.int64]) -> None:
-        self.state, self.blocks = state, blocks
-        # Terms of very many columns stay as they are: they are what metal left, not effects.
-        terms = [t for t in state.terms if t.theta.size <= MOST_COLUMNS]
-        self._active = joined([state.design(t) for t in terms]) if terms else None
-        self.prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
-        empty: list[Array | None] = [None] * len(state.parts)
-        self.sums = block_sums(state, self._active or empty, blocks)
-        self.held_out = self.sums.held_out(self.prior, TIME_FOLDS) + state.penalty
-
-    def score(self, term: 'Term') -> Score | None:
-        """Return the worth of a candidate; None when it touches no value, or is at a dipole's own
-        place.
-        """
-        probe = self.state.design(term, probe=True)
-        width = _width(probe)
-        if width == 0:
-            return None
-        own = block_sums(self.state, probe, self.blocks)
-        if not np.any(own.normal) or not np.isfinite(own.normal).all():
-            return None
-        sums = self._beside(probe, own)
-        scale = np.sqrt(np.diag(own.normal.sum(axis=0)))
-        prior = np.where(scale > 0, 1e4 / np.maximum(scale, 1e-300), 1.0)
-        full_prior = np.concatenate([self.prior, prior])
-        estimate, _ = sums.solve(full_prior)
-        left = sums.held_out(full_prior, TIME_FOLDS) + self.state.penalty
-        return Score(left, estimate[-width:], own)
-
-    def _beside(self, probe: Columns, own: BlockSums) -> BlockSums:
-        active = self.sums
-        a, b = active.size, own.size
-        if a == 0:
-            return own
-        cross = np.zeros((self.blocks.size, a, b))
-        for part, left, right in zip(self.state.parts, self._active or [], probe, strict=True):
-            if left is None or right is None:
-                continue
-            for i, rows in enumerate(spans(part.blocks, self.blocks)):
-                cross[i] += left[rows].reshape(-1, a).T @ right[rows].reshape(-1, b)
-        normal = np.concatenate(
-            [
-                np.concatenate([active.normal, cross], axis=2),
-                np.concatenate([cross.transpose(0, 2, 1), own.normal], axis=2),
-            ],
-            axis=1,
-        )
-        return BlockSums(normal, np.concatenate([active.right, own.right], axis=1), own.squares)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import PER_PARAMETER
-from anser_ros.diagnosis.fit import Fit, Fitter, misfit
+from anser_ros.diagnosis.fit import Fit, Fitter
 from anser_ros.diagnosis.problem import evaluate
 from anser_ros.diagnosis.rich_modes import Known, rich_modes, thinned
 from anser_ros.diagnosis.scoring import joined
@@ -30,17 +30,10 @@ EVERY_OTHER = 2
 
 @dataclass(frozen=True)
 class Shaping:
-    """Shapes metal that moves in a fit.
-
-    Attributes
-    ----------
-    fitter : Fitter
-    richness : Richness
-        How many modes and knots it may have.
-    """
+    """Shapes metal that moves in a fit."""
 
     fitter: Fitter
-    richness: Richness
+    richness: Richness  # how many modes and knots it may have
 
     def shaped(self, fit: Fit, index: int) -> Fit:
         """Return the fit with one moving metal shaped; the same fit for any other effect."""
@@ -53,14 +46,14 @@ class Shaping:
         """Return the fit with a freer path, as long as its parameters are worth it."""
         for knots in self.richness.knots:
             body = _body(fit.terms[index])
-            if body is None or misfit(fit) < self.richness.left * noise_scale(fit.state) ** 2:
+            if body is None or fit.misfit < self.richness.left * noise_scale(fit.state) ** 2:
                 break
             freer = body.freer(knots)
             if freer is None:
                 continue
             other = self.fitter.fit(_with(fit.terms, index, freer))
-            price = PER_PARAMETER * (freer.placed - body.placed) * max(misfit(other), 1.0)
-            if self.fitter.held_out(fit) - self.fitter.held_out(other) < price:
+            price = PER_PARAMETER * (freer.placed - body.placed) * max(other.misfit, 1.0)
+            if fit.held_out() - other.held_out() < price:
                 break
             fit = other
         return fit
@@ -90,7 +83,7 @@ class Shaping:
         shaped = [fit for fit in found if fit is not None]
         if not shaped:
             return fit
-        best = min(shaped, key=self.fitter.held_out)
+        best = min(shaped, key=Fit.held_out)
         body = _body(best.terms[index])
         assert body is not None
         best = self.fitter.fit(best.terms, 0)

@@ -13,30 +13,21 @@ from anser_ros.diagnosis.residuals import tool_parts
 Array = NDArray[np.float64]
 
 BINS = 12
-"""Cells into which frames are binned by one variable, so that each has tens of frames in a session
-of some hundreds. Fewer blur what changes quickly with the variable; more leave fewer frames for
-each mean."""
+"""Cells into which frames are binned by one variable: tens of frames in each of a session of some
+hundreds."""
+BINNED = ('time', 'position', 'orientation', 'speed', 'amplitude')  # by which frames are binned
 FEWEST_CELL_VALUES = 4
 """Values that a cell needs for its mean to be compared: the mean of four is uncertain by half of
-what one value is, and cells of fewer would add more noise than they tell."""
+what one value is, and cells of fewer would add more noise than information."""
 
 
 @dataclass(frozen=True)
 class StructureTest:
-    """Holds the test of one variable.
-
-    Attributes
-    ----------
-    variable : str
-    share : float
-        Part of the residual power that the cell means explain beyond chance.
-    probability : float
-        Of as much structure in noise.
-    """
+    """Holds the test of one variable."""
 
     variable: str
-    share: float
-    probability: float
+    share: float  # part of the residual power that the cell means explain beyond chance
+    probability: float  # of as much structure in noise
 
     @property
     def significant(self) -> bool:
@@ -53,7 +44,7 @@ def structure_tests(state: State) -> list[StructureTest]:
     """
     tools = tool_parts(state)
     noise = _noise(tools)
-    tests = [_binned(tools, name, noise) for name in _VARIABLES]
+    tests = [_binned(tools, name, noise) for name in BINNED]
     tests += [_grouped(tools, name, noise) for name in ('channel', 'emitter', 'quadrature')]
     return sorted(tests, key=lambda test: -test.share)
 
@@ -73,9 +64,7 @@ def _noise(parts: list[Part]) -> float:
 
 
 def noise_scale(state: State) -> float:
-    """Return the standard deviation of the white part of the tools' residuals, over the expected
-    one.
-    """
+    """Return the deviation of the white part of the tools' residuals over the expected one."""
     return float(np.sqrt(_noise(tool_parts(state))))
 
 
@@ -99,54 +88,31 @@ def _quantiles(values: Array, bins: int) -> NDArray[np.int64]:
     return np.searchsorted(edges, values, side='right')
 
 
-def _time(part: Part) -> list[NDArray[np.int64]]:
-    return [_quantiles(part.view.time, BINS)]
-
-
-def _position(part: Part) -> list[NDArray[np.int64]]:
-    x, y, z = part.view.position.T
-    return [_quantiles(x, 4) * 8 + _quantiles(y, 4) * 2 + _quantiles(z, 2)]
-
-
-def _orientation(part: Part) -> list[NDArray[np.int64]]:
-    # The turn from the orientation of the middle frame, by its components: any orientation that
-    # the tool is near to serves, as the cells are quantiles.
-    reference = part.view.rotation[part.view.rotation.shape[0] // 2]
-    turn = reference.T @ part.view.rotation
-    parts = np.stack(
-        [
-            turn[:, 2, 1] - turn[:, 1, 2],
-            turn[:, 0, 2] - turn[:, 2, 0],
-            turn[:, 1, 0] - turn[:, 0, 1],
-        ]
-    )
-    return [_quantiles(parts[0], 3) * 9 + _quantiles(parts[1], 3) * 3 + _quantiles(parts[2], 3)]
-
-
-def _speed(part: Part) -> list[NDArray[np.int64]]:
-    x, y, z = part.view.velocity[:, :3].T
+def _cells(part: Part, name: str) -> list[NDArray[np.int64]]:
+    """Cell of each frame by a variable; by the amplitude, those of each reading apart."""
+    view = part.view
+    if name == 'time':
+        return [_quantiles(view.time, BINS)]
+    if name == 'amplitude':
+        size = view.flux.real.reshape(len(view.flux), -1)
+        return [_quantiles(column, BINS) for column in size.T]
+    if name == 'position':
+        x, y, z = view.position.T
+        return [_quantiles(x, 4) * 8 + _quantiles(y, 4) * 2 + _quantiles(z, 2)]
+    if name == 'speed':
+        x, y, z = view.velocity[:, :3].T
+    else:
+        # The turn from the middle frame's orientation, by its components: any orientation that
+        # the tool is near to serves, as the cells are quantiles.
+        turn = view.rotation[len(view.rotation) // 2].T @ view.rotation
+        x, y, z = (turn[:, b, a] - turn[:, a, b] for a, b in ((1, 2), (2, 0), (0, 1)))
     return [_quantiles(x, 3) * 9 + _quantiles(y, 3) * 3 + _quantiles(z, 3)]
-
-
-def _amplitude(part: Part) -> list[NDArray[np.int64]]:
-    flux = part.view.flux
-    size = flux.real.reshape(flux.shape[0], -1)
-    return [_quantiles(column, BINS) for column in size.T]
-
-
-_VARIABLES = {
-    'time': _time,
-    'position': _position,
-    'orientation': _orientation,
-    'speed': _speed,
-    'amplitude': _amplitude,
-}
 
 
 def _binned(parts: list[Part], name: str, noise: float) -> StructureTest:
     explained, cells, total = 0.0, 0, 0.0
     for part in parts:
-        bins = _VARIABLES[name](part)
+        bins = _cells(part, name)
         good = part.whitener.weight > 0
         total += float(np.sum(part.white[good] ** 2))
         half = part.white.shape[1] // 2

@@ -19,15 +19,13 @@ LAGS = 12
 """Frames back to which a memory is looked for: half a second at 25 Hz. Fewer overlook a slow
 course, and each further one is one more chance for noise to pass the bound."""
 OUTLYING = 4.5
-"""Standard deviations beyond which a value is not used here, which a normal one is once in
-150,000: outliers are judged elsewhere, and one alone would make a kurtosis. Smaller takes the
-tails of noise away that are to be judged; larger lets a single outlier make noise look
-heavy-tailed."""
+"""Standard deviations beyond which a value is not used here, once in 150,000: outliers are judged
+elsewhere, and one alone would make a kurtosis."""
 
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Holds the strongest structure of each kind that is no noise; zero where none is told."""
+    """Holds the strongest structure of each kind that is no noise; zero where none is found."""
 
     memory: float
     shared: float

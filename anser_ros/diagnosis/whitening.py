@@ -37,17 +37,11 @@ def _survey_share(accuracy: Accuracy) -> float:
 
 @dataclass(frozen=True)
 class Spread:
-    """Holds standard deviations that are expected when all is well.
+    """Holds standard deviations that are expected when all is well."""
 
-    Attributes
-    ----------
-    flux_t : float
-        Noise of a phasor component, the model's own error included, T.
-    accuracy : Accuracy
-        Of the instruments: the noise when all is well, optical jitter, the references' survey.
-    """
-
+    # Noise of a phasor component, the model's own error included, T.
     flux_t: float = Accuracy.flux_noise_t
+    # Of the instruments: the noise when all is well, optical jitter, the references' survey.
     accuracy: Accuracy = field(default_factory=Accuracy)
 
     @property
@@ -73,39 +67,25 @@ def parts(values: ComplexArray) -> Array:
 
 
 def pose_jacobian(view: View) -> Array:
-    """Return the derivative of the flux parts by the body's pose, (F, 2 S K, 6): m, rad about fg's
-    axes.
-    """
+    """Return the derivative of flux parts by the body's pose, (F, 2 S K, 6): m, rad, fg's axes."""
     columns = np.concatenate([view.d_position, view.d_turn], axis=2)
     return parts(np.moveaxis(columns, 2, -1))
 
 
 @dataclass(frozen=True)
 class Whitener:
-    """Multiplies each frame by the inverse square root of its covariance.
+    """Multiplies each frame by the inverse square root of its covariance."""
 
-    Attributes
-    ----------
-    weight : ndarray, shape (F, n)
-        Inverse noise; 0 where a value must not count.
-    basis : ndarray, shape (F, n, m), or None
-        Weighted directions along which a frame may move, a standard deviation long.
-    inner : ndarray, shape (F, m, m), or None
-        What is taken off between the two projections.
-    penalty : float
-        What -2 log likelihood grows by with the directions beyond the pose's (their log det).
-    """
-
-    weight: Array
+    weight: Array  # (F, n), inverse noise; 0 where a value must not count
+    # (F, n, m), weighted directions along which a frame may move, a standard deviation long.
     basis: Array | None = None
-    inner: Array | None = None
+    inner: Array | None = None  # (F, m, m), what is taken off between the two projections
+    # What -2 log likelihood grows by with the directions beyond the pose's (their log det).
     penalty: float = 0.0
 
     @staticmethod
     def of(weight: Array, directions: Array, known: int = 0) -> 'Whitener':
-        """Make it from weights (F, n) and directions (F, n, m), the first ``known`` of them the
-        pose's.
-        """
+        """Make it from weights (F, n) and directions (F, n, m), the first ``known`` a pose's."""
         basis = directions * weight[..., None]
         gram = basis.transpose(0, 2, 1) @ basis
         values, vectors = np.linalg.eigh(gram)
@@ -152,12 +132,3 @@ class Whitener:
 
         in_order(work, slices(len(out), FRAMES_A_THREAD))
         return out.reshape(values.shape)
-
-    def moves(self, values: Array) -> Array:
-        """Return the likeliest move of each frame along each direction, in its spread: (F, m)."""
-        if self.basis is None:
-            return np.zeros((values.shape[0], 0))
-        y = values * self.weight
-        normal = self.basis.transpose(0, 2, 1) @ self.basis + np.eye(self.basis.shape[2])
-        right = self.basis.transpose(0, 2, 1) @ y[..., None]
-        return np.asarray(np.linalg.solve(normal, right)[..., 0])

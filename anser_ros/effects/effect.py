@@ -14,15 +14,17 @@ reasons: the stages of the diagnosis that see an effect without the search and s
 themselves, and code that speaks of effects without these classes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.base import BaseEffect
+from anser_ros.effects.base import Remedy as Remedy
 from anser_ros.effects.body_term import BodyTerm, FluctuationTerm
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
@@ -47,16 +49,6 @@ INEXACT = 0.01
 """Share of an effect's power that its model may miss where the effect is truly there, unless the
 effect says otherwise. Gains, tilts and shifts are modelled to better than this; what leaves more
 on the values that it changes is another effect's stand-in."""
-
-
-class Remedy(Enum):
-    """Names what is corrected while tracking, so that an effect does no harm."""
-
-    FLUX = 'the measured flux is corrected'
-    SENSORS = 'the sensor table is corrected'
-    FIELD = "the field model's dipoles are corrected"
-    OPTICAL = 'the optical pose is corrected'
-    NONE = 'nothing can be corrected, only reported'
 
 
 class Family(Enum):
@@ -88,8 +80,10 @@ class Resting:
     extended: Sequence[SizedShapes] = ()
 
 
-class Effect(Generic[TermT]):
-    """Changes nothing; it is the base of all effects.
+class Effect(BaseEffect[TermT]):
+    """Changes nothing; it is the base of all effects on fluxes.
+
+    What every fit needs of an effect (prior, cost, record) is that of `BaseEffect`.
 
     Attributes
     ----------
@@ -121,12 +115,7 @@ class Effect(Generic[TermT]):
         each stretch is where this one starts (`along`).
     """
 
-    name: ClassVar[str] = ''
-    summary: ClassVar[str] = ''
-    units: ClassVar[Mapping[str, str]] = {}
     parts: ClassVar[tuple[str, ...]] = ()
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {}
-    remedy: ClassVar[Remedy] = Remedy.NONE
     family: ClassVar[Family] = Family.STEADY
     inexact: ClassVar[float] = INEXACT
     drifts: ClassVar[bool] = False
@@ -138,10 +127,6 @@ class Effect(Generic[TermT]):
     def candidates(self, apparatus: Apparatus) -> Sequence[TermT]:
         """Return the effect at every site where it may sit, with parameters of zero."""
         return ()
-
-    def prior(self, term: TermT) -> Array:
-        """Return each parameter's standard deviation before anything is measured, shape (q,)."""
-        return np.ones(term.theta.size)
 
     def columns(self, term: TermT, view: View) -> ComplexArray | None:
         """Return the derivative of the view's flux by the parameters, (F, S, K, q), or None."""
@@ -180,19 +165,7 @@ class Effect(Generic[TermT]):
         """
         return ()
 
-    def bounded(self, term: TermT) -> TermT:
-        """Return the term with its parameters brought back into their domain."""
-        return term
-
     # --- comparison --------------------------------------------------------------------------
-    def complexity(self, term: TermT) -> int:
-        """Return how many parameters are paid for when explanations are compared."""
-        return int(term.theta.size)
-
-    def covers(self, term: TermT, candidate: Term) -> bool:
-        """Return whether an active term of this effect stands for a candidate already."""
-        return candidate.name_and_site == term.name_and_site
-
     def rivals(self, term: TermT, other: Term) -> bool:
         """Return whether a steady term is about the same thing, so that one is superfluous."""
         return False
@@ -275,26 +248,6 @@ class Effect(Generic[TermT]):
     ) -> ComplexArray:
         """Return what the channels make of fluxes of shape (F, S, K)."""
         return flux
-
-    # --- records -----------------------------------------------------------------------------
-    def record(self, term: TermT, covariance: Array) -> EffectRecord:
-        """Return the term in the record's parameters; ``covariance`` (q, q) belongs to theta."""
-        raise NotImplementedError
-
-    def term(self, record: EffectRecord) -> TermT:
-        """Return the term of a record; raises `ModelFileError` on missing parameters."""
-        raise NotImplementedError
-
-    def possible(self, record: EffectRecord) -> bool:
-        """Return whether the numbers of a record are in the ranges of ``plausible``."""
-        for key, (low, high) in self.plausible.items():
-            value = record.parameters.get(key)
-            if value is None or isinstance(value, str):
-                continue
-            numbers = np.asarray(value, dtype=np.float64)
-            if numbers.size and (numbers.min() < low or numbers.max() > high):
-                return False
-        return True
 
 
 def needed(record: EffectRecord, key: str) -> Any:

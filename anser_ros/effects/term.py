@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.base import BaseTerm
+
 if TYPE_CHECKING:
     from anser_ros.effects.effect import Effect
 
@@ -29,16 +31,9 @@ class Site(TypedDict, total=False):
     shape: str  # curve of a saturation
     sees: str  # what a saturating channel sees: one tone, or all together
     of: str  # name of the effect whose remainder it is
-    sensor: str  # name of a sensor of a tracker of poses; all of its sensors where there is none
     place: tuple[float, ...]  # where resting metal is looked for, m, frame fg
     z: float  # height of a sheet, m, frame fg
     edge: float  # length of its edge, m
-    degree: int  # of a map's polynomial
-    lowest: int  # lowest degree in it, 1 where it is not stated
-    centre_m: list[float]  # where the polynomial's coordinates are zero, frame of the tracker
-    size_m: float  # what they are divided by
-    middle_s: float  # time at which a clock's offset is its offset
-    two_sided: Literal[True]  # a filter that looks ahead as far as back
 
 
 @dataclass(frozen=True)
@@ -50,7 +45,7 @@ class Held:
 
 
 @dataclass(frozen=True)
-class Term:
+class Term(BaseTerm):
     """Holds an effect at one site (a channel, a coil, a body, ...) with values of its parameters.
 
     An effect that needs more data than a site defines a subclass with more fields.
@@ -59,13 +54,7 @@ class Term:
     effect: 'Effect[Any]'
     # What tells this candidate from others of the same effect, as reports and records show it
     site: Site = field(default_factory=lambda: Site())
-    # (q,), parameters in the units that the effect works in; zero is no effect
-    theta: Array = field(default_factory=lambda: np.zeros(0))
     held: Held | None = None  # None where all parameters are free
-
-    def with_theta(self, theta: Array) -> Self:
-        """Return the same term with other parameters."""
-        return replace(self, theta=np.asarray(theta, dtype=np.float64))
 
     def hold(self, covariance: Array | None = None) -> Self:
         """Return the same term, held; ``covariance`` is kept for its record."""
@@ -80,31 +69,7 @@ class Term:
         return self.effect.belongs(self, other)
 
     @property
-    def complexity(self) -> int:
-        """Return how many parameters are paid for when explanations are compared."""
-        return self.effect.complexity(self)
-
-    @property
     def channels(self) -> tuple[int, ...]:
         """Return the channels that the site names; none where it is about something else."""
         one = (int(self.site['channel']),) if 'channel' in self.site else ()
         return (*one, *(int(c) for c in self.site.get('channels', ())))
-
-    @property
-    def name_and_site(self) -> tuple[str, str]:
-        """Return name and site: the same for one term whatever its parameters, held or free."""
-        return self.effect.name, repr(sorted(self.site.items()))
-
-    @property
-    def label(self) -> str:
-        """Return the effect's name and its site in words."""
-        parts = [f'{key} {_short(value)}' for key, value in self.site.items()]
-        return f'{self.effect.name}{" (" + ", ".join(parts) + ")" if parts else ""}'
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, float):
-        return f'{value:.3g}'
-    if isinstance(value, (tuple, list)):
-        return '[' + ' '.join(_short(v) for v in value) + ']'
-    return str(value)

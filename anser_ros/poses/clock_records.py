@@ -11,21 +11,15 @@ from anser_ros.poses.registry import effect_of_record
 
 AGREE_S = 3.0
 """Time about a session's start or middle, s, at which clocks count as agreeing: programs set
-clocks when they start, and a rate by regression is about the middle. Smaller gives a clock that
-was set late in starting an offset as well; larger hides offsets in the rate."""
+clocks when they start, and a rate by regression is about the middle."""
 
 
 class PoseClock:
     """Knows how late a tracker's stamps are by the records of its clock.
 
-    Parameters
-    ----------
-    records : sequence of EffectRecord
-        Those of the clock are used.
-    support : mapping
-        ``first_ns`` and ``last_ns``, the stamps between which a rate was learnt. Beyond them the
-        offset stays as it is at the nearer one, because nobody knows whether a clock was set
-        since.
+    ``records``: those of the clock are used; ``support``: ``first_ns`` and ``last_ns``, the stamps
+    between which a rate was learnt. Beyond them the offset stays as it is at the nearer one,
+    because nobody knows whether a clock was set since.
     """
 
     def __init__(self, records: Sequence[EffectRecord], support: Mapping[str, Any]) -> None:

@@ -30,20 +30,14 @@ POOR_M = 8e-3
 distorted trackers are off by less, and the inverse of a quaternion makes 25 mm and more."""
 RIGHT_MISFIT_SHARE = 0.5
 """Share (0 to 1) of the misfit as it stands below which another reading is the right one: the
-right one of a distorted tracker leaves a third of a wrong one (`POOR_M`), and two wrong ones leave
-alike. Larger re-reads a session that is only distorted; smaller refuses a right reading of a
-tracker that is poor besides."""
+right one of a distorted tracker leaves a third of a wrong one (`POOR_M`)."""
 TURNS_SHARE, TURNED_SHARE = 0.8, 0.7
-"""Share of the misfit of turns alone below which quaternions may be in another order or sense
-although places fit (a body that turns little), and of the misfit of hand-eye below which they are.
-The right order left 0.57 to 0.69 and 0.43 to 0.51 on recordings at rest that were read wrongly; a
-body that does not turn tells nothing, and leaves 0.86 and 0.84. Larger re-reads what is right."""
+"""Shares of the misfit of turns alone, and of hand-eye, below which quaternions are in another
+order although places fit: recordings that were read wrongly left 0.57 to 0.69 and 0.43 to 0.51."""
 FEW_POSES = 150  # poses of a sensor that a reading is judged by, a fit each: a median needs few
 HOPELESS_M = 25e-3
 """Median misfit, m, with which no reading fits and a session is refused: as much as a wrong
-reading makes at least (`POOR_M`), so its files do not belong together, or mean something that is
-not known here. Smaller refuses sessions with much distortion; larger takes files that do not
-belong together for bad ones."""
+reading makes at least (`POOR_M`)."""
 CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])  # of x y z w: the inverse turn
 UNITS = {
     **{unit: size for unit, size in LENGTH_M.items() if unit != 'm'}, 'km': 1e3,
@@ -71,12 +65,8 @@ class PoseReading:
     def record(self, before: float, after: float, ratio: float) -> EffectRecord:
         """Return the reading as an effect.
 
-        Parameters
-        ----------
-        before, after : float
-            Misfits, m, without and with it.
-        ratio : float
-            Extent of the tracked positions over that of the optical ones, as both are written.
+        ``before`` and ``after``: misfits, m, without and with it; ``ratio``: extent of the tracked
+        positions over that of the optical ones, as both are written.
         """
         effect = effect_with(Role.READING)
         return EffectRecord(
@@ -115,12 +105,10 @@ class PoseReading:
 def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None]:
     """Return the session as it is meant, and the convention by which it is, if that is another.
 
-    Raises
-    ------
-    PlausibilityError
-        When hand-eye fits in no reading, or the reference itself is in another unit.
-    DiagnosisError
-        When there are too few poses.
+    Raises `PlausibilityError` when hand-eye fits in no reading, or the reference itself is in
+    another unit.
+
+    Raises `DiagnosisError` when there are too few poses.
     """
     if session.reference is None:
         return session, None

@@ -27,41 +27,22 @@ strain that a distortion may have."""
 
 @dataclass(frozen=True)
 class CorrectedPose:
-    """Holds a pose without what the model knows of its errors.
+    """Holds a pose without what the model knows of its errors."""
 
-    Attributes
-    ----------
-    state : str
-        `OK`, or why not: outside the places where the model was learnt, no pose, no such sensor.
-    stamp_ns : int
-        On the reference's clock.
-    position : ndarray, shape (3,)
-        m, tracker's frame.
-    quaternion : ndarray, shape (4,)
-        x y z w.
-    covariance : ndarray, shape (6, 6)
-        Of position (m) and turn (rad) along the tracker's axes.
-    """
-
+    # `OK`, or why not: outside the places where the model was learnt, no pose, no such sensor.
     state: str
-    stamp_ns: int
-    position: Array
-    quaternion: Array
-    covariance: Array
+    stamp_ns: int  # on the reference's clock
+    position: Array  # (3,), m, tracker's frame
+    quaternion: Array  # (4,), x y z w
+    covariance: Array  # (6, 6), of position (m) and turn (rad) along the tracker's axes
 
 
 class PoseCorrector:
     """Applies a pose model's offsets, conventions and maps.
 
-    Parameters
-    ----------
-    document : mapping
-        As `anser_ros.poses.document.to_model` makes it.
+    ``document``: as `anser_ros.poses.document.to_model` makes it.
 
-    Raises
-    ------
-    ModelFileError
-        When it is no pose model, or a record lacks a parameter.
+    Raises `ModelFileError` when it is no pose model, or a record lacks a parameter.
     """
 
     def __init__(self, document: Mapping[str, Any]) -> None:
@@ -97,14 +78,8 @@ class PoseCorrector:
     ) -> CorrectedPose:
         """Return the pose of a sensor as it is, with its covariance and state.
 
-        Parameters
-        ----------
-        sensor : str
-        stamp_ns : int
-            On the tracker's clock.
-        position : ndarray, shape (3,)
-            As the tracker tells it; markers for no pose give the state `NO_POSE`.
-        quaternion : ndarray, shape (4,)
+        ``stamp_ns``: on the tracker's clock; ``position`` (3,): as the tracker reports it; markers
+        for no pose give the state `NO_POSE`; ``quaternion`` (4,).
         """
         empty = CorrectedPose(NO_POSE, stamp_ns, position, quaternion, np.full((6, 6), np.nan))
         if sensor not in self.sensors:

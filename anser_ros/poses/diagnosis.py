@@ -10,22 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.term import Term
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
-from anser_ros.poses.effect import (
-    PoseResiduals,
-    Role,
-    Sensing,
-    effect_of,
-    is_of,
-)
+from anser_ros.poses.effect import PoseResiduals, PoseTerm, Role, Sensing
 from anser_ros.poses.fit import (
     PoseFit,
     fit_poses,
     noise_of,
-    unexplained_poses,
     with_time_constants,
 )
 from anser_ros.poses.held_out import HeldOutErrors, errors_of, held_out, judged
@@ -52,59 +44,32 @@ from anser_ros.poses.swaps import put_back, swapped_spans, untangled
 Array = NDArray[np.float64]
 
 ABOVE_FLOOR = 1.3
-"""Factor of the held-out error over the jitter from which something stays unexplained: jitter is
-what differs between neighbours, and errors of a tracker are never quite alike there. What is no
-jitter is then 0.8 of it (the root of 1.3 squared less one); less than that moves no pose by as
-much as it jitters. Smaller always leaves something unexplained; larger says of half-explained
-sessions that all is well."""
+"""Factor of the held-out error over the jitter from which something stays unexplained. What is no
+jitter is then 0.8 of it (the root of 1.3 squared less one)."""
 
-LEAST_TOLD_M = 0.3e-3
+LEAST_REPORTED_M = 0.3e-3
 """Held-out error, m, below which nothing is said to be unexplained: no tracker promises less. Of
 one place at rest, which jitters by micrometres, something always is."""
 
 
 @dataclass(frozen=True)
 class PoseDiagnosis:
-    """Holds what a session of poses was found to contain.
+    """Holds what a session of poses was found to contain."""
 
-    Attributes
-    ----------
-    session : PoseSession
-        As it is meant (units, order of quaternions).
-    fit : PoseFit
-        The two frames and all effects, on all poses.
-    records : tuple of EffectRecord
-        The effects that are named.
-    evidence : mapping of str to PoseEvidence
-        By the label of the term.
-    registered, before, after : HeldOutErrors
-        Held out: with the registration alone, with hand-eye, with the effects.
-    floor_m : float
-        What jitter alone would leave, m.
-    unexplained : float
-        Share of the squared error above the jitter that stays.
-    depends_on : tuple of str
-    refused : tuple of (str, str)
-    states : tuple of PoseState
-        The held-out poses before and after.
-    left_out : tuple of str
-        Sensors that have too few poses at times with a reference.
-    knows_levers : bool
-        Whether the motion determines enough of a lever arm to look for effects of place.
-    """
-
-    session: PoseSession
-    fit: PoseFit
-    records: tuple[EffectRecord, ...]
+    session: PoseSession  # as it is meant (units, order of quaternions)
+    fit: PoseFit  # the two frames and all effects, on all poses
+    records: tuple[EffectRecord, ...]  # the effects that are named
+    # Held out: with the registration alone, with hand-eye, with the effects.
     registered: HeldOutErrors
     before: HeldOutErrors
     after: HeldOutErrors
-    floor_m: float
-    unexplained: float
+    floor_m: float  # what jitter alone would leave, m
+    unexplained: float  # share of the squared error above the jitter that stays
     depends_on: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]
-    states: tuple[PoseState, PoseState]
-    left_out: tuple[str, ...]
+    states: tuple[PoseState, PoseState]  # the held-out poses before and after
+    left_out: tuple[str, ...]  # sensors that have too few poses at times with a reference
+    # Whether the motion determines enough of a lever arm to look for effects of place.
     knows_levers: bool
 
 
@@ -113,16 +78,20 @@ def diagnose_poses(
 ) -> PoseDiagnosis:
     """Find what a tracker of poses lacks on a session.
 
-    Raises
-    ------
-    DiagnosisError
-        When there are too few poses with a reference.
-    PlausibilityError
-        When tracked and optical poses fit in no reading.
+    Raises `DiagnosisError` when there are too few poses with a reference.
+    Raises `PlausibilityError` when tracked and optical poses fit in no reading.
     """
     say = progress or (lambda text: None)
     say('conventions')
-    session, convention, exchanged = _as_meant(session)
+    exchanged: list[EffectRecord] = []
+    try:
+        session, convention = read_rightly(session)
+    except PlausibilityError:
+        # Nothing fits all of a session whose sensors were exchanged for half of it.
+        session, exchanged = untangled(session)
+        if not exchanged:
+            raise
+        session, convention = read_rightly(session)
     problem = pose_problem(session)
     train, test = train_blocks(problem)
     say('hand-eye')
@@ -137,12 +106,14 @@ def diagnose_poses(
         first = first_fit(training, coarse_offset(training), alone)
     search = search_effects(first, session, say)
     say('held out')
-    if not search.knows_levers and _leaves_more(search.fit.state):
-        alone_fit = fit_poses(search.fit.state.problem, frame_terms(search.fit.terms))
+    state = search.fit.state
+    # A clock may stand for what else there is besides jitter.
+    if not search.knows_levers and state.rms()[0] > ABOVE_FLOOR * floor_of(state):
+        alone_fit = fit_poses(state.problem, frame_terms(search.fit.terms))
         search = replace(search, fit=alone_fit, evidence=(None,) * len(alone_fit.terms))
     search = _confirmed(search, problem, test)
     found = search.fit
-    whole = _whole(problem, found)
+    whole = with_time_constants(fit_poses(judged(problem, found), found.terms))
     before, after, registered = held_out(problem, found, test)
     floor = floor_of(after)
     residuals = _residuals(session, problem, whole)
@@ -161,7 +132,7 @@ def diagnose_poses(
     errors = errors_of(after)
     excess = max(errors.position_m**2 - floor**2, 0.0)
     possible = max(errors_of(before).position_m ** 2 - floor**2, excess, 1e-18)
-    significant = errors.position_m > max(ABOVE_FLOOR * floor, LEAST_TOLD_M)
+    significant = errors.position_m > max(ABOVE_FLOOR * floor, LEAST_REPORTED_M)
     return PoseDiagnosis(
         session=session,
         fit=whole,
@@ -174,44 +145,23 @@ def diagnose_poses(
         depends_on=(depends_on(after) or depends_on(whole.state)) if significant else (),
         refused=search.refused,
         states=(before, after),
-        left_out=_left_out(session, problem),
+        left_out=tuple(
+            name
+            for name, poses in session.sensors.items()
+            if poses is not most_poses(session) and name not in problem.setting.sensors
+        ),
         knows_levers=search.knows_levers,
     )
-
-
-def _as_meant(
-    session: PoseSession,
-) -> tuple[PoseSession, EffectRecord | None, list[EffectRecord]]:
-    """The session as it is meant, its convention, and sensors that were exchanged for half of
-    it."""
-    try:
-        return *read_rightly(session), []
-    except PlausibilityError:
-        session, exchanged = untangled(session)
-        if not exchanged:
-            raise
-        return *read_rightly(session), exchanged
-
-
-def _left_out(session: PoseSession, problem: PoseProblem) -> tuple[str, ...]:
-    others = [name for name, p in session.sensors.items() if p is not most_poses(session)]
-    return tuple(name for name in others if name not in problem.setting.sensors)
-
-
-def _leaves_more(state: PoseState) -> bool:
-    """Whether more is left than jitter, so that a clock may stand for what else there is."""
-    return state.rms()[0] > ABOVE_FLOOR * floor_of(state)
 
 
 def _confirmed(search: PoseSearch, problem: PoseProblem, test: NDArray[np.int64]) -> PoseSearch:
     """The search without effects of place that positions do not confirm."""
     fit = search.fit
     for index, term in enumerate(fit.terms):
-        if not effect_of(term).blocks_in_space:
+        if not term.effect.blocks_in_space:
             continue
         rest = fit_poses(fit.state.problem, [t for t in fit.terms if t is not term])
-        noisy = replace(problem, noise=fit.state.problem.noise)
-        why = unconfirmed(rest, fit, term, judged(noisy.in_blocks(test), fit))
+        why = unconfirmed(rest, fit, term, judged(problem.in_blocks(test), fit))
         if why:
             evidence = tuple(e for k, e in enumerate(search.evidence) if k != index)
             refused = (*search.refused, (term.label, why))
@@ -220,7 +170,7 @@ def _confirmed(search: PoseSearch, problem: PoseProblem, test: NDArray[np.int64]
     return search
 
 
-def unconfirmed(rest: PoseFit, fit: PoseFit, term: Term, unseen: PoseProblem) -> str:
+def unconfirmed(rest: PoseFit, fit: PoseFit, term: PoseTerm, unseen: PoseProblem) -> str:
     """Return why an effect of place is not believed beside the rest; empty where it is.
 
     ``rest`` is the fit without it, and ``unseen`` the held-out poses.
@@ -232,38 +182,28 @@ def unconfirmed(rest: PoseFit, fit: PoseFit, term: Term, unseen: PoseProblem) ->
     if _square(unseen.state(rest.terms), term) < _square(unseen.state(fit.terms), term):
         return 'held-out poses are worse with it'
     taken = _square(rest.state, term) - _square(fit.state, term)
-    if is_of(term, Role.MAP) and taken < LEAST_MAP_M**2:
+    if term.role is Role.MAP and taken < LEAST_MAP_M**2:
         return f'takes less than {1e3 * LEAST_MAP_M:g} mm off the errors of positions'
     return ''
 
 
-def _square(state: PoseState, term: Term) -> float:
+def _square(state: PoseState, term: PoseTerm) -> float:
     """Mean squared error of the positions, m^2, of the sensors that a term is about."""
-    parts = [p for p in state.parts if effect_of(term).acts_on(term, p.view.sensor)]
+    parts = [p for p in state.parts if term.acts_on(p.view.sensor)]
     total = sum(float(np.sum(p.residual[p.used, :3] ** 2)) for p in parts)
     return total / max(sum(np.count_nonzero(p.used) for p in parts), 1)
 
 
-def _whole(problem: PoseProblem, found: PoseFit) -> PoseFit:
-    """The terms fitted to all poses, time constants of filters too."""
-    every = judged(replace(problem, noise=found.state.problem.noise), found)
-    return with_time_constants(fit_poses(every, found.terms))
-
-
-def _sensings(state: PoseState, out: tuple[NDArray[np.bool_], ...]) -> list[Sensing]:
-    found = []
-    for part, mask in zip(state.parts, out, strict=True):
+def _residuals(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseResiduals:
+    """What the last fit leaves; what stands out of it, and not of the one before, is out."""
+    known, sensings = judged(problem, whole), []
+    for part, weight in zip(known.state(whole.terms).parts, known.weight, strict=True):
         noise, cost = noise_of(part)
         gain = noise_of(part, with_stamps=False)[1] - cost
-        found.append(Sensing(part.view, part.residual, part.used, mask, noise.position_m,
-                             noise.orientation_rad, noise.stamp_s, gain))  # fmt: skip
-    return found
-
-
-def _residuals(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseResiduals:
-    every = replace(problem, noise=whole.state.problem.noise)
-    out = unexplained_poses(replace(whole, state=every.state(whole.terms)))
-    # What stands out of this fit, and not of the one before it: every pose is used or out.
-    weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
-    sensings = tuple(_sensings(replace(every, weight=weight).state(whole.terms), out))
-    return PoseResiduals(session, problem.setting, sensings, problem.blocks)
+        sensings.append(
+            Sensing(
+                part.view, part.residual, part.used, weight == 0.0, noise.position_m,
+                noise.orientation_rad, noise.stamp_s, gain,
+            )
+        )  # fmt: skip
+    return PoseResiduals(session, problem.setting, tuple(sensings))

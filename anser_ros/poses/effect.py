@@ -5,20 +5,20 @@ A tracked pose is predicted from the optical one in this order::
 
     clock -> optical track -> optical pose -> hand-eye -> tracked pose
 
-and what the tracker's own map of space does (a distortion) is undone on the measured side. The
-effects are those of `anser_ros.effects` seen through another observation: position and rotation
-instead of fluxes. `Term`, records, priors and costs of parameters are the same.
+and what the tracker's own map of space does (a distortion) is undone on the measured side. Prior,
+cost and record of an effect are those of `anser_ros.effects.base`, as for effects on fluxes.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
+from typing import Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Effect
-from anser_ros.effects.term import Site, Term
+from anser_ros.effects.base import BaseEffect, BaseTerm
+from anser_ros.effects.effect import sigmas
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.sequence import PoseSession
@@ -26,62 +26,44 @@ from anser_ros.poses.sequence import PoseSession
 Array = NDArray[np.float64]
 
 
+class PoseSite(TypedDict, total=False):
+    """States where an effect acts, in the words of records and reports."""
+
+    sensor: str  # name of a sensor; all of them where there is none
+    degree: int  # of a map's polynomial
+    lowest: int  # lowest degree in it
+    centre_m: list[float]  # where the polynomial's coordinates are zero, frame of the tracker
+    size_m: float  # what they are divided by
+    middle_s: float  # time at which a clock's offset is its offset
+    two_sided: Literal[True]  # a filter that looks ahead as far as back
+
+
 @dataclass(frozen=True)
 class PoseSetting:
-    """Holds what effects may know of a session before they are fitted.
-
-    Attributes
-    ----------
-    sensors : tuple of str
-    start, duration : float
-        Time of the first tracked pose, and from it to the last, s.
-    centre, size : ndarray (3,), float
-        Middle of the tracked positions and their rms distance from it, m, tracker's frame.
-    """
+    """Holds what effects may know of a session before they are fitted."""
 
     sensors: tuple[str, ...]
-    start: float
-    duration: float
-    centre: Array
-    size: float
+    start: float  # time of the first tracked pose, s
+    duration: float  # from it to the last, s
+    centre: Array  # (3,), middle of the tracked positions, m, tracker's frame
+    size: float  # their rms distance from it, m
 
 
 @dataclass(frozen=True)
 class PoseView:
-    """Holds predicted poses of one sensor, n of them, with what derivatives need.
-
-    Attributes
-    ----------
-    sensor : str
-    time : ndarray, shape (n,)
-        Stamps of the tracked poses, s.
-    measured : ndarray, shape (n, 3)
-        Tracked positions as they were reported, m, tracker's frame.
-    measured_rotation : ndarray, shape (n, 3, 3)
-        The rotations that were reported with them.
-    optical, turn : ndarray, shapes (n, 3) and (n, 3, 3)
-        The body in the optical frame at these times: place (m) and rotation.
-    frame : ndarray, shape (3, 3)
-        Rotation from the optical frame to the tracker's.
-    lever : ndarray, shape (3,)
-        The sensor in the body's frame, m.
-    position, rotation : ndarray, shapes (n, 3) and (n, 3, 3)
-        Predicted pose in the tracker's frame.
-    velocity : ndarray, shape (n, 6)
-        Of the predicted pose, m/s and rad/s, along the axes of the tracker's frame.
-    """
+    """Holds predicted poses of one sensor, n of them, with what derivatives need."""
 
     sensor: str
-    time: Array
-    measured: Array
-    measured_rotation: Array
-    optical: Array
-    turn: Array
-    frame: Array
-    lever: Array
-    position: Array
-    rotation: Array
-    velocity: Array
+    time: Array  # (n,), stamps of the tracked poses, s
+    measured: Array  # (n, 3), tracked positions as they were reported, m, tracker's frame
+    measured_rotation: Array  # (n, 3, 3), reported with them
+    optical: Array  # (n, 3), place of the body in the optical frame, m
+    turn: Array  # (n, 3, 3), its rotation there
+    frame: Array  # (3, 3), rotation from the optical frame to the tracker's
+    lever: Array  # (3,), the sensor in the body's frame, m
+    position: Array  # (n, 3), predicted, m, tracker's frame
+    rotation: Array  # (n, 3, 3), predicted
+    velocity: Array  # (n, 6), of the prediction, m/s and rad/s along the tracker's axes
 
 
 class Role(Enum):
@@ -121,37 +103,45 @@ class Role(Enum):
         """
         return self in (Role.OFFSET, Role.RATE)
 
-    @property
-    def moves_times(self) -> bool:
-        """Return whether it is a clock or a filter, which is a delay to first order."""
-        return self.is_clock or self is Role.FILTER
-
 
 @dataclass(frozen=True)
 class Frames:
-    """Holds the two frames between the reference and one sensor.
+    """Holds the two frames between the reference and one sensor."""
 
-    Attributes
-    ----------
-    rotation, translation : ndarray, shapes (3, 3) and (3,)
-        From the optical frame to the tracker's; m.
-    mount : ndarray, shape (3, 3)
-        Rotation from the sensor's frame to the body's.
-    lever : ndarray, shape (3,)
-        The sensor in the body's frame, m.
-    """
-
-    rotation: Array
-    translation: Array
-    mount: Array
-    lever: Array
+    rotation: Array  # (3, 3), from the optical frame to the tracker's
+    translation: Array  # (3,), m
+    mount: Array  # (3, 3), rotation from the sensor's frame to the body's
+    lever: Array  # (3,), the sensor in the body's frame, m
 
 
 PoseMap = Callable[[str, Array], tuple[Array, float]]
 """What a model adds to the position (3,), m, of a sensor of that name, and its variance, m^2."""
 
 
-class PoseEffect(Effect[Term]):
+@dataclass(frozen=True)
+class PoseTerm(BaseTerm):
+    """Holds an effect on the poses of one sensor, or of all, with values of its parameters."""
+
+    effect: 'PoseEffect'
+    site: PoseSite = field(default_factory=lambda: PoseSite())
+
+    @property
+    def role(self) -> Role:
+        """Return what its effect is to the others."""
+        return self.effect.role
+
+    @property
+    def sensor(self) -> str | None:
+        """Return the only sensor that it is about; None where it is about all of them."""
+        name = self.site.get('sensor')
+        return None if name is None else str(name)
+
+    def acts_on(self, sensor: str) -> bool:
+        """Return whether it is about a sensor."""
+        return self.sensor in (None, sensor)
+
+
+class PoseEffect(BaseEffect[PoseTerm]):
     """Changes nothing; it is the base of the effects on poses."""
 
     role = Role.PLAIN
@@ -165,11 +155,11 @@ class PoseEffect(Effect[Term]):
     makes_jitter = False
     """Whether poses that jitter more than before are explained by it."""
 
-    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         """Return the effect at every site where it may sit, with parameters of zero."""
         return ()
 
-    def slopes(self, term: Term, view: PoseView) -> Array | None:
+    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
         """Return the derivative of predicted less measured pose by the parameters, shape (n, 6,
         q).
 
@@ -177,40 +167,38 @@ class PoseEffect(Effect[Term]):
         """
         return None
 
-    def clock(self, term: Term, sensor: str, time: Array) -> Array:
+    def clock(self, term: PoseTerm, sensor: str, time: Array) -> Array:
         """Return the times on the optical clock, s, at which a sensor's poses apply."""
         return time
 
-    def at_frame(self, site: Site, place: Array, turn: Array) -> Term:
+    def at_frame(self, site: PoseSite, place: Array, turn: Array) -> PoseTerm:
         """Return a frame at a place (3,), m, with a rotation (3, 3)."""
         raise NotImplementedError
 
-    def framed(self, term: Term, sensor: str, frames: Frames) -> Frames:
+    def framed(self, term: PoseTerm, sensor: str, frames: Frames) -> Frames:
         """Return the frames of a sensor with the one that the term holds."""
         return frames
 
-    def moved(self, before: Term, after: Term, middle: Array) -> EffectRecord:
+    def moved(self, before: PoseTerm, after: PoseTerm, middle: Array) -> EffectRecord:
         """Return the record of a frame that has changed; ``middle`` (3,) is where the body is, m,
         optical frame.
         """
         raise NotImplementedError
 
-    def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
+    def filter(self, term: PoseTerm, path: OpticalPath) -> OpticalPath:
         """Return the body's path as a tracker that filters sees it."""
         return path
 
-    def seen(self, term: Term, position: Array) -> Array:
+    def seen(self, term: PoseTerm, position: Array) -> Array:
         """Return optical positions (n, 3) at the tracker's scale, m."""
         return position
 
-    def corrected(
-        self, term: Term, sensor: str, position: Array, rotation: Array
-    ) -> tuple[Array, Array]:
-        """Return tracked poses, (n, 3) m and (n, 3, 3), without what the effect does to them."""
-        return position, rotation
+    def corrected(self, term: PoseTerm, sensor: str, position: Array) -> Array:
+        """Return tracked positions (n, 3), m, without what the effect does to them."""
+        return position
 
     def seen_at(
-        self, record: EffectRecord, term: Term, covariance: Array, views: Sequence[PoseView]
+        self, record: EffectRecord, term: PoseTerm, covariance: Array, views: Sequence[PoseView]
     ) -> EffectRecord:
         """Return the record of a fitted term with what it amounts to at the poses of a session."""
         return record
@@ -223,104 +211,78 @@ class PoseEffect(Effect[Term]):
         """Return streams that have stopped while others go on, each with its ``since_s``."""
         return ()
 
-    def noisier(self, factor: float) -> Sequence[EffectRecord]:
-        """Return what is said where poses jitter so many times as much as when a watch began."""
+    def more_jitter(self, factor: float) -> Sequence[EffectRecord]:
+        """Return what is reported where poses jitter so many times as when a watch began."""
         return ()
 
     def mapping(self, record: EffectRecord) -> PoseMap | None:
         """Return the map of a record, which a corrector applies; None for other effects."""
         return None
 
-    def beside_scale(self, term: Term) -> Term | None:
+    def beside_scale(self, term: PoseTerm) -> PoseTerm | None:
         """Return what is left of a term beside one scale of all sensors; None where nothing is."""
         return term
 
-    def whole(self, term: Term) -> Term | None:
+    def whole(self, term: PoseTerm) -> PoseTerm | None:
         """Return a map with what it lacks beside a scale, with parameters of zero; None for a
         term that lacks nothing.
         """
         return None
 
-    def is_scale(self, term: Term) -> bool:
+    def is_scale(self, term: PoseTerm) -> bool:
         """Return whether a term is one scale, of a sensor or of all."""
         return False
 
-    def rival(self, term: Term) -> Term:
+    def rival(self, term: PoseTerm) -> PoseTerm:
         """Return a filter's smoothing without its delay: what a noisy reference asks for."""
         return term
 
-    def sensor_of(self, term: Term) -> str | None:
-        """Return the only sensor that a term is about; None where it is about all of them."""
-        name = term.site.get('sensor')
-        return None if name is None else str(name)
 
-    def acts_on(self, term: Term, sensor: str) -> bool:
-        """Return whether a term is about a sensor."""
-        return self.sensor_of(term) in (None, sensor)
+class NumberEffect(PoseEffect):
+    """Changes poses by one number, theta, which a record holds as ``base + factor * theta``."""
+
+    key = ''
+    base, factor = 0.0, 1.0
+    spread = 1.0
+    """Standard deviation of theta before anything is measured."""
+
+    def prior(self, term: PoseTerm) -> Array:
+        """Return the standard deviation of theta before anything is measured, shape (1,)."""
+        return np.full(1, self.spread)
+
+    def record(self, term: PoseTerm, covariance: Array) -> EffectRecord:
+        """Return the number and its standard deviation, and the term's site."""
+        sigma = self.factor * float(sigmas(covariance)[0])
+        value = self.base + self.factor * float(term.theta[0])
+        return EffectRecord(self.name, {**term.site, self.key: value}, {self.key: sigma})
 
 
 @dataclass(frozen=True)
 class Sensing:
-    """Holds what one sensor shows once the frames and effects are fitted.
-
-    Attributes
-    ----------
-    view : PoseView
-    residual : ndarray, shape (n, 6)
-        Measured less predicted, m and rad, tracker's frame.
-    used : ndarray of bool, shape (n,)
-        Poses that have a reference and do not stand out.
-    out : ndarray of bool, shape (n,)
-        Poses that have a reference and stand out.
-    position_m, orientation_rad, stamp_s : float
-        The noise that is left, a coordinate, and of the stamps.
-    stamp_gain : float
-        Minus twice the log likelihood that an error of the stamps takes off.
-    """
+    """Holds what one sensor shows once the frames and effects are fitted."""
 
     view: PoseView
-    residual: Array
-    used: NDArray[np.bool_]
-    out: NDArray[np.bool_]
-    position_m: float
-    orientation_rad: float
-    stamp_s: float
-    stamp_gain: float
+    residual: Array  # (n, 6), measured less predicted, m and rad, tracker's frame
+    used: NDArray[np.bool_]  # (n,), poses that have a reference and do not stand out
+    out: NDArray[np.bool_]  # (n,), poses that have a reference and stand out
+    position_m: float = 0.0  # the noise that is left, a coordinate
+    orientation_rad: float = 0.0
+    stamp_s: float = 0.0  # and of the stamps
+    stamp_gain: float = 0.0  # minus twice the log likelihood that an error of the stamps takes off
 
 
 @dataclass(frozen=True)
 class PoseResiduals:
-    """Holds a session and what its fit leaves, where effects without a parameter to fit are seen.
-
-    Attributes
-    ----------
-    session : PoseSession
-    setting : PoseSetting
-    sensors : tuple of Sensing
-    blocks : tuple of ndarray of int, one per sensor
-        Block of time of each pose.
-    """
+    """Holds a session and what its fit leaves, by which some effects are seen without a fit."""
 
     session: PoseSession
     setting: PoseSetting
     sensors: tuple[Sensing, ...]
-    blocks: tuple[NDArray[np.int64], ...]
 
 
-def effect_of(term: Term) -> PoseEffect:
-    """Return the effect that a term of poses belongs to."""
-    assert isinstance(term.effect, PoseEffect)
-    return term.effect
-
-
-def frames_of(terms: Sequence[Term], sensor: str) -> Frames:
+def frames_of(terms: Sequence[PoseTerm], sensor: str) -> Frames:
     """Return the frames of a sensor that some terms hold; the identity where they hold none."""
     frames = Frames(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
     for term in terms:
-        frames = effect_of(term).framed(term, sensor, frames)
+        frames = term.effect.framed(term, sensor, frames)
     return frames
-
-
-def is_of(term: Term, role: Role) -> bool:
-    """Return whether the effect of a term has a role."""
-    return effect_of(term).role is role

@@ -1,18 +1,16 @@
-"""Fits the two frames and all effects in force by Gauss-Newton, and the noise of the rest."""
+"""Fits the two frames and all active effects by Gauss-Newton, and the noise of the rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from anser_ros.calibration.blocks import FOLDS
-from anser_ros.diagnosis.fit import descended, stepped
-from anser_ros.diagnosis.scoring import BlockSums
-from anser_ros.effects.term import Term
-from anser_ros.poses.effect import Role, effect_of, is_of
+from anser_ros.diagnosis.engine import JointFit, descended, stepped
+from anser_ros.poses.effect import PoseTerm, Role
 from anser_ros.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
 from anser_ros.poses.stamp_step import stamp_step
 
@@ -20,20 +18,16 @@ Array = NDArray[np.float64]
 
 STUDENT_FREEDOM = 4.0
 """Degrees of freedom of Student's distribution by which poses are weighted in a robust fit: the
-usual compromise between the mean (infinite) and a distribution without one (1). Smaller gives far
-poses less weight and costs precision where the errors are normal; larger lets a few bad poses move
-the frames."""
+usual compromise between the mean (infinite) and a distribution without one (1)."""
 REWEIGHTINGS = 5
 """Fits of a robust fit after the first, each with the weights of the one before. Fewer leave bad
 poses some of their first weight; more cost a fit each and change weights by little."""
 STANDS_OUT, FAR_OUT = 7.0, 25.0
 """Distances of a pose from its prediction, in robust spreads of a coordinate, from which it stands
-out: where few do, and where many do. Three normal coordinates reach the first once in 1e10; what
-many poses share is something to explain, and only what no distortion makes is left out of it."""
+out: where few do (normal ones once in 1e10), and where many do, as what an effect makes."""
 FEW_SHARE = 0.03
-"""Share of a sensor's poses up to which those that stand out are few. It lies between one window
-and the two that metal must be near to be named (`episodes.WINDOWS`). Smaller takes a handful of
-reflections for something to explain; larger takes an effect of a few seconds for outliers."""
+"""Share of a sensor's poses up to which those that stand out are few: between one window and the
+two that metal must be near to be named (`episodes.WINDOWS`)."""
 SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
 FEWEST_BLOCKS = 10
 """Blocks by whose scores the variance of a time beside a poll is judged. Fewer have no slow
@@ -53,35 +47,24 @@ LARGEST_STAMP_S = 0.1
 
 
 @dataclass(frozen=True)
-class PoseFit:
-    """Holds terms at their joint optimum.
-
-    Attributes
-    ----------
-    state : PoseState
-    sums : BlockSums
-    prior : ndarray, shape (q,)
-    """
-
-    state: PoseState
-    sums: BlockSums
-    prior: Array
+class PoseFit(JointFit[PoseState]):
+    """Holds the terms of poses at their joint optimum."""
 
     @property
-    def terms(self) -> tuple[Term, ...]:
+    def terms(self) -> tuple[PoseTerm, ...]:
         """Return all terms with their fitted parameters."""
         return self.state.terms
 
-    @property
-    def misfit(self) -> float:
-        """Return the mean square of the whitened residuals; one where only noise is left."""
-        return self.state.sum_of_squares / max(self.state.count, 1)
-
     def held_out(self, in_space: bool = False) -> float:
         """Return the cross-validated sum of squares over blocks of time, or of space."""
-        sums = self.state.sums(in_space=True) if in_space else self.sums
-        return sums.held_out(self.prior, FOLDS)
+        return self._held_out_in_space if in_space else super().held_out()
 
+    @cached_property
+    def _held_out_in_space(self) -> float:
+        state = self.state.in_space
+        return state.sums(state.numbers).held_out(self.prior, state.folds)
+
+    @cached_property
     def covariance(self) -> Array:
         """Return the covariance of all parameters, as `BlockSums.covariance`.
 
@@ -90,17 +73,17 @@ class PoseFit:
         errors. What it adds to the poses' own noise is slow, and is seen in the slow course of the
         blocks' scores (by sine tapers); the quick course is where teeth end in blocks.
         """
-        filtered = any(is_of(term, Role.FILTER) for term in self.terms)
-        sums = self.state.sums(filter_slopes=True) if filtered else self.sums
+        filtered = any(term.role is Role.FILTER for term in self.terms)
+        sums = self.state.sums_with(filter_slopes=True) if filtered else self.sums
         whole = sums.covariance(self.prior, self.misfit)
         clocks = np.repeat(
-            [effect_of(t).role.is_clock for t in self.terms], [t.theta.size for t in self.terms]
+            [t.role.is_clock for t in self.terms], [t.theta.size for t in self.terms]
         )
         blocks = sums.squares.size
         if not clocks.any() or blocks <= FEWEST_BLOCKS or not self._is_polled():
             return whole
         formal = sums.solve(self.prior)[1][clocks]
-        exact = self.state.sums(filter_slopes=filtered, stamps_exact=True).normal.sum(axis=0)
+        exact = self.state.sums_with(filtered, stamps_exact=True).normal.sum(axis=0)
         exact += np.diag(1 / self.prior**2)
         least = np.einsum('ci,ij,cj->c', formal, exact, formal) * max(self.misfit, 1.0)
         course = np.outer(np.arange(1, SLOW + 1), np.arange(1, blocks + 1))
@@ -116,53 +99,33 @@ class PoseFit:
         sensors = zip(self.state.problem.sensors, self.state.parts, strict=True)
         return any(part.noise.stamp_s and stamp_step(poses.time) for poses, part in sensors)
 
-    def covariance_of(self, index: int, whole: Array | None = None) -> Array:
-        """Return the covariance of one term's parameters."""
-        sizes = np.cumsum([0] + [t.theta.size for t in self.terms])
-        rows = slice(sizes[index], sizes[index + 1])
-        return (self.covariance() if whole is None else whole)[rows, rows]
 
-
-def fit_poses(problem: PoseProblem, terms: Sequence[Term], iterations: int = 10) -> PoseFit:
-    """Fit all parameters of all terms together.
-
-    Parameters
-    ----------
-    problem : PoseProblem
-    terms : sequence of Term
-        Start values, the two frames among them.
-    iterations : int
-        At most.
-    """
-    prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
-    state, sums, _ = descended(
-        problem.state(terms),
-        lambda state: (state.sums(), prior),
-        lambda state, step: problem.state(stepped(state.terms, step)),
-        iterations,
-    )
-    return PoseFit(state, sums, prior)
+def fit_poses(problem: PoseProblem, terms: Sequence[PoseTerm], iterations: int = 10) -> PoseFit:
+    """Fit all parameters of all terms together, the two frames among them, from their values."""
+    state = problem.state(terms)
+    return PoseFit(*descended(state, state.numbers, iterations))
 
 
 def with_time_constants(fit: PoseFit) -> PoseFit:
     """Return the fit with the time constants of filters, which lie near, fitted by their slopes.
 
-    Positions alone tell them (`PoseState.sums`), so that steps need not lower the sum of squares.
+    Positions alone tell them (`PoseState.sums_with`), so that steps need not lower the sum of
+    squares.
     """
-    filters = [i for i, term in enumerate(fit.terms) if is_of(term, Role.FILTER)]
+    filters = [i for i, term in enumerate(fit.terms) if term.role is Role.FILTER]
     if not filters:
         return fit
     state = fit.state
     for _ in range(FILTER_STEPS):
-        terms = stepped(state.terms, state.sums(filter_slopes=True).step(fit.prior, 0.0))
+        terms = stepped(state.terms, state.sums_with(filter_slopes=True).step(fit.prior, 0.0))
         moved = [float(terms[i].theta[0] / fit.terms[i].theta[0]) for i in filters]
         if not all(1 / NEAR_TAU < factor < NEAR_TAU for factor in moved):
             return fit
-        state = state.problem.state(terms)
-    return PoseFit(state, state.sums(), fit.prior)
+        state = state.moved(terms)
+    return PoseFit(state, state.sums(state.numbers), fit.prior)
 
 
-def robust_fit(problem: PoseProblem, terms: Sequence[Term]) -> PoseFit:
+def robust_fit(problem: PoseProblem, terms: Sequence[PoseTerm]) -> PoseFit:
     """Fit with poses weighted by how far they are off, and with the spread that they show."""
     problem = replace(problem, noise=tuple(_spread(p) for p in problem.state(terms).parts))
     fit = fit_poses(problem, terms, 4)
@@ -195,10 +158,10 @@ def _spread(part: PosePart) -> PoseNoise:
     )
 
 
-def unexplained_poses(fit: PoseFit) -> tuple[NDArray[np.bool_], ...]:
+def unexplained_poses(state: PoseState) -> tuple[NDArray[np.bool_], ...]:
     """Return the poses that nothing explains: far beyond the spread of their sensor's others."""
     found = []
-    for part in fit.state.parts:
+    for part in state.parts:
         noise = replace(_spread(part), stamp_s=part.noise.stamp_s)
         white = noise.whitened(part.residual, part.view.velocity)
         place = np.linalg.norm(white[:, :3], axis=1)

@@ -1,6 +1,6 @@
 """Reads files of poses as trackers and their programs write them into rows, nothing judged yet.
 
-Four forms are told apart by their content: NDI ToolTracker's ``.tsv``; lines of ``Key: numbers``;
+Four forms are recognised by their content: NDI ToolTracker's ``.tsv``; lines of ``Key: numbers``;
 TUM's ``t x y z qx qy qz qw``; and CSV with named columns.
 """
 
@@ -46,54 +46,30 @@ _KEY = re.compile(r'(\w+):\s*((?:[^\s:]+(?:\s+|$)(?!:))*?)(?=\s*\w+:|\s*$)')
 class RawRows:
     """Holds rows of one sensor as they stand in a file, in the file's own units.
 
-    Attributes
-    ----------
-    host, device : list of float
-        Time of receipt and the device's own time, s; NaN where the form lacks it.
-    values : list of tuple
-        Position in the file's unit, and quaternion in the file's order; NaN for no pose.
-    form : str
-        How its quaternions are written, a key of `ORDERS`.
-    unit : str
-        Unit of its lengths, a key of `LENGTH_M`.
+    Each row holds the time of receipt and the device's own time, s (NaN where the form lacks it),
+    the position in the file's unit and the quaternion in the file's order; NaN for no pose.
     """
 
-    host: list[float] = field(default_factory=list)
-    device: list[float] = field(default_factory=list)
-    values: list[tuple[float, ...]] = field(default_factory=list)
-    form: str = 'xyzw'
-    unit: str = 'mm'
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+    form: str = 'xyzw'  # how its quaternions are written, a key of `ORDERS`
+    unit: str = 'mm'  # unit of its lengths, a key of `LENGTH_M`
+
+    @property
+    def table(self) -> Array:
+        """Return the rows as an array, shape (n, 9)."""
+        return np.array(self.rows, dtype=np.float64).reshape(-1, 9)
 
 
-Reader = Callable[[Sequence[str], Path], tuple[dict[str, RawRows], int]]
-"""What makes rows of lines, and tells of how many."""
+Found = tuple[dict[str, RawRows], int]
+"""Rows by the sensor's name, and a number of lines."""
 
 
-@dataclass
-class FormFile:
-    """Holds what a file of poses contains.
-
-    Attributes
-    ----------
-    rows : dict of str to RawRows
-        By the sensor's name.
-    unread : int
-        Lines that hold no pose and no marker for one.
-    """
-
-    rows: dict[str, RawRows]
-    unread: int = 0
-
-
-def read_form(path: Path) -> FormFile:
-    """Read a file of any known form; the rows of each sensor that it names.
+def read_form(path: Path) -> Found:
+    """Read a file of any known form: its rows, and how many lines hold no pose and no marker.
 
     Lines before the first that has the form, such as a title, are left out.
 
-    Raises
-    ------
-    ParameterError
-        When no form fits, or the file has no row.
+    Raises `ParameterError` when no form fits, or the file has no row.
     """
     lines = path.read_text(encoding='utf-8-sig', errors='replace').splitlines()
     lines = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
@@ -104,12 +80,12 @@ def read_form(path: Path) -> FormFile:
         (0, _table),
     )
     rows, read = reader(lines[first:], path)
-    if not any(one.values for one in rows.values()):
+    if not any(one.rows for one in rows.values()):
         raise ParameterError(f'{path}: no row that is a pose')
-    return FormFile(rows, len(lines) - read)
+    return rows, len(lines) - read
 
 
-def _reader(line: str) -> Reader | None:
+def _reader(line: str) -> Callable[[Sequence[str], Path], Found] | None:
     """What reads the form that a line is of, or None; a table's header has names of columns."""
     if line.startswith('Tools\t'):
         return _tool_tracker
@@ -127,7 +103,7 @@ def _number(text: str) -> float:
         return float('nan')
 
 
-def _tool_tracker(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
+def _tool_tracker(lines: Sequence[str], path: Path) -> Found:
     """NDI ToolTracker: a group of columns a port; scalar first; states in words."""
     rows: dict[str, RawRows] = {}
     read = 0
@@ -147,13 +123,11 @@ def _tool_tracker(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows],
             numbers = [_number(cell) for cell in port[4:11]]
             good = port[3].strip() in ('OK', 'Partially Out of Volume')
             pose = (*numbers[4:7], *numbers[:4]) if good else (float('nan'),) * 7
-            one.host.append(float('nan'))
-            one.device.append(_number(port[1]) / rate)
-            one.values.append(pose)
+            one.rows.append((float('nan'), _number(port[1]) / rate, *pose))
     return rows, read
 
 
-def _keyed(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
+def _keyed(lines: Sequence[str], path: Path) -> Found:
     """Lines such as ``SensorID: 0 Position: x y z Orientation: a b c d Time: ns``."""
     rows: dict[str, RawRows] = {}
     for line in lines:
@@ -161,7 +135,7 @@ def _keyed(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
         if len(parts.get('Position', ())) != 3 or len(parts.get('Orientation', ())) != 4:
             continue
         label = f'sensor_{parts["SensorID"][0]}' if 'SensorID' in parts else REFERENCE
-        # Ascension's driver is the one that tells a quality and the time of the day.
+        # Ascension's driver is the one that writes a quality and the time of the day.
         form = 'wxyz_inverse' if 'Quality' in parts else 'xyzw'
         one = rows.setdefault(label, RawRows(form=form))
         host = next((_number(parts[key][0]) for key in HOST_TIMES if parts.get(key)), np.nan)
@@ -172,28 +146,24 @@ def _keyed(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
         numbers = [_number(cell) for cell in (*parts['Position'], *parts['Orientation'])]
         if 'State' in parts and parts['State'][:1] not in (['OK'], ['Partially']):
             numbers = [float('nan')] * 7
-        one.host.append(1e-9 * float(host))
-        one.device.append(float(device))
-        one.values.append(tuple(numbers))
+        one.rows.append((1e-9 * float(host), float(device), *numbers))
     if not rows:
         raise ParameterError(f'{path}: no line with a position and an orientation')
-    return rows, sum(len(one.values) for one in rows.values())
+    return rows, sum(len(one.rows) for one in rows.values())
 
 
-def _tum(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
+def _tum(lines: Sequence[str], path: Path) -> Found:
     """TUM: s, m, scalar last."""
     one = RawRows(unit='m')
     for line in lines:
         numbers = [_number(cell) for cell in re.split(r'[\s,]+', line.strip())]
         if len(numbers) < LEAST_COUNTED:
             raise ParameterError(f'{path}: a line of {len(numbers)} numbers, TUM has 8')
-        one.host.append(numbers[0])
-        one.device.append(float('nan'))
-        one.values.append(tuple(numbers[1:8]))
+        one.rows.append((numbers[0], float('nan'), *numbers[1:8]))
     return {path.stem: one}, len(lines)
 
 
-def _table(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
+def _table(lines: Sequence[str], path: Path) -> Found:
     """CSV: ``stamp_ns`` or ``time_s``, positions with their unit, quaternions, ``sensor``."""
     reader = csv.DictReader(lines)
     names = reader.fieldnames or []
@@ -208,9 +178,7 @@ def _table(lines: Sequence[str], path: Path) -> tuple[dict[str, RawRows], int]:
     rows: dict[str, RawRows] = {}
     for row in reader:
         one = rows.setdefault(str(row.get('sensor') or path.stem), RawRows(unit=unit))
-        stamp = _number(row[clock] or '')
-        one.host.append(1e-9 * stamp if clock == 'stamp_ns' else stamp)
-        one.device.append(float('nan'))
-        place = (_number(row[f'{axis}_{unit}'] or '') for axis in 'xyz')
-        one.values.append((*place, *(_number(row[key] or '') for key in turn)))
+        stamp = _number(row[clock] or '') * (1e-9 if clock == 'stamp_ns' else 1.0)
+        pose = (_number(row[key] or '') for key in (*(f'{axis}_{unit}' for axis in 'xyz'), *turn))
+        one.rows.append((stamp, float('nan'), *pose))
     return rows, len(lines)

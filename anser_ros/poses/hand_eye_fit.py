@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.term import Term
+from anser_ros.effects.effect import sigmas
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
-from anser_ros.poses.effect import Role, effect_of, frames_of, is_of
+from anser_ros.poses.effect import PoseTerm, Role, frames_of
 from anser_ros.poses.fit import PoseFit, fit_poses
 from anser_ros.poses.lever_arms import (
     LEAST_KNOWN_M,
     LEAST_KNOWN_RAD,
-    is_lever_determined,
     turn_jitter,
 )
 from anser_ros.poses.problem import PoseProblem
@@ -44,73 +43,43 @@ TILT_NEEDED_DEG = 20.0  # what is asked for where a lever arm is open
 
 @dataclass(frozen=True)
 class SensorFrames:
-    """Holds place and mount of one sensor on the body with what is known of them.
+    """Holds place and mount of one sensor on the body with what is known of them."""
 
-    Attributes
-    ----------
-    lever_m : ndarray, shape (3,)
-        m, body's frame; NaN where the motion does not determine it.
-    lever_sigma_m : ndarray, shape (3,)
-    mount : ndarray, shape (3, 3), or None
-        Rotation from the sensor's frame to the body's; None where it is not determined.
-    mount_sigma_rad : ndarray, shape (3,)
-    n, n_compared : int
-        Poses that took part, of those that could be compared with an optical pose; the others
-        contradict them.
-    rms : tuple of float
-        Distance (m) and angle (rad) that are left, root mean square, on those that took part.
-    held_out : tuple of float
-        The same on all of the fifth of the recording that took no part in a fit of its own.
-    """
-
-    lever_m: Array
-    lever_sigma_m: Array
+    lever_m: Array  # (3,), m, body's frame; NaN where the motion does not determine it
+    lever_sigma_m: Array  # (3,)
+    # (3, 3), rotation from the sensor's frame to the body's; None where it is not determined.
     mount: Array | None
-    mount_sigma_rad: Array
+    mount_sigma_rad: Array  # (3,)
+    # Poses that took part, of those that could be compared with an optical pose; the others
+    # contradict them.
     n: int
     n_compared: int
+    # Distance (m) and angle (rad) that are left, root mean square, on those that took part.
     rms: tuple[float, float]
+    # The same on all of the fifth of the recording that took no part in a fit of its own.
     held_out: tuple[float, float]
 
 
 @dataclass(frozen=True)
 class HandEye:
-    """Holds what two streams of poses have between them.
+    """Holds what two streams of poses have between them."""
 
-    Attributes
-    ----------
-    session : PoseSession
-        As it is meant (units, order of quaternions).
-    convention : EffectRecord or None
-        How it had to be read, where that is not as it says.
-    rotation : ndarray, shape (3, 3)
-        From the optical frame to the tracker's.
-    rotation_sigma_rad : ndarray, shape (3,)
-    translation_m, translation_sigma_m : ndarray, shape (3,)
-        Of the optical frame's origin in the tracker's, m; NaN where the motion does not determine
-        it.
-    offset_s, rate_ppm : tuple of float (value, standard deviation), or None
-        At stamp t of a tracked pose the optical pose stamped t - offset applies; the tracked clock
-        gains on the optical one by the rate; the offset is that at ``middle_s``. None if the
-        recording does not determine it.
-    middle_s : float
-        s since the recording's start.
-    sensors : dict of str to SensorFrames
-    undetermined : tuple of str
-        What the recording does not determine, and what it would take, in words.
-    fit : PoseFit
-    """
-
-    session: PoseSession
-    convention: EffectRecord | None
-    rotation: Array
-    rotation_sigma_rad: Array
+    session: PoseSession  # as it is meant (units, order of quaternions)
+    convention: EffectRecord | None  # how it had to be read, where that is not as it says
+    rotation: Array  # (3, 3), from the optical frame to the tracker's
+    rotation_sigma_rad: Array  # (3,)
+    # (3,), of the optical frame's origin in the tracker's, m; NaN where the motion does not
+    # determine it.
     translation_m: Array
-    translation_sigma_m: Array
+    translation_sigma_m: Array  # (3,)
+    # At stamp t of a tracked pose the optical pose stamped t - offset applies; the tracked clock
+    # gains on the optical one by the rate; the offset is that at ``middle_s``. None if the
+    # recording does not determine it.
     offset_s: tuple[float, float] | None
     rate_ppm: tuple[float, float] | None
-    middle_s: float
+    middle_s: float  # s since the recording's start
     sensors: dict[str, SensorFrames]
+    # What the recording does not determine, and what it would take, in words.
     undetermined: tuple[str, ...]
     fit: PoseFit
 
@@ -119,10 +88,7 @@ def as_pairs(session: PoseSession) -> PoseSession:
     """Return the n-th pose of every sensor beside the n-th of the reference, whatever their
     stamps.
 
-    Raises
-    ------
-    DiagnosisError
-        When numbers differ, or there is no reference.
+    Raises `DiagnosisError` when numbers differ, or there is no reference.
     """
     if session.reference is None:
         raise DiagnosisError(f'{session.path}: pairs need a reference')
@@ -146,21 +112,12 @@ def fit_hand_eye(
 ) -> HandEye:
     """Fit frames and clocks jointly.
 
-    Parameters
-    ----------
-    session : PoseSession
-        With a reference.
-    pairs : bool
-        Whether the poses are static pairs (`as_pairs`), which say nothing about clocks.
-    progress : callable, optional
-        Called with the name of the stage and its finished fraction.
+    ``session``: with a reference; ``pairs``: whether the poses are static pairs (`as_pairs`),
+    which say nothing about clocks; ``progress``: called with the name of the stage and its
+    finished fraction.
 
-    Raises
-    ------
-    DiagnosisError
-        When there is no reference, or too few poses.
-    PlausibilityError
-        When the two streams fit in no reading.
+    Raises `DiagnosisError` when there is no reference, or too few poses.
+    Raises `PlausibilityError` when the two streams fit in no reading.
     """
     say = progress or (lambda text, share: None)
     if session.reference is None:
@@ -201,7 +158,7 @@ def _sigma(fit: PoseFit, index: int) -> float:
 
 def _clock(fit: PoseFit, role: Role, scale: float) -> tuple[float, float] | None:
     for index, term in enumerate(fit.terms):
-        if is_of(term, role):
+        if term.role is role:
             return scale * float(term.theta[0]), scale * _sigma(fit, index)
     return None
 
@@ -217,22 +174,18 @@ def _described(
     assert reference is not None
     # Pairs are not in the order of a motion, so their differences tell no jitter.
     shaking = 0.0 if pairs else turn_jitter(reference)
-    covariance = fit.covariance()
-    spreads = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
-    (base,) = (i for i, t in enumerate(fit.terms) if is_of(t, Role.REGISTRATION))
+    (base,) = (i for i, t in enumerate(fit.terms) if t.role is Role.REGISTRATION)
     frames = frames_of(fit.terms, '')
     sensors, words = {}, []
     for index, term in enumerate(fit.terms):
-        if not is_of(term, Role.MOUNT):
+        if term.role is not Role.MOUNT:
             continue
-        name = str(effect_of(term).sensor_of(term))
+        name = str(term.sensor)
         frames = frames_of(fit.terms, name)
         part = next(p for p in fit.state.parts if p.view.sensor == name)
-        record = hand_eye_record(
-            name, frames, spreads[index], spreads[base], is_lever_determined(part, shaking)
-        )
+        record = hand_eye_record(fit, index, shaking)
         lever = [np.nan if v is None else float(v) for v in record.parameters['lever_arm_m']]
-        sigma = np.sqrt(np.maximum(np.diag(spreads[index]), 0.0))
+        sigma = sigmas(fit.covariance_of(index))
         known = bool(np.all(sigma[3:] < LEAST_KNOWN_RAD))
         sensors[name] = SensorFrames(
             np.array(lever), sigma[:3], frames.mount if known else None, sigma[3:],
@@ -242,7 +195,7 @@ def _described(
         words += _open_lever(name, np.array(lever), part.view.turn[part.used])
         if not known:
             words.append(f'{name}: its mount, known to {np.rad2deg(sigma[3:].max()):.0f} deg only')
-    sigma = np.sqrt(np.maximum(np.diag(spreads[base]), 0.0))
+    sigma = sigmas(fit.covariance_of(base))
     place = np.where(sigma[:3] < LEAST_KNOWN_M, frames.translation, np.nan)
     if np.isnan(place).any():
         words.append(
@@ -265,10 +218,10 @@ def _described(
     )  # fmt: skip
 
 
-def _middle(terms: tuple[Term, ...]) -> float:
+def _middle(terms: tuple[PoseTerm, ...]) -> float:
     """When the offset is the offset: at stamp zero where no rate is known."""
     for term in terms:
-        if is_of(term, Role.RATE):
+        if term.role is Role.RATE:
             return float(term.effect.record(term, np.zeros((1, 1))).parameters['middle_s'])
     return 0.0
 
@@ -292,9 +245,7 @@ def _open_lever(name: str, lever: Array, turn: Array) -> list[str]:
 
 
 def matrix_of(rotation: Array, translation: Array) -> Array:
-    """Return a rotation and a translation as one matrix, shape (4, 4); NaN where either is
-    unknown.
-    """
+    """Return rotation and translation as one matrix (4, 4); NaN where either is unknown."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     return matrix

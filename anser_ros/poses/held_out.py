@@ -22,8 +22,7 @@ Array = NDArray[np.float64]
 
 FEWEST_RECORDINGS = 8
 """Recordings at rest from which each is judged by a fit of others: of fewer the rest does not
-determine all frames, and errs by what that makes. Fewer report that for a tracker's error; more
-report what two or three places happen to be."""
+determine all frames."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +35,11 @@ class HeldOutErrors:
 
 
 def judged(problem: PoseProblem, fit: PoseFit) -> PoseProblem:
-    """Return a problem without the poses that stand out from a fit."""
-    every = replace(problem, weight=tuple(np.ones(s.size) for s in problem.sensors))
-    out = unexplained_poses(replace(fit, state=every.state(fit.terms)))
-    return replace(problem, weight=tuple(np.where(mask, 0.0, 1.0) for mask in out))
+    """Return a problem with the noise of a fit, and without the poses that stand out from it."""
+    every = tuple(np.ones(s.size) for s in problem.sensors)
+    noisy = replace(problem, weight=every, noise=fit.state.problem.noise)
+    out = unexplained_poses(noisy.state(fit.terms))
+    return replace(noisy, weight=tuple(np.where(mask, 0.0, 1.0) for mask in out))
 
 
 def errors_of(state: PoseState) -> HeldOutErrors:
@@ -51,14 +51,10 @@ def errors_of(state: PoseState) -> HeldOutErrors:
 def held_out(
     problem: PoseProblem, found: PoseFit, test: NDArray[np.int64]
 ) -> tuple[PoseState, PoseState, HeldOutErrors]:
-    """Return poses that took no part in a fit, before and after, and what registration alone
-    leaves.
-
-    ``test`` are the blocks that are held out.
-    """
-    noisy, folds = replace(problem, noise=found.state.problem.noise), [(found, test)]
+    """Return held-out poses before and after, and what registration alone leaves of them."""
+    folds = [(found, test)]
     if problem.path.is_at_rest and np.unique(problem.blocks[0]).size >= FEWEST_RECORDINGS:
-        every, known = np.unique(np.concatenate(problem.blocks)), judged(noisy, found)
+        every, known = np.unique(np.concatenate(problem.blocks)), judged(problem, found)
         parts = [every[k::TEST_EVERY] for k in range(min(TEST_EVERY, every.size))]
         folds = [
             (fit_poses(known.in_blocks(np.setdiff1d(every, part)), found.terms), part)
@@ -66,8 +62,9 @@ def held_out(
         ]
     before, after, squares = [], [], []
     for fit, part in folds:
-        frames = fit_poses(_without_stamps(fit.state.problem), frame_terms(fit.terms))
-        unseen = judged(noisy.in_blocks(part), fit)
+        exact = tuple(replace(n, stamp_s=0.0) for n in fit.state.problem.noise)
+        frames = fit_poses(replace(fit.state.problem, noise=exact), frame_terms(fit.terms))
+        unseen = judged(problem.in_blocks(part), fit)
         before.append(unseen.state(frames.terms))
         after.append(unseen.state(fit.terms))
         squares.append(_registered(frames, unseen))
@@ -128,7 +125,3 @@ def _registered(frames: PoseFit, unseen: PoseProblem) -> list[Array]:
             off = off - part.view.optical[part.used] @ rotation.T - shift
         squares.append(np.sum(off**2, axis=1))
     return squares
-
-
-def _without_stamps(problem: PoseProblem) -> PoseProblem:
-    return replace(problem, noise=tuple(replace(n, stamp_s=0.0) for n in problem.noise))

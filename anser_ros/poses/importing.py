@@ -23,9 +23,8 @@ BETWEEN_FILES_S = 10.0
 """Pause, s, between recordings without a host's time that are put one after the other. A pose is
 not interpolated over a tenth of it."""
 MOST_RESTARTS = 5
-"""Falls of a device's counter in one recording up to which they are restarts: a program that is
-restarted more often makes files of its own. Smaller takes restarts for rows in another order;
-larger, rows that are mixed up for a recording of hours."""
+"""Falls of a device's counter in one recording up to which they are restarts; of more, rows are in
+another order."""
 LATEST_S = 9e9
 """Latest time, s: stamps in ns have no room for more in 63 bits."""
 STAMPS = ('host', 'device')
@@ -43,26 +42,16 @@ def import_poses(
 ) -> PoseSession:
     """Read files of tracked poses, and of the reference's, as one session.
 
-    Parameters
-    ----------
-    tracked, reference : sequence of Path
-        Several of each are recordings one after the other, the n-th of both together.
-    stamps : {'host', 'device'}
-    unit : str, optional
-        Unit of the tracked positions where the form does not state it correctly (`LENGTH_M`).
-    quaternion : str, optional
-        How the tracked quaternions are written where it is not as usual in their form (`ORDERS`).
+    ``tracked`` and ``reference``: several of each are recordings one after the other, the n-th of
+    both together; ``unit``: unit of the tracked positions where the form does not state it
+    correctly (`LENGTH_M`); ``quaternion``: how the tracked quaternions are written where it is not
+    as usual in their form (`ORDERS`); ``names``: what sensors shall be called, by the names that
+    the files give them.
 
-    names : mapping, optional
-        What sensors shall be called, by the names that the files give them.
+    Raises `ParameterError` when a file has no known form, an option no known value, numbers of
+    files differ, or names fit no sensor or become the same.
 
-    Raises
-    ------
-    ParameterError
-        When a file has no known form, an option no known value, numbers of files differ, or
-        names fit no sensor or become the same.
-    PlausibilityError
-        When quaternions are not of unit length.
+    Raises `PlausibilityError` when quaternions are not of unit length.
     """
     for value, known in ((stamps, STAMPS), (unit, LENGTH_M), (quaternion, ORDERS)):
         if value is not None and value not in known:
@@ -76,26 +65,26 @@ def import_poses(
     lost: list[str] = []
     free = 0.0  # where the next recording without a host's time begins, s
     for number, path in enumerate(tracked):
-        file = read_form(path)
-        groups, files = _named(file.rows, None, unit, quaternion), [(path, file.unread)]
+        rows, unread = read_form(path)
+        groups, files = _named(rows, None, unit, quaternion), [(path, unread)]
         if reference:
-            file = read_form(reference[number])
-            groups |= _named(file.rows, REFERENCE, None, None)
-            files.append((reference[number], file.unread))
+            rows, unread = read_form(reference[number])
+            groups |= _named(rows, REFERENCE, None, None)
+            files.append((reference[number], unread))
         lost += [
             f'lines of {p} that are no poses, and are left out: {unread}'
             for p, unread in files
             if unread
         ]
-        times = {label: _times(rows, stamps) for label, (rows, _, _) in groups.items()}
+        times = {label: _times(table, stamps) for label, table in groups.items()}
         for label, (time, _) in times.items():
             if not np.isfinite(time).any():
                 raise ParameterError(f'{path}: {label}: no pose has a time')
         own = [time for time, is_host in times.values() if not is_host]
-        for label, (_, position, turn) in groups.items():
+        for label, table in groups.items():
             time, is_host = times[label]
             begin = 0.0 if is_host else _begin(label, times) - free
-            pieces.append((label, time - begin, position, turn))
+            pieces.append((label, time - begin, table[:, 2:5], table[:, 5:]))
         if own:
             free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
     session = _session(str(tracked[0]), _renamed(pieces, names or {}))
@@ -123,24 +112,26 @@ def _begin(label: str, times: Mapping[str, tuple[Array, bool]]) -> float:
 
 def _named(
     rows: Mapping[str, RawRows], name: str | None, unit: str | None, quaternion: str | None
-) -> dict[str, tuple[RawRows, Array, Array]]:
-    """Positions (m) and quaternions (x y z w) of each group of rows, under its name."""
+) -> dict[str, Array]:
+    """Each group of rows (n, 9) under its name, with positions in m and quaternions x y z w."""
     if name is not None:  # of an optical file only the tool with most poses is the reference
-        rows = {name: max(rows.values(), key=lambda one: np.isfinite(one.values).all(1).sum())}
+        most = max(rows.values(), key=lambda one: np.isfinite(one.table[:, 2:]).all(1).sum())
+        rows = {name: most}
     found = {}
     for label, one in rows.items():
-        table = np.array(one.values, dtype=np.float64).reshape(-1, 7)
+        table = one.table
         order, is_inverse = ORDERS[quaternion or one.form]
-        turn = table[:, 3:][:, list(order)]
+        table[:, 2:5] *= LENGTH_M[unit or one.unit]
+        table[:, 5:] = table[:, 5:][:, list(order)]
         if is_inverse:
-            turn = turn * np.array([-1.0, -1.0, -1.0, 1.0])
-        found[label] = one, table[:, :3] * LENGTH_M[unit or one.unit], turn
+            table[:, 5:8] *= -1.0
+        found[label] = table
     return found
 
 
-def _times(rows: RawRows, stamps: str) -> tuple[Array, bool]:
+def _times(table: Array, stamps: str) -> tuple[Array, bool]:
     """Times of a group of rows, s, and whether they are on the host's axis."""
-    host, device = np.array(rows.host), np.array(rows.device)
+    host, device = table[:, 0], table[:, 1].copy()
     if not np.isfinite(host).any():
         return _continued(device), False
     if stamps == 'host' or not np.isfinite(device).any():

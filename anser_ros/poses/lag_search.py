@@ -3,15 +3,13 @@
 import numpy as np
 
 from anser_ros.diagnosis.decisions import LEAST_GAIN
-from anser_ros.poses.effect import Role, effect_of, is_of
+from anser_ros.poses.effect import Role
 from anser_ros.poses.fit import PoseFit, fit_poses, with_time_constants
 from anser_ros.poses.prices import gain_of, price
 from anser_ros.poses.registry import pose_effects
 
 CHANCE_SIGMAS = 3.0
-"""Standard deviations of what chance adds to the noise that a smoother reference takes off.
-Smaller names a filter for noise in one clean session of a hundred; larger compares slight filters
-with a smoother reference."""
+"""Standard deviations of what chance adds to the noise that a smoother reference takes off."""
 LAG_STEPS = (1.4, 1.4, 1.2, 1.1, 1.05)  # factors of a time constant by which it is neared
 
 
@@ -22,7 +20,7 @@ def with_lag(
 
     Also the best fit with a low pass or a smooth reference, whether it pays or not.
     """
-    if any(is_of(term, Role.FILTER) for term in fit.terms):
+    if any(term.role is Role.FILTER for term in fit.terms):
         return None, None
     trials = [
         fit_poses(fit.state.problem, [*fit.terms, term], 3)
@@ -34,7 +32,7 @@ def with_lag(
     term = trial.terms[-1]
     noisy = _is_smoothing(fit, trial)
     widths = [term.with_theta(factor * term.theta) for factor in (0.5, 1.0, 2.0) if noisy]
-    rivals = [fit_poses(fit.state.problem, [*fit.terms, effect_of(t).rival(t)], 3) for t in widths]
+    rivals = [fit_poses(fit.state.problem, [*fit.terms, t.effect.rival(t)], 3) for t in widths]
     best = min([fit, *rivals], key=lambda f: f.held_out())
     gain = gain_of(best, trial, term)
     need = price(term, fit.held_out(), fit)
@@ -89,5 +87,5 @@ def finest_lag(fit: PoseFit) -> PoseFit:
 
 def _slower(fit: PoseFit, factor: float) -> PoseFit:
     """The fit with time constants so many times as long, and all else fitted again."""
-    terms = [t.with_theta(factor * t.theta) if is_of(t, Role.FILTER) else t for t in fit.terms]
+    terms = [t.with_theta(factor * t.theta) if t.role is Role.FILTER else t for t in fit.terms]
     return fit_poses(fit.state.problem, terms, 3)

@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.poses.effect import Role, effect_of, is_of
+from anser_ros.effects.effect import sigmas
+from anser_ros.poses.effect import Role
 from anser_ros.poses.fit import PoseFit
 from anser_ros.poses.problem import PosePart
 from anser_ros.poses.sequence import PoseSequence, PoseSession
@@ -19,27 +20,23 @@ LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
 the motion does not determine it."""
 MUCH_TILT = 0.15
 """Turns of the body, rad rms, that move a lever arm of 5 cm by 8 mm, as much as a slow filter
-moves a hand. Smaller takes what goes with small turns for effects; larger looks for no effect
-where a large one hides the lever arm."""
+moves a hand."""
 HARDLY_DETERMINED_M = 0.022
 """Lever arm, m, that would make the median error by turns alone, from which the motion does not
-determine it, whatever its formal uncertainty: errors of trackers go with the turns of a hand. On
-recordings of one body levers were off by 9 mm and more beyond this, and by 4 mm and less below."""
+determine it: beyond this levers of recordings were off by 9 mm and more, below by 4 and less."""
 
 OWN_ERROR_M = 1e-3
-"""Error, m, that a tracker has of itself: data sheets say 0.5 to 1.4 mm. A motion of some seconds
-leaves less, because the frames take up what goes with its turns: on parts of recordings of one
-body levers were off by 37 mm with 0.2 mm left. Smaller gives such levers; larger gives none of a
-hand-held body."""
+"""Error, m, that a tracker has of itself (data sheets: 0.5 to 1.4 mm). A motion of some seconds
+leaves less, as the frames take up what goes with its turns, and with it wrong levers."""
 
 
-def is_lever_determined(part: PosePart, jitter_rad: float) -> NDArray[np.bool_]:
-    """Return the mask (3,) of the components of a lever arm that the motion determines."""
-    return _is_turned_for(part, jitter_rad, OWN_ERROR_M)
+def is_lever_determined(
+    part: PosePart, jitter_rad: float, error_m: float = OWN_ERROR_M
+) -> NDArray[np.bool_]:
+    """Return the mask (3,) of the components of a lever arm that the motion determines.
 
-
-def _is_turned_for(part: PosePart, jitter_rad: float, error_m: float) -> NDArray[np.bool_]:
-    """Mask (3,) of the components that turns determine, with errors of at least so much."""
+    The tracker's errors are taken to be ``error_m`` at least.
+    """
     if not part.used.any():
         return np.zeros(3, dtype=np.bool_)
     is_near = lever_reach(part, error_m) < HARDLY_DETERMINED_M
@@ -100,13 +97,13 @@ def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
     with hardly a turn, or not moved at all. Much tilt determines them once the effects are found,
     however large the error is that these make before.
     """
-    shaking, covariance = turn_jitter(reference), fit.covariance()
+    shaking = turn_jitter(reference)
     parts = {part.view.sensor: part for part in fit.state.parts}
     for index, term in enumerate(fit.terms):
-        if is_of(term, Role.MOUNT):
-            part = parts[str(effect_of(term).sensor_of(term))]
-            sigma = np.sqrt(np.maximum(np.diag(fit.covariance_of(index, covariance)), 0.0))[:3]
-            is_known = (sigma < LEAST_KNOWN_M) & _is_turned_for(part, shaking, 0.0)
+        if term.role is Role.MOUNT:
+            part = parts[str(term.sensor)]
+            sigma = sigmas(fit.covariance_of(index))[:3]
+            is_known = (sigma < LEAST_KNOWN_M) & is_lever_determined(part, shaking, 0.0)
             turns = _turn_information(part) if part.used.any() else np.zeros((3, 3))
             tilted = np.sqrt(np.diag(turns)) > MUCH_TILT
             if np.count_nonzero(is_known | tilted) >= 2:

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.term import Term
+from anser_ros.diagnosis.scoring import block_sums
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses
-from anser_ros.poses.effect import Role, effect_of
+from anser_ros.poses.effect import PoseTerm, Role
 from anser_ros.poses.problem import PoseProblem, PoseState
 from anser_ros.poses.registry import effect_of_record, pose_effects
 from anser_ros.poses.sequence import REFERENCE, PoseSession
@@ -35,36 +35,21 @@ FEWEST_POSES_OF_CHANGE = 20  # poses of the later half of a window by which a ch
 
 @dataclass(frozen=True)
 class PoseSighting:
-    """Holds what one look at the last seconds found.
+    """Holds what one look at the last seconds found."""
 
-    Attributes
-    ----------
-    findings : tuple of EffectRecord
-        What is wrong; empty when all is well or nothing that is known explains it.
-    poses : int
-        Tracked poses that were looked at.
-    before_m, after_m, jitter_m : float
-        Held-out error with hand-eye alone and with the findings, and what jitter makes; NaN where
-        the poses were judged by the frames of earlier.
-    misfit_m : float
-        Median distance from where the frames of earlier have the poses; NaN before there are any.
-    unexplained : float
-        Share of the squared error above the jitter that nothing explains.
-    depends_on : tuple of str
-        What that depends on.
-    remark : str
-        Why nothing is named although something is there.
-    """
-
+    # What is wrong; empty when all is well or nothing that is known explains it.
     findings: tuple[EffectRecord, ...]
-    poses: int
+    poses: int  # tracked poses that were looked at
+    # Held-out error with hand-eye alone and with the findings, and what jitter makes; NaN where
+    # the poses were judged by the frames of earlier.
     before_m: float = float('nan')
     after_m: float = float('nan')
     jitter_m: float = float('nan')
+    # Median distance from where the frames of earlier have the poses; NaN before there are any.
     misfit_m: float = float('nan')
-    unexplained: float = 0.0
-    depends_on: tuple[str, ...] = ()
-    remark: str = ''
+    unexplained: float = 0.0  # share of the squared error above the jitter that nothing explains
+    depends_on: tuple[str, ...] = ()  # what that depends on
+    remark: str = ''  # why nothing is named although something is there
 
     @property
     def is_clear(self) -> bool:
@@ -74,9 +59,9 @@ class PoseSighting:
 
 @dataclass(frozen=True)
 class _Known:
-    """The frames and effects of the first look that told them all."""
+    """The frames and effects of the first look that determined them all."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[PoseTerm, ...]
     misfit: dict[str, float]
     jitter_m: float
 
@@ -84,10 +69,7 @@ class _Known:
 class PoseWatch:
     """Looks at one window after the other, and remembers the frames it learnt first.
 
-    Attributes
-    ----------
-    searches : int
-        How often effects were searched for.
+    ``searches``: how often effects were searched for.
     """
 
     def __init__(self) -> None:
@@ -97,12 +79,8 @@ class PoseWatch:
     def look(self, session: PoseSession) -> PoseSighting:
         """Look at a window whose stamps count from its own beginning.
 
-        Raises
-        ------
-        DiagnosisError
-            When there are too few poses to say anything.
-        PlausibilityError
-            When tracked and optical poses fit in no reading.
+        Raises `DiagnosisError` when there are too few poses to say anything.
+        Raises `PlausibilityError` when tracked and optical poses fit in no reading.
         """
         poses = sum(one.size for one in session.sensors.values())
         frozen, since = frozen_streams(session)
@@ -135,7 +113,7 @@ class PoseWatch:
             return float('nan'), (), ''
         problem = _later_half(pose_problem(session))
         present = {None, *(poses.name for poses in problem.sensors)}
-        terms = [t for t in known.terms if effect_of(t).sensor_of(t) in present]
+        terms = [t for t in known.terms if t.sensor in present]
         state = problem.state(terms)
         misfit = _misfits(state)
         if not misfit or not set(misfit) <= set(known.misfit):
@@ -150,8 +128,8 @@ class PoseWatch:
         trials = []
         for index, term in enumerate(terms):
             # The reference's frame is every sensor's, a mount is its own.
-            effect = effect_of(term)
-            if effect.role.is_frame and off == [s for s in misfit if effect.acts_on(term, s)]:
+            effect = term.effect
+            if effect.role.is_frame and off == [s for s in misfit if term.acts_on(s)]:
                 moved = _fitted_alone(problem, terms, index)
                 left = max(_misfits(problem.state(moved)).values())
                 trials.append((left, index, moved))
@@ -171,7 +149,7 @@ class PoseWatch:
         if self._known is None or any(effect_of_record(r).makes_jitter for r in named):
             return ()
         factor = found.floor_m / max(self._known.jitter_m, 1e-9)
-        return [r for effect in pose_effects().values() for r in effect.noisier(factor)]
+        return [r for effect in pose_effects().values() for r in effect.more_jitter(factor)]
 
 
 def frozen_streams(session: PoseSession) -> tuple[tuple[EffectRecord, ...], float]:
@@ -216,22 +194,23 @@ def _learnt(session: PoseSession, found: PoseDiagnosis) -> _Known | None:
     return _Known(found.fit.terms, misfit, found.floor_m) if misfit else None
 
 
-def _fitted_alone(problem: PoseProblem, terms: Sequence[Term], index: int) -> list[Term]:
+def _fitted_alone(problem: PoseProblem, terms: Sequence[PoseTerm], index: int) -> list[PoseTerm]:
     """The terms with one of them fitted to the poses, all others as they are."""
     trial = list(terms)
     prior = trial[index].effect.prior(trial[index])
     for _ in range(FRAME_STEPS):
-        sums = problem.state(trial).sums([trial[index]])
+        state = problem.state(trial)
+        sums = block_sums(state.parts, state.design(trial[index]), state.numbers)
         moved = trial[index].with_theta(trial[index].theta + sums.step(prior, 0.0))
         trial[index] = moved.effect.bounded(moved)
     return trial
 
 
 def _change(
-    before: Term, after: Term, state: PoseState, worst: float, left: float
+    before: PoseTerm, after: PoseTerm, state: PoseState, worst: float, left: float
 ) -> EffectRecord:
     """The change of a frame as an effect, with the misfits (m) without and with it."""
     middle = np.concatenate([p.view.optical[p.used] for p in state.parts]).mean(axis=0)
-    record = effect_of(before).moved(before, after, middle)
+    record = before.effect.moved(before, after, middle)
     misfits = {'misfit_before_m': worst, 'misfit_after_m': left}
     return replace(record, evidence={**misfits, **record.evidence})

@@ -17,18 +17,10 @@ MOST_POSES = 6000
 class PoseWindow:
     """Keeps what came in the last seconds by the stamps of each stream.
 
-    Parameters
-    ----------
-    sensors : sequence of str
-        Names of the tracked streams; the reference is `REFERENCE`.
-    length_s : float
+    ``sensors``: names of the tracked streams; the reference is `REFERENCE`.
 
-    Attributes
-    ----------
-    restarts : int
-        How often the stamps of a stream ran backwards, and all was forgotten.
-    first_ns : int
-        Stamp of the first pose of all; 0 before.
+    ``restarts``: how often the stamps of a stream ran backwards, and all was forgotten;
+    ``first_ns``: stamp of the first pose of all; 0 before.
     """
 
     def __init__(self, sensors: Sequence[str], length_s: float) -> None:
@@ -59,10 +51,7 @@ class PoseWindow:
     def session(self, without: Iterable[str] = ()) -> PoseSession | None:
         """Return what is in the window, without some streams; None while nothing is tracked.
 
-        Raises
-        ------
-        PlausibilityError
-            When quaternions are not of unit length.
+        Raises `PlausibilityError` when quaternions are not of unit length.
         """
         left_out = set(without)
         kept = {n: list(r) for n, r in self._rows.items() if r and n not in left_out}

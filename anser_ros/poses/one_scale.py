@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 from scipy.special import ndtri
 
-from anser_ros.poses.effect import Role, effect_of, is_of
+from anser_ros.poses.effect import Role
 from anser_ros.poses.fit import PoseFit, fit_poses
 
 SAME_SCALE = 1 / 370
@@ -29,10 +29,10 @@ def is_one_scale(fit: PoseFit) -> bool:
         # A map of its own would take up what differs.
         terms = [
             t for t in fit.terms
-            if effect_of(t).acts_on(t, poses.name) and not is_of(t, Role.MAP)
+            if t.acts_on(poses.name) and t.role is not Role.MAP
         ]  # fmt: skip
         one = fit_poses(alone, terms)
-        index = next(k for k, t in enumerate(one.terms) if is_of(t, Role.SCALE))
+        index = next(k for k, t in enumerate(one.terms) if t.role is Role.SCALE)
         scale = 1e-3 * float(one.terms[index].theta[0])
         found.append((scale, 1e-3 * float(np.sqrt(one.covariance_of(index)[0, 0]))))
     pairs = list(combinations(found, 2))

@@ -21,39 +21,27 @@ FEWEST_PATH_POSES = 4
 MEDIAN_GAPS = 2.5
 """Gap in median intervals over which a slow reference is interpolated: one pose may be lost."""
 STEPS_A_TAU = 20
-"""Steps of a filter's grid in its time constant. Straight lines between them round off motions a
-little more, by a twelfth of the step's square: fewer make the time constant that is found too
-short, eight by 0.13 %, which is three of its standard deviations; more cost time."""
+"""Steps of a filter's grid in its time constant. Straight lines between them round off motions;
+eight make the time constant too short by three of its standard deviations."""
 SMALLEST_STEP_S = 0.002  # grid of a filter, s: a hand moves by 0.2 mm in it
 
 
 @dataclass(frozen=True, eq=False)
 class OpticalPath:
-    """Describes a body's path as cubic pieces through its poses, with a parabola's slopes at each.
+    """Describes a body's path: cubic pieces through its poses, a parabola's slopes at each."""
 
-    Attributes
-    ----------
-    knots : ndarray, shape (m,)
-        Times of the poses, s.
-    longest_gap : float
-        Gap over which nothing is interpolated, s.
-    is_at_rest : bool
-        Whether all is at rest whenever there is a pose: what differs is noise and no velocity.
-    """
-
-    knots: Array
-    longest_gap: float
+    knots: Array  # (m,), times of the poses, s
+    longest_gap: float  # gap over which nothing is interpolated, s
+    # Whether all is at rest whenever there is a pose: what differs is noise and no velocity.
     is_at_rest: bool
     _spline: CubicHermiteSpline
+    source: 'OpticalPath | None' = None  # of a filtered path, known where this is known
 
     @classmethod
     def through(cls, track: PoseTrack, is_at_rest: bool = False) -> 'OpticalPath':
         """Return the path through a track's poses.
 
-        Raises
-        ------
-        DiagnosisError
-            When there are too few poses.
+        Raises `DiagnosisError` when there are too few poses.
         """
         time = track.time
         if time.size < FEWEST_PATH_POSES:
@@ -79,9 +67,7 @@ class OpticalPath:
 
         Times without a valid path get the nearest pose, at rest.
         """
-        inside = np.clip(time, self.knots[0], self.knots[-1])
-        right = np.clip(np.searchsorted(self.knots, inside, side='left'), 1, self.knots.size - 1)
-        valid = (inside == time) & (self.knots[right] - self.knots[right - 1] <= self.longest_gap)
+        inside, valid = np.clip(time, self.knots[0], self.knots[-1]), self._valid(time)
         values, slopes = self._spline(inside), self._spline(inside, 1)
         norm = np.maximum(np.linalg.norm(values[:, 3:], axis=1, keepdims=True), 1e-6)
         turn, rate = values[:, 3:] / norm, slopes[:, 3:] / norm
@@ -91,7 +77,16 @@ class OpticalPath:
         velocity[:, 3:] = 2 * (d_vector * scalar - d_scalar * vector - np.cross(d_vector, vector))
         velocity[~valid | self.is_at_rest] = 0.0
         matrices = np.asarray(Rotation.from_quat(turn).as_matrix()).reshape(-1, 3, 3)
+        if self.source is not None:
+            valid = valid & self.source._valid(time)
         return values[:, :3], matrices, velocity, valid
+
+    def _valid(self, time: Array) -> Mask:
+        """Where it is interpolated: between poses that are near each other."""
+        right = np.clip(np.searchsorted(self.knots, time, side='left'), 1, self.knots.size - 1)
+        inside = (time >= self.knots[0]) & (time <= self.knots[-1])
+        near = self.knots[right] - self.knots[right - 1] <= self.longest_gap
+        return np.asarray(inside & near)
 
     def jitter(self, lever: Array) -> float:
         """Return the rms, m a coordinate, by which a point (3,) of the body leaves its own course.
@@ -101,9 +96,9 @@ class OpticalPath:
         """
         place, turn, _, _ = self.at(self.knots)
         point, time = place + turn @ lever, self.knots
-        near = np.stack([time[:-4], time[1:-3], time[3:-1], time[4:]]) - time[2:-2]
+        four = np.arange(time.size - 4) + np.array([[0], [1], [3], [4]])
+        near, about = time[four] - time[2:-2], point[four]
         weight = np.stack([_share_at_zero(near, k) for k in range(4)])
-        about = np.stack([point[:-4], point[1:-3], point[3:-1], point[4:]])
         off = point[2:-2] - np.einsum('kn,kni->ni', weight, about)
         whole = near[3] - near[0] < 4 * self.longest_gap
         size = off[whole] / np.sqrt(1 + np.sum(weight**2, axis=0))[whole, None]
@@ -123,31 +118,6 @@ def _share_at_zero(nodes: Array, k: int) -> Array:
     return np.asarray(np.prod([-nodes[j] / (nodes[k] - nodes[j]) for j in others], axis=0))
 
 
-@dataclass(frozen=True)
-class _Gaps:
-    """Where a path is interpolated: between poses that are near each other."""
-
-    knots: Array
-    longest_gap: float
-
-    def valid(self, time: Array) -> Mask:
-        right = np.clip(np.searchsorted(self.knots, time, side='left'), 1, self.knots.size - 1)
-        inside = (time >= self.knots[0]) & (time <= self.knots[-1])
-        near = self.knots[right] - self.knots[right - 1] <= self.longest_gap
-        return np.asarray(inside & near)
-
-
-@dataclass(frozen=True, eq=False)
-class _FilteredPath(OpticalPath):
-    """A filtered path is on a grid of its own, and known where the unfiltered one is."""
-
-    gaps: _Gaps
-
-    def at(self, time: Array) -> tuple[Array, Array, Array, Mask]:
-        position, rotation, velocity, valid = super().at(time)
-        return position, rotation, velocity, valid & self.gaps.valid(time)
-
-
 @lru_cache(maxsize=8)
 def _behind(path: OpticalPath, tau: float, two_sided: bool) -> OpticalPath:
     """Return what `OpticalPath.filtered` does; a fit asks again and again for the same filter."""
@@ -164,5 +134,4 @@ def _behind(path: OpticalPath, tau: float, two_sided: bool) -> OpticalPath:
         driven = lfilter([1 - late, late - keep], [1.0, -keep], turned - turned[0], axis=0)
         passed = (driven + turned[0])[::way]
     spline = CubicHermiteSpline(grid, passed, np.gradient(passed, grid, axis=0))
-    gaps = _Gaps(path.knots, path.longest_gap)
-    return _FilteredPath(grid, path.longest_gap, path.is_at_rest, spline, gaps)
+    return OpticalPath(grid, path.longest_gap, path.is_at_rest, spline, path)

@@ -15,13 +15,7 @@ from anser_ros.poses.smooth_map import SMOOTH
 def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
     """Return what a corrector needs of an error map; a map that is not confirmed corrects nothing.
 
-    Parameters
-    ----------
-    found : ErrorMap
-    sensor : str
-        Whose poses are to be corrected.
-    source : str
-        Where the points are from.
+    ``sensor``: whose poses are to be corrected; ``source``: where the points are from.
     """
     turn = Rotation.from_matrix(found.rotation).as_rotvec(degrees=True)
     frames = {

@@ -2,14 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.diagnosis.scoring import BlockSums
-from anser_ros.effects.term import Term
-from anser_ros.poses.effect import PoseSetting, PoseView, Role, effect_of, frames_of, is_of
+from anser_ros.calibration.blocks import FOLDS
+from anser_ros.diagnosis.engine import JointState
+from anser_ros.diagnosis.scoring import BlockSums, block_sums, joined
+from anser_ros.poses.effect import PoseSetting, PoseTerm, PoseView, Role, frames_of
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.sequence import PoseSequence
 
@@ -24,19 +27,11 @@ filter's grid; larger, its curvature."""
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """States how far a sensor's poses are off without any effect, one standard deviation.
+    """States how far a sensor's poses are off without any effect, one standard deviation."""
 
-    Attributes
-    ----------
-    position_m, orientation_rad : float
-        Of each coordinate.
-    stamp_s : float
-        Of the stamps against each other: moves a pose along its own velocity.
-    """
-
-    position_m: float
+    position_m: float  # of each coordinate
     orientation_rad: float
-    stamp_s: float = 0.0
+    stamp_s: float = 0.0  # of the stamps against each other: moves a pose along its own velocity
 
     def whitened(self, values: Array, velocity: Array) -> Array:
         """Return values (n, 6, ...) in units of their spread; velocity (n, 6) as in `PoseView`."""
@@ -45,9 +40,7 @@ class PoseNoise:
         return self.without_stamps(values * scale.reshape(shape), velocity)
 
     def without_stamps(self, values: Array, velocity: Array) -> Array:
-        """Return values (n, 6, ...) of unit spread apart from what errors of stamps add, without
-        that.
-        """
+        """Return values (n, 6, ...) of unit spread without what errors of stamps add."""
         if self.stamp_s == 0.0:
             return values
         scale = np.repeat([1 / self.position_m, 1 / self.orientation_rad], 3)
@@ -61,30 +54,14 @@ class PoseNoise:
 
 @dataclass(frozen=True)
 class PoseProblem:
-    """Holds everything that a fit starts from.
+    """Holds everything that a fit starts from; what is one of each sensor stands in tuples."""
 
-    Attributes
-    ----------
-    sensors : tuple of PoseSequence
-        Poses in the order of time; repeats are left out.
-    path : OpticalPath
-        Of the reference.
-    setting : PoseSetting
-    blocks : tuple of ndarray of int, one per sensor, shape (n,)
-        Number of the time block that each pose is in.
-    places : tuple of ndarray of int, one per sensor, shape (n,)
-        Number of the block of space.
-    weight : tuple of ndarray, one per sensor, shape (n,)
-        Square root of what a pose counts; zero leaves it out.
-    noise : tuple of PoseNoise, one per sensor
-    """
-
-    sensors: tuple[PoseSequence, ...]
-    path: OpticalPath
+    sensors: tuple[PoseSequence, ...]  # poses in the order of time; repeats are left out
+    path: OpticalPath  # of the reference
     setting: PoseSetting
-    blocks: tuple[Ints, ...]
-    places: tuple[Ints, ...]
-    weight: tuple[Array, ...]
+    blocks: tuple[Ints, ...]  # (n,), number of the time block that each pose is in
+    places: tuple[Ints, ...]  # (n,), number of the block of space
+    weight: tuple[Array, ...]  # (n,), square root of what a pose counts; zero leaves it out
     noise: tuple[PoseNoise, ...]
 
     def rows(self, keep: Sequence[NDArray[np.generic]]) -> 'PoseProblem':
@@ -101,8 +78,8 @@ class PoseProblem:
         """Return the problem with only the poses in some blocks of time."""
         return self.rows([np.isin(blocks, wanted) for blocks in self.blocks])
 
-    def state(self, terms: Sequence[Term]) -> 'PoseState':
-        """Return all poses predicted with some effects in force, and what they are missed by."""
+    def state(self, terms: Sequence[PoseTerm]) -> 'PoseState':
+        """Return all poses predicted with some active effects, and what they are missed by."""
         parts = []
         for i, sensor in enumerate(self.sensors):
             view, residual, known = _predicted(self.path, sensor, terms)
@@ -113,20 +90,19 @@ class PoseProblem:
 
 
 def _predicted(
-    path: OpticalPath, sensor: PoseSequence, terms: Sequence[Term]
+    path: OpticalPath, sensor: PoseSequence, terms: Sequence[PoseTerm]
 ) -> tuple[PoseView, Array, Mask]:
     """View, residual (n, 6) measured less predicted, and where the reference is known."""
     time, position, rotation = sensor.time, sensor.position, sensor.rotation
     frames = frames_of(terms, sensor.name)
     frame, lever = frames.rotation, frames.lever
     for term in terms:
-        effect = effect_of(term)
-        path = effect.filter(term, path) if effect.acts_on(term, sensor.name) else path
-        time = effect.clock(term, sensor.name, time)
-        position, rotation = effect.corrected(term, sensor.name, position, rotation)
+        path = term.effect.filter(term, path) if term.acts_on(sensor.name) else path
+        time = term.effect.clock(term, sensor.name, time)
+        position = term.effect.corrected(term, sensor.name, position)
     optical, turn, velocity, known = path.at(time)
     for term in terms:
-        optical = effect_of(term).seen(term, optical)
+        optical = term.effect.seen(term, optical)
     body = frame @ turn
     arm = body @ lever
     predicted = optical @ frame.T + arm + frames.translation
@@ -148,27 +124,16 @@ def _predicted(
 
 @dataclass(frozen=True)
 class PosePart:
-    """Holds one sensor's prediction and residual.
-
-    Attributes
-    ----------
-    view : PoseView
-    residual : ndarray, shape (n, 6)
-        Measured less predicted: m, and rad along the tracker's axes.
-    weight : ndarray, shape (n,)
-        Square root of what a pose counts.
-    noise : PoseNoise
-    blocks, places : ndarray of int, shape (n,)
-    """
+    """Holds one sensor's prediction and residual."""
 
     view: PoseView
-    residual: Array
-    weight: Array
+    residual: Array  # (n, 6), measured less predicted: m, and rad along the tracker's axes
+    weight: Array  # (n,), square root of what a pose counts
     noise: PoseNoise
-    blocks: Ints
-    places: Ints
+    blocks: Ints  # (n,)
+    places: Ints  # (n,)
 
-    @property
+    @cached_property
     def white(self) -> Array:
         """Return residuals in units of their spread, weighted, shape (n, 6)."""
         return self.weight[:, None] * self.noise.whitened(self.residual, self.view.velocity)
@@ -178,24 +143,32 @@ class PosePart:
         """Return a mask (n,) of the poses that have a weight."""
         return self.weight > 0
 
-
-@dataclass(frozen=True)
-class PoseState:
-    """Holds a problem with a list of terms in force."""
-
-    problem: PoseProblem
-    terms: tuple[Term, ...]
-    parts: tuple[PosePart, ...]
-
-    @property
-    def sum_of_squares(self) -> float:
-        """Return the sum of squares of the whitened residuals."""
-        return float(sum(np.sum(part.white**2) for part in self.parts))
-
     @property
     def count(self) -> int:
         """Return the number of values that have a weight, six a pose."""
-        return int(6 * sum(np.count_nonzero(part.used) for part in self.parts))
+        return 6 * int(np.count_nonzero(self.used))
+
+
+@dataclass(frozen=True)
+class PoseState(JointState[PoseTerm, PosePart]):
+    """Holds a problem of poses with a list of active terms."""
+
+    problem: PoseProblem
+    folds: ClassVar[int] = FOLDS
+
+    @property
+    def numbers(self) -> Ints:
+        """Return the numbers of the blocks."""
+        return np.unique(np.concatenate([part.blocks for part in self.parts]))
+
+    @property
+    def in_space(self) -> 'PoseState':
+        """Return the state with blocks of space in place of those of time."""
+        return replace(self, parts=tuple(replace(p, blocks=p.places) for p in self.parts))
+
+    def moved(self, terms: Sequence[PoseTerm]) -> 'PoseState':
+        """Return the state of the same problem with other terms."""
+        return self.problem.state(terms)
 
     def rms(self, sensor: str | None = None) -> tuple[float, float]:
         """Return distance (m) and angle (rad), root mean square over the poses that count."""
@@ -206,63 +179,56 @@ class PoseState:
         squares = np.mean(every**2, axis=0)
         return float(np.sqrt(squares[:3].sum())), float(np.sqrt(squares[3:].sum()))
 
-    def sums(
-        self,
-        terms: Sequence[Term] | None = None,
-        in_space: bool = False,
-        filter_slopes: bool = False,
-        stamps_exact: bool = False,
-    ) -> BlockSums:
-        """Return normal equations of the terms' parameters, block by block.
+    def design(self, term: PoseTerm, probe: bool = False) -> list[Array | None]:
+        """Return whitened columns of a term, one array (n, 6, q) a sensor."""
+        return self._whitened(self._slopes(term))
 
-        With ``filter_slopes`` time constants of filters, which have no slopes of their own, count
-        by differences; otherwise they are held. Positions alone tell times then: how a tracker
-        takes means of orientations (of vectors, quaternions or matrices) is not known, and moves
-        a time constant by two standard deviations. With ``stamps_exact`` the normal equations are
-        the scores' variance if the stamps have no errors after all, with the weights as they are.
+    def sums_with(self, filter_slopes: bool = False, stamps_exact: bool = False) -> BlockSums:
+        """Return normal equations by the slopes of filters, or as if the stamps were exact.
+
+        Time constants of filters, which have no slopes of their own, count by differences.
+        Positions alone tell times then: how a tracker takes means of orientations (of vectors,
+        quaternions or matrices) is not known, and moves a time constant by two standard
+        deviations. With ``stamps_exact`` the normal equations are the scores' variance if the
+        stamps have no errors after all, with the weights as they are.
         """
-        wanted = self.terms if terms is None else tuple(terms)
-        sizes = [term.theta.size for term in wanted]
-        edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-        labels = [part.places if in_space else part.blocks for part in self.parts]
-        numbers = np.unique(np.concatenate(labels)) if labels else np.zeros(0, dtype=np.int64)
-        total = int(edges[-1])
-        normal = np.zeros((numbers.size, total, total))
-        right, squares = np.zeros((numbers.size, total)), np.zeros(numbers.size)
-        filters = [t for t in wanted if is_of(t, Role.FILTER)] if filter_slopes else []
-        turned = {t.name_and_site: self._differences(t) for t in filters}
-        for i, (part, label) in enumerate(zip(self.parts, labels, strict=True)):
-            columns = np.zeros((part.residual.shape[0], 6, total))
-            for term, a, b in zip(wanted, edges[:-1], edges[1:], strict=True):
-                slope = effect_of(term).slopes(term, part.view)
-                if term.name_and_site in turned:
-                    slope = turned[term.name_and_site][i]
-                if slope is not None and turned and effect_of(term).role.moves_times:
+        is_filtered = filter_slopes and any(term.role is Role.FILTER for term in self.terms)
+        groups = []
+        for term in self.terms:
+            is_filter = is_filtered and term.role is Role.FILTER
+            slopes = self._differences(term) if is_filter else self._slopes(term)
+            if is_filtered and (is_filter or term.role.is_clock):
+                for slope in slopes:
                     slope[:, 3:] = 0.0
-                if slope is not None:
-                    columns[:, :, a:b] = slope
-            white = part.white
-            columns = part.noise.whitened(columns, part.view.velocity)
+            groups.append(self._whitened(slopes, stamps_exact))
+        return block_sums(self.parts, joined(groups), self.numbers)
+
+    def _slopes(self, term: PoseTerm) -> list[Array]:
+        """Slopes (n, 6, q) of predicted less measured poses by a term's parameters."""
+        found = [term.effect.slopes(term, part.view) for part in self.parts]
+        return [
+            np.zeros((*part.residual.shape, term.theta.size)) if slope is None else slope
+            for part, slope in zip(self.parts, found, strict=True)
+        ]
+
+    def _differences(self, term: PoseTerm) -> list[Array]:
+        """The same by a filter's time constant, (n, 6, 1)."""
+        step = FILTER_STEP * term.theta
+        more, less = (
+            self.moved([t.with_theta(t.theta + way * step) if t is term else t
+                        for t in self.terms]).parts
+            for way in (1, -1)
+        )  # fmt: skip
+        return [
+            (b.residual - a.residual)[:, :, None] / (2 * step[0])
+            for a, b in zip(more, less, strict=True)
+        ]
+
+    def _whitened(self, slopes: Sequence[Array], stamps_exact: bool = False) -> list[Array | None]:
+        out: list[Array | None] = []
+        for part, slope in zip(self.parts, slopes, strict=True):
+            columns = part.noise.whitened(slope, part.view.velocity)
             if stamps_exact:
                 columns = part.noise.without_stamps(columns, part.view.velocity)
-            columns *= part.weight[:, None, None]
-            for row, number in enumerate(numbers):
-                chosen = label == number
-                flat, rest = columns[chosen].reshape(-1, total), white[chosen].ravel()
-                normal[row] += flat.T @ flat
-                right[row] += flat.T @ rest
-                squares[row] += rest @ rest
-        return BlockSums(normal, right, squares)
-
-    def _differences(self, term: Term) -> list[Array]:
-        """Slopes (n, 6, 1) of predicted less measured poses by a filter's time constant."""
-        step = FILTER_STEP * term.theta
-        ends = [
-            self.problem.state([t.with_theta(t.theta + way * step) if t is term else t
-                                for t in self.terms]).parts
-            for way in (1, -1)
-        ]  # fmt: skip
-        return [
-            (less.residual - more.residual)[:, :, None] / (2 * step[0])
-            for more, less in zip(*ends, strict=True)
-        ]
+            out.append(columns * part.weight[:, None, None])
+        return out

@@ -33,20 +33,12 @@ def read_pose_session(
 ) -> PoseSession:
     """Read a bag of tracked and optical poses.
 
-    Parameters
-    ----------
-    path : path of the ``.mcap`` file or of the bag's folder
-    tracked : mapping, optional
-        Topic of each sensor by the sensor's name; by default all ``/tracked/<sensor>/pose``.
-    optical : str, optional
-        Topic of the reference; by default the only ``/optical/<body>/pose``.
+    ``tracked``: topic of each sensor by the sensor's name; by default all
+    ``/tracked/<sensor>/pose``; ``optical``: topic of the reference; by default the only
+    ``/optical/<body>/pose``.
 
-    Raises
-    ------
-    BagError
-        When the bag can't be read, or has no tracked poses, or several references.
-    PlausibilityError
-        When quaternions are not of unit length.
+    Raises `BagError` when the bag can't be read, or has no tracked poses, or several references.
+    Raises `PlausibilityError` when quaternions are not of unit length.
     """
     name, salvage, decoder = os.fspath(path), Salvage(), MessageDecoder()
     stamps: dict[str, list[int]] = {}
@@ -96,10 +88,7 @@ def _only_optical(path: str, topics: list[str]) -> str | None:
 def write_pose_session(path: Path, session: PoseSession) -> None:
     """Write a session of poses as a bag; where a device had no pose, values are NaN.
 
-    Raises
-    ------
-    BagError
-        When the file exists already.
+    Raises `BagError` when the file exists already.
     """
     sequences = [(tracked_topic(n), s) for n, s in session.sensors.items()]
     if session.reference is not None:

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.effects.effect import sigmas
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.clock_records import one_clock
-from anser_ros.poses.effect import Frames, Role, effect_of, frames_of, is_of
+from anser_ros.poses.effect import Role, frames_of
 from anser_ros.poses.fit import PoseFit
 from anser_ros.poses.lever_arms import (
     LEAST_KNOWN_M,
@@ -28,75 +29,61 @@ def records_of(
     fit: PoseFit, evidence: tuple[PoseEvidence | None, ...], session: PoseSession
 ) -> list[EffectRecord]:
     """Return the hand-eye of each sensor, and the effects that were fitted."""
-    covariance = fit.covariance()
-    covariances = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
-    base = next((i for i, t in enumerate(fit.terms) if is_of(t, Role.REGISTRATION)), None)
     shaking = turn_jitter(most_poses(session))
     views = [part.view for part in fit.state.parts]
-    records = []
-    for i, term in enumerate(fit.terms):
-        if is_of(term, Role.MOUNT):
-            name = str(effect_of(term).sensor_of(term))
-            spread = None if base is None else covariances[base]
-            part = next(p for p in fit.state.parts if p.view.sensor == name)
-            is_determined = is_lever_determined(part, shaking)
-            frames = frames_of(fit.terms, name)
-            records.append(hand_eye_record(name, frames, covariances[i], spread, is_determined))
-    for term, one, spread in zip(fit.terms, evidence, covariances, strict=True):
+    records = [
+        hand_eye_record(fit, index, shaking)
+        for index, term in enumerate(fit.terms)
+        if term.role is Role.MOUNT
+    ]
+    for index, (term, one) in enumerate(zip(fit.terms, evidence, strict=True)):
         if one is None:
             continue
-        record = term.effect.record(term, spread)
-        record = effect_of(term).seen_at(record, term, spread, views)
+        spread = fit.covariance_of(index)
+        record = term.effect.seen_at(term.effect.record(term, spread), term, spread, views)
         words = {
-            'summary': term.effect.summary, 'advice': effect_of(term).advice,
+            'summary': term.effect.summary,
+            'advice': term.effect.advice,
             'remedy': term.effect.remedy.value,
-            'parameters_spent': int(term.theta.size), 'held_out_gain': one.gain,
+            'parameters_spent': int(term.theta.size),
+            'held_out_gain': one.gain,
             'held_out_share': one.share,
             'position_rmse_without_m': one.position_rmse_without_m,
             'position_rmse_with_m': one.position_rmse_with_m,
-        }  # fmt: skip
+        }
         records.append(replace(record, evidence=words))
     return one_clock(records, fit.state.problem.setting.duration)
 
 
-def hand_eye_record(
-    sensor: str,
-    frames: Frames,
-    spread: Array,
-    frame_spread: Array | None,
-    is_determined: NDArray[np.bool_],
-) -> EffectRecord:
-    """Return optical frame, lever arm and mount of a sensor; None where the motion does not
-    determine them, and for the optical frame where it was not fitted.
+def hand_eye_record(fit: PoseFit, index: int, jitter_rad: float) -> EffectRecord:
+    """Return optical frame, lever arm and mount of the sensor whose mount the term is.
+
+    None where the motion does not determine them, and for the optical frame where it was not
+    fitted. ``jitter_rad`` is that of the reference's orientation.
     """
-
-    def degrees(matrix: Array) -> list[float]:
-        turn = np.rad2deg(Rotation.from_matrix(matrix).as_rotvec())
-        return [float(v) for v in turn]
-
-    sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
-    lever = [
-        float(v) if s < LEAST_KNOWN_M and is_known else None
-        for v, s, is_known in zip(frames.lever, sigma[:3], is_determined, strict=True)
-    ]
+    name = str(fit.terms[index].sensor)
+    frames, sigma = frames_of(fit.terms, name), sigmas(fit.covariance_of(index))
+    part = next(p for p in fit.state.parts if p.view.sensor == name)
+    is_known = (sigma[:3] < LEAST_KNOWN_M) & is_lever_determined(part, jitter_rad)
+    lever = [float(v) if known else None for v, known in zip(frames.lever, is_known, strict=True)]
     values: dict[str, object] = {
-        'sensor': sensor,
-        'lever_arm_m': lever,
-        'mount_rotation_deg': degrees(frames.mount),
-        'registration_rotation_deg': None,
-        'registration_translation_m': None,
-    }
+        'sensor': name, 'lever_arm_m': lever, 'mount_rotation_deg': _degrees(frames.mount),
+        'registration_rotation_deg': None, 'registration_translation_m': None,
+    }  # fmt: skip
     uncertainty: dict[str, object] = {
-        'lever_arm_m': sigma[:3].tolist(),
-        'mount_rotation_deg': np.rad2deg(sigma[3:]).tolist(),
-    }
-    if frame_spread is not None:
-        frame_sigma = np.sqrt(np.maximum(np.diag(frame_spread), 0.0))
-        values['registration_rotation_deg'] = degrees(frames.rotation)
+        'lever_arm_m': sigma[:3].tolist(), 'mount_rotation_deg': np.rad2deg(sigma[3:]).tolist(),
+    }  # fmt: skip
+    for base in (i for i, t in enumerate(fit.terms) if t.role is Role.REGISTRATION):
+        apart = sigmas(fit.covariance_of(base))
+        values['registration_rotation_deg'] = _degrees(frames.rotation)
         values['registration_translation_m'] = frames.translation.tolist()
-        uncertainty['registration_rotation_deg'] = np.rad2deg(frame_sigma[3:]).tolist()
-        uncertainty['registration_translation_m'] = frame_sigma[:3].tolist()
-    known = all(v is not None for v in lever) and bool(np.all(sigma[3:] < LEAST_KNOWN_RAD))
+        uncertainty['registration_rotation_deg'] = np.rad2deg(apart[3:]).tolist()
+        uncertainty['registration_translation_m'] = apart[:3].tolist()
+    known = bool(is_known.all() and np.all(sigma[3:] < LEAST_KNOWN_RAD))
     effect = effect_with(Role.MOUNT)
     evidence = {'summary': effect.summary, 'observable': known}
     return EffectRecord(effect.name, values, uncertainty, evidence)
+
+
+def _degrees(matrix: Array) -> list[float]:
+    return [float(v) for v in np.rad2deg(Rotation.from_matrix(matrix).as_rotvec())]

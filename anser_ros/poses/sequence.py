@@ -19,9 +19,7 @@ FARTHEST = 1e6
 """Coordinate, m, from which on it is a device's marker for no pose and no position: no tracker
 sees a thousand kilometres, NDI's marker is 3.7e28."""
 NO_TURN = 0.1
-"""Norm of a quaternion below which it is a marker for no pose; a rounded one has a norm near 1.
-Smaller takes a marker of rounded zeros for a turn; larger, a quaternion of another scale for a
-marker."""
+"""Norm of a quaternion below which it is a marker for no pose; a rounded one has a norm near 1."""
 LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
 """How far a pose is from the line between its neighbours if it leaps: m, rad, and in distances of
 these from each other. A hand that shakes turns back within 5 mm at 20 poses a second."""
@@ -33,29 +31,15 @@ Smaller refuses rounded files; larger takes other numbers for quaternions."""
 
 @dataclass(frozen=True)
 class PoseSequence:
-    """Holds poses of one sensor or body in the order of their stamps.
-
-    Attributes
-    ----------
-    name : str
-    time : ndarray, shape (n,)
-        Stamps, s since the session's start, ascending.
-    position : ndarray, shape (n, 3)
-        m, in the frame of the tracker that gave them.
-    quaternion : ndarray, shape (n, 4)
-        Unit, from the sensor's frame to the tracker's, in the order x y z w.
-    missing : ndarray, shape (k,)
-        Stamps, s, under which the device said that it has no pose.
-    unordered : int
-        Poses whose stamp was before that of the pose written before them.
-    """
+    """Holds poses of one sensor or body in the order of their stamps."""
 
     name: str
-    time: Array
-    position: Array
+    time: Array  # (n,), stamps, s since the session's start, ascending
+    position: Array  # (n, 3), m, in the frame of the tracker that gave them
+    # (n, 4), unit, from the sensor's frame to the tracker's, in the order x y z w.
     quaternion: Array
-    missing: Array
-    unordered: int = 0
+    missing: Array  # (k,), stamps, s, under which the device said that it has no pose
+    unordered: int = 0  # poses whose stamp was before that of the pose written before them
 
     @property
     def size(self) -> int:
@@ -67,8 +51,8 @@ class PoseSequence:
         """Return rotation matrices, shape (n, 3, 3), from the sensor's frame to the tracker's."""
         return np.asarray(Rotation.from_quat(self.quaternion).as_matrix()).reshape(-1, 3, 3)
 
-    def rows(self, keep: NDArray[np.generic]) -> 'PoseSequence':
-        """Return the poses that are named by index or mask."""
+    def rows(self, keep: NDArray[np.generic] | slice) -> 'PoseSequence':
+        """Return the poses that are named by index, mask or slice."""
         return replace(
             self,
             time=self.time[keep],
@@ -102,27 +86,14 @@ def missing_words(poses: PoseSequence) -> str:
 
 @dataclass(frozen=True)
 class PoseSession:
-    """Holds one recording of a tracker that gives poses, with an optical reference.
+    """Holds one recording of a tracker that gives poses, with an optical reference."""
 
-    Attributes
-    ----------
-    path : str
-        Where it comes from, for messages.
-    start_ns : int
-        The stamp at time 0.
-    sensors : mapping of str to PoseSequence
-        Tracked poses, all of one rigid body.
-    reference : PoseSequence or None
-        Poses of the body by the optical tracker, in the optical frame and on its own clock.
-    lost : str
-        What could not be read, in words; empty when nothing is missing.
-    """
-
-    path: str
-    start_ns: int
-    sensors: Mapping[str, PoseSequence]
+    path: str  # where it comes from, for messages
+    start_ns: int  # the stamp at time 0
+    sensors: Mapping[str, PoseSequence]  # tracked poses, all of one rigid body
+    # Poses of the body by the optical tracker, in the optical frame and on its own clock.
     reference: PoseSequence | None
-    lost: str = ''
+    lost: str = ''  # what could not be read, in words; empty when nothing is missing
 
     @property
     def streams(self) -> dict[str, PoseSequence]:
@@ -164,20 +135,11 @@ def jumping_poses(poses: PoseSequence) -> Mask:
 def sequence_of(name: str, time: Array, position: Array, quaternion: Array) -> PoseSequence:
     """Return a sequence from rows as they were written: sorted, markers for no pose taken out.
 
-    Parameters
-    ----------
-    name : str
-    time : ndarray, shape (n,)
-        s, in any order.
-    position : ndarray, shape (n, 3)
-        m; not finite, or beyond all measure, where there is no pose.
-    quaternion : ndarray, shape (n, 4)
-        In the order x y z w, of unit length up to rounding; zero or not finite for no pose.
+    ``time`` (n,): s, in any order; ``position`` (n, 3): m; not finite, or beyond all measure,
+    where there is no pose; ``quaternion`` (n, 4): in the order x y z w, of unit length up to
+    rounding; zero or not finite for no pose.
 
-    Raises
-    ------
-    PlausibilityError
-        When quaternions that are no markers are not of unit length.
+    Raises `PlausibilityError` when quaternions that are no markers are not of unit length.
     """
     norm = np.linalg.norm(quaternion, axis=1)
     whole = np.isfinite(position).all(axis=1) & (np.abs(position) < FARTHEST).all(axis=1)

@@ -13,10 +13,7 @@ SMOOTH = 'smooth'
 def smooth_map(record: EffectRecord) -> PositionMap:
     """Return the map of a record: what is added to tracked positions.
 
-    Raises
-    ------
-    EffectError
-        When a parameter is missing.
+    Raises `EffectError` when a parameter is missing.
     """
     places, errors = (
         np.asarray(needed(record, key), dtype=np.float64).reshape(-1, 3)

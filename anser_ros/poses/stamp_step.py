@@ -12,13 +12,11 @@ RATE_SHARE = 0.9
 some poses lost, and no poll's: another clock falls into step for less."""
 FEWEST_BEATS, ON_BEAT = 4, 0.7
 """Distances between the intervals that are not one step, and the share of them that differ by one
-interval at most, from which they are the beat of two clocks. Poses lost at random make that in one
-recording of a thousand. Fewer and smaller take chance for a poll; more and larger leave a poll
-unnamed that is nearly as quick as its tracker."""
+interval at most, from which they are two clocks' beat; poses lost at random make it once in
+1000."""
 SHARED = 0.05
 """Share of poses under the stamp of the pose before them from which a grid is a poll's, whatever
-its intervals: a tracker gives each pose a time of its own. Smaller takes a few poses that were
-sent together for a poll; larger leaves a poll that is hardly slower than its tracker unnamed."""
+its intervals: a tracker gives each pose a time of its own."""
 
 
 def stamp_step(time: Array) -> float:

@@ -8,11 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.diagnosis.prepare import BLOCKS, TEST_EVERY
-from anser_ros.effects.term import Site, Term
 from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.physics.angles import nearest_rotation
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
-from anser_ros.poses.effect import PoseSetting, Role
+from anser_ros.poses.effect import PoseSetting, PoseSite, PoseTerm, Role
 from anser_ros.poses.fit import PoseFit, robust_fit
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.problem import PoseNoise, PoseProblem
@@ -29,12 +28,11 @@ HAND_M = 0.1  # a hand's breadth, m: distance at which an angle counts as the di
 AT_REST_SHARE = 0.3  # share of poses kept below which all is recordings at rest
 FEWEST_PARTS = 5  # recordings that make blocks of their own; fewer leave too few to hold out
 FEWEST_HAND_EYE_POSES = 8
-"""Poses with a reference that hand-eye needs: it has twelve unknowns, a pose tells six, and as
+"""Poses with a reference that hand-eye needs: it has twelve unknowns, a pose gives six, and as
 many again have to judge it."""
 MOST_POSES = 900
-"""Poses of a sensor that are fitted at most, evenly over the session. More add nothing of errors
-that are alike for seconds, and a session of four sensors has to be done within seconds. Fewer make
-effects uncertain; more cost time."""
+"""Poses of a sensor that are fitted at most, evenly over the session: more add nothing of errors
+that are alike for seconds, and a session has to be done within seconds."""
 GOLDEN = (5**0.5 - 1) / 2
 """Squares of whole numbers times it, less whole numbers, are spread evenly and fall into step with
 nothing. Its multiples fall into step with a poll that goes on by as much from pose to pose."""
@@ -42,20 +40,16 @@ COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
 COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
 COARSE_OFFSET_MISFIT = 0.8
-"""Share of the misfit at no offset below which a coarse offset is taken. Chance takes off 6 %: the
-mean distance of 300 poses scatters by 2.4 %, and the least of 61 offsets is some 2.4 of that
-lower; an offset of a single step moves a hand by a centimetre, many times the misfit. Smaller
-starts at no offset although there is one; larger starts at an offset that noise has made."""
+"""Share of the misfit at no offset below which a coarse offset is taken. Chance takes off 6 % (the
+least of 61 mean distances of 300 poses); an offset of a step moves a hand many times the
+misfit."""
 START_NOISE = PoseNoise(2e-3, 0.02)  # m, rad: of the first fit, which then finds its own
 
 
 def pose_problem(session: PoseSession) -> PoseProblem:
     """Set a session up; without a reference the sensor with most poses takes its place.
 
-    Raises
-    ------
-    DiagnosisError
-        When there are too few poses.
+    Raises `DiagnosisError` when there are too few poses.
     """
     sensors = dict(session.sensors)
     reference = session.reference
@@ -208,12 +202,9 @@ def train_blocks(problem: PoseProblem) -> tuple[NDArray[np.int64], NDArray[np.in
 
 def coarse_offset(problem: PoseProblem) -> float:
     """Return the offset, s, at which tracked places are most nearly linear in the optical pose."""
-    chosen = []
-    for poses in problem.sensors:
-        step = max(1, poses.size // COARSE_POSES)
-        chosen.append(poses.rows(np.arange(0, poses.size, step)))
     if problem.path.is_at_rest:
         return 0.0
+    chosen = [p.rows(slice(None, None, max(1, p.size // COARSE_POSES))) for p in problem.sensors]
     trials = np.arange(-COARSE_S, COARSE_S + COARSE_STEP_S / 2, COARSE_STEP_S)
     misfits = np.array([_misfit(problem.path, chosen, float(trial)) for trial in trials])
     still = float(misfits[np.argmin(np.abs(trials))])
@@ -222,6 +213,7 @@ def coarse_offset(problem: PoseProblem) -> float:
 
 
 def _misfit(path: OpticalPath, sensors: Sequence[PoseSequence], offset: float) -> float:
+    """Mean distance, m, of tracked places from a linear function of the optical pose."""
     total = 0.0
     for poses in sensors:
         place, turn, _, known = path.at(poses.time - offset)
@@ -231,23 +223,23 @@ def _misfit(path: OpticalPath, sensors: Sequence[PoseSequence], offset: float) -
             [np.ones((known.sum(), 1)), place[known], turn[known].reshape(-1, 9)], axis=1
         )
         columns -= columns.mean(axis=0) * (np.arange(13) > 0)
-        scale = np.linalg.norm(columns, axis=0) + 1e-12
-        rest = poses.position[known]
-        weight = np.ones(len(rest))
+        columns /= np.linalg.norm(columns, axis=0) + 1e-12
+        tracked, weight, size = poses.position[known], np.ones(len(columns)), np.zeros(0)
         for _ in range(3):  # towards the median: a few poses may be far off
-            normal = (columns / scale * weight[:, None]).T @ (columns / scale)
-            right = (columns / scale * weight[:, None]).T @ poses.position[known]
-            solution = np.linalg.solve(normal + 1e-6 * np.trace(normal) / 13 * np.eye(13), right)
-            rest = poses.position[known] - columns / scale @ solution
-            size = np.linalg.norm(rest, axis=1)
+            weighted = (columns * weight[:, None]).T
+            normal = weighted @ columns
+            normal += 1e-6 * np.trace(normal) / 13 * np.eye(13)
+            size = np.linalg.norm(
+                tracked - columns @ np.linalg.solve(normal, weighted @ tracked), axis=1
+            )
             weight = 1 / np.maximum(size, 0.3 * np.median(size) + 1e-9)
             weight /= weight.mean()
-        total += float(np.mean(np.linalg.norm(rest, axis=1)))
+        total += float(np.mean(size))
     return total if total > 0 else np.inf
 
 
 def frames_from_places(tracked: Array, optical: Array) -> Array:
-    """Return the rotation (3, 3) that takes optical places (n, 3) to tracked ones, by Kabsch."""
+    """Return the rotation (3, 3) that takes optical places (n, 3) to tracked ones."""
     left, right = tracked - np.median(tracked, axis=0), optical - np.median(optical, axis=0)
     return nearest_rotation(left.T @ right)
 
@@ -260,18 +252,16 @@ def frames_from_turns(tracked: Array, optical: Array) -> Array:
     """
     solution = _turn_of_turns(tracked, optical)
     # Of all products of units from the left and the right, how much of each is in it: a dyad.
-    units, matrix = np.eye(4), np.zeros((4, 4))
+    units = [Rotation.from_quat(unit) for unit in np.eye(4)]
+    every, matrix = Rotation.from_quat(np.eye(4)), np.zeros((4, 4))
     for a, b in np.ndindex(4, 4):
-        both = np.stack([_product(_product(units[a], u), units[b]) for u in units], axis=1)
-        matrix[a, b] = np.sum(both * solution)
+        matrix[a, b] = np.sum((units[a] * every * units[b]).as_quat().T * solution)
     u, _, _ = np.linalg.svd(matrix)
     return np.asarray(Rotation.from_quat(u[:, 0]).as_matrix())
 
 
 def turn_misfit(tracked: Array, optical: Array) -> float:
-    """Return the median angle, rad, by which quaternions (n, 4) miss those of a body with any
-    frame and any mount.
-    """
+    """Return the median angle, rad, by which quaternions (n, 4) miss any frame and mount."""
     agreement = np.einsum('ij,ij->i', tracked, optical @ _turn_of_turns(tracked, optical).T)
     return float(np.median(2 * np.arccos(np.clip(np.abs(agreement), 0.0, 1.0))))
 
@@ -292,13 +282,7 @@ def _turn_of_turns(tracked: Array, optical: Array) -> Array:
     return np.asarray(solution)
 
 
-def _product(left: Array, right: Array) -> Array:
-    """Product of quaternions x y z w."""
-    vector = left[3] * right[:3] + right[3] * left[:3] + np.cross(left[:3], right[:3])
-    return np.array([*vector, left[3] * right[3] - left[:3] @ right[:3]])
-
-
-def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[Term]:
+def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[PoseTerm]:
     """Return both frames and an offset to start from; a known registration is the identity."""
     pairs = []
     for poses in problem.sensors:
@@ -310,15 +294,15 @@ def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> 
         shift = np.median(
             np.concatenate([p - o @ rotation.T for p, _, o, _ in pairs if len(p)]), axis=0
         )
-    terms: list[Term] = []
+    terms: list[PoseTerm] = []
     if frame is not None:
         terms.append(effect_with(Role.REGISTRATION).at_frame({}, shift, rotation))
     for poses, (_, turned, _, turn) in zip(problem.sensors, pairs, strict=True):
         mounts = Rotation.from_matrix(turn.transpose(0, 2, 1) @ (rotation.T @ turned))
         middle = _middle(mounts)
-        site: Site = {'sensor': poses.name}
+        site: PoseSite = {'sensor': poses.name}
         terms.append(effect_with(Role.MOUNT).at_frame(site, np.zeros(3), middle))
-    return [*terms, Term(effect_with(Role.OFFSET), {}, np.array([offset]))]
+    return [*terms, PoseTerm(effect_with(Role.OFFSET), {}, np.array([offset]))]
 
 
 def _middle(turns: Rotation) -> Array:

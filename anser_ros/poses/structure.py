@@ -10,9 +10,8 @@ Array = NDArray[np.float64]
 
 GROUPS = 6  # groups of neighbours by which a dependence is looked for
 LEAST_OF_MEANS = 0.1
-"""Share (0 to 1) of the squared residual that groups' means must explain beyond chance to be told.
-Without it the error would be 5 % less. Smaller tells of traces that any tracker has; larger leaves
-a dependence unsaid."""
+"""Share (0 to 1) of the squared residual that groups' means must explain beyond chance to be
+reported; without it the error would be 5 % less."""
 FEWEST_POSES = 30  # poses of a sensor by which a dependence is judged
 TWICE = 1 / 3
 """Share by which halves of poses differ, of their sum, if one has twice the squared error of the

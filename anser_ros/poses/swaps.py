@@ -16,6 +16,7 @@ from anser_ros.poses.sequence import PoseSequence, PoseSession
 from anser_ros.poses.start import coarse_offset, first_fit, pose_problem
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 FAR, FITS = 8.0, 0.25
 """Distance of a pose from its own prediction, in spreads, from which it may be another sensor's,
@@ -33,10 +34,10 @@ def swapped_spans(
     """Return pairs of sensors, and the spans (s) in which each gives the other's poses."""
     found = []
     for a, b in combinations(range(len(problem.sensors)), 2):
-        masks = [_looks_like(problem, fit, i, j) for i, j in ((a, b), (b, a))]
-        if min(float(mask.mean()) for mask in masks) < LEAST_SHARE:
+        (mask, rather), (other, _) = (_look_like(problem, fit, *pair) for pair in ((a, b), (b, a)))
+        if min(float(mask.mean()), float(other.mean())) < LEAST_SHARE:
             continue
-        spans = _runs(problem.sensors[a].time, masks[0], _looks_like(problem, fit, a, b, True))
+        spans = _runs(problem.sensors[a].time, mask, rather)
         if spans:
             found.append((problem.sensors[a].name, problem.sensors[b].name, spans))
     return found
@@ -57,26 +58,23 @@ def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
     return put_back(session, swapped_spans(problem, fit))
 
 
-def _looks_like(
-    problem: PoseProblem, fit: PoseFit, i: int, j: int, rather: bool = False
-) -> NDArray[np.bool_]:
-    """Mask of the poses of sensor i that fit where sensor j should be, or rather fit there."""
-    own = replace(problem, noise=fit.state.problem.noise).state(fit.terms).parts[i]
+def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Mask, Mask]:
+    """Masks of the poses of sensor i that fit where sensor j should be, and that rather fit there
+    than where i should be."""
+    problem = replace(problem, noise=fit.state.problem.noise)
+    own = problem.state(fit.terms).parts[i]
     sensors = list(problem.sensors)
     sensors[i] = replace(sensors[i], name=problem.sensors[j].name)
-    other = replace(problem, sensors=tuple(sensors), noise=fit.state.problem.noise)
-    as_other = other.state(fit.terms).parts[i]
+    as_other = replace(problem, sensors=tuple(sensors)).state(fit.terms).parts[i]
     noise = replace(own.noise, stamp_s=0.0)
-    here = np.linalg.norm(noise.whitened(own.residual, own.view.velocity), axis=1)
-    there = np.linalg.norm(noise.whitened(as_other.residual, own.view.velocity), axis=1)
-    if rather:
-        return np.asarray(there < here)
-    return np.asarray((here > FAR) & (there < FITS * here) & (own.weight > 0))
+    here, there = (
+        np.linalg.norm(noise.whitened(part.residual, own.view.velocity), axis=1)
+        for part in (own, as_other)
+    )
+    return (here > FAR) & (there < FITS * here) & (own.weight > 0), there < here
 
 
-def _runs(
-    time: Array, mask: NDArray[np.bool_], rather: NDArray[np.bool_]
-) -> list[tuple[float, float]]:
+def _runs(time: Array, mask: Mask, rather: Mask) -> list[tuple[float, float]]:
     """Spans in which a mask holds, as far as poses rather fit the other sensor."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
     runs = zip(edges[::2], edges[1::2], strict=True)
@@ -117,9 +115,7 @@ def put_back(
     return replace(session, sensors=sensors), records
 
 
-def _merged(
-    own: PoseSequence, keep: NDArray[np.bool_], other: PoseSequence, take: NDArray[np.bool_]
-) -> PoseSequence:
+def _merged(own: PoseSequence, keep: Mask, other: PoseSequence, take: Mask) -> PoseSequence:
     time = np.concatenate([own.time[keep], other.time[take]])
     order = np.argsort(time, kind='stable')
     return replace(

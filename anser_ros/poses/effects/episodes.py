@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,35 +14,27 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WINDOWS, FEWEST_WINDOWS = 40, 15
-"""Windows of time that a session is cut into: an episode of a twentieth is seen in two. Fewer miss
-short episodes; more leave too few poses in a window to judge it. A slow tracker has fewer windows:
-of fewer yet an episode is too large a part."""
+"""Windows of time that a session is cut into: an episode of a twentieth is seen in two. A slow
+tracker has fewer; of fewer yet an episode is too large a part."""
 FEWEST_POSES_OF_WINDOW = 4  # poses that a window needs to be judged: fewer may be outliers
 POSES_OF_WINDOW = 4.5  # on average, so that most windows can be judged
 TIMES = 9.0
 """Squared error over the median window's from which a window belongs to an episode: three times
-the error, which the range of places in a session hardly makes. Smaller takes the far side of the
-volume for an episode; larger misses those that bend poses little."""
+the error, which the range of places in a session hardly makes."""
 LOUD = 3.0
-"""The same of a window in which a sensor leaves the others on its body by `TIMES`. Smaller takes
-differences of sensors that are all good for an episode; larger overlooks metal where stamps
-jitter, which makes every window loud."""
+"""The same of a window in which a sensor leaves the others on its body by `TIMES`: stamps that
+jitter make every window loud."""
 LONGEST = 0.4
-"""Share (0 to 1) of the windows that episodes may be: they stand out from the median
-window, which is a quiet one only where fewer than half are in episodes, and a tenth is left for
-what else is loud. Larger takes half a session for the exception; smaller overlooks metal that
-stayed for a while."""
+"""Share (0 to 1) of the windows that episodes may be: the median window must be a quiet one, and a
+tenth is left for what else is loud."""
 ALIKE = 0.4  # share of a window's squared error that its mean must be; noise has a small one
 NEAR_M = 0.03
-"""Distance within which a place outside the episode is the same place; metal changes over its own
-size, centimetres. Smaller finds no pose to compare with; larger compares places where a constant
-distortion differs."""
+"""Distance within which a place outside the episode is the same place: metal changes over its own
+size, centimetres."""
 REVISITED_SHARE = 0.5  # share of the episode's places that must have been visited outside it
 STRETCH, FILLED = 0.15, 0.8
 """Share of the windows that an episode of one sensor alone must span where its places were visited
-at no other time, and the share of these that are in it: a hand does not stay so long where a
-smooth distortion is large. Smaller takes what is left of a distortion for metal; larger overlooks
-metal beside which a sensor stays for a seventh of the session."""
+at no other time, and the share of these that are in it: no hand stays so long in a distortion."""
 LOOSE, FAST = 0.5, 0.25
 """Share of a sensor's squared error that shifts in the body's frame explain if its mount is loose,
 and up to which the others' must be lower."""
@@ -65,18 +56,10 @@ def windows_of(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Episode:
-    """Holds when a sensor is off.
+    """Holds when a sensor is off."""
 
-    Attributes
-    ----------
-    windows : tuple of int
-        Of time; none where it never is.
-    is_alone : bool
-        Whether the others on its body are right meanwhile.
-    """
-
-    windows: tuple[int, ...] = ()
-    is_alone: bool = False
+    windows: tuple[int, ...] = ()  # of time; none where it never is
+    is_alone: bool = False  # whether the others on its body are right meanwhile
 
 
 def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
@@ -179,7 +162,7 @@ class PoseMovingMetal(PoseEffect):
     name = 'moving_metal'
     summary = 'metal comes near for a while'
     advice = 'See what was near these sensors at that time, and do not use their poses of it.'
-    units: ClassVar[Mapping[str, str]] = {'t_start_s': 's', 't_end_s': 's'}
+    units = {'t_start_s': 's', 't_end_s': 's'}
     needs_levers = True
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
@@ -227,7 +210,7 @@ class LooseMount(PoseEffect):
     name = 'loose_mount'
     summary = 'a sensor moves against the body and the other sensors'
     advice = 'Fasten the sensor on its body, and record again.'
-    units: ClassVar[Mapping[str, str]] = {'rms_m': 'm', 'rms_deg': 'deg'}
+    units = {'rms_m': 'm', 'rms_deg': 'deg'}
     needs_levers = True
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:

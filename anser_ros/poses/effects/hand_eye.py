@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.term import Site, Term
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import Frames, PoseEffect, PoseView, Role
+from anser_ros.poses.effect import Frames, PoseEffect, PoseSite, PoseTerm, PoseView, Role
 from anser_ros.poses.effects.episodes import LooseMount
 
 Array = NDArray[np.float64]
@@ -22,15 +21,10 @@ FREE = 1e3
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameTerm(Term):
-    """Holds a frame as a start and a step from it.
+class FrameTerm(PoseTerm):
+    """Holds a frame as a start and a step from it."""
 
-    Attributes
-    ----------
-    start : ndarray, shape (3, 3)
-        Rotation that theta's turn (its last three, rad) comes on top of, from the left.
-    """
-
+    # (3, 3), rotation that theta's turn (its last three, rad) comes on top of, from the left.
     start: Array
 
     @property
@@ -52,15 +46,15 @@ class FrameTerm(Term):
 class _Frame(PoseEffect):
     """Theta is a translation (m) and a turn (rad)."""
 
-    def at_frame(self, site: Site, place: Array, turn: Array) -> Term:
+    def at_frame(self, site: PoseSite, place: Array, turn: Array) -> PoseTerm:
         """Return the frame with a turn of zero from a rotation matrix."""
         return FrameTerm(self, site, np.array([*place, 0, 0, 0]), start=turn)
 
-    def prior(self, term: Term) -> Array:
+    def prior(self, term: PoseTerm) -> Array:
         """Return a wide prior, as nothing is known of the frame before."""
         return np.full(6, FREE)
 
-    def bounded(self, term: Term) -> Term:
+    def bounded(self, term: PoseTerm) -> PoseTerm:
         """Return the same frame with a turn of zero."""
         frame = _frame(term)
         return replace(frame, theta=np.array([*frame.translation, 0, 0, 0]), start=frame.rotation)
@@ -73,12 +67,12 @@ class OpticalFrame(_Frame):
     summary = "the optical frame is not aligned with the tracker's"
     role = Role.REGISTRATION
 
-    def framed(self, term: Term, sensor: str, frames: Frames) -> Frames:
+    def framed(self, term: PoseTerm, sensor: str, frames: Frames) -> Frames:
         """Return the frames with this one from the reference to the tracker."""
         frame = _frame(term)
         return replace(frames, rotation=frame.rotation, translation=frame.translation)
 
-    def moved(self, before: Term, after: Term, middle: Array) -> EffectRecord:
+    def moved(self, before: PoseTerm, after: PoseTerm, middle: Array) -> EffectRecord:
         """Record the turn, and the shift where the poses are.
 
         A turn about the far origin of a camera moves that by decimetres.
@@ -92,7 +86,7 @@ class OpticalFrame(_Frame):
         summary = 'tracker and reference have moved against each other since the watch began'
         return EffectRecord(self.name, values, {}, {'summary': summary})
 
-    def slopes(self, term: Term, view: PoseView) -> Array | None:
+    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
         """Return the derivative by a shift of all poses and a turn about the tracker's origin."""
         out = np.zeros((view.time.size, 6, 6))
         out[:, :3, :3] = np.eye(3)
@@ -108,14 +102,14 @@ class Mount(_Frame):
     summary = 'the two unknown frames; no effect, always fitted'
     role = Role.MOUNT
 
-    def framed(self, term: Term, sensor: str, frames: Frames) -> Frames:
+    def framed(self, term: PoseTerm, sensor: str, frames: Frames) -> Frames:
         """Return the frames with the mount and lever arm of the term's own sensor."""
-        if not self.acts_on(term, sensor):
+        if not term.acts_on(sensor):
             return frames
         frame = _frame(term)
         return replace(frames, mount=frame.rotation, lever=frame.translation)
 
-    def moved(self, before: Term, after: Term, middle: Array) -> EffectRecord:
+    def moved(self, before: PoseTerm, after: PoseTerm, middle: Array) -> EffectRecord:
         """Record how far the sensor has moved on the body, as a mount that is loose."""
         first, last = _frame(before), _frame(after)
         values = {
@@ -126,9 +120,9 @@ class Mount(_Frame):
         summary = 'the sensor sits elsewhere on the body than when the watch began'
         return EffectRecord(LooseMount.name, values, {}, {'summary': summary})
 
-    def slopes(self, term: Term, view: PoseView) -> Array | None:
+    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
         """Return the derivative of this sensor's poses by shift and turn in the body's frame."""
-        if not self.acts_on(term, view.sensor):
+        if not term.acts_on(view.sensor):
             return None
         body = view.frame @ view.turn
         out = np.zeros((view.time.size, 6, 6))
@@ -146,7 +140,7 @@ def _cross(vectors: Array) -> Array:
     return out
 
 
-def _frame(term: Term) -> FrameTerm:
+def _frame(term: PoseTerm) -> FrameTerm:
     assert isinstance(term, FrameTerm)
     return term
 

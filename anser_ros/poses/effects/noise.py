@@ -1,8 +1,7 @@
 """A sensor's noise is larger than the others', or grows with the distance."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +17,12 @@ Mask = NDArray[np.bool_]
 
 NOISIER = 2.0
 """Factor over the other sensors' median noise from which a sensor's is named; sensors of one kind
-at one place differ by a half. Smaller names a sensor for its place; larger misses one that is
-worn."""
+at one place differ by a half."""
 GROWN = 2.0
-"""Factor of the jitter over that of a watch's first look from which it is told: that of trackers
+"""Factor of the jitter over that of a watch's first look from which it is reported: of trackers it
 grows by half over their volume."""
 WIDEST = 1.3
-"""Ratio of far to near distances (95 to 5 %) without which no power law of it can be told."""
+"""Ratio of far to near distances (95 to 5 %) without which no power law of it can be seen."""
 LEAST_LAW_SIGMAS = 5.0
 """Standard deviations by which the noise must differ from a constant: by the likelihood, and by
 those of the exponent, which few distances leave large."""
@@ -40,9 +38,8 @@ REACHED = 12.0
 """Squared deviation over its variance by the law that noise does not reach: once in 1e5. A pose
 that the law does not reach has another cause, and one that it reaches is no outlier."""
 AT_REST_M_S, HARDLY_EVER = 0.01, 0.1
-"""Speed, m/s, below which a body counts as at rest, and share of poses in motion below which it
-always is: a hand that holds still drifts by less. Smaller takes a rest for motion; larger leaves
-out slow motions."""
+"""Speed, m/s, below which a body counts as at rest (a hand drifts by less), and share of poses in
+motion below which it always is."""
 FEWEST_DIFFERENCES = 60  # differences of neighbours that a power law is fitted to
 
 
@@ -118,10 +115,10 @@ class PoseExcessNoise(PoseEffect):
     name = 'excess_noise'
     summary = "a sensor's noise is larger than the others'"
     advice = 'Exchange the sensor or its cable, and record again.'
-    units: ClassVar[Mapping[str, str]] = {'factor': '1'}
+    units = {'factor': '1'}
     makes_jitter = True
 
-    def noisier(self, factor: float) -> Sequence[EffectRecord]:
+    def more_jitter(self, factor: float) -> Sequence[EffectRecord]:
         """Return a record without a sensor: all of them jitter more."""
         if factor < GROWN:
             return ()
@@ -154,7 +151,7 @@ class RangeNoise(PoseEffect):
     name = 'range_noise'
     summary = 'jitter grows with the distance from the field generator'
     advice = 'Work nearer to the field generator.'
-    units: ClassVar[Mapping[str, str]] = {'exponent': '1', 'reference_m': 'm'}
+    units = {'exponent': '1', 'reference_m': 'm'}
     makes_jitter = True
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:

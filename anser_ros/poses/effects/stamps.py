@@ -1,7 +1,6 @@
 """Stamps are those of a receipt or of a poll, and not of the measurement."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +16,7 @@ LEAST_S = 2e-3
 Smaller names what harms nobody; larger leaves errors of a fast hand unnamed."""
 LEAST_LIKELIHOOD_GAIN = 25.0
 """Minus twice the log likelihood that it must take off in the median sensor; chance takes one, and
-so much once in two million sensors. Smaller takes chance for an error of the stamps; larger misses
-one that takes little off."""
+so much once in two million sensors."""
 STEP_SHARE = (0.15, 0.7)
 """Error over the step that rounding to a step makes: 0.29 if even, more if a poll is late."""
 
@@ -71,7 +69,7 @@ class ReceiptJitter(PoseEffect):
     name = 'stamp_jitter'
     summary = 'stamps are those of receipt, and jitter'
     advice = 'Use the counter of the device as stamp (import_poses --stamps device).'
-    units: ClassVar[Mapping[str, str]] = {'rms_s': 's'}
+    units = {'rms_s': 's'}
     needs_levers = True
     makes_jitter = True
 
@@ -91,7 +89,7 @@ class QuantisedStamps(PoseEffect):
     name = 'quantised_stamps'
     summary = 'stamps are those of a poll'
     advice = 'Use the counter of the device as stamp, or poll more often.'
-    units: ClassVar[Mapping[str, str]] = {'step_s': 's'}
+    units = {'step_s': 's'}
     needs_levers = True
     makes_jitter = True
 

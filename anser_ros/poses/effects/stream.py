@@ -1,7 +1,6 @@
 """Finds what is wrong with a stream: poses that are repeated, missing or outliers."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +16,10 @@ from anser_ros.sessions.plausibility import FROZEN_S
 Array = NDArray[np.float64]
 
 FEWEST_STALE = 0.02
-"""Share (0 to 1) of poses of a moving body from which repeats are named. One in 60 comes again
-where a tracker of 60 Hz is polled a hertz too fast, which harms nothing. Smaller names that, and a
-hand that stops; larger leaves a tracker unnamed that seldom repeats itself."""
+"""Share (0 to 1) of poses of a moving body from which repeats are named: one in 60 comes again
+where a tracker of 60 Hz is polled a hertz too fast, which harms nothing."""
 MOVING_M = 5e-4
-"""Way between two poses, m, from which a body moves: trackers tell a tenth of it. Smaller takes
-jitter for motion, so that a tracker at rest seems to repeat poses; larger sees no motion in slow
-hands."""
+"""Way between two poses, m, from which a body moves: trackers resolve a tenth of it."""
 FROZEN_WAY_M = 0.01
 """Way of another stream, m, while one stands still that is frozen: far more than any tracker's
 jitter."""
@@ -38,8 +34,7 @@ PAUSE_S, MANY_PAUSES = 2.0, 4
 FEWEST_OUTLYING_POSES = 3  # outliers that must be there at least: one or two are an accident
 FAR = 14.0
 """Distance of the median outlier in spreads of a coordinate from which it is one: errors of real
-trackers have tails of half that. Smaller names the tails of usual errors; larger misses
-reflections near by."""
+trackers have tails of half that."""
 
 
 class StalePoses(PoseEffect):
@@ -48,12 +43,12 @@ class StalePoses(PoseEffect):
     name = 'stale_poses'
     summary = 'the same pose again under a new stamp'
     advice = 'Ask the device no more often than it measures, or leave the repeats out.'
-    units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'runs': '1'}
+    units = {'fraction': '1', 'runs': '1'}
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a record for each stream in which poses come again."""
         found = []
-        for poses in _streams(residuals):
+        for poses in residuals.session.streams.values():
             moving = _moving(poses)
             count = int(np.count_nonzero(moving))
             if count < 20:
@@ -64,8 +59,8 @@ class StalePoses(PoseEffect):
                 continue
             runs = int(np.count_nonzero(np.diff(again.astype(int), prepend=0) == 1))
             values = {'stream': poses.name, 'fraction': share, 'runs': runs}
-            found.append(_record(self.name, values,
-                                 {'fraction': float(np.sqrt(share / count))}))  # fmt: skip
+            sigma = float(np.sqrt(share / count))
+            found.append(EffectRecord(self.name, values, {'fraction': sigma}))
         return found
 
     def frozen(self, session: PoseSession) -> Sequence[EffectRecord]:
@@ -97,12 +92,12 @@ class MissingPoses(PoseEffect):
     name = 'missing_poses'
     summary = 'poses are missing, or marked as such by the device'
     advice = 'Keep sensors within the volume and markers in view.'
-    units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'spans': 's'}
+    units = {'fraction': '1', 'spans': 's'}
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a record for each stream that lacks poses."""
         found = []
-        for poses in _streams(residuals):
+        for poses in residuals.session.streams.values():
             spans = _gaps(poses)
             lost = poses.missing.size / max(poses.missing.size + poses.size, 1)
             length = max(float(np.ptp(poses.time)), 1e-9)
@@ -111,7 +106,7 @@ class MissingPoses(PoseEffect):
             marked = poses.missing.size >= FEWEST_MARKED and lost > FEWEST_MARKED_SHARE
             if not marked and (share < FEWEST_MISSING or not (spans or poses.missing.size > 1)):
                 continue
-            found.append(_record(self.name, {
+            found.append(EffectRecord(self.name, {
                 'stream': poses.name, 'fraction': share, 'marked': int(poses.missing.size),
                 'spans': [[round(a, 3), round(b, 3)] for a, b in spans[:20]],
             }, {}))  # fmt: skip
@@ -124,11 +119,11 @@ class PoseOutliers(PoseEffect):
     name = 'outliers'
     summary = 'poses that fit no model, such as those of a marker in its other solution'
     advice = 'Do not use these poses; show the marker from another side.'
-    units: ClassVar[Mapping[str, str]] = {'fraction': '1'}
+    units = {'fraction': '1'}
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return one record of the outlying poses of all sensors."""
-        found = list(self._leaping(residuals))
+        found = _leaping(residuals.session.reference)
         outs = [_alone(sensing, residuals) for sensing in residuals.sensors]
         out = np.concatenate(outs)
         used = np.concatenate([s.used for s in residuals.sensors])
@@ -137,52 +132,42 @@ class PoseOutliers(PoseEffect):
         if found or share < FEWEST_OUTLIERS or count < FEWEST_OUTLYING_POSES:
             return found
         residual = np.concatenate([s.residual for s in residuals.sensors])[out]
-        noise = np.concatenate(
-            [
-                np.tile([s.position_m, s.orientation_rad], (int(mask.sum()), 1))
-                for s, mask in zip(residuals.sensors, outs, strict=True)
-            ]
+        place, turn = (np.linalg.norm(residual[:, k : k + 3], axis=1) for k in (0, 3))
+        noise = np.repeat(
+            [[s.position_m, s.orientation_rad] for s in residuals.sensors],
+            [np.count_nonzero(mask) for mask in outs],
+            axis=0,
         )
-        far = np.linalg.norm(residual[:, :3], axis=1) / noise[:, 0]
-        turned = np.linalg.norm(residual[:, 3:], axis=1) / noise[:, 1]
+        far, turned = place / noise[:, 0], turn / noise[:, 1]
         if float(np.median(np.maximum(far, turned))) < FAR:
             return []  # the tail of a distribution, and no poses of their own
         values = {
             'fraction': share,
-            'position_m': float(np.median(np.linalg.norm(residual[:, :3], axis=1))),
-            'orientation_rad': float(np.median(np.linalg.norm(residual[:, 3:], axis=1))),
+            'position_m': float(np.median(place)),
+            'orientation_rad': float(np.median(turn)),
             'by_sensor': {
                 s.view.sensor: int(m.sum()) for s, m in zip(residuals.sensors, outs, strict=True)
             },
         }
-        return [_record(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
+        return [EffectRecord(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
 
-    def _leaping(self, residuals: PoseResiduals) -> Iterator[EffectRecord]:
-        """The reference's poses that leap."""
-        reference = residuals.session.reference
-        if reference is None:
-            return
-        away = jumping_poses(reference)
-        share = float(away.mean()) if away.size else 0.0
-        if share > FEWEST_OUTLIERS and np.count_nonzero(away) >= FEWEST_OUTLYING_POSES:
-            values = {'fraction': share, 'stream': reference.name}
-            yield _record(self.name, values, {'fraction': float(np.sqrt(share / away.size))})
+
+def _leaping(reference: PoseSequence | None) -> list[EffectRecord]:
+    """A record of the reference's poses that leap."""
+    if reference is None:
+        return []
+    away = jumping_poses(reference)
+    share = float(away.mean()) if away.size else 0.0
+    if share <= FEWEST_OUTLIERS or np.count_nonzero(away) < FEWEST_OUTLYING_POSES:
+        return []
+    values = {'fraction': share, 'stream': reference.name}
+    sigma = float(np.sqrt(share / away.size))
+    return [EffectRecord(PoseOutliers.name, values, {'fraction': sigma})]
 
 
 def _alone(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.bool_]:
     """Poses of a sensor that stand out, less those of an episode, which are off together."""
     return np.asarray(sensing.out & ~in_episode(sensing, residuals))
-
-
-def _record(
-    name: str, parameters: Mapping[str, object], uncertainty: Mapping[str, object]
-) -> EffectRecord:
-    return EffectRecord(name, parameters, uncertainty)
-
-
-def _streams(residuals: PoseResiduals) -> list[PoseSequence]:
-    reference = residuals.session.reference
-    return [*residuals.session.sensors.values(), *([reference] if reference else [])]
 
 
 def _moving(poses: PoseSequence) -> NDArray[np.bool_]:

@@ -1,15 +1,12 @@
 """The tracker filters its poses by a low pass, which is more than a delay."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Remedy, needed, sigmas
-from anser_ros.effects.term import Term
-from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSetting, Role
+from anser_ros.effects.base import Remedy
+from anser_ros.poses.effect import NumberEffect, PoseSetting, PoseTerm, Role
 from anser_ros.poses.path import OpticalPath
 
 Array = NDArray[np.float64]
@@ -19,7 +16,7 @@ TAUS_S = (0.015, 0.03, 0.06, 0.12, 0.24)
 a delay, beyond a quarter nobody would work with the tracker."""
 
 
-class TrackerLag(PoseEffect):
+class TrackerLag(NumberEffect):
     """Theta is the time constant, s, of a first-order low pass on position and rotation.
 
     To first order a filter is a delay, so only its smoothing distinguishes it from one: it has no
@@ -29,35 +26,24 @@ class TrackerLag(PoseEffect):
     name = 'tracker_lag'
     summary = 'the tracker filters its poses, which rounds off quick motions'
     advice = 'Switch the filter of the tracker off, or move slowly.'
-    units: ClassVar[Mapping[str, str]] = {'tau_s': 's'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'tau_s': (0.0, 1.0)}
+    units = {'tau_s': 's'}
+    plausible = {'tau_s': (0.0, 1.0)}
     remedy = Remedy.NONE
     role = Role.FILTER
+    key = 'tau_s'
+    spread = 0.1  # s: lags are some tenths of a second
 
-    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         """Return one term for all sensors, which a tracker filters alike."""
-        return [Term(self, {}, np.array([tau])) for tau in TAUS_S]
+        return [PoseTerm(self, {}, np.array([tau])) for tau in TAUS_S]
 
-    def prior(self, term: Term) -> Array:
-        """Return a prior spread of 0.1 s: lags are some tenths of a second."""
-        return np.full(1, 0.1)
-
-    def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
+    def filter(self, term: PoseTerm, path: OpticalPath) -> OpticalPath:
         """Return the optical path as it is behind the tracker's filter."""
         return path.filtered(float(term.theta[0]), 'two_sided' in term.site)
 
-    def rival(self, term: Term) -> Term:
+    def rival(self, term: PoseTerm) -> PoseTerm:
         """Return the same smoothing without a sense of time."""
-        return Term(self, {'two_sided': True}, term.theta)
-
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the filter's time constant and its uncertainty, s."""
-        sigma = float(sigmas(covariance)[0])
-        return EffectRecord(self.name, {'tau_s': float(term.theta[0])}, {'tau_s': sigma})
-
-    def term(self, record: EffectRecord) -> Term:
-        """Read the filter's time constant, s, from a record."""
-        return Term(self, {}, np.array([float(needed(record, 'tau_s'))]))
+        return PoseTerm(self, {'two_sided': True}, term.theta)
 
 
 EFFECTS = (TrackerLag(),)

@@ -1,0 +1,264 @@
+"""Fits and selects terms of any observation: Gauss-Newton, cross-validation, forward selection.
+
+Fluxes and poses are fitted and searched by this engine alone. A state says what is predicted with
+some active terms (`JointState`): whitened residuals in parts with blocks of time, the whitened
+columns of a term, and the state with other terms. A term offers its effect's prior, bounds, cost
+and record (`anser_ros.effects.base`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, ClassVar, Generic, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.decisions import TIME_FOLDS
+from anser_ros.diagnosis.scoring import (
+    BlockSums,
+    Columns,
+    Ints,
+    WhitePart,
+    block_sums,
+    cross_sums,
+    joined,
+    width_of,
+)
+from anser_ros.effects.base import BaseTerm
+
+Array = NDArray[np.float64]
+TermT = TypeVar('TermT', bound=BaseTerm)
+
+ATTEMPTS = 6
+"""Dampings that are tried for a step that lowers the sum of squares; each is ten or a hundred
+times the one before, so the last steps are far too small to help."""
+SETTLED = 1e-5
+"""Share of the sum of squares by which a step must lower it for the fit to go on: one, where 1e5
+readings are fitted to their noise, so that the next step of a fit that converges is by far less
+than a standard deviation. Larger ends fits that still creep; smaller costs steps."""
+MOST_COLUMNS = 60
+"""Columns that an active term may have to be fitted again with each candidate. A term with more
+is what metal left, and no effect's rival."""
+PartT = TypeVar('PartT', bound=WhitePart)
+
+
+@dataclass(frozen=True)
+class JointState(Generic[TermT, PartT]):
+    """Holds a problem with a list of active terms."""
+
+    problem: Any
+    terms: tuple[TermT, ...]
+    parts: tuple[PartT, ...]
+    folds: ClassVar[int] = TIME_FOLDS
+
+    def design(self, term: TermT, probe: bool = False) -> list[Array | None]:
+        """Return whitened columns of a term, one array (F, n, q) a part, None for no columns."""
+        raise NotImplementedError
+
+    def moved(self, terms: Sequence[TermT]) -> Self:
+        """Return the state of the same problem with other terms."""
+        raise NotImplementedError
+
+    @property
+    def sum_of_squares(self) -> float:
+        """Return the sum of squares of the whitened residuals."""
+        return float(sum(np.sum(part.white**2) for part in self.parts))
+
+    @property
+    def penalty(self) -> float:
+        """Return what freedom that is left to each frame costs."""
+        return 0.0
+
+    @property
+    def count(self) -> int:
+        """Return the number of values that have a weight, over all parts."""
+        return sum(part.count for part in self.parts)
+
+    @property
+    def misfit(self) -> float:
+        """Return the mean square of the whitened residuals; one where only noise is left."""
+        return self.sum_of_squares / max(self.count, 1)
+
+    def prior(self, terms: Sequence[TermT] | None = None) -> Array:
+        """Return the standard deviations of the terms' parameters, by default of all, (q,)."""
+        chosen = self.terms if terms is None else terms
+        return np.concatenate([term.effect.prior(term) for term in chosen] or [np.zeros(0)])
+
+    def sums(self, blocks: Ints) -> BlockSums:
+        """Return the normal equations of all terms, block by block."""
+        columns = joined([self.design(term) for term in self.terms]) if self.terms else None
+        return block_sums(self.parts, columns or [None] * len(self.parts), blocks)
+
+
+StateT = TypeVar('StateT', bound=JointState[Any, Any])
+
+
+@dataclass(frozen=True)
+class JointFit(Generic[StateT]):
+    """Holds a state at the joint optimum of its terms."""
+
+    state: StateT
+    sums: BlockSums
+    prior: Array  # (q,)
+
+    @property
+    def misfit(self) -> float:
+        """Return the mean square of the whitened residuals; one where only noise is left."""
+        return self.state.misfit
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Return the covariance (q, q) of all terms' parameters, in their order."""
+        if not self.prior.size:
+            return np.zeros((0, 0))
+        return self.sums.covariance(self.prior, self.misfit)
+
+    def rows(self, index: int) -> slice:
+        """Return where a term's parameters stand among all."""
+        edges = np.cumsum([0] + [t.theta.size for t in self.state.terms]).tolist()
+        return [slice(a, b) for a, b in pairwise(edges)][index]
+
+    def covariance_of(self, index: int) -> Array:
+        """Return the covariance of one term's parameters."""
+        return self.covariance[self.rows(index), self.rows(index)]
+
+    def held_out(self) -> float:
+        """Return the cross-validated squares, linear about the optimum, plus what freedom cost."""
+        return self.sums.held_out(self.prior, self.state.folds) + self.state.penalty
+
+
+FitT = TypeVar('FitT', bound=JointFit[Any])
+
+
+def descended(state: StateT, blocks: Ints, iterations: int) -> tuple[StateT, BlockSums, Array]:
+    """Lower a sum of squares by damped Gauss-Newton steps until it has settled.
+
+    ``blocks`` are those of the sums that are kept, ``iterations`` the steps at most. Returns the
+    state, its sums and its prior.
+    """
+    sums, prior, damping = state.sums(blocks), state.prior(), 0.0
+    for _ in range(iterations if prior.size else 0):
+        better, damping = _better(state, sums, prior, damping)
+        if better is None:
+            break
+        gain = state.sum_of_squares - better.sum_of_squares
+        settled = gain < SETTLED * state.sum_of_squares
+        state = better
+        sums, prior = state.sums(blocks), state.prior()
+        if settled:
+            break
+    return state, sums, prior
+
+
+def _better(
+    state: StateT, sums: BlockSums, prior: Array, damping: float
+) -> tuple[StateT | None, float]:
+    """A state with a lower sum of squares, and the damping (Marquardt's) that found it."""
+    for attempt in range(ATTEMPTS):
+        trial = state.moved(stepped(state.terms, sums.step(prior, damping)))
+        if trial.sum_of_squares < state.sum_of_squares:
+            return trial, damping / 30 if damping > 1e-6 else 0.0
+        damping = max(1e-5, 10 ** (attempt % 2 + 1) * damping)
+    return None, damping
+
+
+def stepped(terms: Sequence[TermT], step: Array) -> list[TermT]:
+    """Return terms with a step added to all their parameters."""
+    out, start = [], 0
+    for term in terms:
+        part = step[start : start + term.theta.size]
+        start += term.theta.size
+        out.append(term.effect.bounded(term.with_theta(term.theta + part)))
+    return out
+
+
+def is_covered(candidate: BaseTerm, active: Sequence[BaseTerm]) -> bool:
+    """Return whether an active term stands for a candidate already."""
+    return any(one.effect.covers(one, candidate) for one in active)
+
+
+@dataclass(frozen=True)
+class Score:
+    """Scores one candidate, given the active effects."""
+
+    held_out: float  # sum of squares of the held-out residuals with the candidate
+    solution: Array  # (q,), the candidate's coefficients, the active effects refitted
+    own: BlockSums  # of the candidate alone
+
+
+class Scorer(Generic[StateT]):
+    """Scores candidates against one state; the sums of the active effects are made once."""
+
+    def __init__(self, state: StateT, blocks: Ints) -> None:
+        self.state, self.blocks = state, blocks
+        # Terms of very many columns stay as they are: they are what metal left, not effects.
+        terms = [t for t in state.terms if t.theta.size <= MOST_COLUMNS]
+        empty: Columns = [None] * len(state.parts)
+        self._active = joined([state.design(t) for t in terms]) if terms else empty
+        self.prior = state.prior(terms)
+        self.sums = block_sums(state.parts, self._active, blocks)
+        self.held_out = self.sums.held_out(self.prior, state.folds) + state.penalty
+
+    def score(self, term: BaseTerm, prior: Array | None = None) -> Score | None:
+        """Return the worth of a candidate; None when it touches no value, or is at a dipole's own
+        place. Without a prior (q,) its coefficients are free.
+        """
+        probe = self.state.design(term, probe=True)
+        width = width_of(probe)
+        if width == 0:
+            return None
+        own = block_sums(self.state.parts, probe, self.blocks)
+        if not np.any(own.normal) or not np.isfinite(own.normal).all():
+            return None
+        sums = cross_sums(self.state.parts, self._active, probe, self.sums, own, self.blocks)
+        if prior is None:
+            scale = np.sqrt(np.diag(own.normal.sum(axis=0)))
+            prior = np.where(scale > 0, 1e4 / np.maximum(scale, 1e-300), 1.0)
+        full_prior = np.concatenate([self.prior, prior])
+        estimate, _ = sums.solve(full_prior)
+        left = sums.held_out(full_prior, self.state.folds) + self.state.penalty
+        return Score(left, estimate[-width:], own)
+
+
+class ForwardSelection(Generic[FitT]):
+    """Adds effects one by one, the best first, while each pays for itself, and removes the others.
+
+    What pays, and what is superfluous beside the others, an observation says.
+    """
+
+    most = 6  # effects after which the search ends: more would be stand-ins
+
+    def addition(self, fit: FitT) -> FitT | None:
+        """Return the fit with the effect that is worth most, or None when none pays."""
+        raise NotImplementedError
+
+    def taken(self, fit: FitT) -> FitT:
+        """Return a fit with an effect more, the earlier ones reconsidered."""
+        return fit
+
+    def is_lost(self, fit: FitT) -> bool:
+        """Return whether further effects would only stand in for another cause."""
+        return False
+
+    def superfluous(self, fit: FitT) -> FitT | None:
+        """Return the fit without one effect that the others explain away; None for none."""
+        raise NotImplementedError
+
+    def grown(self, fit: FitT) -> FitT:
+        """Return the fit with all effects that pay."""
+        for _ in range(self.most):
+            better = self.addition(fit)
+            if better is None:
+                break
+            fit = self.taken(better)
+            if self.is_lost(fit):
+                break
+        return fit
+
+    def thinned(self, fit: FitT) -> FitT:
+        """Return the fit without what the others explain away."""
+        while (without := self.superfluous(fit)) is not None:
+            fit = without
+        return fit
