@@ -206,9 +206,9 @@ def replay_through_nodes(
                 listener.spin(0.2)
             assert player.returncode == 0, (logs / 'replay.log').read_text()
             before = -1
-            while listener.total() != before:
+            while listener.total() != before:  # what is on its way comes sooner than that
                 before = listener.total()
-                listener.spin(0.5)
+                listener.spin(2.0)
             return listener.poses()
         finally:
             stop(processes)

@@ -1,8 +1,7 @@
 """The tests' own end of the graph, beside a tracker or a field_model in the same process."""
 
-import time
-
 import numpy as np
+from conftest import wait
 from tracking_world import certain_model, setup_of, triaxial_tool
 
 from anser_ros.wire.points import DipolePoints, FluxPoints, encode_field_model
@@ -88,11 +87,9 @@ class Bench:
     def value(self, name, key):
         return self.states.get(name, ('', {}))[1].get(key, '')
 
-    def spin_until(self, condition, timeout_s=10.0):
-        end = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < end, (self.node.counters, self.states)
-            self.executor.spin_once(timeout_sec=0.02)
+    def spin_until(self, condition):
+        came = wait(condition, lambda: self.executor.spin_once(timeout_sec=0.02))
+        assert came, (self.node.counters, self.states)
 
     def connect(self, *publishers):
         self.spin_until(

@@ -1,8 +1,7 @@
 """A field_model node that refits, in the process of the test, fed by its callbacks."""
 
-import time
-
 import numpy as np
+from conftest import wait
 from refit_world import anser_world, metal_block
 from tracking_world import CENTRES_MM, GEOMETRY, TURNED
 
@@ -77,11 +76,9 @@ class Rig:
         self.cloud, self.stamp_ns = FluxCloud('fg'), FIRST_NS
         self.rng = np.random.default_rng(1)
 
-    def until(self, condition, timeout_s=20.0):
-        end = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < end, self.node.counters
-            self.executor.spin_once(timeout_sec=0.02)
+    def until(self, condition):
+        spins = wait(condition, lambda: self.executor.spin_once(timeout_sec=0.02))
+        assert spins, self.node.counters
 
     def message(self, channels, flux, flags=None):
         count = len(flux)

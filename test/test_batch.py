@@ -8,9 +8,9 @@ import math
 import os
 import signal
 import threading
-import time
 
 import pytest
+from conftest import wait
 from pose_world import World
 
 from anser_ros.cli import session_runs
@@ -85,10 +85,8 @@ def test_a_worker_that_dies_loses_nothing(sessions, alone, tmp_path, capfd):
         batch = threading.Thread(target=lambda: done.append(main(arguments)))
         batch.start()
         first = cluster.workers[0].pid
-        deadline_s = time.monotonic() + 30.0
-        while not any(one.processing for one in cluster.scheduler.workers.values()):
-            assert time.monotonic() < deadline_s
-            time.sleep(0.01)
+        workers = cluster.scheduler.workers
+        assert wait(lambda: any(one.processing for one in workers.values()))
         os.kill(first, signal.SIGKILL)
         batch.join(60.0)
         assert cluster.workers[0].pid != first

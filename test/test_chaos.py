@@ -146,14 +146,13 @@ def test_the_page_of_faults_has_the_kept_result(tmp_path):
 
 
 @pytest.mark.processes
-@pytest.mark.realtime
 def test_a_sample_of_the_trial_passes(tmp_path):
     out = tmp_path / 'rows.json'
     command = [sys.executable, str(CHAOS / 'run.py'), '--only', *SAMPLE, '--duration', '1.0']
     environment = {k: v for k, v in os.environ.items() if k != 'ROS_DOMAIN_ID'}
     done = subprocess.run(
         [*command, '--out', str(out)],
-        capture_output=True, text=True, timeout=150, check=False, env=environment,
+        capture_output=True, text=True, timeout=280, check=False, env=environment,
     )  # fmt: skip
     rows = {row['name']: row for row in json.loads(out.read_text())}
     assert set(rows) == set(SAMPLE), done.stderr

@@ -37,10 +37,5 @@ def test_example_runs(name, tmp_path, monkeypatch, capsys):
     assert SAID[name] in capsys.readouterr().out
 
 
-def test_every_example_is_short_documented_and_run():
-    scripts = {path.stem: path.read_text(encoding='utf-8') for path in EXAMPLES.glob('*.py')}
-    assert set(scripts) == set(SAID)
-    page = (REPO / 'docs' / 'examples.md').read_text(encoding='utf-8')
-    for name, text in scripts.items():
-        assert len(text.splitlines()) <= 40 and text.startswith('"""')
-        assert f'examples/{name}.py' in page
+def test_every_example_is_run():
+    assert {path.stem for path in EXAMPLES.glob('*.py')} == set(SAID)

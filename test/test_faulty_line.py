@@ -21,7 +21,7 @@ def line(ros, start, tmp_path):
     listener = Listener(ros)
     start('acquisition', '--ros-args', '-p', f'device:={tmp_path / "cu"}')
     try:
-        listener.until(lambda: len(listener.tool) > 10, 30.0)
+        listener.until(lambda: len(listener.tool) > 10)
         yield unit, listener
     finally:
         unit.close()

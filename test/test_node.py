@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from conftest import Process, spin_until
+from conftest import Process, spin_until, wait
 
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.runtime import parameters
@@ -136,10 +136,10 @@ class Sample(AnserNode):
         super().__init__(**options)
         print('rate', self.parameters.rate_hz, flush=True)
         if self.parameters.rate_hz == 99.0:
-            time.sleep(20)
+            time.sleep(600)
         if self.parameters.rate_hz == 98.0:  # a library that lets no Python handler run
-            ctypes.CDLL(None).poll(None, 0, 20000)
-            ctypes.CDLL(None).sleep(20)
+            ctypes.CDLL(None).poll(None, 0, 600000)
+            ctypes.CDLL(None).sleep(600)
         if end is not None:
             self.stop(end)
 
@@ -170,18 +170,14 @@ class TestProcess:
     def test_a_signal_ends_it_in_order(self, run, number):
         process = run('--ros-args', '-p', 'rate_hz:=50')
         process.wait_for('rate 50.0')
-        began = time.monotonic()
         assert process.interrupt(number) == 0
-        assert time.monotonic() - began < 2.0
         assert process.output.endswith('closed\n')
 
     @pytest.mark.parametrize('rate', [98, 99])
     def test_a_signal_ends_it_while_it_is_still_being_made(self, run, rate):
         process = run('--ros-args', '-p', f'rate_hz:={rate}')
         process.wait_for(f'rate {rate}.0')
-        began = time.monotonic()
         assert process.interrupt() == 0
-        assert time.monotonic() - began < 2.5
         assert process.output == f'rate {rate}.0\n'
 
     def test_a_signal_ends_it_while_it_imports(self, domain, tmp_path):
@@ -194,7 +190,7 @@ class TestProcess:
         assert 'Traceback' not in process.output
 
     def test_it_can_end_itself(self, run):
-        assert run('--end', '0').popen.wait(20) == 0
+        assert run('--end', '0').wait() == 0
 
     @pytest.mark.parametrize(
         ('arguments', 'said'),
@@ -207,7 +203,7 @@ class TestProcess:
     )
     def test_a_wrong_argument_is_one_clear_line(self, run, arguments, said):
         process = run(*arguments)
-        assert process.popen.wait(20) == 2
+        assert process.wait() == 2
         assert said in process.output
         assert 'Traceback' not in process.output
 
@@ -221,7 +217,7 @@ class TestProcess:
 
     def test_help_prints_the_table(self, run):
         process = run('--help')
-        assert process.popen.wait(20) == 0
+        assert process.wait() == 0
         assert 'rate_hz = 25.0 [1 to inf]' in process.output
 
 
@@ -254,9 +250,7 @@ class TestGraph:
         executor = ros.executors.SingleThreadedExecutor()
         executor.add_node(node)
         executor.add_node(listener)
-        end = time.monotonic() + 10
-        while not got and time.monotonic() < end:
-            executor.spin_once(timeout_sec=0.1)
+        assert wait(lambda: got, lambda: executor.spin_once(timeout_sec=0.1))
         executor.shutdown()
         own, part = got[0].status
         assert (own.name, own.level, own.message) == ('anser/sample', b'\x01', 'waiting')

@@ -130,13 +130,13 @@ def test_the_stream_is_started_by_the_same_rules(wire, port):
     port.send(control.due(1_000_000_000))
     assert wire.read() == b'who 1\n'
     wire.write(line('hello'))
-    for record in port.get(1.0).records or port.get(1.0).records:
-        control.take(record, 1_100_000_000)
+    for payload in receive(port, 1):
+        control.take(Record(payload), 1_100_000_000)
     port.send(control.due(1_200_000_000))
     assert wire.read() == b'go 2\n'
     wire.write(line('done', 'go', 2))
-    for record in port.get(1.0).records:
-        control.take(record, 1_300_000_000)
+    for payload in receive(port, 1):
+        control.take(Record(payload), 1_300_000_000)
     assert control.started
 
 

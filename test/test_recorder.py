@@ -6,7 +6,7 @@ import time
 
 import pytest
 import yaml
-from conftest import spin_until
+from conftest import spin_until, wait
 from mcap.reader import make_reader
 
 from anser_ros.errors import BagError
@@ -51,10 +51,12 @@ def begin(start, source, tmp_path, *options):
     arguments = [f'directory:={tmp_path}', 'name:=bag', *options]
     pairs = [word for argument in arguments for word in ('-p', argument)]
     process = start('recorder', '--ros-args', *pairs)
-    assert spin_until(source, lambda: source.pose.get_subscription_count() == 1, 20), (
-        process.output
-    )
+    assert spin_until(source, lambda: source.pose.get_subscription_count() == 1), process.output
     return process
+
+
+def values_of(message):
+    return {pair.key: pair.value for status in message.status for pair in status.values}
 
 
 def call(node, name):
@@ -75,21 +77,27 @@ def test_another_tracker_is_recorded_and_the_model_error_is_not(start, source, t
         source.create_publisher(String, f'/anser/{topic}', 10)
     source.create_publisher(PoseStamped, '/tracked/tip/pose', 10)
     process = begin(start, source, tmp_path)
-    time.sleep(0.8)
-    assert source.count_subscribers('/tracked/tip/pose') == 1
-    assert source.count_subscribers('/anser/field_model') == 1
+    for topic in ('/tracked/tip/pose', '/anser/field_model'):
+        assert spin_until(source, lambda topic=topic: source.count_subscribers(topic) == 1)
     assert source.count_subscribers('/anser/field_model_error') == 0
     assert process.interrupt(signal.SIGTERM) == 0
 
 
 def test_a_bag_is_complete_and_described(start, source, tmp_path):
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    told = {}
+    source.create_subscription(
+        DiagnosticArray, '/diagnostics', lambda m: told.update(values_of(m)), qos_profile=10
+    )
     process = begin(start, source, tmp_path)
     for _ in range(50):
         source.send()
         time.sleep(0.01)
     source.sent += 30
     source.send()
-    time.sleep(1.5)  # the latched setup and a diagnostic message come in their own time
+    # The poses, the latched setup and a diagnostic message.
+    assert spin_until(source, lambda: int(told.get('messages', 0)) > 52)
     assert process.interrupt(signal.SIGTERM) == 0
     assert '/optical/tool_a/pose 1 gaps up to 0.31 s' in process.output
     bag = tmp_path / 'bag' / 'bag_0.mcap'
@@ -118,31 +126,29 @@ def test_a_bag_is_complete_and_described(start, source, tmp_path):
     assert info['custom_data'] == {'closed': 'true'}
 
 
-def test_a_kill_costs_less_than_a_second(start, source, tmp_path):
-    process = begin(start, source, tmp_path)
-    sent_s, end_s = [], time.time() + 4.5
-    while time.time() < end_s:
+def test_a_kill_costs_only_what_came_since_the_last_flush(start, source, tmp_path):
+    process, bag = begin(start, source, tmp_path), tmp_path / 'bag'
+
+    def there():
+        salvage = Salvage()
+        messages = list(iter_messages(bag, salvage)) if (bag / 'metadata.yaml').exists() else []
+        return messages, salvage
+
+    def send():
         source.send()
-        sent_s.append(time.time())
         time.sleep(0.02)
-    last_s = time.time()
+
+    assert wait(lambda: sum('pose' in m.topic for m in there()[0]) > 50, send)
+    flushed = len(there()[0])
     process.interrupt(signal.SIGKILL)
-    salvage = Salvage()
-    messages = list(iter_messages(tmp_path / 'bag', salvage))
-    poses = [m for m in messages if m.topic == '/optical/tool_a/pose']
-    assert salvage.lost
-    assert last_s - max(m.log_time_ns for m in poses) * 1e-9 <= 1.0
-    assert len(poses) > 0.9 * sum(moment_s < last_s - 1.0 for moment_s in sent_s)
-    info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
-    info = info['rosbag2_bagfile_information']
+    messages, salvage = there()
+    assert salvage.lost and len(messages) >= flushed
+    info = yaml.safe_load((bag / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
     assert info['relative_file_paths'] == ['bag_0.mcap']
     assert info['custom_data'] == {'closed': 'false'}
+    assert 0 < info['message_count'] <= len(messages)
     told_s = 1e-9 * info['duration']['nanoseconds']
-    there_s = 1e-9 * (messages[-1].log_time_ns - messages[0].log_time_ns)
-    # A period, a flush, and some for a busy machine; the topics appeared 4.5 s before the end.
-    assert there_s > 4.0
-    assert there_s - 2.9 < told_s <= there_s
-    assert info['message_count'] >= 0.3 * len(messages)
+    assert told_s <= 1e-9 * (messages[-1].log_time_ns - messages[0].log_time_ns)
 
 
 def test_services_start_and_stop(start, source, tmp_path):
@@ -173,6 +179,7 @@ def test_a_bag_is_never_written_over(start, source, tmp_path):
 
 
 def test_a_full_disk_ends_only_the_recording(start, source, small_disk):
+    import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
 
     errors = []
@@ -182,10 +189,12 @@ def test_a_full_disk_ends_only_the_recording(start, source, small_disk):
 
     source.create_subscription(DiagnosticArray, '/diagnostics', listen, 10)
     process = begin(start, source, small_disk)
-    end = time.monotonic() + 20
-    while not errors and time.monotonic() < end:
+
+    def fill():
         source.send(os.urandom(40_000).hex())  # that much noise can't be compressed away
-        spin_until(source, lambda: False, 0.01)
+        rclpy.spin_once(source, timeout_sec=0.01)
+
+    wait(lambda: errors, fill)
     assert errors[0] == 'recording stopped: No space left on device'
     assert process.popen.poll() is None
     answer = call(source, '/anser/recorder/stop')

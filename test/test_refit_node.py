@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import wait
 from refit_rig import HEAD, PATCH_COILS, STEP_NS, Rig, setup_text
 from refit_world import anser_world, metal_block
 
@@ -294,18 +295,14 @@ def test_coils_on_a_patch_take_part_where_the_pose_says(make):
         rig.node._moving.on_flux(rig.message([40, 41], flux))
         rig.stamp_ns -= STEP_NS
         rig.say(world.metal(HEAD) if change else 0.0)
-        time.sleep(0.002)
+        time.sleep(0.01)
 
     def left_out():
         return rig.node._refit.result.left_out
 
     frame(False)
     assert left_out() == ('patch/0', 'patch/1'), 'nothing was worked out for that place yet'
-    end = time.monotonic() + 60.0
-    while rig.node.counters['patch_moves'] < 1:
-        assert time.monotonic() < end
-        frame(False)
-        time.sleep(0.01)
+    assert wait(lambda: rig.node.counters['patch_moves'], lambda: frame(False))
     for _ in range(40):
         frame(False)
     assert left_out() == ()
@@ -352,13 +349,8 @@ def test_a_patch_leaves_no_thread_when_its_refit_is_worked_out(ros):
     refit = patches.started(world.model, world.references)
     patches.take_pose('patch', pose_message(1, [0.02, 0.05, 0.16]))
     assert patches.moved_refit(refit, 1) is None and workers()
-    end = time.monotonic() + 20.0
-    while patches.moved_refit(refit, 1) is None:
-        assert time.monotonic() < end
-        time.sleep(0.01)
-    for thread in workers():
-        thread.join(timeout=5.0)
-    assert not workers()
+    assert wait(lambda: patches.moved_refit(refit, 1) is not None)
+    assert wait(lambda: not workers())
 
 
 def test_markers_of_nothing_and_of_one_source(ros):
@@ -377,7 +369,7 @@ def test_markers_of_nothing_and_of_one_source(ros):
 def test_lost_references_are_told_to_the_trackers_and_to_the_operator(make):
     from anser_ros.nodes.tracker_parts.model_intake import ModelIntake
 
-    rig, intake, given = make(references_age_s=0.5, refit_rate_hz=1000.0), ModelIntake(), []
+    rig, intake, given = make(references_age_s=2.0, refit_rate_hz=1000.0), ModelIntake(), []
     rig.node._output.errors.publish = lambda message: intake.take_error(message)
     rig.node._output.models.publish = lambda message: given.append(intake.take(message))
     rig.start()
@@ -394,4 +386,4 @@ def test_lost_references_are_told_to_the_trackers_and_to_the_operator(make):
     rig.say(change)
     assert given[-1].withheld == ''
     rig.until(lambda: rig.node.status().level == Level.ERROR)
-    assert rig.node.status().message.startswith('references_lost: no reference fluxes for 0.')
+    assert rig.node.status().message.startswith('references_lost: no reference fluxes for ')

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import PATIENCE_S
 from refit_rig import Rig, setup_text
 from refit_world import anser_world
 
@@ -30,11 +31,11 @@ class Held:
 
         def held(*given, report, **named):
             report(self.share)
-            assert self.let.wait(20.0)
+            assert self.let.wait(PATIENCE_S)
             return build(*given, report=report, **named)
 
         def held_refit(*given, **named):
-            assert self.let.wait(20.0)
+            assert self.let.wait(PATIENCE_S)
             return refit(*given, **named)
 
         monkeypatch.setattr(tables, 'build_tables', held)
@@ -163,15 +164,15 @@ def test_tables_that_nobody_wants_any_more_are_given_up(ros, monkeypatch):
         begun.set()
         while True:
             report(0.5)
-            goes_on.wait(20.0)
+            goes_on.wait(PATIENCE_S)
 
     monkeypatch.setattr(tables, 'build_tables', endless)
     setup = parse_setup(setup_text(world))
     start = RefitStart(setup, world.model, world.references, ())
     start.begin(np.zeros((16, 8), complex))
     assert start.taken() is None and start.is_making
-    assert begun.wait(20.0)
+    assert begun.wait(PATIENCE_S)
     time.sleep(0.01)
     assert not start.end(0.01), 'it is between two words'
     goes_on.set()
-    assert start.end(20.0)
+    assert start.end(PATIENCE_S)

@@ -1,6 +1,5 @@
 """The node tracker over DDS: poses, states, parameters, and a recorded session."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -100,9 +99,12 @@ def test_states_without_model_setup_or_data(tracker):
     tracker.spin_until(lambda: tracker.state('anser/tracker: tool_a') == 'no_model')
     assert tracker.state('anser/tracker') == 'no field model yet'
     tracker.node.set_parameters([Parameter('stale_after_s', value=0.3)])
-    time.sleep(0.4)
-    tracker.node.publish_diagnostics()
-    tracker.spin_until(lambda: tracker.state('anser/tracker: tool_a') == 'stale')
+
+    def is_stale():
+        tracker.node.publish_diagnostics()
+        return tracker.state('anser/tracker: tool_a') == 'stale'
+
+    tracker.spin_until(is_stale)
 
 
 def test_another_model_while_it_runs(tracker, tmp_path):
@@ -233,10 +235,10 @@ def test_what_acquisition_measures_meanwhile_changes_settings_only(tracker):
 
 def test_a_wrong_parameter_ends_the_node_with_one_line(start):
     process = start('tracker', '--ros-args', '-p', 'volume_low_m:=[0.1]')
-    assert process.popen.wait(20) == 2
+    assert process.wait() == 2
     assert 'volume_low_m: three numbers needed' in process.output
     process = start('field_model', '--ros-args', '-p', 'model_file:=/dev/null')
-    assert process.popen.wait(20) == 2
+    assert process.wait() == 2
     assert 'schema' in process.output
     assert 'Traceback' not in process.output
 
