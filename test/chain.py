@@ -10,6 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
 from anser_ros.wire.bag_writer import BagWriter
@@ -85,11 +90,6 @@ class Listener:
 
     def __init__(self, topics: list[str], domain: int) -> None:
         import rclpy
-        from diagnostic_msgs.msg import DiagnosticArray
-        from geometry_msgs.msg import PoseStamped
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-        from std_msgs.msg import String
 
         self._context = rclpy.Context()
         self._context.init(domain_id=domain)

@@ -291,6 +291,12 @@ def spin_until(node: Any, condition: Callable[[], Any]) -> bool:
     return wait(condition, lambda: rclpy.spin_once(node, timeout_sec=0.05))
 
 
+def needs(*parts: str) -> pytest.MarkDecorator:
+    """Let a test be skipped where a folder of the shared data is not there."""
+    folder = SHARED.joinpath(*parts)
+    return pytest.mark.skipif(not folder.is_dir(), reason=f'no folder {folder}')
+
+
 @pytest.fixture
 def shared() -> Path:
     """Return the folder of the recorded sessions, or skip where it is not there."""

@@ -2,8 +2,18 @@
 
 import numpy as np
 from conftest import wait
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 from tracking_world import certain_model, setup_of, triaxial_tool
 
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.streams.clouds import FluxCloud
+from anser_ros.nodes.streams.model_clouds import CloudMaker
+from anser_ros.nodes.tracker import TrackerNode
 from anser_ros.wire.points import DipolePoints, FluxPoints, encode_field_model
 from anser_ros.wire.setup import SensorSpec, dump_setup
 
@@ -32,15 +42,6 @@ class Bench:
     """The test's own end of the graph."""
 
     def __init__(self, ros, node):
-        from diagnostic_msgs.msg import DiagnosticArray
-        from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-        from rclpy.executors import SingleThreadedExecutor
-        from sensor_msgs.msg import PointCloud2
-        from std_msgs.msg import String
-
-        from anser_ros.nodes.runtime import qos
-        from anser_ros.nodes.streams.clouds import FluxCloud
-
         self.peer = ros.create_node('bench', namespace='anser')
         self.node = node
         self.executor = SingleThreadedExecutor()
@@ -97,13 +98,9 @@ class Bench:
         )
 
     def say_setup(self, text=None):
-        from std_msgs.msg import String
-
         self.setup.publish(String(data=text or dump_setup(setup_of(SENSORS, reference_specs()))))
 
     def say_model(self, model, stamp_ns=5):
-        from anser_ros.nodes.streams.model_clouds import CloudMaker
-
         packed = encode_field_model(DipolePoints(model.positions, model.directions, model.moments))
         self.model.publish(CloudMaker().message(packed, 'fg', stamp_ns))
 
@@ -147,10 +144,6 @@ def tracker_bench(ros):
 
     No frame grows stale: how old one is when it is told of is a matter of the machine.
     """
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.tracker import TrackerNode
-
     node = TrackerNode(parameter_overrides=[Parameter('stale_after_s', value=30.0)])
     bench = Bench(ros, node)
     bench.connect(bench.setup, bench.flux, bench.model)

@@ -13,7 +13,7 @@ import pytest
 from conftest import wait
 from pose_world import World
 
-from anser_ros.cli import session_runs
+from anser_ros.cli import batch, session_runs
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, main
 from anser_ros.cli.session_runs import names_of, perform, runs_of
 from anser_ros.cli.summary import Outcome, row_of, write_summary
@@ -98,8 +98,6 @@ def test_a_worker_that_dies_loses_nothing(sessions, alone, tmp_path, capfd):
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(sessions, tmp_path, capsys, monkeypatch):
-    from anser_ros.cli import batch
-
     monkeypatch.setattr(batch, 'CONNECT_S', 0.2)
     arguments = ['--poses', '--out', str(tmp_path), '--scheduler', 'tcp://127.0.0.1:1']
     assert main(['batch', 'evaluate', sessions[0], *arguments]) == EXIT_BAD_INPUT

@@ -17,8 +17,9 @@ from anser_ros.wire.frames import encode
 from anser_ros.wire.records import SampleBlock
 
 CHAOS = Path(__file__).resolve().parent / 'chaos'
-SAMPLE = ('nothing', 'torn', 'unplugged')
-"""Faults of the sample: none, one that costs frames, one that costs the connection."""
+SAMPLE = ('nothing', 'torn', 'unplugged', 'ring', 'ticks-frozen')
+"""None, one that costs frames, one that costs the connection, and a unit that repeats its samples
+or whose clock stands still."""
 
 
 @pytest.fixture(scope='module', autouse=True)

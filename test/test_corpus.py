@@ -15,6 +15,7 @@ from anser_ros.effects.correction import Correction
 from anser_ros.effects.registry import all_effects
 from anser_ros.errors import AnserError, ModelFileError
 from anser_ros.field.model import EffectRecord
+from anser_ros.nodes.output_parts.igtl_server import IgtlServer
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.frame_reader import FrameReader
@@ -144,8 +145,6 @@ def heard(client, server):
 
 
 def test_whatever_a_client_says_to_openigtlink():
-    from anser_ros.nodes.output_parts.igtl_server import IgtlServer
-
     server = IgtlServer('127.0.0.1', 0, lambda header: b'answer')
     try:
         for path in files('igtl'):

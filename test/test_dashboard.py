@@ -15,6 +15,7 @@ pytest.importorskip('nicegui', reason='nicegui is not installed')
 
 from dashboard_world import OFF_M, ten_sensors
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import serialize_message
 from tracking_world import certain_model
 
@@ -22,6 +23,7 @@ from anser_ros.cli import demo, missing
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.nodes.dashboard import DashboardParameters
+from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.output_parts import live_view
 from anser_ros.nodes.output_parts.causes import LastStatus
 from anser_ros.nodes.output_parts.chain_client import ChainClient, ChainError
@@ -29,6 +31,7 @@ from anser_ros.nodes.output_parts.live_view import LiveView, read_pose
 from anser_ros.nodes.output_parts.polled import polling_node
 from anser_ros.nodes.output_parts.traces import latency_of
 from anser_ros.nodes.output_parts.view_source import ViewSource
+from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.volume import tracked_volume
 from anser_ros.web import loop as loop_module
 from anser_ros.web.folder import RESULTS, RecordingFolder
@@ -358,11 +361,6 @@ def test_the_view_has_place_ellipsoid_error_and_residual(monkeypatch):
 
 
 def test_the_nodes_are_asked_for_services_and_models(ros, tmp_path):
-    from rclpy.executors import SingleThreadedExecutor
-
-    from anser_ros.nodes.field_model import FieldModelNode
-    from anser_ros.sessions.model_file import save_model
-
     server, asker = FieldModelNode(), ros.create_node('asker', namespace='anser')
     client = ChainClient(asker, lambda: None, print)
     executor = SingleThreadedExecutor()

@@ -88,18 +88,6 @@ def test_what_is_said_of_any_shipped_session_is_short(name, tmp_path, capsys):
     assert len(said) == 1 and 100 < len(said[0]) < MOST_CHARACTERS
 
 
-@pytest.mark.parametrize(
-    ('bag', 'message'),
-    [('absent.mcap', 'no such bag'), (str(MODEL), 'not an MCAP file')],
-)
-def test_bad_input_is_one_line_and_exit_two(tmp_path, capsys, bag, message):
-    arguments = ['diagnose', bag, '--model', str(MODEL), '--out', str(tmp_path)]
-    assert main(arguments) == 2
-    text = capsys.readouterr().err
-    assert message in text
-    assert len(text.strip().split('\n')) == 1
-
-
 def test_the_session_needs_poses(tmp_path, capsys):
     bag = read_bag(BAGS / 'moving.mcap')
     path = tmp_path / 'blind.mcap'

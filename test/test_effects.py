@@ -25,16 +25,6 @@ def scenery():
     return made, made.problem()
 
 
-def test_every_name_of_the_interfaces_is_found():
-    effects = all_effects()
-    assert effects
-    for name, effect in effects.items():
-        assert effect.name == name
-        assert effect.summary
-        assert effect.units
-        assert isinstance(effect.remedy, Remedy)
-
-
 def test_effects_declare_what_the_search_needs(scenery):
     """Whoever adds an effect of a family must give what that family is refined with."""
     apparatus = scenery[1].apparatus

@@ -8,11 +8,21 @@ from dataclasses import make_dataclass, replace
 import numpy as np
 import pytest
 from conftest import PATIENCE_S, spin_until
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.srv import GetParameters
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
 from tracked_tool import CHANNELS, MODEL, TOOL
 
 from anser_ros.errors import ParameterError
+from anser_ros.nodes.runtime import process, qos
 from anser_ros.nodes.runtime.handover import DirectSubscription, HandedFlux, Handover, NewestWorker
+from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.runtime.parameter_files import names_for
+from anser_ros.nodes.streams.one_source import OneSource
+from anser_ros.nodes.tracker_parts.rehearsal import LONGEST_S, Rehearsal
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux
@@ -61,11 +71,6 @@ def test_what_takes_long_is_done_aside_with_the_newest():
 
 def test_what_is_worked_on_aside_has_nothing_to_do_with_a_node_that_is_gone(ros):
     """The thread ends with its node, and what it still does then is no fault of a callback."""
-    from std_msgs.msg import String
-
-    from anser_ros.nodes.runtime import qos
-    from anser_ros.nodes.runtime.node import AnserNode
-
     began, goes_on = threading.Event(), threading.Event()
 
     class Slow(AnserNode):
@@ -113,8 +118,6 @@ def test_what_is_put_off_is_done_one_thing_a_pause_while_there_are_pauses():
 
 
 def test_a_node_prepares_for_each_frame_that_is_due(ros):
-    from anser_ros.nodes.runtime.node import AnserNode
-
     class Preparing(AnserNode):
         NAME = 'preparing'
 
@@ -138,9 +141,6 @@ def test_a_node_prepares_for_each_frame_that_is_due(ros):
 
 
 def test_only_a_frame_that_gave_poses_in_time_is_rehearsed():
-    pytest.importorskip('rclpy')
-    from anser_ros.nodes.tracker_parts.rehearsal import LONGEST_S, Rehearsal
-
     rehearsal, tracker = Rehearsal(TOOL, TrackerSettings()), Tracker(MODEL, TOOL)
     flux = MODEL.flux(TOOL.position + [0.0, 0.0, 0.15], TOOL.axis, TOOL.length)
     nowhere = np.full((len(CHANNELS), 3), np.nan)
@@ -173,9 +173,6 @@ def test_handed_fluxes_are_those_that_are_published():
 
 
 def test_parameters_of_one_node_are_given_to_it_alone():
-    pytest.importorskip('rclpy')
-    from anser_ros.nodes.runtime import process
-
     tracker, server = (
         type('T', (), {'NAME': name, 'PARAMETERS': make_dataclass('P', [(known, float, 0.0)])})
         for name, known in (('tracker', 'gate'), ('field_model', 'refit'))
@@ -211,12 +208,6 @@ def test_a_file_tells_which_values_it_has_for_one_node(tmp_path):
 
 
 def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros):
-    from sensor_msgs.msg import PointCloud2
-
-    from anser_ros.nodes.runtime import qos
-    from anser_ros.nodes.runtime.node import AnserNode
-    from anser_ros.nodes.streams.one_source import OneSource
-
     class Giver(AnserNode):
         NAME = 'giver'
 
@@ -243,12 +234,7 @@ def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros)
 
 
 def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
-    from geometry_msgs.msg import PoseStamped
-    from rcl_interfaces.srv import GetParameters
-    from std_srvs.srv import SetBool
-
     link, node, poses, levels = tmp_path / 'cu', ros.create_node('peer'), [], {}
-    from diagnostic_msgs.msg import DiagnosticArray
 
     def note(message):
         levels.update({status.name: status.message for status in message.status})
@@ -292,9 +278,6 @@ def test_what_several_nodes_cannot_be_given_is_one_line(start, words, said):
 @pytest.mark.parametrize('is_noticed', [True, False])
 def test_who_is_given_up_says_good_bye_to_devices_first(monkeypatch, is_noticed):
     """A process too busy to notice Ctrl-C ends all the same; the unit must not stream on."""
-    pytest.importorskip('rclpy')
-    from anser_ros.nodes.runtime import process
-
     done = []
 
     def fail():

@@ -8,10 +8,16 @@ from pathlib import Path
 
 import pytest
 from conftest import Process, spin_until, wait
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.runtime import parameters
+from anser_ros.nodes.runtime import process as processes
 from anser_ros.nodes.runtime.diagnostics import Throttle, text_of
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameter_files import complaints
 from anser_ros.nodes.runtime.parameters import parameter
 
@@ -224,8 +230,6 @@ class TestProcess:
 class TestGraph:
     @pytest.fixture
     def node(self, ros):
-        from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-
         class Sample(AnserNode):
             NAME = 'sample'
             PARAMETERS = Table
@@ -241,8 +245,6 @@ class TestGraph:
         node.destroy_node()
 
     def test_diagnostics_hold_state_counters_and_parts(self, ros, node):
-        from diagnostic_msgs.msg import DiagnosticArray
-
         got = []
         node.count('windows', 5)
         listener = ros.create_node('listener')
@@ -259,9 +261,6 @@ class TestGraph:
         assert part.name == 'anser/sample: tool_a/0/x'
 
     def test_a_failing_callback_is_counted_and_survived(self, ros, node):
-        from std_msgs.msg import String
-        from std_srvs.srv import Trigger
-
         def fail(_message):
             raise ZeroDivisionError('on purpose')
 
@@ -281,8 +280,6 @@ class TestGraph:
         assert spin_until(node, lambda: node.counters['callback_faults'] == 1)
 
     def test_parameters_change_only_within_the_table(self, node):
-        from rclpy.parameter import Parameter
-
         before = node.parameters
         (done,) = node.set_parameters([Parameter('rate_hz', value=50)])
         assert done.successful and node.parameters.rate_hz == 50.0 and before.rate_hz == 25.0
@@ -295,10 +292,8 @@ class TestGraph:
 
 def test_the_executor_is_the_one_told_of_events_where_rclpy_has_it(monkeypatch):
     experimental = pytest.importorskip('rclpy.experimental')
-    from anser_ros.nodes.runtime import process
-
     monkeypatch.setattr(experimental, 'EventsExecutor', lambda: 'events')
-    assert process.make_executor() == 'events'
+    assert processes.make_executor() == 'events'
     monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)
-    monkeypatch.setattr(process, 'SingleThreadedExecutor', lambda: 'waiting')
-    assert process.make_executor() == 'waiting'
+    monkeypatch.setattr(processes, 'SingleThreadedExecutor', lambda: 'waiting')
+    assert processes.make_executor() == 'waiting'

@@ -10,8 +10,19 @@ import numpy as np
 import pyigtl
 import pytest
 from conftest import spin_until, wait
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 
 from anser_ros.errors import ParameterError, PortError
+from anser_ros.nodes.openigtlink import (
+    OpenIGTLink,
+    OpenIGTLinkParameters,
+    check_templates,
+    devices_of,
+)
 from anser_ros.nodes.output_parts.igtl_server import MOST_CLIENTS, IgtlServer
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import parse_setup
@@ -46,11 +57,6 @@ def answer(header):
 @pytest.fixture
 def tracker(ros):
     """A node that publishes what a tracker does."""
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-    from geometry_msgs.msg import PoseStamped
-    from rclpy.qos import DurabilityPolicy, QoSProfile
-    from std_msgs.msg import String
-
     node = ros.create_node('tracker', namespace='anser')
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     setup = node.create_publisher(String, 'setup', latched)
@@ -129,10 +135,6 @@ def test_poses_and_states_reach_clients(start, tracker, connect):
 
 
 def test_a_pose_that_is_none_is_refused(ros, tracker):
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.openigtlink import OpenIGTLink
-
     node = OpenIGTLink(parameter_overrides=[Parameter('port', value=0)])
     try:
         assert spin_until(node, lambda: tracker.listeners() == 1)
@@ -254,10 +256,6 @@ def read(client, count):
 
 def test_replies_of_the_node(ros, tracker):
     """What it can, how it is, and the poses of all that are tracked."""
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.openigtlink import OpenIGTLink
-
     values = {'port': 0, 'coil_name': '{sensor}Of{body}'}
     node = OpenIGTLink(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()])
     try:
@@ -302,8 +300,6 @@ def take(client):
 
 class TestNames:
     def named(self, text=SETUP, **values):
-        from anser_ros.nodes.openigtlink import OpenIGTLinkParameters, devices_of
-
         return devices_of(parse_setup(text), OpenIGTLinkParameters(**values))
 
     def test_templates(self):
@@ -311,8 +307,6 @@ class TestNames:
         assert self.named(body_name='{body}ToTracker', coils=False) == {
             'tool_a': 'tool_aToTracker'
         }
-        from anser_ros.nodes.openigtlink import OpenIGTLinkParameters, check_templates
-
         with pytest.raises(ParameterError, match=r'body_name may have \{body\}'):
             check_templates(OpenIGTLinkParameters(body_name='{tool}'))
 

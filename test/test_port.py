@@ -209,14 +209,6 @@ def test_gap_in_the_sequence_is_counted_in_blocks(wire, port):
     assert port.counters.gap_blocks == 3, 'a restarted stream is no gap'
 
 
-def test_bad_crc_is_counted(wire, port):
-    raw = bytearray(block(0))
-    raw[40] ^= 1
-    wire.write(bytes(raw) + block(1))
-    assert [p.sequence for p in receive(port, 1)] == [1]
-    assert port.fault_counters()['bad_crc'] == 1
-
-
 def test_bytes_without_records_are_called_a_wrong_baud_rate(wire, port):
     rng = np.random.default_rng(1)
 
@@ -268,15 +260,6 @@ def test_receiver_is_woken_for_as_many_blocks_as_it_wants(wire, port):
 def test_port_can_be_started_once(port):
     with pytest.raises(PortError, match='started before'):
         port.start()
-
-
-def test_device_that_does_not_exist_is_tried_again_and_named(tmp_path):
-    port = ControlUnitPort(str(tmp_path / 'nothing'), pause_s=0.01, longest_pause_s=0.02)
-    port.start()
-    assert wait(lambda: port.counters.open_failures >= 3)
-    assert port.state is PortState.ABSENT
-    assert 'nothing' in port.reason
-    port.stop()
 
 
 def test_the_right_port_is_found_by_listening_only(wire, tmp_path):

@@ -1,8 +1,6 @@
 """Another control unit's protocol: bytes of its own, the same records, nothing else changed."""
 
 import json
-import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +9,7 @@ from test_port import HELLO, TONES, Wire, receive, wait
 
 from anser_ros.nodes.acquisition_parts.acquisition_parameters import AcquisitionParameters
 from anser_ros.wire.frames import TYPE_OF
-from anser_ros.wire.port import ControlUnitPort, PortState, find_port
+from anser_ros.wire.port import ControlUnitPort, PortState
 from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol
 from anser_ros.wire.records import (
     Identify,
@@ -138,20 +136,6 @@ def test_the_stream_is_started_by_the_same_rules(wire, port):
     for payload in receive(port, 1):
         control.take(Record(payload), 1_300_000_000)
     assert control.started
-
-
-def test_the_port_of_another_unit_is_found_by_its_hello(wire):
-    found = []
-
-    def search():
-        found.append(find_port([str(wire.link)], protocol=TOY, listen_s=1.0))
-
-    thread = threading.Thread(target=search)
-    thread.start()
-    while thread.is_alive():  # pyserial empties the buffer when it opens a port
-        wire.write(line('hello'))
-        time.sleep(0.05)
-    assert found == [str(wire.link)]
 
 
 def test_the_acquisition_knows_every_protocol():

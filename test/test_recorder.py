@@ -7,12 +7,19 @@ import time
 import pytest
 import yaml
 from conftest import spin_until, wait
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from anser_ros.errors import BagError
+from anser_ros.nodes.bag_parts.definitions import definition, message_class, type_hash
 from anser_ros.nodes.bag_parts.recording_log import TopicLog, report
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_metadata import BagRecord
+from anser_ros.wire.cdr import DEFINITIONS
 
 pytestmark = pytest.mark.light
 
@@ -20,10 +27,6 @@ pytestmark = pytest.mark.light
 @pytest.fixture
 def source(ros):
     """A node that publishes what the recorder is to record."""
-    from geometry_msgs.msg import PoseStamped
-    from rclpy.qos import DurabilityPolicy, QoSProfile
-    from std_msgs.msg import String
-
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     node = ros.create_node('source')
     node.setup = node.create_publisher(String, '/anser/setup', latched)
@@ -45,8 +48,6 @@ def source(ros):
 
 def begin(start, source, tmp_path, *options):
     """Start a recorder and wait until it listens."""
-    from std_msgs.msg import String
-
     source.setup.publish(String(data='schema: anser_setup/1'))
     arguments = [f'directory:={tmp_path}', 'name:=bag', *options]
     pairs = [word for argument in arguments for word in ('-p', argument)]
@@ -60,8 +61,6 @@ def values_of(message):
 
 
 def call(node, name):
-    from std_srvs.srv import Trigger
-
     client = node.create_client(Trigger, name)
     assert client.wait_for_service(10)
     future = client.call_async(Trigger.Request())
@@ -70,9 +69,6 @@ def call(node, name):
 
 
 def test_another_tracker_is_recorded_and_the_model_error_is_not(start, source, tmp_path):
-    from geometry_msgs.msg import PoseStamped
-    from std_msgs.msg import String
-
     for topic in ('field_model', 'field_model_error'):
         source.create_publisher(String, f'/anser/{topic}', 10)
     source.create_publisher(PoseStamped, '/tracked/tip/pose', 10)
@@ -84,8 +80,6 @@ def test_another_tracker_is_recorded_and_the_model_error_is_not(start, source, t
 
 
 def test_a_bag_is_complete_and_described(start, source, tmp_path):
-    from diagnostic_msgs.msg import DiagnosticArray
-
     told = {}
     source.create_subscription(
         DiagnosticArray, '/diagnostics', lambda m: told.update(values_of(m)), qos_profile=10
@@ -180,7 +174,6 @@ def test_a_bag_is_never_written_over(start, source, tmp_path):
 
 def test_a_full_disk_ends_only_the_recording(start, source, small_disk):
     import rclpy
-    from diagnostic_msgs.msg import DiagnosticArray
 
     errors = []
 
@@ -255,8 +248,6 @@ class TestLog:
 
 class TestDefinitions:
     def test_unknown_types_are_refused(self):
-        from anser_ros.nodes.bag_parts.definitions import definition, message_class, type_hash
-
         for name in ('no_msgs/msg/None', 'std_msgs/msg/Nothing', 'String'):
             with pytest.raises(BagError):
                 message_class(name)
@@ -266,8 +257,6 @@ class TestDefinitions:
 
     def test_the_embedded_texts_agree_with_the_installed_ones(self):
         """Comments aside, and in any order."""
-        from anser_ros.nodes.bag_parts.definitions import definition
-        from anser_ros.wire.cdr import DEFINITIONS
 
         def essence(text):
             lines = (line.split('#')[0].split() for line in text.splitlines())

@@ -7,10 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import PATIENCE_S
+from rclpy.parameter import Parameter
 from refit_rig import Rig, setup_text
 from refit_world import anser_world
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from anser_ros.errors import FitError
+from anser_ros.nodes.field_model_parts import refit_start
+from anser_ros.nodes.field_model_parts.refit_start import RefitStart
 from anser_ros.nodes.runtime.diagnostics import Level
 from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
@@ -24,8 +29,6 @@ class Held:
     """Lets the making of a refit begin, and go on when it is told to."""
 
     def __init__(self, monkeypatch):
-        from anser_ros.nodes.field_model_parts import refit_start
-
         self.let, self.share = threading.Event(), 0.4
         build, refit = tables.build_tables, refit_start.LiveRefit
 
@@ -58,9 +61,6 @@ def rig(ros, tmp_path, held):
 
 
 def given_baseline(rig):
-    from std_msgs.msg import String
-    from std_srvs.srv import Trigger
-
     if rig.node._setup is None:
         rig.node._on_setup(String(data=setup_text(rig.world)))
     for _ in range(12):
@@ -70,8 +70,6 @@ def given_baseline(rig):
 
 
 def test_frames_and_services_are_answered_while_the_first_refit_is_made(rig, held):
-    from std_srvs.srv import Trigger
-
     rig.stamp_ns = time.time_ns()
     given_baseline(rig)
     rig.until(lambda: 'refit being prepared, 40%' in rig.node.status().message)
@@ -106,8 +104,6 @@ def test_the_former_refit_goes_on_until_that_to_a_new_baseline_is_there(rig, hel
 
 
 def give_another_model(rig, held, tmp_path):
-    from rclpy.parameter import Parameter
-
     held.let.set()
     given_baseline(rig)
     rig.until(lambda: rig.node.counters['refit_starts'] == 1)
@@ -156,8 +152,6 @@ def test_a_refit_that_cannot_be_made_is_said_and_awaited_no_longer(rig, monkeypa
 
 
 def test_tables_that_nobody_wants_any_more_are_given_up(ros, monkeypatch):
-    from anser_ros.nodes.field_model_parts.refit_start import RefitStart
-
     world, begun, goes_on = anser_world(), threading.Event(), threading.Event()
 
     def endless(*_given, report):

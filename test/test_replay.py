@@ -11,7 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Process, spin_until, wait
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 
+from anser_ros.nodes import replay
 from anser_ros.nodes.replay import name_played
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage, iter_messages
@@ -47,13 +54,6 @@ def make_session(path, count):
 @pytest.fixture
 def listener(ros, request):
     """A node that takes what is replayed, with a queue of 5 or so; ``delay_s`` makes it slow."""
-    from geometry_msgs.msg import PoseStamped
-    from rclpy.executors import SingleThreadedExecutor
-    from rclpy.qos import DurabilityPolicy, QoSProfile
-    from rosgraph_msgs.msg import Clock
-    from sensor_msgs.msg import PointCloud2
-    from std_msgs.msg import String
-
     node = ros.create_node('listener')
     node.stamps, node.arrivals, node.got, node.delay_s = [], [], [], 0.0
 
@@ -113,10 +113,6 @@ def test_as_fast_as_taken_loses_nothing(start, listener, tmp_path):
 
 def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, start, tmp_path):
     """A relay stands in for the tracker; the queue of who listens holds five."""
-    from geometry_msgs.msg import PoseStamped
-    from rclpy.executors import SingleThreadedExecutor
-    from sensor_msgs.msg import PointCloud2
-
     bag, topic, count = tmp_path / 'a.mcap', 'tool_a_0/x/pose', 50
     with SessionWriter(bag) as session:
         session.write_setup(read_config('demo_setup.yaml'), START_NS)
@@ -237,8 +233,6 @@ def test_a_bag_of_other_topics_is_refused(start, tmp_path):
 
 def test_nobody_listens(ros, tmp_path):
     """It waits for listeners, and plays for the record when none comes."""
-    from anser_ros.nodes import replay
-
     node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 3)), rate=100.0, wait=0.2)
     assert spin_until(node, lambda: node.exit_code is not None)
     assert node.exit_code == 0 and node.counters['no_listeners'] == 1
@@ -248,10 +242,6 @@ def test_nobody_listens(ros, tmp_path):
 
 def test_a_node_that_is_still_starting_is_waited_for_longer(ros, tmp_path):
     """A tracker that compiles its kernels is in the graph, and has not said a word yet."""
-    from sensor_msgs.msg import PointCloud2
-
-    from anser_ros.nodes import replay
-
     starting = ros.create_node('tracker', namespace='anser')
     starting.create_subscription(PointCloud2, 'tool/flux', lambda _: None, 10)
     began = time.monotonic()

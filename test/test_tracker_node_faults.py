@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from conftest import wait
 from graph_bench import BODY, FIRST_NS, SENSORS, ready, tracker_bench, wait_frame
+from sensor_msgs.msg import PointCloud2
 from tracking_world import certain_model, fluxes, random_pose
 
+from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.streams.backlog import Backlog
 from anser_ros.tracking.tracker import Tracker
 
@@ -17,10 +19,6 @@ tracker = pytest.fixture(tracker_bench)
 
 
 def test_two_publishers_give_no_poses_and_their_models_are_not_obeyed(tracker):
-    from sensor_msgs.msg import PointCloud2
-
-    from anser_ros.nodes.runtime import qos
-
     rng = np.random.default_rng(8)
     ready(tracker)
     node, first = tracker.node, tracker.flux

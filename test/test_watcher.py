@@ -5,10 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import REPO, spin_until
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
 
 from anser_ros.cli.main import main
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.streams.clouds import FluxCloud
+from anser_ros.nodes.watcher import Watcher
 from anser_ros.sessions import watch as watching
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.prepared import prepare
@@ -188,10 +194,6 @@ class Heard:
     """What the watcher says in /diagnostics: level, message and values of each of its lines."""
 
     def __init__(self, ros):
-        from diagnostic_msgs.msg import DiagnosticArray
-
-        from anser_ros.nodes.runtime import qos
-
         self.node = ros.create_node('listener')
         self.lines = {}
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._take, qos.EVENTS)
@@ -242,12 +244,6 @@ def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
 
 
 def test_fluxes_of_another_frame_are_counted_and_not_looked_at(ros, moving):
-    from rclpy.parameter import Parameter
-    from std_msgs.msg import String
-
-    from anser_ros.nodes.streams.clouds import FluxCloud
-    from anser_ros.nodes.watcher import Watcher
-
     node = Watcher(parameter_overrides=[Parameter('model_file', value=str(MODEL))])
     try:
         node._on_setup(String(data=moving.setup_text))
