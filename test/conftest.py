@@ -186,6 +186,14 @@ def by_room(files: Iterable[Path]) -> Any:
     return pytest.mark.parametrize('paths', rooms.values(), ids=rooms)
 
 
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> Any:
+    """Give the test a random generator with the seed of its module."""
+    import numpy as np
+
+    return np.random.default_rng(request.module.SEED)
+
+
 @pytest.fixture(scope='session')
 def domains() -> Iterator[DomainPool]:
     """Give the run its pool of domains."""
@@ -284,11 +292,11 @@ def wait(
     return bool(holds)
 
 
-def spin_until(node: Any, condition: Callable[[], Any]) -> bool:
+def spin_until(node: Any, condition: Callable[[], Any], timeout_s: float = PATIENCE_S) -> bool:
     """Spin a node until a condition holds; return whether it does."""
     import rclpy
 
-    return wait(condition, lambda: rclpy.spin_once(node, timeout_sec=0.05))
+    return wait(condition, lambda: rclpy.spin_once(node, timeout_sec=0.05), timeout_s)
 
 
 def needs(*parts: str) -> pytest.MarkDecorator:

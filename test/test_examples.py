@@ -17,7 +17,7 @@ SAID = {
 
 
 # A whole diagnosis or calibration: some ten seconds on a quiet machine, a minute on a busy one.
-SLOW = (pytest.mark.long, pytest.mark.timeout(300))
+SLOW = pytest.mark.long
 LONG = ('find_an_effect', 'own_board', 'own_data')
 NAMES = [pytest.param(n, marks=SLOW) if n in LONG else n for n in SAID]
 

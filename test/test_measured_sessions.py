@@ -17,14 +17,10 @@ from anser_ros.measured.session_file import write_frames
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
+SEED = 7
 NAVION = SHARED / 'measured' / 'navion'
 PLACES = np.array([[0.06, 0.02, 0.01], [-0.05, 0.04, 0.0], [-0.04, -0.05, 0.03], [0.0, 0.0, 0.09]])
 COILS = tuple(Coil(f'c{k}', (0.1 * k, 0.0, 0.0), 0.0, 1.0 + k) for k in range(3))
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(7)
 
 
 class TestFrames:

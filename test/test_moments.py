@@ -35,12 +35,8 @@ from anser_ros.errors import FitError
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.settings import Accuracy
 
+SEED = 5
 LAYER = Layout('layer', 9, 1.3, 0.0)
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(5)
 
 
 @pytest.fixture

@@ -112,7 +112,6 @@ def test_too_few_poses_are_refused():
         PoseWatch().look(filled(session, end=1.2))
 
 
-@pytest.mark.timeout(240)
 @pytest.mark.long
 def test_over_dds_a_late_tracker_is_named_with_no_field_model(ros):
     world = World(7, duration=14.0, sensors=1)
