@@ -241,9 +241,9 @@ class Process:
         """Return all that it has written so far."""
         return self.log.read_text(errors='replace')
 
-    def wait(self) -> int:
+    def wait(self, timeout_s: float = PATIENCE_S) -> int:
         """Return the exit code, once it has ended."""
-        return self.popen.wait(PATIENCE_S)
+        return self.popen.wait(timeout_s)
 
     def interrupt(self, number: int = signal.SIGINT) -> int:
         """Send a signal and return the exit code."""
@@ -261,6 +261,12 @@ class Process:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.popen.pid, signal.SIGKILL)
         self.popen.wait(PATIENCE_S)
+
+
+def skip_if_too_slow(output: str) -> None:
+    """Skip a test of a stream in real time where the nodes say that this computer is too slow."""
+    if 'too slow' in output or 'no pose within' in output:
+        pytest.skip('this machine was too busy for a stream in real time')
 
 
 @pytest.fixture

@@ -101,6 +101,7 @@ def test_the_model_tracks_to_the_optical_jitter(done):
         assert np.sqrt(np.nanmean(series.position_error**2)) < 0.16e-3
 
 
+@pytest.mark.long
 def test_json_is_all_of_stdout(tmp_path, capsys):
     arguments = (FACTORY, '--out', tmp_path / 'm.yaml', '--dipoles', '9x9', '--json')
     assert calibrate(*arguments, '--estimate', 'none') == 0

@@ -7,7 +7,7 @@ from dataclasses import make_dataclass, replace
 
 import numpy as np
 import pytest
-from conftest import PATIENCE_S, spin_until
+from conftest import PATIENCE_S, skip_if_too_slow, spin_until
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import GetParameters
@@ -245,9 +245,12 @@ def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
     words = ['-r', '__ns:=/x', '-r', 'tracker:__node:=guide', '-p', f'device:={link}']
     words += ['-p', 'tracker:gate:=4.0', '-p', 'allow_uncalibrated:=true']
     live = start('live', '--ros-args', *words)
-    assert spin_until(node, lambda: len(poses) > 50), live.output
-    names = {f'{space}/{name}' for name, space in node.get_node_names_and_namespaces()}
-    assert {'/x/acquisition', '/x/field_model', '/x/guide'} <= names
+    wanted = {'/x/acquisition', '/x/field_model', '/x/guide'}
+
+    def names():
+        return {f'{space}/{name}' for name, space in node.get_node_names_and_namespaces()}
+
+    assert spin_until(node, lambda: wanted <= names()), live.output
     # Each speaks once a second, and in a pause between two frames.
     assert spin_until(node, lambda: {'x/acquisition', 'x/field_model', 'x/guide'} <= set(levels))
     client = node.create_client(GetParameters, '/x/guide/get_parameters')
@@ -258,7 +261,11 @@ def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
     assert freeze.wait_for_service(10)
     future = freeze.call_async(SetBool.Request(data=True))
     assert spin_until(node, future.done) and future.result().success
+    tracked = spin_until(node, lambda: len(poses) > 50)
     assert live.interrupt() == 0, live.output
+    if not tracked:
+        skip_if_too_slow(live.output)
+    assert tracked, live.output
 
 
 @pytest.mark.processes
