@@ -10,6 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
 from anser_ros.wire.bag_writer import BagWriter
@@ -85,11 +90,6 @@ class Listener:
 
     def __init__(self, topics: list[str], domain: int) -> None:
         import rclpy
-        from diagnostic_msgs.msg import DiagnosticArray
-        from geometry_msgs.msg import PoseStamped
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-        from std_msgs.msg import String
 
         self._context = rclpy.Context()
         self._context.init(domain_id=domain)
@@ -206,9 +206,9 @@ def replay_through_nodes(
                 listener.spin(0.2)
             assert player.returncode == 0, (logs / 'replay.log').read_text()
             before = -1
-            while listener.total() != before:
+            while listener.total() != before:  # what is on its way comes sooner than that
                 before = listener.total()
-                listener.spin(0.5)
+                listener.spin(2.0)
             return listener.poses()
         finally:
             stop(processes)

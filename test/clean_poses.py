@@ -18,7 +18,6 @@ Course = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Knots, s, and at them places (n, 3), m, about the middle, and turns (n, 3), rad."""
 LONGER = 3.0  # seconds that a course goes on before and after a session
 
-MODERATE = np.array([0.05, 0.02, -0.3])
 NOISES_M, NOISES_RAD = (1e-4, 1e-3), (1e-3, 1e-2)  # least and most of trackers' data sheets
 STREAMS = ('as measured', 'irregular', 'some lost', 'sensors differ', 'alike for a while')
 """How the reference's poses come, or what the tracker's noise is like: on its own rate and white;

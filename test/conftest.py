@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 # All of this must stand in the environment before the first ROS module is imported.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -41,10 +41,10 @@ from domain_pool import DomainPool
 
 REPO = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared'))
-STOP_TIMEOUT_S = 5.0
-CHAINS = ('alone', 'recording', 'unit')
-"""Tests that take the machine alone, and chains of nodes by what feeds them, in this order: who
-takes the machine waits for the tests that run, and at the beginning these are few and short."""
+PATIENCE_S = 60.0
+"""How long a test waits for what must come, s: it only ends what would wait for ever."""
+CHAINS = ('recording', 'unit')
+"""Chains of nodes by what feeds them."""
 PLAYED = ('test_replay', 'test_main_job', 'test_refit_live', 'test_watcher')
 """Files of chains of nodes that a recording feeds, about half the time of all chains; the first
 one's tests are short."""
@@ -86,10 +86,10 @@ def pytest_unconfigure() -> None:
 def pytest_itemcollected(item: pytest.Item) -> None:
     """Mark a test that takes a ROS domain, and name the group that one worker takes as a whole.
 
-    Of three workers one begins with the tests that need the machine alone, and then calculates;
-    two take the tests whose nodes are processes, which mostly wait: so two chains of nodes run at
-    a time, one that a simulated unit feeds and one that a recording does, and a file's fixtures
-    are made once. Nodes in the test's own process do what the test says: calculation.
+    Of three workers one calculates; two take the tests whose nodes are processes, which mostly
+    wait: so two chains of nodes run at a time, one that a simulated unit feeds and one that a
+    recording does, and a file's fixtures are made once. Nodes in the test's own process do what
+    the test says: calculation.
     This must be done as soon as a test is known: later, pytest-xdist has read the groups already.
     """
     if _has_nodes(item):
@@ -131,33 +131,6 @@ def pytest_collection_finish(session: pytest.Session) -> None:
         raise pytest.UsageError('this pytest and pytest-xdist do not know groups together')
 
 
-_held: list[IO[str]] = []
-
-
-@pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
-    """Give a test marked ``realtime`` the machine alone: other workers wait between their tests.
-
-    All tests of a run share a lock that such a test takes for itself, and leaves to the next one
-    of its kind. A gate before the lock keeps those that come later from passing the one that
-    waits.
-    """
-    if 'PYTEST_XDIST_WORKER' not in os.environ:
-        return (yield)
-    alone = _takes_machine(item)
-    if not _held:
-        shared = item.config._tmp_path_factory.getbasetemp().parent  # the workers' are in it
-        _held.append((shared / 'tests.lock').open('w'))
-        with (shared / 'gate.lock').open('w') as gate:
-            fcntl.flock(gate, fcntl.LOCK_EX)
-            fcntl.flock(_held[0], fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
-    try:
-        return (yield)
-    finally:
-        if not (alone and nextitem is not None and _takes_machine(nextitem)):
-            _held.pop().close()
-
-
 _calculates: list[bool] = []
 
 
@@ -178,16 +151,10 @@ def _is_light(item: pytest.Item) -> bool:
 
 def _chain(item: pytest.Item) -> str:
     """Return which group of `CHAINS` a test is of; nothing where it mostly calculates."""
-    if _takes_machine(item):
-        return CHAINS[0]
     names = getattr(item, 'fixturenames', ())
     if not _has_nodes(item) or _is_light(item) or ('start' not in names and 'ros' in names):
         return ''
-    return CHAINS[1 if item.path.stem in PLAYED else 2]
-
-
-def _takes_machine(item: pytest.Item) -> bool:
-    return item.get_closest_marker('realtime') is not None
+    return CHAINS[0 if item.path.stem in PLAYED else 1]
 
 
 def _room(item: pytest.Item) -> str:
@@ -218,6 +185,14 @@ def by_room(files: Iterable[Path]) -> Any:
         folder = path.parent.relative_to(REPO).as_posix()
         rooms.setdefault(folder, []).append(path)
     return pytest.mark.parametrize('paths', rooms.values(), ids=rooms)
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> Any:
+    """Give the test a random generator with the seed of its module."""
+    import numpy as np
+
+    return np.random.default_rng(request.module.SEED)
 
 
 @pytest.fixture(scope='session')
@@ -267,25 +242,32 @@ class Process:
         """Return all that it has written so far."""
         return self.log.read_text(errors='replace')
 
-    def interrupt(self, number: int = signal.SIGINT, timeout_s: float = STOP_TIMEOUT_S) -> int:
+    def wait(self, timeout_s: float = PATIENCE_S) -> int:
+        """Return the exit code, once it has ended."""
+        return self.popen.wait(timeout_s)
+
+    def interrupt(self, number: int = signal.SIGINT) -> int:
         """Send a signal and return the exit code."""
         if self.popen.poll() is None:
             self.popen.send_signal(number)
-        return self.popen.wait(timeout_s)
+        return self.wait()
 
-    def wait_for(self, text: str, timeout_s: float = 20.0) -> None:
+    def wait_for(self, text: str) -> None:
         """Wait until its output contains a text."""
-        end = time.monotonic() + timeout_s
-        while text not in self.output:
-            assert self.popen.poll() is None, f'ended early:\n{self.output}'
-            assert time.monotonic() < end, f'never said {text!r}:\n{self.output}'
-            time.sleep(0.02)
+        assert wait(lambda: text in self.output or self.popen.poll() is not None), self.output
+        assert text in self.output, f'ended early:\n{self.output}'
 
     def kill_group(self) -> None:
         """Kill whatever is left of its process group."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.popen.pid, signal.SIGKILL)
-        self.popen.wait(STOP_TIMEOUT_S)
+        self.popen.wait(PATIENCE_S)
+
+
+def skip_if_too_slow(output: str) -> None:
+    """Skip a test of a stream in real time where the nodes say that this computer is too slow."""
+    if 'too slow' in output or 'no pose within' in output:
+        pytest.skip('this machine was too busy for a stream in real time')
 
 
 @pytest.fixture
@@ -305,16 +287,29 @@ def start(domain: int, tmp_path: Path) -> Iterator[Callable[..., Process]]:
         process.kill_group()
 
 
-def spin_until(node: Any, condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
+def wait(
+    condition: Callable[[], Any],
+    meanwhile: Callable[[], Any] = lambda: time.sleep(0.01),
+    timeout_s: float = PATIENCE_S,
+) -> bool:
+    """Do something again and again until a condition holds; return whether it does."""
+    end = time.monotonic() + timeout_s
+    while not (holds := condition()) and time.monotonic() < end:
+        meanwhile()
+    return bool(holds)
+
+
+def spin_until(node: Any, condition: Callable[[], Any], timeout_s: float = PATIENCE_S) -> bool:
     """Spin a node until a condition holds; return whether it does."""
     import rclpy
 
-    end = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        rclpy.spin_once(node, timeout_sec=0.05)
-    return True
+    return wait(condition, lambda: rclpy.spin_once(node, timeout_sec=0.05), timeout_s)
+
+
+def needs(*parts: str) -> pytest.MarkDecorator:
+    """Let a test be skipped where a folder of the shared data is not there."""
+    folder = SHARED.joinpath(*parts)
+    return pytest.mark.skipif(not folder.is_dir(), reason=f'no folder {folder}')
 
 
 @pytest.fixture

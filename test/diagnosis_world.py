@@ -85,17 +85,6 @@ class World:
         if reference is not None:
             self.reference = replace(self.reference, flux=reference)
 
-    def add_sources(self, sources: Dipoles) -> None:
-        """Add a static field."""
-        position, rotation = self.true_pose()
-        centres, axes = self.tool.sensors.placed(position, rotation)
-        more = sources.flux(centres.reshape(-1, 3), axes.reshape(-1, 3), None)
-        fixed = self.reference.sensors
-        self.change(
-            self.tool.flux + more.reshape(self.tool.flux.shape),
-            self.reference.flux + sources.flux(fixed.position, fixed.axis, fixed.length),
-        )
-
     def move_track(self, track: PoseTrack) -> None:
         """Another optical track."""
         position, rotation, valid = track.at(self.tool.time, 0.25)

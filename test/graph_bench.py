@@ -1,10 +1,19 @@
 """The tests' own end of the graph, beside a tracker or a field_model in the same process."""
 
-import time
-
 import numpy as np
+from conftest import wait
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 from tracking_world import certain_model, setup_of, triaxial_tool
 
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.streams.clouds import FluxCloud
+from anser_ros.nodes.streams.model_clouds import CloudMaker
+from anser_ros.nodes.tracker import TrackerNode
 from anser_ros.wire.points import DipolePoints, FluxPoints, encode_field_model
 from anser_ros.wire.setup import SensorSpec, dump_setup
 
@@ -33,15 +42,6 @@ class Bench:
     """The test's own end of the graph."""
 
     def __init__(self, ros, node):
-        from diagnostic_msgs.msg import DiagnosticArray
-        from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-        from rclpy.executors import SingleThreadedExecutor
-        from sensor_msgs.msg import PointCloud2
-        from std_msgs.msg import String
-
-        from anser_ros.nodes.runtime import qos
-        from anser_ros.nodes.streams.clouds import FluxCloud
-
         self.peer = ros.create_node('bench', namespace='anser')
         self.node = node
         self.executor = SingleThreadedExecutor()
@@ -88,11 +88,9 @@ class Bench:
     def value(self, name, key):
         return self.states.get(name, ('', {}))[1].get(key, '')
 
-    def spin_until(self, condition, timeout_s=10.0):
-        end = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < end, (self.node.counters, self.states)
-            self.executor.spin_once(timeout_sec=0.02)
+    def spin_until(self, condition):
+        came = wait(condition, lambda: self.executor.spin_once(timeout_sec=0.02))
+        assert came, (self.node.counters, self.states)
 
     def connect(self, *publishers):
         self.spin_until(
@@ -100,13 +98,9 @@ class Bench:
         )
 
     def say_setup(self, text=None):
-        from std_msgs.msg import String
-
         self.setup.publish(String(data=text or dump_setup(setup_of(SENSORS, reference_specs()))))
 
     def say_model(self, model, stamp_ns=5):
-        from anser_ros.nodes.streams.model_clouds import CloudMaker
-
         packed = encode_field_model(DipolePoints(model.positions, model.directions, model.moments))
         self.model.publish(CloudMaker().message(packed, 'fg', stamp_ns))
 
@@ -150,10 +144,6 @@ def tracker_bench(ros):
 
     No frame grows stale: how old one is when it is told of is a matter of the machine.
     """
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.tracker import TrackerNode
-
     node = TrackerNode(parameter_overrides=[Parameter('stale_after_s', value=30.0)])
     bench = Bench(ros, node)
     bench.connect(bench.setup, bench.flux, bench.model)

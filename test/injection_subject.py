@@ -147,7 +147,7 @@ def listed(stage: int) -> Callable[..., Any]:
 def unlisted(stage: int, *allowed: str) -> Callable[..., Any]:
     def add(put: Any) -> Any:
         name = put.__name__
-        UNLISTED[name] = Injection(name, put, stage, allowed)
+        UNLISTED[name] = Injection(name, lambda *given: put(*given) or {}, stage, allowed)
         return put
 
     return add

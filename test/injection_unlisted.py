@@ -31,85 +31,75 @@ from anser_ros.physics.pose_track import PoseTrack
 
 
 @unlisted(EMITTER, 'coil_fluctuation')
-def coil_steps(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def coil_steps(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     step = size * signed(rng, 0.005, 0.02)
     s.emitter(int(rng.integers(s.emitters)), 1 + step * (s.time > a_moment(s, rng)))
-    return {}
 
 
 @unlisted(EMITTER, 'coil_fluctuation')
-def coil_ripple(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def coil_ripple(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     wave = np.sin(2 * np.pi * rng.uniform(0.05, 0.6) * s.time + rng.uniform(0, 6))
     s.emitter(int(rng.integers(s.emitters)), 1 + size * rng.uniform(0.005, 0.02) * wave)
-    return {}
 
 
 @unlisted(EMITTER, 'coil_gain')
-def coil_weaker(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def coil_weaker(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     gain = 1 + size * signed(rng, 0.005, 0.02)
     s.emitter(int(rng.integers(s.emitters)), np.full(s.time.size, gain))
-    return {}
 
 
 @unlisted(EMITTER, 'coil_fluctuation')
-def coil_off_for_a_while(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def coil_off_for_a_while(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     start, left = a_moment(s, rng), rng.uniform(0.0, 0.5)
     off = (s.time > start) & (s.time < start + size * rng.uniform(1, 2))
     s.emitter(int(rng.integers(s.emitters)), np.where(off, left, 1.0))
-    return {}
 
 
 @unlisted(EMITTER, 'tool_gain_drift', 'coil_fluctuation')
-def amplitude_hum(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def amplitude_hum(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """Mains hum on the supply, all emitters and channels alike, aliased by the frame rate."""
     wave = np.sin(2 * np.pi * rng.uniform(2.0, 9.0) * s.time + rng.uniform(0, 6))
     factor = 1 + size * rng.uniform(0.002, 0.006) * wave
     for coil in range(s.emitters):
         s.emitter(coil, factor)
-    return {}
 
 
 @unlisted(OFFSET)
-def additive_hum(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def additive_hum(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """A common additive tone in all channels, that comes and goes with the beat."""
     wave = np.sin(2 * np.pi * rng.uniform(2.0, 9.0) * s.time + rng.uniform(0, 6))
     phasor = size * rng.uniform(0.5e-9, 1.5e-9) * complex_normal(rng, (s.sensors, s.emitters))
     s.flux(s.tool.flux + wave[:, None, None] * phasor)
-    return {}
 
 
 @unlisted(CHANNEL, 'sensor_gain_drift')
-def gain_ripple(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def gain_ripple(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row, _ = a_channel(s, rng)
     wave = np.sin(2 * np.pi * rng.uniform(0.1, 1.0) * s.time + rng.uniform(0, 6))
     s.channel(row, s.tool.flux[:, row] * (1 + size * rng.uniform(0.01, 0.03) * wave)[:, None])
-    return {}
 
 
 @unlisted(CHANNEL, 'tool_gain_drift', 'tool_gain')
-def gain_with_temperature(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def gain_with_temperature(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     warm = 1 - np.exp(-s.time / rng.uniform(10, 40))
     factor = 1 + size * signed(rng, 0.005, 0.02) * warm
     s.flux(s.tool.flux * factor[:, None, None])
-    return {}
 
 
 @unlisted(CHANNEL, 'sensor_gain_drift')
-def gain_steps(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def gain_steps(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row, _ = a_channel(s, rng)
     step = size * signed(rng, 0.005, 0.02) * (s.time > a_moment(s, rng))
     s.channel(row, s.tool.flux[:, row] * (1 + step)[:, None])
-    return {}
 
 
 @unlisted(CHANNEL, 'tool_gain')
-def common_gain(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def common_gain(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     s.flux(s.tool.flux * (1 + size * signed(rng, 0.004, 0.015)))
-    return {}
 
 
 @unlisted(READING, 'loose_contact', 'sensor_gain_drift')
-def loose_contact(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def loose_contact(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row, _ = a_channel(s, rng)
     share, left = min(0.04 * size, 0.15), rng.choice([0.0, 0.5])
     change = rng.random(s.time.size) < 0.3
@@ -117,152 +107,135 @@ def loose_contact(s: Subject, rng: np.random.Generator, size: float) -> Truth:
     for i in range(1, s.time.size):
         off[i] = off[i - 1] if not change[i] else rng.random() < share
     s.channel(row, np.where(off[:, None], left, 1.0) * s.tool.flux[:, row])
-    return {}
 
 
 @unlisted(TABLE, 'loose_sensor_axis')
-def loose_axis(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def loose_axis(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row, _ = a_channel(s, rng)
     about = np.cross(s.tool.sensors.axis[row], a_direction(rng))
     about /= np.linalg.norm(about)
     wave = np.sin(2 * np.pi * rng.uniform(0.1, 0.8) * s.time + rng.uniform(0, 6))
     turn = np.radians(size * rng.uniform(0.4, 1.2)) * wave[:, None] * about
     turn_axes(s, [row], Rotation.from_rotvec(turn).as_matrix())
-    return {}
 
 
 @unlisted(TABLE, 'loose_sensor_position')
-def bending_body(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def bending_body(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """The last cluster gives way under gravity, so it moves with the orientation."""
     rows = sorted(s.clusters())[-1]
     pull = s.rotation.transpose(0, 2, 1) @ np.array([0.0, 0.0, -1.0])
     move_coils(s, rows, size * rng.uniform(1e-3, 3e-3) * (pull - pull.mean(axis=0)))
-    return {}
 
 
 @unlisted(TABLE, 'sensor_position')
-def cluster_elsewhere(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def cluster_elsewhere(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     groups = sorted(s.clusters())
     move_coils(s, groups[int(rng.integers(len(groups)))], size * 5e-4 * rng.normal(size=3))
-    return {}
 
 
 @unlisted(TABLE, 'sensor_position')
-def warm_body(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def warm_body(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """The body is longer than it was surveyed."""
     flux, longer = s.tool.flux.copy(), size * signed(rng, 0.01, 0.03)
     shift = s.rotation @ s.tool.sensors.position.T * longer
     flux += s.read(s.centres + shift.transpose(0, 2, 1), s.axes) - s.clean
     s.flux(flux)
-    return {}
 
 
 @unlisted(READING)
-def channel_iq_imbalance(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def channel_iq_imbalance(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row, _ = a_channel(s, rng)
     own = s.tool.flux[:, row]
     gain, skew = size * signed(rng, 0.005, 0.02), size * signed(rng, 0.005, 0.02)
     s.channel(row, own.real + 1j * ((1 + gain) * own.imag + skew * np.abs(own.real)))
-    return {}
 
 
 @unlisted(READING, 'tool_gain')
-def conjugate_leak(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def conjugate_leak(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """Mixers of unequal gain in all channels: the conjugate leaks in, turned."""
     leak = size * rng.uniform(0.003, 0.01) * np.exp(1j * rng.uniform(0, 6))
     s.flux(s.tool.flux + leak * s.tool.flux.conj())
-    return {}
 
 
 @unlisted(CHANNEL)
-def channel_low_pass(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def channel_low_pass(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row, _ = a_channel(s, rng)
     corner = s.omega.max() * 30 / size
     response = 1 / (1 + 1j * s.omega / corner)
     s.channel(row, s.tool.flux[:, row] * response / np.abs(response[0]))
-    return {}
 
 
 @unlisted(CHANNEL)
-def channel_resonance(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def channel_resonance(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row, _ = a_channel(s, rng)
     response = 1 + size * rng.uniform(0.005, 0.02) * complex_normal(rng, (s.emitters,))
     s.channel(row, s.tool.flux[:, row] * response)
-    return {}
 
 
 @unlisted(READING)
-def channel_lag(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def channel_lag(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """A channel that is smoothed in time."""
     row, _ = a_channel(s, rng)
     keep, out = min(0.25 * size, 0.7), s.tool.flux[:, row].copy()
     for i in range(1, len(out)):
         out[i] = keep * out[i - 1] + (1 - keep) * s.tool.flux[i, row]
     s.channel(row, out)
-    return {}
 
 
 @unlisted(READING)
-def hysteresis(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def hysteresis(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """A channel whose core remembers the way that the reading came."""
     row, _ = a_channel(s, rng)
     own = s.tool.flux[:, row].real
     way = np.tanh(np.gradient(own, axis=0) / np.std(np.gradient(own, axis=0), axis=0))
     s.channel(row, s.tool.flux[:, row] + size * rng.uniform(0.5e-9, 1.5e-9) * way)
-    return {}
 
 
 @unlisted(READING)
-def quantised(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def quantised(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     step = size * rng.uniform(0.6e-9, 1.5e-9)
     flux = s.tool.flux
     s.flux(step * (np.round(flux.real / step) + 1j * np.round(flux.imag / step)))
-    return {}
 
 
 @unlisted(READING)
-def even_order(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def even_order(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """A channel whose gain depends on the sign of the reading."""
     row, _ = a_channel(s, rng)
     own = s.tool.flux[:, row]
     s.channel(row, own * (1 + size * rng.uniform(0.004, 0.012) * np.sign(own.real)))
-    return {}
 
 
 @unlisted(CHANNEL, 'swapped_channels')
-def channels_swapped(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def channels_swapped(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     pair = rng.choice(s.sensors, 2, replace=False)
     flux = s.tool.flux.copy()
     flux[:, pair] = flux[:, pair[::-1]]
     s.flux(flux)
-    return {}
 
 
 @unlisted(EMITTER, 'swapped_coils')
-def coils_swapped(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def coils_swapped(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     order = np.arange(s.emitters)
     pair = rng.choice(s.emitters, 2, replace=False)
     order[pair] = order[pair[::-1]]
     s.mixed(np.eye(s.emitters)[order])
-    return {}
 
 
 @unlisted(READING, 'dead_channel')
-def dead_channel(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def dead_channel(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row, _ = a_channel(s, rng)
     s.channel(row, NOISE_T * complex_normal(rng, (s.time.size, s.emitters)))
-    return {}
 
 
 @unlisted(TRACK, 'optical_scale')
-def optical_scale(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def optical_scale(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     track, scale = s.tool.track, 1 + size * signed(rng, 0.003, 0.01)
     s.track(replace(track, position=track.position * scale))
-    return {}
 
 
 @unlisted(TRACK, 'registration_drift', 'optical_jitter')
-def registration_drift(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def registration_drift(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     track, way = s.tool.track, size * 1e-3 * rng.normal(size=3)
     s.track(
         replace(
@@ -271,20 +244,18 @@ def registration_drift(s: Subject, rng: np.random.Generator, size: float) -> Tru
             + way * ((track.time - track.time[0]) / np.ptp(track.time))[:, None],
         )
     )
-    return {}
 
 
 @unlisted(TRACK, 'registration_drift', 'optical_jitter')
-def optical_knock(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def optical_knock(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """Somebody knocks the optical tracker, once."""
     track, way = s.tool.track, size * 1e-3 * rng.normal(size=3)
     after = (track.time > a_moment(s, rng))[:, None]
     s.track(replace(track, position=track.position + way * after))
-    return {}
 
 
 @unlisted(TRACK, 'optical_jitter')
-def optical_jitter(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def optical_jitter(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     track, more = s.tool.track, 1 + 2 * size
     shake = Rotation.from_rotvec(more * JITTER_RAD * rng.normal(size=(track.time.size, 3)))
     s.track(
@@ -294,43 +265,38 @@ def optical_jitter(s: Subject, rng: np.random.Generator, size: float) -> Truth:
             (shake * Rotation.from_quat(track.quaternion)).as_quat(),
         )
     )
-    return {}
 
 
 @unlisted(TRACK, 'clock_rate')
-def clock_runs_slow(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def clock_runs_slow(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     track, rate = s.tool.track, size * signed(rng, 300e-6, 1000e-6)
     s.track(replace(track, time=track.time / (1 + rate)))
-    return {}
 
 
 @unlisted(TRACK, 'stamp_jitter', 'optical_jitter')
-def stamp_jitter(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def stamp_jitter(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     track = s.tool.track
     shaken = track.time + size * 4e-3 * rng.normal(size=track.time.size)
     s.track(replace(track, time=np.maximum.accumulate(shaken) + 1e-9 * np.arange(shaken.size)))
-    return {}
 
 
 @unlisted(TRACK, 'stamp_jitter')
-def clock_steps(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def clock_steps(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     track, step = s.tool.track, size * rng.uniform(0.01, 0.03)
     s.track(replace(track, time=track.time + step * (track.time > a_moment(s, rng))))
-    return {}
 
 
 @unlisted(FIELD)
-def weak_stray_field(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def weak_stray_field(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """A smooth field at every tone that no board makes; the references don't see it."""
     uniform = size * 1e-9 * rng.normal(size=(3, s.emitters))
     gradient = size * 1e-8 * rng.normal(size=(3, 3, s.emitters))
     field = uniform + np.einsum('fsi,ijk->fsjk', s.centres, gradient)
     s.flux(s.tool.flux + np.einsum('fsj,fsjk->fsk', s.axes, field))
-    return {}
 
 
 @unlisted(CHANNEL, 'sensor_gain')
-def reference_gain(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def reference_gain(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """One reference channel's gain is off; the listed name fits it."""
     row = int(rng.integers(len(s.reference.sensors)))
     flux = s.reference.flux.copy()
@@ -342,7 +308,7 @@ def reference_gain(s: Subject, rng: np.random.Generator, size: float) -> Truth:
 
 
 @unlisted(CHANNEL, 'reference_changed', 'sensor_gain')
-def reference_moved(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def reference_moved(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row = int(rng.integers(len(s.reference.sensors)))
     table, flux = s.reference.sensors, s.reference.flux.copy()
     place, shift = table.position[row : row + 1], size * 3e-3 * a_direction(rng)
@@ -350,21 +316,18 @@ def reference_moved(s: Subject, rng: np.random.Generator, size: float) -> Truth:
     there = s.illumination.flux(place + shift, axis, None)
     flux[:, row] += there - s.illumination.flux(place, axis, None)
     s.references(flux)
-    return {}
 
 
 @unlisted(READING, 'dead_channel')
-def reference_dead(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def reference_dead(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row = int(rng.integers(len(s.reference.sensors)))
     flux = s.reference.flux.copy()
     flux[:, row] = NOISE_T * complex_normal(rng, flux[:, row].shape)
     s.references(flux)
-    return {}
 
 
 @unlisted(CHANNEL)
-def references_drift(s: Subject, rng: np.random.Generator, size: float) -> Truth:
+def references_drift(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """All references' gain drifts (one amplifier for all), the tool's doesn't."""
     warm = 1 + size * signed(rng, 0.003, 0.01) * (1 - np.exp(-s.reference.time / 15))
     s.references(s.reference.flux * warm[:, None, None])
-    return {}

@@ -1,11 +1,19 @@
 """A field_model node that refits, in the process of the test, fed by its callbacks."""
 
-import time
-
 import numpy as np
+from conftest import wait
+from geometry_msgs.msg import PointStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from refit_world import anser_world, metal_block
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 from tracking_world import CENTRES_MM, GEOMETRY, TURNED
+from visualization_msgs.msg import MarkerArray
 
+from anser_ros.nodes.field_model import FieldModelNode
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.sessions.model_file import save_model
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
@@ -38,15 +46,6 @@ class Rig:
     """A field_model node, what it publishes, and the callbacks that it is fed through."""
 
     def __init__(self, ros, folder, **parameters):
-        from geometry_msgs.msg import PointStamped
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.parameter import Parameter
-        from visualization_msgs.msg import MarkerArray
-
-        from anser_ros.nodes.field_model import FieldModelNode
-        from anser_ros.nodes.runtime import qos
-        from anser_ros.nodes.streams.clouds import FluxCloud
-
         self.world = anser_world()
         save_model(folder / 'model.yaml', self.world.model)
         values = {
@@ -71,11 +70,9 @@ class Rig:
         self.cloud, self.stamp_ns = FluxCloud('fg'), FIRST_NS
         self.rng = np.random.default_rng(1)
 
-    def until(self, condition, timeout_s=20.0):
-        end = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < end, self.node.counters
-            self.executor.spin_once(timeout_sec=0.02)
+    def until(self, condition):
+        spins = wait(condition, lambda: self.executor.spin_once(timeout_sec=0.02))
+        assert spins, self.node.counters
 
     def message(self, channels, flux, flags=None):
         count = len(flux)
@@ -94,9 +91,6 @@ class Rig:
         self.executor.spin_once(timeout_sec=0.0)
 
     def start(self):
-        from std_msgs.msg import String
-        from std_srvs.srv import Trigger
-
         self.node._on_setup(String(data=setup_text(self.world)))
         for _ in range(12):
             self.say(0.0)

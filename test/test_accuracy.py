@@ -84,11 +84,6 @@ class TestPauses:
         assert np.abs(place - true).max() < 5 * noise_m / np.sqrt(20)
         assert all(0.5 < p.jitter_m / (noise_m * np.sqrt(3)) < 1.5 for p in found)
 
-    def test_turns_about_one_place_are_points_too(self):
-        turns = [Rotation.from_rotvec([0, 0, np.deg2rad(11.25 * k)]) for k in range(8)]
-        found = still_points(visited(np.zeros((8, 3)), turns, 7))
-        assert len(found) == 8
-
     def test_a_moving_tool_has_none(self):
         time = np.arange(0, 20, 0.05)
         place = np.stack([0.1 * np.sin(time), 0.1 * np.cos(time), 0 * time], axis=1)

@@ -8,12 +8,12 @@ import math
 import os
 import signal
 import threading
-import time
 
 import pytest
+from conftest import wait
 from pose_world import World
 
-from anser_ros.cli import session_runs
+from anser_ros.cli import batch, session_runs
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, main
 from anser_ros.cli.session_runs import names_of, perform, runs_of
 from anser_ros.cli.summary import Outcome, row_of, write_summary
@@ -85,10 +85,8 @@ def test_a_worker_that_dies_loses_nothing(sessions, alone, tmp_path, capfd):
         batch = threading.Thread(target=lambda: done.append(main(arguments)))
         batch.start()
         first = cluster.workers[0].pid
-        deadline_s = time.monotonic() + 30.0
-        while not any(one.processing for one in cluster.scheduler.workers.values()):
-            assert time.monotonic() < deadline_s
-            time.sleep(0.01)
+        workers = cluster.scheduler.workers
+        assert wait(lambda: any(one.processing for one in workers.values()))
         os.kill(first, signal.SIGKILL)
         batch.join(60.0)
         assert cluster.workers[0].pid != first
@@ -100,8 +98,6 @@ def test_a_worker_that_dies_loses_nothing(sessions, alone, tmp_path, capfd):
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(sessions, tmp_path, capsys, monkeypatch):
-    from anser_ros.cli import batch
-
     monkeypatch.setattr(batch, 'CONNECT_S', 0.2)
     arguments = ['--poses', '--out', str(tmp_path), '--scheduler', 'tcp://127.0.0.1:1']
     assert main(['batch', 'evaluate', sessions[0], *arguments]) == EXIT_BAD_INPUT

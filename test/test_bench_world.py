@@ -30,11 +30,6 @@ def test_only_the_writer_of_bags_is_shared():
             assert ours <= {'anser_ros.wire.session_writer', 'anser_ros.wire.points'}, path.name
 
 
-def test_nothing_in_the_package_knows_the_world():
-    for path in (WORLD.parents[2] / 'anser_ros').rglob('*.py'):
-        assert 'bench.world' not in path.read_text(), path
-
-
 def test_a_coil_has_the_field_that_magpylib_gives_it(world):
     magpylib = pytest.importorskip('magpylib')
     rng = np.random.default_rng(3)

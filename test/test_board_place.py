@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from anser_ros.errors import BagError, FitError, ModelFileError
+from anser_ros.nodes.field_model_parts import place_watch
+from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
 from anser_ros.sessions.baseline import board_place_of, check_place, clean_flux
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model
@@ -86,9 +88,6 @@ def test_the_drawing_and_a_model_with_metal_are_not_asked(recorded):
 
 def test_poses_wait_for_references_that_are_announced_and_not_for_others(recorded, monkeypatch):
     from types import SimpleNamespace
-
-    from anser_ros.nodes.field_model_parts import place_watch
-    from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
 
     session, model = recorded
     sensors, announced = session.reference.sensors, [0]

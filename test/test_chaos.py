@@ -10,15 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPO
+from conftest import REPO, skip_if_too_slow
 
 from anser_ros.wire.frame_reader import FrameReader
 from anser_ros.wire.frames import encode
 from anser_ros.wire.records import SampleBlock
 
 CHAOS = Path(__file__).resolve().parent / 'chaos'
-SAMPLE = ('nothing', 'torn', 'unplugged')
-"""Faults of the sample: none, one that costs frames, one that costs the connection."""
+SAMPLE = ('nothing', 'torn', 'unplugged', 'ring', 'ticks-frozen')
+"""None, one that costs frames, one that costs the connection, and a unit that repeats its samples
+or whose clock stands still."""
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -146,18 +147,19 @@ def test_the_page_of_faults_has_the_kept_result(tmp_path):
 
 
 @pytest.mark.processes
-@pytest.mark.realtime
+@pytest.mark.timeout(900)
 def test_a_sample_of_the_trial_passes(tmp_path):
     out = tmp_path / 'rows.json'
     command = [sys.executable, str(CHAOS / 'run.py'), '--only', *SAMPLE, '--duration', '1.0']
     environment = {k: v for k, v in os.environ.items() if k != 'ROS_DOMAIN_ID'}
     done = subprocess.run(
         [*command, '--out', str(out)],
-        capture_output=True, text=True, timeout=150, check=False, env=environment,
+        capture_output=True, text=True, timeout=850, check=False, env=environment,
     )  # fmt: skip
     rows = {row['name']: row for row in json.loads(out.read_text())}
     assert set(rows) == set(SAMPLE), done.stderr
     assert all(row['wrong'] == 0 and not row['crashed'] for row in rows.values()), done.stdout
-    counts = {name: row['poses'] + row['skipped'] for name, row in rows.items()}
-    assert min(counts.values()) > 0, done.stdout
     assert any('unplug' in words for words in rows['unplugged']['heard'])
+    if not all(row['poses'] + row['skipped'] for row in rows.values()):
+        skip_if_too_slow(done.stdout)
+        pytest.fail(done.stdout)

@@ -20,14 +20,10 @@ from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
 from anser_ros.settings import Accuracy
 
+SEED = 7
 ROOT = Path(__file__).resolve().parents[1]
 ACCURACY = Accuracy()
 SIGMA_T = 2e-12
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(7)
 
 
 def known_of(world):

@@ -19,14 +19,6 @@ from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.cli.main import main
 
 DOCS = REPO / 'docs'
-OWN_WORDS = {
-    'demo': 'its live table',
-    'loop': 'a line a step',
-    'measured': 'the commands that it runs',
-    'setup': 'its questions',
-    'warm_up': 'a line every five seconds',
-}
-"""Commands that show by themselves how far they are; `main` does it for the others."""
 NOWHERE = '/nowhere/x'
 WRONG = {
     'accuracy': ['rest', NOWHERE],
@@ -110,22 +102,12 @@ def examples_of(name):
         yield parser, shlex.split(re.sub(r'\([^)]*\)', '', line).partition(';')[0])
 
 
-def help_of(command, capsys):
-    assert main([*command, '--help']) == 0
-    return capsys.readouterr().out
-
-
 @pytest.mark.parametrize('name', OFFLINE)
-def test_help_has_an_example_and_a_document_for_programs(name, capsys):
-    text = help_of([name], capsys)
-    assert re.search(rf'\bexamples?: +anser {name}\b', ' '.join(text.split()))
+def test_help_has_examples_that_hold_and_a_document_for_programs(name, capsys):
     verbs = ['calibrate', 'evaluate', 'diagnose'] if name == 'batch' else []
-    for words in [help_of([name, verb], capsys) for verb in verbs] or [text]:
-        assert '--json' in words
-
-
-@pytest.mark.parametrize('name', OFFLINE)
-def test_the_examples_are_taken_by_their_command(name):
+    for command in [[name, verb] for verb in verbs] or [[name]]:
+        assert main([*command, '--help']) == 0
+        assert '--json' in capsys.readouterr().out
     found = list(examples_of(name))
     assert found
     for parser, arguments in found:
@@ -241,12 +223,6 @@ def test_json_is_one_document_whose_schema_the_pages_name(
         (DOCS / page).read_text(encoding='utf-8') for page in ('commands.md', 'interfaces.md')
     ]
     assert any(f'`{document["schema"]}`' in page for page in pages)
-
-
-@pytest.mark.parametrize('name', OFFLINE)
-def test_what_takes_long_says_how_far_it_is(name):
-    module = importlib.import_module(OFFLINE[name][0])
-    assert hasattr(module, 'work') != (name in OWN_WORDS) == hasattr(module, 'run')
 
 
 def test_every_command_has_a_page():

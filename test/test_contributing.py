@@ -74,31 +74,6 @@ def test_whatever_is_named_is_there():
     assert list(missing(TEXT)) == []
 
 
-@pytest.mark.parametrize(
-    ('word', 'other'),
-    [
-        ('`RecordReader`', '`RecordReaders`'),
-        ('`anser_ros/tracking/solve_verdict.py`', '`anser_ros/tracking/solve_verdicts.py`'),
-        ('`make parameters`', '`make parameter`'),
-        ('`test_every_kind_has_a_nominal_model`', '`test_every_kind_has_a_model`'),
-        ('`pytest test/test_docs.py -k Setup`', '`pytest test/test_docs.py -k Setups`'),
-        ('`anser measured`', '`anser measures`'),
-        ('`TYPE_OF[Start]`', '`TYPES_OF[Start]`'),
-        ('`anser_ros/effects/NAME.py`', '`anser_ros/effect/NAME.py`'),
-    ],
-)
-def test_what_is_not_there_is_missed(word, other):
-    assert word in TEXT
-    assert other.strip('`') in list(missing(TEXT.replace(word, other)))
-
-
-def test_there_are_recipes():
-    assert len(re.findall('`.*?`', TEXT)) > 150
-    recipes = set(re.findall('^### (.*)$', TEXT, re.MULTILINE))
-    wanted = {'An effect', 'A board', 'An output', 'A node parameter', 'A data set', 'A gate'}
-    assert wanted | {"Another control unit's protocol"} <= recipes
-
-
 def test_the_hooks_use_what_make_has_installed():
     hooks = yaml.safe_load((REPO / '.pre-commit-config.yaml').read_text())['repos']
     assert [repo['repo'] for repo in hooks] == ['local']

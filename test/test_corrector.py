@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 import yaml
 from conftest import spin_until
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from pose_world import World
+from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
 
+from anser_ros.cli.main import main
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
+from anser_ros.nodes.corrector import Corrector
 from anser_ros.poses.corrector import NO_POSE, OK, OUTSIDE, UNKNOWN, PoseCorrector
 from anser_ros.poses.diagnosis import diagnose_poses
 from anser_ros.poses.document import MODEL_SCHEMA, to_model
@@ -146,11 +150,6 @@ def test_what_is_no_model_of_poses_is_refused(bent):
 
 @pytest.mark.light
 def test_the_node_corrects_what_comes_and_tells_what_does_not(ros, bent, tmp_path):
-    from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.corrector import Corrector
-
     path = tmp_path / 'model.yaml'
     path.write_text(yaml.safe_dump(bent[1]), encoding='utf-8')
     node = Corrector(parameter_overrides=[Parameter('model', value=str(path))])
@@ -188,8 +187,6 @@ def test_the_node_corrects_what_comes_and_tells_what_does_not(ros, bent, tmp_pat
 
 def test_a_map_of_points_is_applied_where_it_is_confirmed(tmp_path, capsys):
     """`error_map` writes what the corrector takes; mere noise is not corrected."""
-    from anser_ros.cli.main import main
-
     rng = np.random.default_rng(5)
     true = np.stack(np.meshgrid(*2 * [np.linspace(-0.1, 0.1, 8)], [0.0]), -1).reshape(-1, 3)
     turn, shift = Rotation.from_rotvec([0.3, 1.0, -0.4]), np.array([0.4, 0.1, -0.2])

@@ -15,6 +15,7 @@ pytest.importorskip('nicegui', reason='nicegui is not installed')
 
 from dashboard_world import OFF_M, ten_sensors
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import serialize_message
 from tracking_world import certain_model
 
@@ -22,6 +23,7 @@ from anser_ros.cli import demo, missing
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.nodes.dashboard import DashboardParameters
+from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.output_parts import live_view
 from anser_ros.nodes.output_parts.causes import LastStatus
 from anser_ros.nodes.output_parts.chain_client import ChainClient, ChainError
@@ -29,6 +31,7 @@ from anser_ros.nodes.output_parts.live_view import LiveView, read_pose
 from anser_ros.nodes.output_parts.polled import polling_node
 from anser_ros.nodes.output_parts.traces import latency_of
 from anser_ros.nodes.output_parts.view_source import ViewSource
+from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.volume import tracked_volume
 from anser_ros.web import loop as loop_module
 from anser_ros.web.folder import RESULTS, RecordingFolder
@@ -125,12 +128,6 @@ def test_other_machines_need_a_token(tmp_path):
             token_for('0.0.0.0', str(path))
 
 
-def test_who_comes_before_the_page_is_served_waits_for_it(tmp_path):
-    server = PageServer('127.0.0.1', 0, '', RecordingFolder(tmp_path))
-    with socket.create_connection(('127.0.0.1', server.port), 1.0):
-        server.end()
-
-
 def test_the_address_for_other_machines_has_the_name_of_this_one(tmp_path):
     server = PageServer('0.0.0.0', 0, TOKEN, RecordingFolder(tmp_path))
     server.end()
@@ -210,7 +207,7 @@ def test_a_job_tells_why_it_failed_and_can_be_ended(tmp_path):
         task = asyncio.create_task(ended.run())
         await asyncio.sleep(0.2)
         ended.cancel()
-        await asyncio.wait_for(task, 5.0)
+        await asyncio.wait_for(task, 60.0)
 
     asyncio.run(cancelled())
     assert ended.failure == 'warm_up was cancelled'
@@ -284,7 +281,9 @@ def test_the_loop_from_recording_to_undo(tmp_path, monkeypatch):
             str(tmp_path / 'one'), '--model', 'nominal', '--baseline', 'clean.mcap',
             '--out', str(loop.job.folder), '--json',
         ]  # fmt: skip
-        await asyncio.sleep(0.05)
+        async with asyncio.timeout(60.0):
+            while loop.found is None:
+                await asyncio.sleep(0.01)
         assert 'sensor_gain (channel 3, gain 1.1)' in loop.found.words
         assert loop.found.rows[0] == ('residual, pT', '5000', '100')
         assert loop.found.rows[1] == ('position error, mm', '4.00', '0.20')
@@ -362,11 +361,6 @@ def test_the_view_has_place_ellipsoid_error_and_residual(monkeypatch):
 
 
 def test_the_nodes_are_asked_for_services_and_models(ros, tmp_path):
-    from rclpy.executors import SingleThreadedExecutor
-
-    from anser_ros.nodes.field_model import FieldModelNode
-    from anser_ros.sessions.model_file import save_model
-
     server, asker = FieldModelNode(), ros.create_node('asker', namespace='anser')
     client = ChainClient(asker)
     executor = SingleThreadedExecutor()
@@ -378,7 +372,7 @@ def test_the_nodes_are_asked_for_services_and_models(ros, tmp_path):
     files = {'field_model': str(tmp_path / 'model.yaml')}
 
     async def asked_for():
-        async with asyncio.timeout(10.0):
+        async with asyncio.timeout(60.0):
             while not (client.is_there('field_model/set_baseline') and await client.model_files()):
                 await asyncio.sleep(0.05)
         assert await client.model_files() == {'field_model': 'nominal'}

@@ -11,7 +11,6 @@ from anser_ros.cli.diagnosis_words import MOST_CHARACTERS, verdict
 from anser_ros.cli.main import main
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import read_bag
-from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.session_writer import SessionWriter
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,13 +28,9 @@ def rewritten(name: str, path: Path, gain: float = 1.0, step: int = 1) -> Path:
     with SessionWriter(path) as writer:
         writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
         gains = np.where(bag.tool.channel == CHANNEL, gain, 1.0)[:, None]
-        empty = np.full((bag.tool.channel.size, 3), np.nan)
         frames = zip(bag.tool.stamp_ns.tolist(), bag.tool.flux, strict=True)
         for stamp, flux in itertools.islice(frames, 0, None, step):
-            flags = np.zeros(bag.tool.channel.size, int)
-            points = FluxPoints(bag.tool.channel, flags, flux * gains, empty, empty)
-            fields, point_step, data = encode_flux(points)
-            writer.write_flux('/anser/tool/flux', stamp, fields, point_step, len(gains), data)
+            writer.write_readings(bag.setup.tool_sensors, stamp, flux * gains)
         for body, track in bag.optical.items():
             for stamp, position, quaternion in zip(
                 track.stamp_ns.tolist(), track.position, track.quaternion, strict=True
@@ -88,29 +83,13 @@ def test_what_is_said_of_any_shipped_session_is_short(name, tmp_path, capsys):
     assert len(said) == 1 and 100 < len(said[0]) < MOST_CHARACTERS
 
 
-@pytest.mark.parametrize(
-    ('bag', 'message'),
-    [('absent.mcap', 'no such bag'), (str(MODEL), 'not an MCAP file')],
-)
-def test_bad_input_is_one_line_and_exit_two(tmp_path, capsys, bag, message):
-    arguments = ['diagnose', bag, '--model', str(MODEL), '--out', str(tmp_path)]
-    assert main(arguments) == 2
-    text = capsys.readouterr().err
-    assert message in text
-    assert len(text.strip().split('\n')) == 1
-
-
 def test_the_session_needs_poses(tmp_path, capsys):
     bag = read_bag(BAGS / 'moving.mcap')
     path = tmp_path / 'blind.mcap'
     with SessionWriter(path) as writer:
         writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
-        empty = np.full((bag.tool.channel.size, 3), np.nan)
-        flags = np.zeros(bag.tool.channel.size, int)
-        points = FluxPoints(bag.tool.channel, flags, bag.tool.flux[0], empty, empty)
-        fields, step, data = encode_flux(points)
         stamp = int(bag.tool.stamp_ns[0])
-        writer.write_flux('/anser/tool/flux', stamp, fields, step, len(empty), data)
+        writer.write_readings(bag.setup.tool_sensors, stamp, bag.tool.flux[0])
     assert load_session(path).tools[0].track is None
     assert main(['diagnose', str(path), '--model', str(MODEL), '--out', str(tmp_path)]) == 2
     assert 'at least 30 frames with an optical pose, got 0' in capsys.readouterr().err

@@ -25,10 +25,7 @@ from anser_ros.physics.dipole import (
     flux_jacobian,
 )
 
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(11)
+SEED = 11
 
 
 @pytest.fixture

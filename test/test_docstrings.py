@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 
 import pytest
-from conftest import by_room
 from source_trees import nodes_of
 
 pytestmark = pytest.mark.long
@@ -35,9 +34,8 @@ def pairs(node):
         yield sorted({*public} & {*(told(node, 'Attributes') or public)}), public
 
 
-@by_room(sorted(PACKAGE.rglob('*.py')))
-def test_sections_list_what_is_there(paths):
-    walked = [(path, node) for path in paths for node in nodes_of(path)]
+def test_sections_list_what_is_there():
+    walked = [(path, node) for path in PACKAGE.rglob('*.py') for node in nodes_of(path)]
     nodes = [(p, n) for p, n in walked if isinstance(n, (ast.FunctionDef, ast.ClassDef))]
     found = [(p.name, n.name, listed, real) for p, n in nodes for listed, real in pairs(n)]
     assert not [fault for fault in found if fault[2] != fault[3]]

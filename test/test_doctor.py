@@ -76,10 +76,6 @@ def test_the_clock(tmp_path, monkeypatch, said, kernel, state):
     assert (alone.state == doctor.GOOD) == (kernel is True)
 
 
-def test_the_kernel_has_a_word_of_its_clock():
-    assert doctor.kernel_clock() in (True, False)
-
-
 @pytest.mark.parametrize(
     ('text', 'state'),
     [('0', None), ('101', None), ('150', doctor.NOTE), ('233', doctor.BAD), ('-1', doctor.BAD),

@@ -17,29 +17,12 @@ from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
-REQUIRED = {
-    'sensor_gain', 'sensor_axis', 'sensor_polarity', 'sensor_size', 'lever_arm', 'registration',
-    'time_offset', 'channel_crosstalk', 'coil_crosstalk', 'coil_drift', 'coil_moved', 'pickup',
-    'saturation', 'phase_delay', 'static_metal', 'conductive_plate', 'moving_metal',
-    'excess_noise', 'outliers',
-}  # fmt: skip
-
 
 @pytest.fixture(scope='module')
 def scenery():
     made = world(frames=60)
     made.move_track(made.true_track)
     return made, made.problem()
-
-
-def test_every_name_of_the_interfaces_is_found():
-    effects = all_effects()
-    assert set(effects) >= REQUIRED
-    for name, effect in effects.items():
-        assert effect.name == name
-        assert effect.summary
-        assert effect.units
-        assert isinstance(effect.remedy, Remedy)
 
 
 def test_effects_declare_what_the_search_needs(scenery):

@@ -17,7 +17,7 @@ from anser_ros.sessions.baseline import baseline_flux
 from anser_ros.sessions.evaluation import Evaluation, track_session
 from anser_ros.sessions.evaluation_document import to_document
 from anser_ros.sessions.follower import RefitSummary
-from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
@@ -143,32 +143,6 @@ def test_the_truth_is_what_the_model_s_effects_make_of_it(model, moving, record,
     expected = np.full(len(apart), moved_m) if moved_m else np.where(later[2], apart, np.nan)
     assert np.nanmax(expected) > 5e-3
     np.testing.assert_allclose(body.position_error, expected, atol=1.5e-3)
-
-
-@pytest.mark.parametrize(
-    ('change', 'message'),
-    [
-        (['--model', 'absent.yaml'], 'absent.yaml'),
-        (['--refit'], '--baseline'),
-        (['--refit', '--baseline', 'absent.mcap'], 'no such bag'),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_two(model, tmp_path, capsys, change, message):
-    arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', str(model), *change]
-    assert main([*arguments, '--out', str(tmp_path)]) == 2
-    text = capsys.readouterr().err
-    assert message in text
-    assert len(text.strip().split('\n')) == 1
-
-
-def test_a_model_of_another_board_is_refused(model, tmp_path, capsys):
-    other = tmp_path / 'other.yaml'
-    good = load_model(model)
-    names = tuple(f'other{k}' for k in range(len(good.emitters)))
-    save_model(other, dataclasses.replace(good, emitters=names))
-    arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', str(other)]
-    assert main([*arguments, '--out', str(tmp_path)]) == 2
-    assert 'other0' in capsys.readouterr().err
 
 
 def test_a_baseline_whose_references_are_elsewhere_is_refused():

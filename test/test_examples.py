@@ -17,7 +17,7 @@ SAID = {
 
 
 # A whole diagnosis or calibration: some ten seconds on a quiet machine, a minute on a busy one.
-SLOW = (pytest.mark.long, pytest.mark.timeout(300))
+SLOW = pytest.mark.long
 LONG = ('find_an_effect', 'own_board', 'own_data')
 NAMES = [pytest.param(n, marks=SLOW) if n in LONG else n for n in SAID]
 
@@ -37,10 +37,5 @@ def test_example_runs(name, tmp_path, monkeypatch, capsys):
     assert SAID[name] in capsys.readouterr().out
 
 
-def test_every_example_is_short_documented_and_run():
-    scripts = {path.stem: path.read_text(encoding='utf-8') for path in EXAMPLES.glob('*.py')}
-    assert set(scripts) == set(SAID)
-    page = (REPO / 'docs' / 'examples.md').read_text(encoding='utf-8')
-    for name, text in scripts.items():
-        assert len(text.splitlines()) <= 40 and text.startswith('"""')
-        assert f'examples/{name}.py' in page
+def test_every_example_is_run():
+    assert {path.stem for path in EXAMPLES.glob('*.py')} == set(SAID)

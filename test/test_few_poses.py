@@ -14,7 +14,7 @@ from anser_ros.sessions.calibration import is_estimated_jointly
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
-pytestmark = [pytest.mark.long, pytest.mark.timeout(180)]
+pytestmark = pytest.mark.long
 VOLUME = ((-0.3, -0.3, 0.05), (0.3, 0.3, 0.5))
 
 

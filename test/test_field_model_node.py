@@ -5,18 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graph_bench import FIRST_NS, Bench, reference_specs
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
 from tracking_world import certain_model
 
+from anser_ros.nodes.field_model import FieldModelNode
+from anser_ros.nodes.streams.model_clouds import read_dipoles, read_error
 from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.session import sensor_table
+from anser_ros.stamps import stamp_of
 
 
 @pytest.fixture
 def server(ros, tmp_path):
     """A field_model node that saves into the test's folder."""
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.field_model import FieldModelNode
-
     node = FieldModelNode(
         parameter_overrides=[
             Parameter('save_file', value=str(tmp_path / 'kept.yaml')),
@@ -35,15 +37,12 @@ def call(bench, kind, name, **request):
     client = bench.peer.create_client(kind, f'field_model/{name}')
     bench.spin_until(client.service_is_ready)
     future = client.call_async(kind.Request(**request))
-    bench.spin_until(future.done, 30.0)
+    bench.spin_until(future.done)
     bench.peer.destroy_client(client)
     return future.result()
 
 
 def test_the_nominal_model_is_served_latched_with_its_uncertainty(server):
-    from anser_ros.nodes.streams.model_clouds import read_dipoles, read_error
-    from anser_ros.stamps import stamp_of
-
     server.say_setup()
     server.spin_until(lambda: server.models and server.errors)
     points = read_dipoles(server.models[0])
@@ -59,11 +58,6 @@ def test_the_nominal_model_is_served_latched_with_its_uncertainty(server):
 
 
 def test_services_of_the_field_model(server, tmp_path):
-    from std_srvs.srv import SetBool, Trigger
-
-    from anser_ros.sessions.session import sensor_table
-    from anser_ros.stamps import stamp_of
-
     assert not call(server, Trigger, 'reset').success, 'there is no model yet'
     assert not call(server, Trigger, 'save').success
     assert not call(server, Trigger, 'set_baseline').success
@@ -95,11 +89,6 @@ def test_services_of_the_field_model(server, tmp_path):
 
 def test_another_model_while_it_runs(server, tmp_path):
     """It is served, and followed with the baseline of before; one that does not fit is refused."""
-    from rclpy.parameter import Parameter
-    from std_srvs.srv import Trigger
-
-    from anser_ros.nodes.streams.model_clouds import read_dipoles
-    from anser_ros.sessions.session import sensor_table
 
     def give(name):
         return server.node.set_parameters([Parameter('model_file', value=str(tmp_path / name))])[0]
@@ -116,7 +105,7 @@ def test_another_model_while_it_runs(server, tmp_path):
         server.reference.publish(server.cloud.message(points, FIRST_NS + i * 40_000_000))
     server.spin_until(lambda: server.node.counters['frames'] == 8)
     assert call(server, Trigger, 'set_baseline').success
-    server.spin_until(lambda: server.node.counters['refit_starts'] == 1, 30.0)
+    server.spin_until(lambda: server.node.counters['refit_starts'] == 1)
     before = len(server.models)
     for name, why in (('other.yaml', 'emitters'), ('nowhere.yaml', 'nowhere.yaml')):
         refused = give(name)
@@ -127,7 +116,7 @@ def test_another_model_while_it_runs(server, tmp_path):
     server.spin_until(lambda: len(server.models) > before)
     served = read_dipoles(server.models[-1])
     np.testing.assert_allclose(served.moments, 1.01 * model.moments)
-    server.spin_until(lambda: server.node.counters['refit_starts'] == 2, 30.0)
+    server.spin_until(lambda: server.node.counters['refit_starts'] == 2)
     points = server.points(clean, channels=references.channel)
     server.reference.publish(server.cloud.message(points, FIRST_NS + 400_000_000))
     server.spin_until(lambda: server.node.counters['refits'] == 1)
@@ -135,10 +124,6 @@ def test_another_model_while_it_runs(server, tmp_path):
 
 
 def test_a_model_file_is_served_at_once_and_must_fit_the_setup(ros, tmp_path):
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.field_model import FieldModelNode
-
     model = certain_model()
     other = type(model)(
         model.positions, model.directions, model.moments,

@@ -1,19 +1,17 @@
 """Messages that are too large are refused by their bytes, before they become objects."""
 
-import time
-
 import pytest
+from conftest import wait
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 
 from anser_ros.errors import LayoutError
+from anser_ros.nodes.runtime import incoming, qos
+from anser_ros.nodes.runtime.incoming import opened
+from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.wire.cdr import cloud_bytes, string_bytes
 from anser_ros.wire.points import FLOAT32, MOST_POINTS, flux_fields
-
-
-@pytest.fixture
-def opened():
-    from anser_ros.nodes.runtime.incoming import opened
-
-    return opened
 
 
 def cloud(width=1, count=None, size=None):
@@ -24,21 +22,13 @@ def cloud(width=1, count=None, size=None):
     return cloud_bytes(7, 'fg', fields, step, width, data)
 
 
-def test_a_message_within_its_bounds_is_opened(opened):
-    from sensor_msgs.msg import PointCloud2
-    from std_msgs.msg import String
-
+def test_a_message_within_its_bounds_is_opened():
     assert opened(string_bytes('a setup'), String).data == 'a setup'
     message = opened(cloud(9), PointCloud2)
     assert (message.width, len(message.fields), len(message.data)) == (9, 24, 9 * 92)
 
 
-def test_what_is_too_large_is_refused_unopened(opened, monkeypatch):
-    from sensor_msgs.msg import PointCloud2
-    from std_msgs.msg import String
-
-    from anser_ros.nodes.runtime import incoming
-
+def test_what_is_too_large_is_refused_unopened(monkeypatch):
     monkeypatch.setattr(incoming, 'deserialize_message', None)  # would fail if it were called
     with pytest.raises(LayoutError, match='bytes is refused'):
         opened(string_bytes('x' * 1_000_001), String)
@@ -52,12 +42,6 @@ def test_what_is_too_large_is_refused_unopened(opened, monkeypatch):
 
 def test_a_node_counts_what_it_refuses_and_goes_on(ros):
     """Over DDS come a cloud of a million points, a huge text and a good one, which is taken."""
-    from rclpy.executors import SingleThreadedExecutor
-    from sensor_msgs.msg import PointCloud2
-    from std_msgs.msg import String
-
-    from anser_ros.nodes.runtime import qos
-    from anser_ros.nodes.runtime.node import AnserNode
 
     class Taker(AnserNode):
         NAME = 'taker'
@@ -77,12 +61,9 @@ def test_a_node_counts_what_it_refuses_and_goes_on(ros):
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     executor.add_node(peer)
-    end = time.monotonic() + 10.0
 
     def spin_until(condition):
-        while not condition():
-            assert time.monotonic() < end, node.counters
-            executor.spin_once(timeout_sec=0.05)
+        assert wait(condition, lambda: executor.spin_once(timeout_sec=0.05)), node.counters
 
     spin_until(lambda: text.get_subscription_count() and clouds.get_subscription_count())
     clouds.publish(PointCloud2(height=1, width=10**6, point_step=1))

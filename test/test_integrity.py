@@ -16,13 +16,9 @@ from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.rotations import rotation_of_vector
 from anser_ros.tracking.tracker import Tracker
 
+SEED = 7
 HANDS = MotionBounds(2.0, 40.0)
 FAULT = 30
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(7)
 
 
 def wrong_and_ok(estimates, position, rotation):

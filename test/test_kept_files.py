@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from refit_rig import HEAD, Rig, setup_text
 from refit_world import anser_world
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 from test_refit_start import given_baseline
 
 from anser_ros.cli import warm_up
 from anser_ros.nodes.field_model_parts.kept_baseline import BASELINE_S, KeptBaseline
+from anser_ros.nodes.runtime import qos
 from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
 from anser_ros.sessions import kept_tables
@@ -115,10 +118,6 @@ def test_a_baseline_is_taken_up_soon_after_and_from_the_same_sender_only(tmp_pat
 @pytest.fixture
 def started(ros, tmp_path, monkeypatch):
     """Starts nodes one after the other, with one sender of references that goes on."""
-    from sensor_msgs.msg import PointCloud2
-
-    from anser_ros.nodes.runtime import qos
-
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     sender = ros.create_node('sender', namespace='anser')
     sender.create_publisher(PointCloud2, 'reference/flux', qos.STREAM)
@@ -140,8 +139,6 @@ def started(ros, tmp_path, monkeypatch):
 
 
 def test_a_node_that_is_started_near_metal_follows_the_references_again(started):
-    from std_msgs.msg import String
-
     rig = started()
     given_baseline(rig)
     rig.until(lambda: rig.node.counters['refit_starts'] == 1)
@@ -162,8 +159,6 @@ def test_a_node_that_is_started_near_metal_follows_the_references_again(started)
 
 
 def test_a_baseline_that_references_contradict_is_not_taken_up(started):
-    from std_msgs.msg import String
-
     rig = started()
     given_baseline(rig)
     rig.until(lambda: rig.node.counters['refit_starts'] == 1)

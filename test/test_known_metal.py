@@ -109,12 +109,6 @@ class TestLattice:
         alone = 20.0 * np.repeat(two.answers, 3) * driving
         assert np.abs(moments - alone).max() > 0.05 * np.abs(alone).max(), 'they drive each other'
 
-    def test_points_far_apart_do_not_drive_each_other(self):
-        two = lattice_of([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0]])
-        driving = np.ones((1, 6))
-        alone = 20.0 * np.repeat(two.answers, 3)
-        np.testing.assert_allclose(two.moments(driving, np.zeros(1))[0], alone, rtol=1e-8)
-
     def test_the_response_is_reciprocal_at_any_frequency(self, lattice):
         _, response, _ = lattice.scattering
         base, sloped = lattice.responses
@@ -142,26 +136,6 @@ class TestLattice:
             left.append(np.abs(near.moments(driving, tilt) - exact).max())
             assert left[-1] < 0.2 * np.abs(exact - lattice.moments(driving, tilt)).max()
         assert left[0] / left[1] == pytest.approx(4.0, rel=0.1), 'of second order'
-
-    def test_no_change_near_is_the_same_lattice(self, lattice):
-        driving = np.random.default_rng(5).normal(size=(8, 24))
-        near = lattice.near(np.zeros(4 * len(lattice)))
-        np.testing.assert_allclose(
-            near.moments(driving, TILT), lattice.moments(driving, TILT), rtol=1e-9
-        )
-
-    def test_a_change_of_the_slopes_alone_is_right_in_full(self, lattice):
-        rng, n = np.random.default_rng(5), len(lattice)
-        driving = rng.normal(size=(8, 3 * n))
-        change = np.concatenate([np.zeros(2 * n), rng.normal(size=2 * n)])
-        whole = lattice.with_parameters(lattice.parameters + change)
-        near = lattice.near(change).moments(driving, TILT)
-        np.testing.assert_allclose(near, whole.moments(driving, TILT), rtol=1e-9)
-
-    def test_parameters_are_what_they_make(self, lattice):
-        again = lattice.with_parameters(lattice.parameters)
-        np.testing.assert_array_equal(again.answers, lattice.answers)
-        np.testing.assert_array_equal(again.slopes, lattice.slopes)
 
     def test_columns_by_the_pose_are_the_differences(self, lattice, setting, coils):
         columns = setting.pose_columns(lattice, POSE, coils)

@@ -7,12 +7,22 @@ from dataclasses import make_dataclass, replace
 
 import numpy as np
 import pytest
-from conftest import spin_until
+from conftest import PATIENCE_S, skip_if_too_slow, spin_until
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.srv import GetParameters
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
 from tracked_tool import CHANNELS, MODEL, TOOL
 
 from anser_ros.errors import ParameterError
+from anser_ros.nodes.runtime import process, qos
 from anser_ros.nodes.runtime.handover import DirectSubscription, HandedFlux, Handover, NewestWorker
+from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.runtime.parameter_files import names_for
+from anser_ros.nodes.streams.one_source import OneSource
+from anser_ros.nodes.tracker_parts.rehearsal import LONGEST_S, Rehearsal
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux
@@ -41,7 +51,7 @@ def test_what_takes_long_is_done_aside_with_the_newest():
 
     def slow(what):
         began.set()
-        assert goes_on.wait(10)
+        assert goes_on.wait(PATIENCE_S)
         done.append(what)
         if what == 'b4':
             finished.set()
@@ -49,23 +59,18 @@ def test_what_takes_long_is_done_aside_with_the_newest():
     finished = threading.Event()
     aside = NewestWorker(lambda: skipped.append(1))
     aside.put('/a', slow, 'a1')
-    assert began.wait(10)
+    assert began.wait(PATIENCE_S)
     for k in range(2, 5):
         aside.put('/a', slow, f'a{k}')
         aside.put('/b', slow, f'b{k}')
     goes_on.set()
-    assert finished.wait(10)
+    assert finished.wait(PATIENCE_S)
     aside.end(10)
     assert done == ['a1', 'a4', 'b4'] and len(skipped) == 4
 
 
 def test_what_is_worked_on_aside_has_nothing_to_do_with_a_node_that_is_gone(ros):
     """The thread ends with its node, and what it still does then is no fault of a callback."""
-    from std_msgs.msg import String
-
-    from anser_ros.nodes.runtime import qos
-    from anser_ros.nodes.runtime.node import AnserNode
-
     began, goes_on = threading.Event(), threading.Event()
 
     class Slow(AnserNode):
@@ -74,7 +79,7 @@ def test_what_is_worked_on_aside_has_nothing_to_do_with_a_node_that_is_gone(ros)
 
         def take(self, _what):
             began.set()
-            goes_on.wait(10)
+            goes_on.wait(PATIENCE_S)
             self.get_clock().now()
             raise RuntimeError('the node is gone')
 
@@ -83,7 +88,7 @@ def test_what_is_worked_on_aside_has_nothing_to_do_with_a_node_that_is_gone(ros)
     node = Slow(handover=handover)
     node.create_subscription(String, 'news', node.take, qos.STREAM)
     handover.give('/anser/news', 'first')
-    assert began.wait(10)
+    assert began.wait(PATIENCE_S)
     assert not node.stop_working(), 'it is still at it'
     thread = node._aside._thread
     node.destroy_node()
@@ -113,8 +118,6 @@ def test_what_is_put_off_is_done_one_thing_a_pause_while_there_are_pauses():
 
 
 def test_a_node_prepares_for_each_frame_that_is_due(ros):
-    from anser_ros.nodes.runtime.node import AnserNode
-
     class Preparing(AnserNode):
         NAME = 'preparing'
 
@@ -138,9 +141,6 @@ def test_a_node_prepares_for_each_frame_that_is_due(ros):
 
 
 def test_only_a_frame_that_gave_poses_in_time_is_rehearsed():
-    pytest.importorskip('rclpy')
-    from anser_ros.nodes.tracker_parts.rehearsal import LONGEST_S, Rehearsal
-
     rehearsal, tracker = Rehearsal(TOOL, TrackerSettings()), Tracker(MODEL, TOOL)
     flux = MODEL.flux(TOOL.position + [0.0, 0.0, 0.15], TOOL.axis, TOOL.length)
     nowhere = np.full((len(CHANNELS), 3), np.nan)
@@ -173,9 +173,6 @@ def test_handed_fluxes_are_those_that_are_published():
 
 
 def test_parameters_of_one_node_are_given_to_it_alone():
-    pytest.importorskip('rclpy')
-    from anser_ros.nodes.runtime import process
-
     tracker, server = (
         type('T', (), {'NAME': name, 'PARAMETERS': make_dataclass('P', [(known, float, 0.0)])})
         for name, known in (('tracker', 'gate'), ('field_model', 'refit'))
@@ -211,12 +208,6 @@ def test_a_file_tells_which_values_it_has_for_one_node(tmp_path):
 
 
 def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros):
-    from sensor_msgs.msg import PointCloud2
-
-    from anser_ros.nodes.runtime import qos
-    from anser_ros.nodes.runtime.node import AnserNode
-    from anser_ros.nodes.streams.one_source import OneSource
-
     class Giver(AnserNode):
         NAME = 'giver'
 
@@ -242,14 +233,8 @@ def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros)
         node.destroy_node()
 
 
-@pytest.mark.realtime
 def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
-    from geometry_msgs.msg import PoseStamped
-    from rcl_interfaces.srv import GetParameters
-    from std_srvs.srv import SetBool
-
     link, node, poses, levels = tmp_path / 'cu', ros.create_node('peer'), [], {}
-    from diagnostic_msgs.msg import DiagnosticArray
 
     def note(message):
         levels.update({status.name: status.message for status in message.status})
@@ -260,9 +245,12 @@ def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
     words = ['-r', '__ns:=/x', '-r', 'tracker:__node:=guide', '-p', f'device:={link}']
     words += ['-p', 'tracker:gate:=4.0', '-p', 'allow_uncalibrated:=true']
     live = start('live', '--ros-args', *words)
-    assert spin_until(node, lambda: len(poses) > 50, 60.0), live.output
-    names = {f'{space}/{name}' for name, space in node.get_node_names_and_namespaces()}
-    assert {'/x/acquisition', '/x/field_model', '/x/guide'} <= names
+    wanted = {'/x/acquisition', '/x/field_model', '/x/guide'}
+
+    def names():
+        return {f'{space}/{name}' for name, space in node.get_node_names_and_namespaces()}
+
+    assert spin_until(node, lambda: wanted <= names()), live.output
     # Each speaks once a second, and in a pause between two frames.
     assert spin_until(node, lambda: {'x/acquisition', 'x/field_model', 'x/guide'} <= set(levels))
     client = node.create_client(GetParameters, '/x/guide/get_parameters')
@@ -273,7 +261,11 @@ def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
     assert freeze.wait_for_service(10)
     future = freeze.call_async(SetBool.Request(data=True))
     assert spin_until(node, future.done) and future.result().success
+    tracked = spin_until(node, lambda: len(poses) > 50)
     assert live.interrupt() == 0, live.output
+    if not tracked:
+        skip_if_too_slow(live.output)
+    assert tracked, live.output
 
 
 @pytest.mark.processes
@@ -286,16 +278,13 @@ def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
 )
 def test_what_several_nodes_cannot_be_given_is_one_line(start, words, said):
     process = start('live', '--ros-args', *words)
-    assert process.popen.wait(30) == 2
+    assert process.wait() == 2
     assert said in process.output and 'Traceback' not in process.output
 
 
 @pytest.mark.parametrize('is_noticed', [True, False])
 def test_who_is_given_up_says_good_bye_to_devices_first(monkeypatch, is_noticed):
     """A process too busy to notice Ctrl-C ends all the same; the unit must not stream on."""
-    pytest.importorskip('rclpy')
-    from anser_ros.nodes.runtime import process
-
     done = []
 
     def fail():

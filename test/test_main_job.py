@@ -4,7 +4,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-import pytest
 from chain import beginning, replay_through_nodes
 
 from anser_ros.sessions.evaluation import track_session
@@ -48,7 +47,6 @@ def test_our_own_bag(domain, factory_calibration):
     compare(BAGS / 'moving.mcap', factory_calibration / 'model.yaml')
 
 
-@pytest.mark.timeout(180)
 def test_a_session_that_this_package_did_not_make(domain, shared, effects_model, tmp_path):
     """Its first ten seconds, in which the tool crosses the whole width of the volume."""
     bag = shared / 'sessions' / 'effects' / 's01.mcap'

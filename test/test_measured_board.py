@@ -1,10 +1,8 @@
 """A tracker's points over a flat board: what they show of a map, and that noise shows none."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
+from conftest import SHARED, needs
 from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.error_map import LEAST_GAIN_SIGMAS, learn_error_map
@@ -12,9 +10,8 @@ from anser_ros.cli.main import main
 from anser_ros.errors import BagError, FitError
 from anser_ros.measured import anser_board
 
-ROOT = Path(__file__).resolve().parents[1]
-FOLDER = Path(os.environ.get('ANSER_SHARED', ROOT.parent / 'shared')) / 'measured' / 'anser_board'
-needs_data = pytest.mark.skipif(not FOLDER.is_dir(), reason='no shared folder with measured data')
+FOLDER = SHARED / 'measured' / 'anser_board'
+needs_data = needs('measured', 'anser_board')
 
 
 def test_broken_lists_are_one_line(tmp_path):

@@ -1,19 +1,15 @@
 """The command `anser measured`: usage, table and JSON."""
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import SHARED, needs
 
 from anser_ros.cli import measured
 from anser_ros.cli.main import main as measured_main
 from anser_ros.measured import ReportRow
 from anser_ros.measured.recipe import Recipe
-
-ROOT = Path(__file__).resolve().parents[1]
-SHARED = Path(os.environ.get('ANSER_SHARED', ROOT.parent / 'shared'))
 
 
 def test_unknown_data_set_and_missing_folder(capsys, tmp_path):
@@ -61,7 +57,7 @@ def test_numbers_that_are_missing_are_null():
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not (SHARED / 'measured').is_dir(), reason='no shared measured data')
+@needs('measured')
 def test_json_alone_on_stdout(capsys, tmp_path):
     code = measured_main(
         ['measured', 'anser_board', '--json', '--out', str(tmp_path), '--shared', str(SHARED)]

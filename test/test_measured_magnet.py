@@ -1,11 +1,10 @@
 """A magnet before sensors as sessions: what is written, and files that are refused."""
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO, SHARED, needs
 from scipy.spatial.transform import Rotation
 
 from anser_ros.cli.main import main
@@ -20,9 +19,8 @@ from anser_ros.measured.magnet_patch import (
 )
 from anser_ros.sessions.session import load_session
 
-ROOT = Path(__file__).resolve().parents[1]
-FOLDER = Path(os.environ.get('ANSER_SHARED', ROOT.parent / 'shared')) / 'measured' / 'magnet_patch'
-needs_data = pytest.mark.skipif(not FOLDER.is_dir(), reason='no shared folder with measured data')
+FOLDER = SHARED / 'measured' / 'magnet_patch'
+needs_data = needs('measured', 'magnet_patch')
 
 
 def made_up(frames):
@@ -92,7 +90,7 @@ class TestKept:
         )['sources'][magnet_patch.BODY]
         kept = {
             row['figure']: row['after']
-            for row in json.loads((ROOT / 'docs/results/measured.json').read_text())['rows']
+            for row in json.loads((REPO / 'docs/results/measured.json').read_text())['rows']
         }
         for kind, of_source in (
             ('position', 1e3 * found['position_rmse_m']),

@@ -2,12 +2,11 @@
 
 import itertools
 import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import SHARED, needs
 from scipy.spatial.transform import Rotation
 
 from anser_ros.cli import measured
@@ -18,16 +17,10 @@ from anser_ros.measured.session_file import write_frames
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
-ROOT = Path(__file__).resolve().parents[1]
-SHARED = Path(os.environ.get('ANSER_SHARED', ROOT.parent / 'shared'))
+SEED = 7
 NAVION = SHARED / 'measured' / 'navion'
 PLACES = np.array([[0.06, 0.02, 0.01], [-0.05, 0.04, 0.0], [-0.04, -0.05, 0.03], [0.0, 0.0, 0.09]])
 COILS = tuple(Coil(f'c{k}', (0.1 * k, 0.0, 0.0), 0.0, 1.0 + k) for k in range(3))
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(7)
 
 
 class TestFrames:
@@ -96,7 +89,7 @@ class TestNavion:
         with pytest.raises(FitError, match='63 rows, expected 64'):
             navion.read(tmp_path / 'cut')
 
-    @pytest.mark.skipif(not NAVION.is_dir(), reason='no shared measured data')
+    @needs('measured', 'navion')
     def test_the_real_data(self, tmp_path):
         (path,) = navion.write_sessions(NAVION, tmp_path / 'bags')
         (tool,) = load_session(path).tools

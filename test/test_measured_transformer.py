@@ -1,11 +1,10 @@
 """The field before a transformer as sessions: which points are taken, and in which frame."""
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import SHARED, needs
 
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
@@ -13,8 +12,7 @@ from anser_ros.measured import transformer
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session
 
-ROOT = Path(__file__).resolve().parents[1]
-FOLDER = Path(os.environ.get('ANSER_SHARED', ROOT.parent / 'shared')) / 'measured' / 'transformer'
+FOLDER = SHARED / 'measured' / 'transformer'
 MOMENT = np.array([20.0 + 5.0j, -8.0j, 60.0])
 """Of a dipole at the data set's (0, 0, 1), A m^2, along its axes."""
 
@@ -79,7 +77,7 @@ def test_rows_compare_the_model_with_an_interpolation_on_the_plane_left_out(tmp_
     assert named.after == 0
 
 
-@pytest.mark.skipif(not FOLDER.is_dir(), reason='no folder measured/transformer beside the others')
+@needs('measured', 'transformer')
 def test_the_published_file_has_the_planes(tmp_path):
     place, field = transformer.read(FOLDER)
     assert len(place) == 3 * 231 + 66 and np.abs(field).max() < 1e-3

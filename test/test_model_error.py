@@ -6,10 +6,7 @@ import pytest
 from anser_ros.errors import LayoutError
 from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
 
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(51)
+SEED = 51
 
 
 def test_model_error_survives_its_message(rng):

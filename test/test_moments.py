@@ -32,14 +32,11 @@ from anser_ros.calibration.pose_correction import (
 from anser_ros.calibration.pose_whitening import PoseWhitener
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.errors import FitError
+from anser_ros.physics.dipole import flux_basis
 from anser_ros.settings import Accuracy
 
+SEED = 5
 LAYER = Layout('layer', 9, 1.3, 0.0)
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(5)
 
 
 @pytest.fixture
@@ -149,8 +146,6 @@ def fitted(world, damping=0.0, **options):
     fitter = MomentFitter([world.measurements], dipoles, damping, Accuracy())
 
     def flux(moments):
-        from anser_ros.physics.dipole import flux_basis
-
         return lambda points, axes: (
             flux_basis(points, axes, None, dipoles.positions, dipoles.directions) @ moments
         )

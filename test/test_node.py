@@ -7,11 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from conftest import Process, spin_until
+from conftest import Process, spin_until, wait
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.runtime import parameters
+from anser_ros.nodes.runtime import process as processes
 from anser_ros.nodes.runtime.diagnostics import Throttle, text_of
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameter_files import complaints
 from anser_ros.nodes.runtime.parameters import parameter
 
@@ -137,10 +143,10 @@ class Sample(AnserNode):
         super().__init__(**options)
         print('rate', self.parameters.rate_hz, flush=True)
         if self.parameters.rate_hz == 99.0:
-            time.sleep(20)
+            time.sleep(600)
         if self.parameters.rate_hz == 98.0:  # a library that lets no Python handler run
-            ctypes.CDLL(None).poll(None, 0, 20000)
-            ctypes.CDLL(None).sleep(20)
+            ctypes.CDLL(None).poll(None, 0, 600000)
+            ctypes.CDLL(None).sleep(600)
         if end is not None:
             self.stop(end)
 
@@ -171,18 +177,14 @@ class TestProcess:
     def test_a_signal_ends_it_in_order(self, run, number):
         process = run('--ros-args', '-p', 'rate_hz:=50')
         process.wait_for('rate 50.0')
-        began = time.monotonic()
         assert process.interrupt(number) == 0
-        assert time.monotonic() - began < 2.0
         assert process.output.endswith('closed\n')
 
     @pytest.mark.parametrize('rate', [98, 99])
     def test_a_signal_ends_it_while_it_is_still_being_made(self, run, rate):
         process = run('--ros-args', '-p', f'rate_hz:={rate}')
         process.wait_for(f'rate {rate}.0')
-        began = time.monotonic()
         assert process.interrupt() == 0
-        assert time.monotonic() - began < 2.5
         assert process.output == f'rate {rate}.0\n'
 
     def test_a_signal_ends_it_while_it_imports(self, domain, tmp_path):
@@ -195,7 +197,7 @@ class TestProcess:
         assert 'Traceback' not in process.output
 
     def test_it_can_end_itself(self, run):
-        assert run('--end', '0').popen.wait(20) == 0
+        assert run('--end', '0').wait() == 0
 
     @pytest.mark.parametrize(
         ('arguments', 'said'),
@@ -208,7 +210,7 @@ class TestProcess:
     )
     def test_a_wrong_argument_is_one_clear_line(self, run, arguments, said):
         process = run(*arguments)
-        assert process.popen.wait(20) == 2
+        assert process.wait() == 2
         assert said in process.output
         assert 'Traceback' not in process.output
 
@@ -222,15 +224,13 @@ class TestProcess:
 
     def test_help_prints_the_table(self, run):
         process = run('--help')
-        assert process.popen.wait(20) == 0
+        assert process.wait() == 0
         assert 'rate_hz = 25.0 [1 to inf]' in process.output
 
 
 class TestGraph:
     @pytest.fixture
     def node(self, ros):
-        from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-
         class Sample(AnserNode):
             NAME = 'sample'
             PARAMETERS = Table
@@ -246,8 +246,6 @@ class TestGraph:
         node.destroy_node()
 
     def test_diagnostics_hold_state_counters_and_parts(self, ros, node):
-        from diagnostic_msgs.msg import DiagnosticArray
-
         got = []
         node.count('windows', 5)
         listener = ros.create_node('listener')
@@ -255,9 +253,7 @@ class TestGraph:
         executor = ros.executors.SingleThreadedExecutor()
         executor.add_node(node)
         executor.add_node(listener)
-        end = time.monotonic() + 10
-        while not got and time.monotonic() < end:
-            executor.spin_once(timeout_sec=0.1)
+        assert wait(lambda: got, lambda: executor.spin_once(timeout_sec=0.1))
         executor.shutdown()
         own, part = got[0].status
         assert (own.name, own.level, own.message) == ('anser/sample', b'\x01', 'waiting')
@@ -266,9 +262,6 @@ class TestGraph:
         assert part.name == 'anser/sample: tool_a/0/x'
 
     def test_a_failing_callback_is_counted_and_survived(self, ros, node):
-        from std_msgs.msg import String
-        from std_srvs.srv import Trigger
-
         def fail(_message):
             raise ZeroDivisionError('on purpose')
 
@@ -288,8 +281,6 @@ class TestGraph:
         assert spin_until(node, lambda: node.counters['callback_faults'] == 1)
 
     def test_parameters_change_only_within_the_table(self, node):
-        from rclpy.parameter import Parameter
-
         before = node.parameters
         (done,) = node.set_parameters([Parameter('rate_hz', value=50)])
         assert done.successful and node.parameters.rate_hz == 50.0 and before.rate_hz == 25.0
@@ -302,10 +293,8 @@ class TestGraph:
 
 def test_the_executor_is_the_one_told_of_events_where_rclpy_has_it(monkeypatch):
     experimental = pytest.importorskip('rclpy.experimental')
-    from anser_ros.nodes.runtime import process
-
     monkeypatch.setattr(experimental, 'EventsExecutor', lambda: 'events')
-    assert process.make_executor() == 'events'
+    assert processes.make_executor() == 'events'
     monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)
-    monkeypatch.setattr(process, 'SingleThreadedExecutor', lambda: 'waiting')
-    assert process.make_executor() == 'waiting'
+    monkeypatch.setattr(processes, 'SingleThreadedExecutor', lambda: 'waiting')
+    assert processes.make_executor() == 'waiting'

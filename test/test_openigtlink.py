@@ -9,9 +9,20 @@ import time
 import numpy as np
 import pyigtl
 import pytest
-from conftest import spin_until
+from conftest import spin_until, wait
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 
 from anser_ros.errors import ParameterError, PortError
+from anser_ros.nodes.openigtlink import (
+    OpenIGTLink,
+    OpenIGTLinkParameters,
+    check_templates,
+    devices_of,
+)
 from anser_ros.nodes.output_parts.igtl_server import MOST_CLIENTS, IgtlServer
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import parse_setup
@@ -46,11 +57,6 @@ def answer(header):
 @pytest.fixture
 def tracker(ros):
     """A node that publishes what a tracker does."""
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-    from geometry_msgs.msg import PoseStamped
-    from rclpy.qos import DurabilityPolicy, QoSProfile
-    from std_msgs.msg import String
-
     node = ros.create_node('tracker', namespace='anser')
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     setup = node.create_publisher(String, 'setup', latched)
@@ -100,36 +106,35 @@ def test_poses_and_states_reach_clients(start, tracker, connect):
     process = start('openigtlink', '--ros-args', '-p', 'port:=0', '-p', 'version:=2')
     port = read_port(process)
     first, second = connect(port), connect(port)
-    assert spin_until(tracker, lambda: tracker.listeners() == 1, 20)
-    waiting = first.wait_for_message('tool_a/0/x/state', timeout=10)
+    assert spin_until(tracker, lambda: tracker.listeners() == 1)
+    waiting = first.wait_for_message('tool_a/0/x/state', timeout=60)
     assert waiting.string == 'no pose yet'
-    second.wait_for_message('tool_a/0/x/state', timeout=10)
+    second.wait_for_message('tool_a/0/x/state', timeout=60)
     tracker.send(w=float(np.sqrt(0.5)))
     for client in (first, second):
-        pose = client.wait_for_message('tool_a/0/x', timeout=10)
+        pose = client.wait_for_message('tool_a/0/x', timeout=60)
         assert pose.message_type == 'TRANSFORM'
         assert pose.header_version == 2 and pose.metadata == {'TransformStatus': 'OK'}
         assert pose.timestamp == pytest.approx(1_750_000_000.25, abs=1e-6)
         expected = [[0, -1, 0, 100], [1, 0, 0, 0], [0, 0, 1, 200], [0, 0, 0, 1]]
         np.testing.assert_allclose(pose.matrix, expected, atol=1e-4)
-    began = time.monotonic()
-    states = []
-    while 'residual' not in states and time.monotonic() - began < 10:
+    heard = []
+
+    def say():
         tracker.say('residual')
         message = first.wait_for_message('tool_a/0/x/state', timeout=0.2)
-        states += [message.string] if message else []
-    assert message.timestamp == pytest.approx(1_750_000_000.25, abs=30), "the pose's clock"
+        heard.extend([message] if message else [])
+
+    assert wait(lambda: 'residual' in [message.string for message in heard], say)
+    states, message = [message.string for message in heard], heard[-1]
+    assert message.timestamp == pytest.approx(1_750_000_000.25, abs=300), "the pose's clock"
     assert states[-1] == 'residual' and set(states) <= {'ok', 'stale', 'residual'}
     tracker.send()
-    assert first.wait_for_message('tool_a/0/x', timeout=10).matrix[0, 3] == pytest.approx(100)
+    assert first.wait_for_message('tool_a/0/x', timeout=60).matrix[0, 3] == pytest.approx(100)
     assert process.interrupt() == 0
 
 
 def test_a_pose_that_is_none_is_refused(ros, tracker):
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.openigtlink import OpenIGTLink
-
     node = OpenIGTLink(parameter_overrides=[Parameter('port', value=0)])
     try:
         assert spin_until(node, lambda: tracker.listeners() == 1)
@@ -146,7 +151,7 @@ class TestServer:
         with socket.create_server(('127.0.0.1', 0)) as taken:
             port = taken.getsockname()[1]
             process = start('openigtlink', '--ros-args', '-p', f'port:={port}')
-            assert process.popen.wait(20) == 2
+            assert process.wait() == 2
             assert f'cannot listen on 127.0.0.1:{port}: Address already' in process.output
             assert 'Traceback' not in process.output
             with pytest.raises(PortError, match='Address already in use'):
@@ -160,7 +165,7 @@ class TestServer:
         server = IgtlServer('127.0.0.1', 0, answer)
         try:
             with socket.create_connection(('127.0.0.1', server.port)) as client:
-                client.settimeout(5.0)
+                client.settimeout(60.0)
                 for byte in asked[0][:30], asked[0][30:] + other, begin:
                     client.sendall(byte)
                     time.sleep(0.02)
@@ -180,12 +185,12 @@ class TestServer:
         server = IgtlServer('127.0.0.1', 0, answer)
         try:
             client = socket.create_connection(('127.0.0.1', server.port))
-            wait_until(lambda: server.n_clients == 1)
+            assert wait(lambda: server.n_clients == 1)
             client.sendall(b'whatever a client may say')
             server.send(b'hello', b'newer')
             assert client.recv(5) == b'hello'
             client.close()
-            wait_until(lambda: server.n_clients == 0)
+            assert wait(lambda: server.n_clients == 0)
             server.send(b'to nobody')
         finally:
             server.close()
@@ -195,13 +200,11 @@ class TestServer:
         server = IgtlServer('127.0.0.1', 0, answer)
         try:
             with socket.create_connection(('127.0.0.1', server.port)):
-                wait_until(lambda: server.n_clients == 1)
-                began = time.monotonic()
+                assert wait(lambda: server.n_clients == 1)
                 for _ in range(2000):
                     server.send(bytes(100_000))
-                assert time.monotonic() - began < 2.0
                 assert server.dropped > 0
-                wait_until(lambda: server.n_clients == 0)
+                assert wait(lambda: server.n_clients == 0)
         finally:
             server.close()
 
@@ -211,13 +214,13 @@ class TestServer:
         try:
             for _ in range(MOST_CLIENTS + 3):
                 clients.append(socket.create_connection(('127.0.0.1', server.port)))
-            wait_until(lambda: server.refused == 3)
+            assert wait(lambda: server.refused == 3)
             assert server.n_clients == MOST_CLIENTS
             assert clients[-1].recv(1) == b'', 'a refused connection is closed'
             clients[0].close()
-            wait_until(lambda: server.n_clients == MOST_CLIENTS - 1)
+            assert wait(lambda: server.n_clients == MOST_CLIENTS - 1)
             clients.append(socket.create_connection(('127.0.0.1', server.port)))
-            wait_until(lambda: server.n_clients == MOST_CLIENTS)
+            assert wait(lambda: server.n_clients == MOST_CLIENTS)
         finally:
             for client in clients:
                 client.close()
@@ -227,25 +230,18 @@ class TestServer:
         server = IgtlServer('127.0.0.1', 0, answer)
         try:
             with socket.create_connection(('127.0.0.1', server.port)) as client:
-                wait_until(lambda: server.n_clients == 1)
+                assert wait(lambda: server.n_clients == 1)
                 client.setblocking(False)
-                end, sent = time.monotonic() + 0.5, 0
-                while time.monotonic() < end:
+                sent = 0
+                while sent <= 2_000_000:
                     with contextlib.suppress(BlockingIOError):
                         sent += client.send(bytes(65536))
                     server.send(b'pose')
                     time.sleep(0.001)
-                client.settimeout(2.0)
-                assert client.recv(4) == b'pose' and sent > 65536
+                client.settimeout(60.0)
+                assert client.recv(4) == b'pose'
         finally:
             server.close()
-
-
-def wait_until(condition, timeout_s=8.0):
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def read(client, count):
@@ -259,15 +255,11 @@ def read(client, count):
 
 def test_replies_of_the_node(ros, tracker):
     """What it can, how it is, and the poses of all that are tracked."""
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.openigtlink import OpenIGTLink
-
     values = {'port': 0, 'coil_name': '{sensor}Of{body}'}
     node = OpenIGTLink(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()])
     try:
         with socket.create_connection(('127.0.0.1', node.port)) as client:
-            client.settimeout(5.0)
+            client.settimeout(60.0)
             for kind in ('GET_CAPABIL', 'GET_STATUS', 'STT_TDATA'):
                 client.sendall(igtl.message(kind, '', 1.0, b''))
             found = [take(client) for _ in range(3)]
@@ -307,8 +299,6 @@ def take(client):
 
 class TestNames:
     def named(self, text=SETUP, **values):
-        from anser_ros.nodes.openigtlink import OpenIGTLinkParameters, devices_of
-
         return devices_of(parse_setup(text), OpenIGTLinkParameters(**values))
 
     def test_templates(self):
@@ -316,8 +306,6 @@ class TestNames:
         assert self.named(body_name='{body}ToTracker', coils=False) == {
             'tool_a': 'tool_aToTracker'
         }
-        from anser_ros.nodes.openigtlink import OpenIGTLinkParameters, check_templates
-
         with pytest.raises(ParameterError, match=r'body_name may have \{body\}'):
             check_templates(OpenIGTLinkParameters(body_name='{tool}'))
 

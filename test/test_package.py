@@ -71,9 +71,6 @@ def test_the_ament_index_knows_the_package(installed, monkeypatch):
 def test_every_command_is_an_executable(installed):
     executables = {path.name for path in (installed / 'lib' / 'anser_ros').iterdir()}
     assert executables == {'anser', *NODES, *COMPOSED, *OFFLINE}
-    needed = {'acquisition', 'field_model', 'tracker', 'recorder', 'replay', 'cu_simulator'}
-    needed |= {'openigtlink', 'calibrate', 'evaluate', 'diagnose', 'demo'}
-    assert needed <= executables
 
 
 def test_the_table_lists_every_module_that_is_a_command():
@@ -93,13 +90,13 @@ def test_an_installed_node_runs(installed, overlay, ros, tmp_path):
     """As `ros2 run anser_ros tracker` starts it: by its executable, from anywhere."""
     command = [sys.executable, str(installed / 'lib' / 'anser_ros' / 'tracker')]
     asked = Process([*command, '--help'], tmp_path / 'help.log', env=overlay, cwd=tmp_path)
-    assert asked.popen.wait(90) == 0, asked.output
+    assert asked.wait() == 0, asked.output
     assert 'parameters' in asked.output
     process = Process(command, tmp_path / 'tracker.log', env=overlay, cwd=tmp_path)
     peer = ros.create_node('peer')
     try:
-        assert spin_until(peer, lambda: 'tracker' in peer.get_node_names(), 30.0), process.output
-        assert process.interrupt(timeout_s=20.0) == 0, process.output
+        assert spin_until(peer, lambda: 'tracker' in peer.get_node_names()), process.output
+        assert process.interrupt() == 0, process.output
     finally:
         process.kill_group()
 
@@ -171,22 +168,6 @@ class TestConsole:
         assert capsys.readouterr() == ('', said)
         assert cli.main(['smaple']) == 2
         assert "no command 'smaple'; there are:" in capsys.readouterr().err
-
-    @pytest.mark.parametrize('name', OFFLINE)
-    def test_every_command_says_in_a_line_what_is_wrong_with_its_arguments(self, name, capsys):
-        assert cli.main([name, '--bogus']) == 2
-        out, said = capsys.readouterr()
-        assert said.startswith(f'anser {name}: ') and said.endswith(
-            f'(usage: anser {name} --help)\n'
-        )
-        assert out == '' and said.count('\n') == 1
-
-    @pytest.mark.parametrize('name', OFFLINE)
-    def test_every_command_that_writes_says_that_it_makes_folders(self, name, capsys):
-        assert cli.main([name, '--help']) == 0
-        words = ' '.join(capsys.readouterr().out.split())
-        assert 'example' in words
-        assert 'made if missing' in words or '--out' not in words
 
     def test_help(self, verb, capsys):
         verb(lambda args: 0)

@@ -11,7 +11,7 @@ from anser_ros.physics.dipole import dipole_field, flux_jacobian
 
 
 def test_results_come_in_the_order_of_the_pieces_from_several_threads():
-    met = threading.Barrier(2, timeout=5.0)
+    met = threading.Barrier(2, timeout=60.0)
 
     def work(piece):
         met.wait()  # passes only where two threads are at it

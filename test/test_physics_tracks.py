@@ -24,10 +24,7 @@ from anser_ros.physics.board import Board, build_board, spiral_path
 from anser_ros.physics.constants import MU_0
 from anser_ros.physics.tracks import loop_field, loop_moment, segment_field
 
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(12)
+SEED = 12
 
 
 def one_coil(kind, geometry, rotation=0.0):

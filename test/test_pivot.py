@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 import yaml
 from conftest import REPO
+from geometry_msgs.msg import PoseStamped
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from anser_ros.assessment.pivot import PivotLimits, fit_pivot
 from anser_ros.cli.main import run_verb
 from anser_ros.errors import FitError, ParameterError, SetupError
+from anser_ros.nodes import tracker
+from anser_ros.nodes.runtime import qos
 from anser_ros.pose_states import OK
 from anser_ros.poses.sequence import sequence_of
 from anser_ros.tracking.estimate import PoseEstimate, no_pose
@@ -182,7 +185,6 @@ class TestDocument:
 
 
 def test_slicer_gets_the_tip_as_a_body():
-    pytest.importorskip('rclpy')
     from anser_ros.nodes import openigtlink as igtl
 
     setup = parse_setup(DEMO).with_tips({'tool_a': TestDocument.SPEC})
@@ -238,19 +240,12 @@ def test_positions_in_millimetres_are_named_and_what_is_no_pose_is_counted(tmp_p
 
 
 def test_a_file_of_tips_that_is_not_there_is_the_callers_fault(tmp_path):
-    pytest.importorskip('rclpy')
-    from anser_ros.nodes import tracker
-
     with pytest.raises(ParameterError, match='tips_file'):
         tracker.tips_of_file(str(tmp_path / 'none.yaml'))
     assert tracker.tips_of_file('') == {}
 
 
 def test_the_command_takes_poses_from_the_graph(ros, tmp_path, capsys):
-    from geometry_msgs.msg import PoseStamped
-
-    from anser_ros.nodes.runtime import qos
-
     poses, tip, _ = pivoting(11)
     node = ros.create_node('pen')
     publisher = node.create_publisher(PoseStamped, '/pen/pose', qos.STREAM)

@@ -20,7 +20,6 @@ from anser_ros.sessions.plausibility import check_points, plausible_tools
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.units import FLUX_UNITS, LENGTH_UNITS, unit_words
 from anser_ros.wire.bag import read_bag
-from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.session_writer import SessionWriter
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -184,7 +183,8 @@ def test_commands_say_it_in_one_line(tmp_path, capsys):
     path = tmp_path / 'millimetres.mcap'
     with SessionWriter(path) as writer:
         writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
-        _copy_fluxes(writer, bag)
+        for stamp, flux in zip(bag.tool.stamp_ns[::10].tolist(), bag.tool.flux[::10], strict=True):
+            writer.write_readings(bag.setup.tool_sensors, stamp, flux)
         for body, stream in bag.optical.items():
             rows = zip(stream.stamp_ns.tolist(), stream.position, stream.quaternion, strict=True)
             for stamp, position, quaternion in rows:
@@ -202,14 +202,6 @@ def test_commands_say_it_in_one_line(tmp_path, capsys):
         assert 'millimetres' in said and said.count('\n') == 1, said
 
 
-def _copy_fluxes(writer, bag):
-    empty = np.full((bag.tool.channel.size, 3), np.nan)
-    for stamp, flux in zip(bag.tool.stamp_ns.tolist()[::10], bag.tool.flux[::10], strict=True):
-        points = FluxPoints(bag.tool.channel, np.zeros(len(empty), int), flux, empty, empty)
-        fields, step, data = encode_flux(points)
-        writer.write_flux('/anser/tool/flux', stamp, fields, step, len(empty), data)
-
-
 def test_points_of_an_error_map():
     rng = np.random.default_rng(2)
     true = rng.uniform(-0.1, 0.1, (30, 3))
@@ -224,17 +216,6 @@ def test_points_of_an_error_map():
         check_points(1e3 * tracked, 1e3 * true)
     with pytest.raises(PlausibilityError, match='all 30 true positions are the same'):
         check_points(tracked, np.tile(true[:1], (30, 1)))
-
-
-def test_an_error_map_in_two_units_is_one_line(tmp_path, capsys):
-    rng = np.random.default_rng(3)
-    rows = rng.uniform(0.0, 0.2, (20, 3))
-    path = tmp_path / 'points.csv'
-    lines = ['x_m,y_m,z_m,true_x_m,true_y_m,true_z_m']
-    lines += [','.join(f'{v:.6f}' for v in (*row, *(1e3 * row))) for row in rows]
-    path.write_text('\n'.join(lines) + '\n')
-    assert main(['error_map', str(path), '--out', str(tmp_path / 'out')]) == 2
-    assert 'millimetres?' in capsys.readouterr().err
 
 
 def test_units_are_told_by_their_size():

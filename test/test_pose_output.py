@@ -2,17 +2,16 @@
 
 import numpy as np
 import pytest
+from geometry_msgs import msg
+from rclpy.serialization import deserialize_message
+
+from anser_ros.nodes.tracker_parts.pose_output import PackedMessage
 
 
 @pytest.mark.parametrize('frame_id', ['', 'fg', 'left_fg', 'boards/left/fg'])
 @pytest.mark.parametrize('kind', ['PoseStamped', 'PoseWithCovarianceStamped'])
 def test_a_packed_message_is_the_message(ros, kind, frame_id):
     """Whatever the length of the frame's name, which moves all that comes after it."""
-    from geometry_msgs import msg
-    from rclpy.serialization import deserialize_message
-
-    from anser_ros.nodes.tracker_parts.pose_output import PackedMessage
-
     message_type = getattr(msg, kind)
     count = 7 if kind == 'PoseStamped' else 43
     told = message_type()

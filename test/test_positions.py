@@ -12,10 +12,7 @@ from anser_ros.calibration.positions import PositionFitter, position_slopes
 from anser_ros.calibration.readings import usable_weights
 from anser_ros.physics.dipole import flux_basis
 
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(8)
+SEED = 8
 
 
 @pytest.mark.parametrize('length', [0.0, 0.008])

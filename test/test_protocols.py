@@ -1,8 +1,6 @@
 """Another control unit's protocol: bytes of its own, the same records, nothing else changed."""
 
 import json
-import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +9,7 @@ from test_port import HELLO, TONES, Wire, receive, wait
 
 from anser_ros.nodes.acquisition_parts.acquisition_parameters import AcquisitionParameters
 from anser_ros.wire.frames import TYPE_OF
-from anser_ros.wire.port import ControlUnitPort, PortState, find_port
+from anser_ros.wire.port import ControlUnitPort, PortState
 from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol
 from anser_ros.wire.records import (
     Identify,
@@ -130,28 +128,14 @@ def test_the_stream_is_started_by_the_same_rules(wire, port):
     port.send(control.due(1_000_000_000))
     assert wire.read() == b'who 1\n'
     wire.write(line('hello'))
-    for record in port.get(1.0).records or port.get(1.0).records:
-        control.take(record, 1_100_000_000)
+    for payload in receive(port, 1):
+        control.take(Record(payload), 1_100_000_000)
     port.send(control.due(1_200_000_000))
     assert wire.read() == b'go 2\n'
     wire.write(line('done', 'go', 2))
-    for record in port.get(1.0).records:
-        control.take(record, 1_300_000_000)
+    for payload in receive(port, 1):
+        control.take(Record(payload), 1_300_000_000)
     assert control.started
-
-
-def test_the_port_of_another_unit_is_found_by_its_hello(wire):
-    found = []
-
-    def search():
-        found.append(find_port([str(wire.link)], protocol=TOY, listen_s=1.0))
-
-    thread = threading.Thread(target=search)
-    thread.start()
-    while thread.is_alive():  # pyserial empties the buffer when it opens a port
-        wire.write(line('hello'))
-        time.sleep(0.05)
-    assert found == [str(wire.link)]
 
 
 def test_the_acquisition_knows_every_protocol():

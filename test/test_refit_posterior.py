@@ -288,7 +288,7 @@ def test_priors_are_the_covariance_of_their_own_draws(world, parts, response):
     cloud = below(region, 0.16)
     tones = np.array(world.model.frequencies_hz)
     arguments = (cloud, response, layer, references, excitation.field(cloud.positions), tones)
-    seeds = range(60)
+    seeds = range(30)
     priors = [build_prior(*arguments, Accuracy(), np.random.default_rng(seed)) for seed in seeds]
     draws = np.concatenate([prior.draw_readings for prior in priors], axis=1)
     moments = np.concatenate([prior.draw_moments for prior in priors], axis=1)

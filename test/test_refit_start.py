@@ -6,10 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import PATIENCE_S
+from rclpy.parameter import Parameter
 from refit_rig import Rig, setup_text
 from refit_world import anser_world
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from anser_ros.errors import FitError
+from anser_ros.nodes.field_model_parts import refit_start
+from anser_ros.nodes.field_model_parts.refit_start import RefitStart
 from anser_ros.nodes.runtime.diagnostics import Level
 from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
@@ -23,18 +29,16 @@ class Held:
     """Lets the making of a refit begin, and go on when it is told to."""
 
     def __init__(self, monkeypatch):
-        from anser_ros.nodes.field_model_parts import refit_start
-
         self.let, self.share = threading.Event(), 0.4
         build, refit = tables.build_tables, refit_start.LiveRefit
 
         def held(*given, report, **named):
             report(self.share)
-            assert self.let.wait(20.0)
+            assert self.let.wait(PATIENCE_S)
             return build(*given, report=report, **named)
 
         def held_refit(*given, **named):
-            assert self.let.wait(20.0)
+            assert self.let.wait(PATIENCE_S)
             return refit(*given, **named)
 
         monkeypatch.setattr(tables, 'build_tables', held)
@@ -57,9 +61,6 @@ def rig(ros, tmp_path, held):
 
 
 def given_baseline(rig):
-    from std_msgs.msg import String
-    from std_srvs.srv import Trigger
-
     if rig.node._setup is None:
         rig.node._on_setup(String(data=setup_text(rig.world)))
     for _ in range(12):
@@ -69,8 +70,6 @@ def given_baseline(rig):
 
 
 def test_frames_and_services_are_answered_while_the_first_refit_is_made(rig, held):
-    from std_srvs.srv import Trigger
-
     rig.stamp_ns = time.time_ns()
     given_baseline(rig)
     rig.until(lambda: 'refit being prepared, 40%' in rig.node.status().message)
@@ -105,8 +104,6 @@ def test_the_former_refit_goes_on_until_that_to_a_new_baseline_is_there(rig, hel
 
 
 def give_another_model(rig, held, tmp_path):
-    from rclpy.parameter import Parameter
-
     held.let.set()
     given_baseline(rig)
     rig.until(lambda: rig.node.counters['refit_starts'] == 1)
@@ -155,23 +152,21 @@ def test_a_refit_that_cannot_be_made_is_said_and_awaited_no_longer(rig, monkeypa
 
 
 def test_tables_that_nobody_wants_any_more_are_given_up(ros, monkeypatch):
-    from anser_ros.nodes.field_model_parts.refit_start import RefitStart
-
     world, begun, goes_on = anser_world(), threading.Event(), threading.Event()
 
     def endless(*_given, report):
         begun.set()
         while True:
             report(0.5)
-            goes_on.wait(20.0)
+            goes_on.wait(PATIENCE_S)
 
     monkeypatch.setattr(tables, 'build_tables', endless)
     setup = parse_setup(setup_text(world))
     start = RefitStart(setup, world.model, world.references)
     start.begin(np.zeros((16, 8), complex))
     assert start.taken() is None and start.is_making
-    assert begun.wait(20.0)
+    assert begun.wait(PATIENCE_S)
     time.sleep(0.01)
     assert not start.end(0.01), 'it is between two words'
     goes_on.set()
-    assert start.end(20.0)
+    assert start.end(PATIENCE_S)

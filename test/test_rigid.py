@@ -18,6 +18,7 @@ from anser_ros.tracking.seed import build_grid
 from anser_ros.tracking.solve import RealField
 from anser_ros.tracking.uncertainty import bounded_inverse
 
+SEED = 41
 MODEL = certain_model()
 FIELD = RealField.of(MODEL.positions, MODEL.directions, MODEL.moments)
 WIDTH = FIELD.moments.shape[1]
@@ -27,11 +28,6 @@ WEIGHTS = np.full((9, WIDTH), 1 / NOISE_T)
 NOTHING = common_factor(np.zeros((9, 0, WIDTH)), WEIGHTS)
 LOW, HIGH = (corner + sign * 0.03 for corner, sign in zip(TrackedVolume().grown(0.03), (-1, 1),
                                                            strict=True))  # fmt: skip
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(41)
 
 
 def real(flux):

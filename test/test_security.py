@@ -25,7 +25,6 @@ def test_every_node_of_an_installation_has_an_enclave_and_the_page_names_it():
 
 
 @pytest.mark.processes
-@pytest.mark.timeout(300)
 def test_the_policy_is_that_of_the_nodes(domain):
     """After a change of a node's topics or services, run `.ci/write_policy.py`."""
     pytest.importorskip('nicegui', reason='nicegui is not installed')

@@ -12,6 +12,7 @@ from anser_ros.tracking.seed import build_grid, grid_points, scan, solve_cold
 from anser_ros.tracking.solve import RealField, whitening_of
 from anser_ros.tracking.uncertainty import chi2_limit
 
+SEED = 31
 MODEL = certain_model()
 FIELD = RealField.of(MODEL.positions, MODEL.directions, MODEL.moments)
 WIDTH = FIELD.moments.shape[1]
@@ -21,11 +22,6 @@ VOLUME = TrackedVolume()
 LOW, HIGH = VOLUME.grown(0.03)
 GATE = chi2_limit(WIDTH - 5, 1e-9)
 GRID = build_grid(FIELD, SIGMA, VOLUME, 0.035)
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(31)
 
 
 def poses(rng, count):

@@ -22,6 +22,7 @@ from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
 
+SEED = 21
 EMITTERS = ('a', 'b', 'c')
 TONES = (1000.0, 1100.0, 1200.0)
 GENERATOR = Generator(np.zeros((1, 3)), np.zeros(1), 0.07)
@@ -33,11 +34,6 @@ def calibrate(measurements, names, generator, emitters, tones, options=None, nom
     generator = replace(generator, emitters=emitters, frequencies_hz=tones, nominal=nominal)
     scan = correct_scan(measurements, generator, options)
     return fit_scan(scan, names, generator, options)
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(21)
 
 
 @pytest.fixture(scope='module')

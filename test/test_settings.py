@@ -13,7 +13,6 @@ from test_setup import document
 
 from anser_ros.calibration.pose_correction import pose_precision
 from anser_ros.cli import calibrate, diagnose, evaluate
-from anser_ros.cli.main import main
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelParameters
 from anser_ros.nodes.runtime.stated_parameters import stated_by
@@ -290,15 +289,6 @@ class TestCommands:
             sigma.append(series.estimates[0].sigma_position_m)
         assert sigma[1] > 1.05 * sigma[0]
 
-    @pytest.mark.parametrize('name', ['evaluate', 'diagnose', 'calibrate'])
-    def test_a_bad_value_is_one_line(self, name, tmp_path, capsys):
-        given = [name, str(BAGS / 'moving.mcap'), '--out', str(tmp_path / 'out')]
-        given += [] if name == 'calibrate' else ['--model', 'nominal']
-        for entry, said in (('gain=1', 'no value gain'), ('reference_gain=2', 'must be in')):
-            assert main([*given, '--set', entry]) == 2
-            told = capsys.readouterr().err
-            assert said in told and told.count('\n') == 1
-
 
 class TestNodes:
     @pytest.mark.parametrize(
@@ -331,9 +321,3 @@ class TestNodes:
     def test_a_value_out_of_range_is_refused_at_the_start(self):
         with pytest.raises(ParameterError, match='flux_noise_t must be in'):
             stated_by(TrackerParameters(flux_noise_t=1e-20))
-
-
-def test_a_session_states_for_all_its_stages():
-    session = load_session(BAGS / 'moving.mcap')
-    assert session.with_stated({'seed': 4}).setup.refit.seed == 4
-    assert session.setup.refit == RefitSettings()

@@ -48,6 +48,7 @@ def test_options_make_a_document_and_a_picture(tmp_path, capsys):
     assert not (tmp_path / 'again' / 'setup.yaml').exists()
 
 
+@pytest.mark.long
 def test_questions_ask_again_until_the_answer_is_right(tmp_path, capsys, monkeypatch):
     rows = [text.replace(',pen,', ',', 1) for text in SENSORS[:2]]
     answers = [

@@ -20,16 +20,12 @@ from anser_ros.tracking.uncertainty import (
     coil_covariance,
 )
 
+SEED = 21
 MODEL = certain_model()
 FIELD = RealField.of(MODEL.positions, MODEL.directions, MODEL.moments)
 LOW, HIGH = TrackedVolume().grown(0.03)
 WIDTH = FIELD.moments.shape[1]
 WHITENING = whitening_of(np.full(WIDTH, NOISE_T))
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(21)
 
 
 def pose(rng, low=0.08, high=0.25):

@@ -2,14 +2,15 @@
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseStamped
 from tracked_tool import CHANNELS, MODEL, TOOL
 
+from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
 from anser_ros.nodes.runtime.handover import HandedFlux
+from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import parse_setup
-
-pytest.importorskip('rclpy')
 
 
 class Refit:
@@ -24,9 +25,6 @@ class Refit:
 
 @pytest.fixture
 def witnesses(ros):
-    from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
-    from anser_ros.nodes.runtime.node import AnserNode
-
     class Server(AnserNode):
         NAME = 'server'
 
@@ -48,8 +46,6 @@ def flux(stamp_ns, level):
 
 
 def pose(stamp_ns, x, frame_id='fg'):
-    from geometry_msgs.msg import PoseStamped
-
     message = PoseStamped()
     message.header.frame_id, message.header.stamp.nanosec = frame_id, stamp_ns
     message.pose.position.x, message.pose.orientation.w = x, 1.0
@@ -96,7 +92,6 @@ def test_poses_of_another_frame_are_refused(witnesses):
 
 def test_a_body_whose_poses_have_two_publishers_witnesses_nothing(ros, witnesses):
     from conftest import spin_until
-    from geometry_msgs.msg import PoseStamped
 
     stranger, refit = ros.create_node('stranger'), Refit()
     publishers = [stranger.create_publisher(PoseStamped, '/anser/tool_a/pose', 5) for _ in 'ab']

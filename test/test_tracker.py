@@ -18,13 +18,9 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
+SEED = 51
 EXACT = TrackerSettings(stamp_sigma_s=0.0)
 """Settings for stamps without an error, as this file's own have none."""
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(51)
 
 
 def run(tracker, count, rng, model=MODEL, noise_t=NOISE_T, seed=0):

@@ -14,10 +14,7 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.tracking.estimate import NO_GATE, NoiseScale, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(51)
+SEED = 51
 
 
 def test_duplicates_jumps_and_gaps(rng):

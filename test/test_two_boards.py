@@ -5,7 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 
+from anser_ros.nodes.monitor import Monitor
+from anser_ros.nodes.recorder import Recorder
+from anser_ros.nodes.replay import Replay
 from anser_ros.nodes.tracker_parts.pose_output import PoseTopic
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.points import FluxPoints, encode_flux
@@ -17,8 +21,6 @@ SHARED = {'/diagnostics', '/rosout', '/parameter_events'}
 
 
 def node_of(kind, board, *arguments, **values):
-    from rclpy.parameter import Parameter
-
     overrides = [Parameter(name, value=value) for name, value in values.items()]
     return kind(*arguments, namespace=board, parameter_overrides=overrides)
 
@@ -28,8 +30,6 @@ def names(pairs):
 
 
 def test_two_replays_share_no_topic(ros):
-    from anser_ros.nodes.replay import Replay
-
     made = {
         board: node_of(
             Replay, board, str(BAG), optical=f'/{board}/optical', clock=f'/{board}/clock'
@@ -50,9 +50,6 @@ def test_two_replays_share_no_topic(ros):
 
 
 def test_a_recorder_and_a_monitor_take_what_is_their_boards(ros, tmp_path):
-    from anser_ros.nodes.monitor import Monitor
-    from anser_ros.nodes.recorder import Recorder
-
     text = read_bag(BAG).setup_text
     recorder = node_of(
         Recorder, 'left', optical='/left/optical', directory=str(tmp_path), autostart=False

@@ -46,20 +46,8 @@ def test_the_files_of_config_are_those_of_the_demo(tmp_path):
 def test_another_board_in_another_namespace(tmp_path, capsys):
     (tmp_path / 'two.yaml').write_text(TWO_TOOLS)
     command = ['views', str(tmp_path / 'two.yaml'), '--out', str(tmp_path), '--json']
-    assert (
-        main(
-            [
-                *command,
-                '--namespace',
-                'or/left',
-                '--optical',
-                '/left/optical',
-                '--frame-prefix',
-                'left_',
-            ]
-        )
-        == 0
-    )
+    options = ['--namespace', 'or/left', '--optical', '/left/optical', '--frame-prefix', 'left_']
+    assert main([*command, *options]) == 0
     assert len(json.loads(capsys.readouterr().out)['files']) == 2
     manager, layout = read(tmp_path)
     shown = {d['Topic']['Value']: d for d in manager['Displays'] if 'Topic' in d}

@@ -5,10 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import spin_until
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
 from pose_world import World
+from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import DiagnosisError, ParameterError
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.watcher import Watcher
 from anser_ros.poses.live_look import PoseWatch, frozen_streams
 from anser_ros.poses.live_window import PoseWindow
 from anser_ros.poses.sequence import REFERENCE
@@ -107,16 +112,8 @@ def test_too_few_poses_are_refused():
         PoseWatch().look(filled(session, end=1.2))
 
 
-@pytest.mark.timeout(240)
 @pytest.mark.long
 def test_over_dds_a_late_tracker_is_named_with_no_field_model(ros):
-    from diagnostic_msgs.msg import DiagnosticArray
-    from geometry_msgs.msg import PoseStamped
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.runtime import qos
-    from anser_ros.nodes.watcher import Watcher
-
     world = World(7, duration=14.0, sensors=1)
     world.offset = 0.06
     topics = {'sensor_0': '/aurora/probe', REFERENCE: '/polaris/body'}
@@ -173,9 +170,5 @@ def test_over_dds_a_late_tracker_is_named_with_no_field_model(ros):
     'given', [{'tracked_poses': ['/a/pose']}, {'tracked_poses': ['/a/pose', '/tracked/a/pose']}]
 )
 def test_topics_that_make_no_session_are_refused(ros, given):
-    from rclpy.parameter import Parameter
-
-    from anser_ros.nodes.watcher import Watcher
-
     with pytest.raises(ParameterError):
         Watcher(parameter_overrides=[Parameter(k, value=v) for k, v in given.items()])

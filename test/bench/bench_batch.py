@@ -67,8 +67,3 @@ def rows() -> list[dict[str, Any]]:
             'value': shared / alone, 'unit': '', 'target': MOST,
         },
     ]  # fmt: skip
-
-
-if __name__ == '__main__':
-    for row in rows():
-        print(row)

@@ -60,8 +60,3 @@ def rows() -> list[dict[str, Any]]:
             'value': float(np.median(spent_ms)), 'unit': 'ms', 'target': TARGET_MS,
         }
     ]  # fmt: skip
-
-
-if __name__ == '__main__':
-    for row in rows():
-        print(f'{row["name"]}: {row["value"]:.3f} {row["unit"]}, at most {row["target"]}')

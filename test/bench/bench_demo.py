@@ -103,8 +103,3 @@ def _told(bag: str) -> tuple[list[int], dict[str, dict[int, int]], list[tuple[fl
                     if status.name == TRACKER:
                         ages.append((at, float(values['model_age_s_max'])))
     return windows, poses, ages
-
-
-if __name__ == '__main__':
-    for row in rows():
-        print(row)

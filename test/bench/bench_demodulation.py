@@ -46,8 +46,3 @@ def _median_ms(work) -> float:
         work()
         spent.append(time.perf_counter() - start)
     return float(1e3 * np.median(spent))
-
-
-if __name__ == '__main__':
-    for row in rows():
-        print(row)

@@ -87,8 +87,3 @@ def of_following(
         share = figures['over'] / max(figures['poses'], 1)
         yield {'name': f'{about}: over 3 sigma', 'value': share, 'unit': '1', 'target': 0.003}
     yield {'name': f'head of {learnt} in {name}: a frame', 'value': spent_s, 'unit': 's'}
-
-
-if __name__ == '__main__':
-    for row in rows():
-        print(f'{row["name"]}: {row["value"]:.4g} {row["unit"]}', flush=True)

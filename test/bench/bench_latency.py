@@ -137,8 +137,3 @@ def _sustained_hz(clear: list[bytes]) -> float:
         if run_chain(layout, clear, SHORT_S).lost == 0:
             return rate_hz
     return 50.0
-
-
-if __name__ == '__main__':
-    for row in rows():
-        print(row)

@@ -68,8 +68,3 @@ def rows() -> Iterator[dict]:
             'unit': 'ms',
             'target': target,
         }
-
-
-if __name__ == '__main__':
-    for row in rows():
-        print(row)

@@ -8,7 +8,6 @@ from faults_graph import bomb
 
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.config_folder import config_path
-from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.recorded import Bag
 from anser_ros.wire.session_writer import SessionWriter
 
@@ -17,14 +16,10 @@ BAGS = Path(__file__).resolve().parents[2] / 'bags'
 
 def _written(path: Path, bag: Bag, poses: object = None, scale: float = 1.0) -> Path:
     """Write a bag anew, with other poses or larger fluxes."""
-    empty = np.full((bag.tool.channel.size, 3), np.nan)
-    flags = np.zeros(bag.tool.channel.size, int)
     with SessionWriter(path) as writer:
         writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
         for stamp, flux in zip(bag.tool.stamp_ns.tolist(), bag.tool.flux, strict=True):
-            points = FluxPoints(bag.tool.channel, flags, scale * flux, empty, empty)
-            fields, step, data = encode_flux(points)
-            writer.write_flux('/anser/tool/flux', stamp, fields, step, len(empty), data)
+            writer.write_readings(bag.setup.tool_sensors, stamp, scale * flux)
         for body, stream in bag.optical.items():
             position, quaternion = stream.position, stream.quaternion
             if poses is not None:
