@@ -28,7 +28,7 @@ setup(
     name=PACKAGE,
     version=VERSION,
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={PACKAGE: ['py.typed'], f'{PACKAGE}.web': ['*.js', '*.css']},
+    package_data={PACKAGE: ['py.typed'], f'{PACKAGE}.apps.dashboard': ['*.js', '*.css']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

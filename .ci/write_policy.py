@@ -17,9 +17,9 @@ from typing import Any
 
 import yaml
 
+from anser_ros.apps.poses.corrector import MODEL_SCHEMA
 from anser_ros.cli.commands import COMPOSED
 from anser_ros.cli.commands import NODES as ALL_NODES
-from anser_ros.poses.document import MODEL_SCHEMA
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
@@ -68,7 +68,7 @@ def policy(setup_file: str = 'demo_setup.yaml') -> str:
 
 def _profiles_of(node: str, graph: Mapping[tuple[str, str], list[str]]) -> list[str]:
     """A node of the package, and what it polls topics with."""
-    from anser_ros.nodes.output_parts.polled import STREAMS
+    from anser_ros.apps.dashboard.nodes.view_source import STREAMS
 
     return sorted({name for name, _ in graph if name.removesuffix(STREAMS) == node})
 
@@ -90,8 +90,8 @@ def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
     from std_msgs.msg import String
 
     from anser_ros.nodes.runtime import qos
-    from anser_ros.wire.config_folder import read_config
     from anser_ros.wire.setup import parse_setup, topic_of
+    from anser_ros.wire.text_files import read_config
 
     text = read_config(setup_file)
     bodies = parse_setup(text).bodies

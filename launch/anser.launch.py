@@ -12,9 +12,9 @@ from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.parameter_descriptions import ParameterValue
 
 from anser_ros.cli.commands import NODES
-from anser_ros.nodes.runtime.parameter_files import checked
-from anser_ros.wire.config_folder import config_path
+from anser_ros.nodes.runtime.parameters import checked
 from anser_ros.wire.tcp_ports import LIVE_VIEW, OPENIGTLINK
+from anser_ros.wire.text_files import config_path
 
 PACKAGE = 'anser_ros'
 # Exit code of a node that refuses its arguments or parameters, which it does before it starts.

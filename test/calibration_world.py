@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.layouts import Generator
+from anser_ros.calibration.readings import DipoleSites
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.rotations import tilted
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.physics.tangent import tilted
 
 NOISE_T = 40e-12
 JITTER_M = 0.07e-3

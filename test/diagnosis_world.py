@@ -6,8 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Problem
-from anser_ros.diagnosis.whitening import Spread
+from anser_ros.diagnosis.problem import Problem, Spread
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel

@@ -1,7 +1,7 @@
 """A lump of coupled conducting spheres that moves about the drawn board, and what coils read.
 
 The spheres and their answers are those of the benchmarks' field world (`bench/world`), which
-shares no code with the lattices of `anser_ros.known_metal`.
+shares no code with the lattices of `anser_ros.apps.lab`.
 """
 
 import importlib
@@ -18,10 +18,10 @@ from tracking_world import NOISE_T, anser_board, certain_model, setup_of, triaxi
 
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.excitation import Excitation, excitation_for
-from anser_ros.refit.tool_readings import ToolReading
+from anser_ros.refit.clouds import Excitation, excitation_for
+from anser_ros.refit.witness import ToolReading
 from anser_ros.sessions.session import Session
-from anser_ros.wire.session_writer import SessionWriter
+from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.setup import SensorSpec, Setup, dump_setup
 
 WORLD = Path(__file__).parent / 'bench' / 'world'

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from anser_ros.poses.sequence import PoseSession, sequence_of
+from anser_ros.apps.poses.sequence import PoseSession, sequence_of
 
 FRAME = Rotation.from_euler('xyz', [100, -35, 70], degrees=True)
 SHIFT = np.array([0.25, -0.4, 0.9])

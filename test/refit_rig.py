@@ -14,7 +14,7 @@ from visualization_msgs.msg import MarkerArray
 from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.streams.clouds import FluxCloud
-from anser_ros.sessions.model_file import save_model
+from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
 

@@ -8,27 +8,34 @@ import pytest
 from pose_world import World
 from scipy.spatial.transform import Rotation
 
-from anser_ros.assessment.control import ALERT, FAIL, NOTE, PASS, judged
-from anser_ros.assessment.dynamic import assess_motion
-from anser_ros.assessment.f2554 import point_to_point, single_point, standing_alone
-from anser_ros.assessment.history import EarlierFigure, SessionVerdict
-from anser_ros.assessment.hummel import (
+from anser_ros.apps.poses.assessment.dynamic import assess_motion
+from anser_ros.apps.poses.assessment.f2554 import point_to_point, single_point, standing_alone
+from anser_ros.apps.poses.assessment.history import (
+    ALERT,
+    FAIL,
+    NOTE,
+    PASS,
+    EarlierFigure,
+    SessionVerdict,
+    judged,
+)
+from anser_ros.apps.poses.assessment.hummel import (
     Grid,
     distance_errors,
     grid_points,
     have_common_errors,
     rotation_errors,
 )
-from anser_ros.assessment.intervals import IntervalEstimate
-from anser_ros.assessment.metal import metal_shifts
-from anser_ros.assessment.protocols import Assessment
-from anser_ros.assessment.stillness import StillPoint, still_points
-from anser_ros.cli.control_chart import control_chart
+from anser_ros.apps.poses.assessment.intervals import IntervalEstimate
+from anser_ros.apps.poses.assessment.protocols import Assessment
+from anser_ros.apps.poses.assessment.stability import metal_shifts
+from anser_ros.apps.poses.assessment.stillness import StillPoint, still_points
+from anser_ros.apps.poses.cli.accuracy_report import control_chart
+from anser_ros.apps.poses.hand_eye import fit_hand_eye
+from anser_ros.apps.poses.importing import write_pose_session
+from anser_ros.apps.poses.sequence import sequence_of
 from anser_ros.cli.main import run_verb
 from anser_ros.errors import FitError, ParameterError
-from anser_ros.poses.hand_eye_fit import fit_hand_eye
-from anser_ros.poses.recording import write_pose_session
-from anser_ros.poses.sequence import sequence_of
 
 pytestmark = pytest.mark.long
 

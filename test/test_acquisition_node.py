@@ -15,16 +15,15 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros.errors import PortError, SetupError
-from anser_ros.nodes.acquisition_parts.flux_stream import FluxStream, StreamOptions
+from anser_ros.nodes.acquisition_stream import FluxStream, StreamOptions
 from anser_ros.nodes.runtime import qos
 from anser_ros.simulation.control_unit import Piece
-from anser_ros.simulation.faults import FaultInjector
-from anser_ros.simulation.pseudo_port import PseudoPort
+from anser_ros.simulation.line import FaultInjector, PseudoPort
 from anser_ros.wire.channel_calibration import parse_channels
-from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.frames import Channel, ChannelKind, Hello, SampleBlock
 from anser_ros.wire.points import DROPPED, SATURATED, STALE, decode_flux
-from anser_ros.wire.records import Channel, ChannelKind, Hello, SampleBlock
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import read_config
 
 SETUP = parse_setup(read_config('demo_setup.yaml'))
 CHANNELS = parse_channels(read_config('demo_channels.yaml'))

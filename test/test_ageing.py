@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from tracking_world import certain_model
 
-from anser_ros.integrity.ageing import ModelAge
+from anser_ros.integrity.model_trust import ModelAge
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OF_MODEL, REFERENCES_DOUBTFUL, REFERENCES_LOST, code_of
 from anser_ros.pose_states import state_of as state_of_code
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.tracked_session import track_session
 
 ROOT = Path(__file__).resolve().parents[1]
 STEP_NS = 20_000_000

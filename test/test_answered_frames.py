@@ -2,7 +2,7 @@
 
 import pytest
 
-from anser_ros.nodes.tracker_parts.answered_frames import MOST_LATE, AnsweredFrames
+from anser_ros.nodes.tracker_models import MOST_LATE, AnsweredFrames
 
 STEP_NS = 20_000_000
 FIRST_NS = 1_750_000_000_000_000_000

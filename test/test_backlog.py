@@ -2,8 +2,7 @@
 
 import pytest
 
-from anser_ros.nodes.streams.backlog import Backlog
-from anser_ros.nodes.streams.overload import too_slow
+from anser_ros.nodes.streams.one_source import Backlog, too_slow
 
 
 def backlog(spacing_s, work_s, stamp_spacing_s=None):

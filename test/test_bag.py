@@ -8,8 +8,8 @@ import pytest
 from anser_ros.errors import BagError
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
+from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
-from anser_ros.wire.session_writer import SessionWriter
 
 START = 1_700_000_000_000_000_000
 STEP = 40_000_000

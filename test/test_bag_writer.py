@@ -12,10 +12,15 @@ from mcap.stream_reader import StreamReader
 
 from anser_ros.errors import BagError
 from anser_ros.wire import cdr
-from anser_ros.wire.bag_metadata import BagRecord, TopicRecord, qos_profile, write_metadata
-from anser_ros.wire.bag_writer import BagWriter
+from anser_ros.wire.bag_writer import (
+    BagRecord,
+    BagWriter,
+    SessionWriter,
+    TopicRecord,
+    qos_profile,
+    write_metadata,
+)
 from anser_ros.wire.points import STALE, decode_flux
-from anser_ros.wire.session_writer import SessionWriter
 from anser_ros.wire.setup import SensorSpec
 
 FIELDS = [('x', 0, 7, 1), ('channel', 4, 4, 1), ('flags', 6, 4, 1)]

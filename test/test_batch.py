@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import csv
+import importlib
 import io
 import math
 import os
@@ -13,12 +14,11 @@ import pytest
 from conftest import wait
 from pose_world import World
 
-from anser_ros.cli import batch, session_runs
+from anser_ros.apps.poses.importing import write_pose_session
+from anser_ros.cli import batch
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, main
-from anser_ros.cli.session_runs import names_of, perform, runs_of
-from anser_ros.cli.summary import Outcome, row_of, write_summary
+from anser_ros.cli.sessions import Outcome, names_of, perform, row_of, runs_of, write_summary
 from anser_ros.errors import BagError, ParameterError
-from anser_ros.poses.recording import write_pose_session
 
 pytestmark = pytest.mark.long
 
@@ -128,7 +128,7 @@ class Module:
 
 
 def test_a_defect_of_one_session_is_its_row_with_the_traceback(monkeypatch, tmp_path):
-    monkeypatch.setattr(session_runs.importlib, 'import_module', lambda name: Module)
+    monkeypatch.setattr(importlib, 'import_module', lambda name: Module)
     args = argparse.Namespace(sessions=['bad', 'worse'], out=tmp_path)
     bad, worse = (perform(run) for run in runs_of('evaluate', args))
     assert (bad.code, bad.words, bad.traceback) == (EXIT_BAD_INPUT, 'bad: no bag', '')

@@ -27,7 +27,7 @@ def test_only_the_writer_of_bags_is_shared():
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ''] if isinstance(node, ast.ImportFrom) else []
             ours = {n for n in names if n.split('.')[0] == 'anser_ros'}
-            assert ours <= {'anser_ros.wire.session_writer', 'anser_ros.wire.points'}, path.name
+            assert ours <= {'anser_ros.wire.bag_writer', 'anser_ros.wire.points'}, path.name
 
 
 def test_a_coil_has_the_field_that_magpylib_gives_it(world):

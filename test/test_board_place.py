@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from anser_ros.errors import BagError, FitError, ModelFileError
-from anser_ros.nodes.field_model_parts import place_watch
-from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
+from anser_ros.nodes import field_model_io
+from anser_ros.nodes.field_model_io import PlaceWatch
 from anser_ros.sessions.baseline import board_place_of, check_place, clean_flux
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
-from anser_ros.sessions.starting_model import model_for
+from anser_ros.sessions.starting_model import load_model, model_for
+from anser_ros.sessions.tracked_session import track_session
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -93,7 +92,7 @@ def test_poses_wait_for_references_that_are_announced_and_not_for_others(recorde
     sensors, announced = session.reference.sensors, [0]
     watch = PlaceWatch.of(model, sensors, session.setup, lambda: announced[0])
     assert watch.is_waiting, 'whoever sends references may not be known yet'
-    monkeypatch.setattr(place_watch, 'DISCOVERY_S', 0.0)
+    monkeypatch.setattr(field_model_io, 'DISCOVERY_S', 0.0)
     assert not watch.is_waiting
     announced[0] = 1
     assert watch.is_waiting

@@ -12,7 +12,7 @@ sys.path.append(str(Path(__file__).resolve().parent / 'bench'))
 from bench_bound import marginal
 from bound_block import BALL, Block, block_points
 
-from anser_ros.refit.excitation import excitation_for
+from anser_ros.refit.clouds import excitation_for
 
 PLACE = np.array([0.02, -0.01, -0.05, 0.05, -0.02, 0.1])
 

@@ -17,12 +17,12 @@ from anser_ros.errors import FitError
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.calibration import calibrate_sessions
 from anser_ros.sessions.calibration_engine import generator_of
-from anser_ros.sessions.drawing import NominalBoard
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.tracked_session import track_session
+from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
-from anser_ros.wire.session_writer import SessionWriter
 from anser_ros.wire.setup import dump_setup
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'

@@ -1,6 +1,6 @@
 """The monitor says why: in the nodes' own words, the gravest first, and not too many."""
 
-from anser_ros.nodes.output_parts.causes import MOST_CAUSES, MOST_TEXT, LastStatus, causes
+from anser_ros.nodes.operator_words import MOST_CAUSES, MOST_TEXT, LastStatus, causes
 
 
 def told(**changes):

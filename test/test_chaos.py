@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from conftest import REPO, skip_if_too_slow
 
-from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import encode
-from anser_ros.wire.records import SampleBlock
+from anser_ros.wire.frames import SampleBlock, encode
+from anser_ros.wire.protocols import FrameReader
 
 CHAOS = Path(__file__).resolve().parent / 'chaos'
 SAMPLE = ('nothing', 'torn', 'unplugged', 'ring', 'ticks-frozen')

@@ -8,10 +8,10 @@ import pytest
 
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
-from anser_ros.sessions.chosen_references import parse_references, with_references
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.follower import parse_references, with_references
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.tracked_session import track_session
 
 REPO = Path(__file__).resolve().parents[1]
 MODEL = REPO / 'config' / 'demo_model.yaml'

@@ -8,7 +8,7 @@ import pytest
 from refit_world import anser_world, metal_block, three_coil_world
 
 from anser_ros.errors import BagError, FitError
-from anser_ros.field.reference_readings import ReferenceReadings
+from anser_ros.field.model import ReferenceReadings
 from anser_ros.integrity.clean_references import (
     change_without_gains,
     check_as_calibrated,
@@ -16,8 +16,8 @@ from anser_ros.integrity.clean_references import (
     check_steady,
 )
 from anser_ros.sessions.baseline import baseline_flux, check_clean, clean_flux, readings_of
-from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import load_model
 from anser_ros.settings import Accuracy
 
 SEED = 7

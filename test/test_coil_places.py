@@ -7,13 +7,12 @@ import pytest
 from calibration_world import scene
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration.blocks import fold_of_frames
-from anser_ros.calibration.coil_places import CoilPlacer
 from anser_ros.calibration.held_out import rms
-from anser_ros.calibration.layout_fit import LayoutFitter, LayoutPlacer, rich_layout
-from anser_ros.calibration.layout_score import LayoutScorer
+from anser_ros.calibration.layout_fit import LayoutFitter, LayoutPlacer, ScaledNominal, rich_layout
 from anser_ros.calibration.layouts import Layout, place
-from anser_ros.calibration.prior import ScaledNominal
+from anser_ros.calibration.placement import CoilPlacer
+from anser_ros.calibration.readings import fold_of_frames
+from anser_ros.calibration.selection import LayoutScorer
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
 

@@ -10,18 +10,15 @@ import pytest
 from anser_ros.cli.main import main
 from anser_ros.errors import ParameterError
 from anser_ros.pose_states import OK
-from anser_ros.sessions.comparison import (
+from anser_ros.sessions.evaluation_files import (
+    ERRORS_FILE,
     FEWEST_BLOCKS,
     compare_errors,
     compare_shares,
     read_errors,
-)
-from anser_ros.sessions.evaluation import Evaluation
-from anser_ros.sessions.pose_errors import PoseSeries
-from anser_ros.sessions.pose_table import (
-    ERRORS_FILE,
     write_tables,
 )
+from anser_ros.sessions.tracked_session import Evaluation, PoseSeries
 
 STEP_NS = 40_000_000
 FRAMES = 750

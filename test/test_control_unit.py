@@ -10,20 +10,13 @@ from anser_ros.physics.dipole import field_basis
 from anser_ros.signals.demodulation import Demodulator
 from anser_ros.signals.flux import FluxConverter
 from anser_ros.signals.repetition import RepetitionWatch
-from anser_ros.signals.ticks import TickCheck
-from anser_ros.signals.window import WindowCutter
-from anser_ros.simulation import raw_effects
-from anser_ros.simulation.control_unit import ControlUnit
-from anser_ros.simulation.effect_draw import CATALOGUE, draw
-from anser_ros.simulation.metal import steel_disc
-from anser_ros.simulation.motion import Approach, Lissajous
-from anser_ros.simulation.sampling import FrontEnd
-from anser_ros.simulation.world import World
+from anser_ros.signals.window import TickCheck, WindowCutter
+from anser_ros.simulation import effects
+from anser_ros.simulation.control_unit import ControlUnit, FrontEnd
+from anser_ros.simulation.effects import CATALOGUE, draw
+from anser_ros.simulation.world import Approach, Lissajous, World, steel_disc
 from anser_ros.wire.channel_calibration import parse_channels
-from anser_ros.wire.config_folder import config_path, read_config
-from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import encode
-from anser_ros.wire.records import (
+from anser_ros.wire.frames import (
     DeviceState,
     DeviceStatus,
     Hello,
@@ -35,8 +28,11 @@ from anser_ros.wire.records import (
     SetFrequencies,
     Start,
     Stop,
+    encode,
 )
+from anser_ros.wire.protocols import FrameReader
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import config_path, read_config
 
 SETUP = parse_setup(read_config('demo_setup.yaml'))
 CHANNELS = parse_channels(read_config('demo_channels.yaml'))
@@ -44,7 +40,7 @@ TONES = np.array(SETUP.frequencies_hz)
 
 
 @dataclass(frozen=True)
-class CurrentDrift(raw_effects.RawEffect):
+class CurrentDrift(effects.RawEffect):
     """A coil current that changes by `amount` with time constant `tau_s`, as copper warms up."""
 
     coil: int
@@ -200,43 +196,43 @@ class TestEffects:
 
     def test_crosstalk(self):
         clean, _ = self.codes()
-        leaky, _ = self.codes(raw_effects.RawChannelCrosstalk((3, 5), ((1.0, 0.1), (0.0, 1.0))))
+        leaky, _ = self.codes(effects.RawChannelCrosstalk((3, 5), ((1.0, 0.1), (0.0, 1.0))))
         assert np.abs(leaky[:, 3] - clean[:, 3] - 0.1 * clean[:, 5]).max() <= 1
         assert np.array_equal(np.delete(leaky, 3, 1), np.delete(clean, 3, 1))
 
     def test_compression(self):
         clean, _ = self.codes()
         limit = 5.0 * np.abs(clean[:, 20]).max() / 32768
-        bent, _ = self.codes(raw_effects.CompressingAmplifier(20, limit))
+        bent, _ = self.codes(effects.CompressingAmplifier(20, limit))
         ratio = np.abs(bent[:, 20]).max() / np.abs(clean[:, 20]).max()
         assert ratio == pytest.approx(np.tanh(1.0), abs=1e-3)
 
     def test_loose_contact(self):
         clean, _ = self.codes()
-        loose, _ = self.codes(raw_effects.LooseSensor(20, share=0.5, period_s=0.02, rest=0.0))
+        loose, _ = self.codes(effects.LooseSensor(20, share=0.5, period_s=0.02, rest=0.0))
         assert np.abs(loose[:400, 20]).max() == 0
         assert np.array_equal(loose[400:800], clean[400:800])
 
     def test_tilted_sensor_is_tilted_in_the_world_only(self):
-        real = raw_effects.TiltedSensor(2, (0.0, 0.6, 0.8)).setup(SETUP)
+        real = effects.TiltedSensor(2, (0.0, 0.6, 0.8)).setup(SETUP)
         assert real.sensors[2].axis == (0.0, 0.6, 0.8)
         assert real.sensors[3:] == SETUP.sensors[3:]
 
     def test_gain_ripple_and_wrong_gain(self):
         clean, _ = self.codes()
-        swung, _ = self.codes(raw_effects.GainRipple(0.1, 0.4))
+        swung, _ = self.codes(effects.GainRipple(0.1, 0.4))
         assert np.abs(swung[-1, 20] - 1.1 * clean[-1, 20]) <= 1
-        scaled, _ = self.codes(raw_effects.ChannelGain(20, 0.5))
+        scaled, _ = self.codes(effects.ChannelGain(20, 0.5))
         assert np.abs(scaled[:, 20] - 0.5 * clean[:, 20]).max() <= 1
 
     def test_coil_that_weakens_at_constant_current(self):
-        unit = ControlUnit(world(), CHANNELS, effects=[raw_effects.CoilWeakens(2, -0.1, 1e-4)])
+        unit = ControlUnit(world(), CHANNELS, effects=[effects.CoilWeakens(2, -0.1, 1e-4)])
         got, _, times = fluxes(unit, 0.1)
         ratio = got[:, 20] / [world().flux(t)[20] for t in times]
         assert ratio[0].real == pytest.approx([1, 1, 0.9, 1, 1, 1, 1, 1], abs=2e-2)
 
     def test_drift_begins_with_the_first_start(self):
-        drift = raw_effects.CoilWeakens(2, -0.5, 0.05)
+        drift = effects.CoilWeakens(2, -0.5, 0.05)
 
         def current_share(unit, seconds):
             unit.advance(int(seconds * unit.sample_rate_hz))
@@ -254,13 +250,13 @@ class TestEffects:
 
     def test_what_is_small_is_lost_behind_a_crossover(self):
         clean, _ = self.codes()
-        crossed, _ = self.codes(raw_effects.CrossoverAmplifier(20, 0.02))
+        crossed, _ = self.codes(effects.CrossoverAmplifier(20, 0.02))
         volts = clean[:, 20] * 5.0 / 32768
         expected = clean[:, 20] - 0.02 * np.tanh(volts / 0.02) * 32768 / 5.0
         assert np.abs(crossed[:, 20] - expected).max() <= 2
 
     def test_optical_clock(self):
-        clock = raw_effects.OpticalClock(early_s=0.03, fast_ppm=1000.0)
+        clock = effects.OpticalClock(early_s=0.03, fast_ppm=1000.0)
         assert clock.optical_time(0.0) == -0.03
         assert clock.optical_time(10.0) == pytest.approx(9.98)
 

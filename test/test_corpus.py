@@ -15,10 +15,10 @@ from anser_ros.effects.correction import Correction
 from anser_ros.effects.registry import all_effects
 from anser_ros.errors import AnserError, ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.nodes.output_parts.igtl_server import IgtlServer
-from anser_ros.sessions.model_file import load_model
+from anser_ros.nodes.openigtlink import IgtlServer
 from anser_ros.sessions.session import load_session
-from anser_ros.wire.frame_reader import FrameReader
+from anser_ros.sessions.starting_model import load_model
+from anser_ros.wire.protocols import FrameReader
 from anser_ros.wire.setup import parse_setup
 
 CORPUS = Path(__file__).resolve().parent / 'corpus'

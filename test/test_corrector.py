@@ -11,13 +11,20 @@ from pose_world import World
 from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.poses.corrector import (
+    MODEL_SCHEMA,
+    NO_POSE,
+    OK,
+    OUTSIDE,
+    UNKNOWN,
+    PoseCorrector,
+    to_model,
+)
+from anser_ros.apps.poses.diagnosis import diagnose_poses
+from anser_ros.apps.poses.nodes.corrector import Corrector
 from anser_ros.cli.main import main
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.nodes.corrector import Corrector
-from anser_ros.poses.corrector import NO_POSE, OK, OUTSIDE, UNKNOWN, PoseCorrector
-from anser_ros.poses.diagnosis import diagnose_poses
-from anser_ros.poses.document import MODEL_SCHEMA, to_model
 
 
 @pytest.fixture(scope='module')

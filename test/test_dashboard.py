@@ -19,26 +19,28 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import serialize_message
 from tracking_world import certain_model
 
+from anser_ros.apps.dashboard import loop as loop_module
+from anser_ros.apps.dashboard.loop import RESULTS, CorrectionLoop, Job, RecordingFolder
+from anser_ros.apps.dashboard.nodes import live_view
+from anser_ros.apps.dashboard.nodes.dashboard import ChainClient, ChainError, DashboardParameters
+from anser_ros.apps.dashboard.nodes.live_view import LiveView, read_pose
+from anser_ros.apps.dashboard.nodes.view_source import ViewSource, polling_node
+from anser_ros.apps.dashboard.server import (
+    COOKIE,
+    LEAST_TOKEN,
+    MOST_PAGES,
+    Guard,
+    PageServer,
+    token_for,
+)
 from anser_ros.cli import demo, missing
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
-from anser_ros.nodes.dashboard import DashboardParameters
 from anser_ros.nodes.field_model import FieldModelNode
-from anser_ros.nodes.output_parts import live_view
-from anser_ros.nodes.output_parts.causes import LastStatus
-from anser_ros.nodes.output_parts.chain_client import ChainClient, ChainError
-from anser_ros.nodes.output_parts.live_view import LiveView, read_pose
-from anser_ros.nodes.output_parts.polled import polling_node
-from anser_ros.nodes.output_parts.traces import latency_of
-from anser_ros.nodes.output_parts.view_source import ViewSource
-from anser_ros.sessions.model_file import save_model
-from anser_ros.sessions.volume import tracked_volume
-from anser_ros.web import loop as loop_module
-from anser_ros.web.folder import RESULTS, RecordingFolder
-from anser_ros.web.guard import COOKIE, MOST_PAGES, Guard
-from anser_ros.web.job import Job
-from anser_ros.web.loop import CorrectionLoop
-from anser_ros.web.server import LEAST_TOKEN, PageServer, token_for
+from anser_ros.nodes.operator_words import LastStatus
+from anser_ros.nodes.traces import latency_of
+from anser_ros.sessions.nominal_board import tracked_volume
+from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.setup import dump_setup, parse_setup
 
 TOKEN = 'a-token-of-enough-letters'

@@ -15,17 +15,16 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from std_msgs.msg import String
 
-from anser_ros.cli.demo_report import draw, load, summarise
-from anser_ros.cli.folders import make_new_folder, remove_empty_folders
+from anser_ros.cli.demo import draw, load, summarise
 from anser_ros.cli.main import main
-from anser_ros.cli.ros_domain import own_domain
-from anser_ros.cli.supervisor import Supervisor, tail
+from anser_ros.cli.output import make_new_folder, remove_empty_folders
+from anser_ros.cli.processes import Supervisor, own_domain, tail
 from anser_ros.errors import ParameterError
-from anser_ros.nodes.output_parts.traces import OpticalTrace, PoseTrace, Traces, targets_of
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Traces, targets_of
 from anser_ros.wire.bag import Salvage, iter_messages
-from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup, topic_of
+from anser_ros.wire.text_files import read_config
 
 SETUP_TEXT = read_config('demo_setup.yaml')
 SETUP = parse_setup(SETUP_TEXT)
@@ -78,7 +77,7 @@ class TestSupervisor:
         mark = f'orphan_{os.getpid()}'
         script = (
             'import sys, time; from pathlib import Path; '
-            'from anser_ros.cli.supervisor import Supervisor\n'
+            'from anser_ros.cli.processes import Supervisor\n'
             f'child = [sys.executable, "-c", "import time; time.sleep(600) # {mark}"]\n'
             f'with Supervisor(Path({str(tmp_path)!r})) as s:\n'
             '    s.start("child", child)\n'

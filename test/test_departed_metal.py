@@ -9,12 +9,11 @@ from diagnosis_world import board, world
 from anser_ros.diagnosis import departure as departing
 from anser_ros.diagnosis.departure import departure
 from anser_ros.diagnosis.prepare import build_problem, train_blocks
-from anser_ros.diagnosis.problem import evaluate
-from anser_ros.diagnosis.whitening import Spread
+from anser_ros.diagnosis.problem import Spread, evaluate
 from anser_ros.effects.departed_metal import DepartedMetal
 from anser_ros.effects.metal_path import FreePath
 from anser_ros.field.dipoles import Dipoles
-from anser_ros.metal.sphere import sphere_polarisability
+from anser_ros.metal.body import sphere_polarisability
 
 REST, NEAREST = np.array([0.12, -0.1, -0.16]), np.array([0.03, -0.02, -0.08])
 BALLS = np.array([[0.0, 0.0, 0.0], [0.04, 0.01, 0.0], [-0.01, 0.035, 0.01]])

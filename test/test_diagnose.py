@@ -11,7 +11,7 @@ from anser_ros.cli.diagnosis_words import MOST_CHARACTERS, verdict
 from anser_ros.cli.main import main
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import read_bag
-from anser_ros.wire.session_writer import SessionWriter
+from anser_ros.wire.bag_writer import SessionWriter
 
 ROOT = Path(__file__).resolve().parents[1]
 BAGS, MODEL = ROOT / 'bags', ROOT / 'config' / 'demo_model.yaml'

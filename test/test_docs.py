@@ -13,7 +13,7 @@ from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.effects.registry import all_effects
 from anser_ros.physics.board import KINDS
 from anser_ros.pose_states import STATES
-from anser_ros.sessions.diagnosis_document import DEPENDENCIES
+from anser_ros.sessions.diagnosis import DEPENDENCIES
 from anser_ros.sessions.starting_model import board_of
 from anser_ros.wire.points import flux_fields
 from anser_ros.wire.setup import KEYS

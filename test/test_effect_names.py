@@ -12,11 +12,11 @@ from pathlib import Path
 
 from source_trees import nodes_of
 
+import anser_ros.apps.poses.effects as pose_package
 import anser_ros.effects as package
-import anser_ros.poses.effects as pose_package
+from anser_ros.apps.poses.effect import pose_effects
 from anser_ros.effects.base import BaseEffect, BaseTerm
 from anser_ros.effects.registry import all_effects
-from anser_ros.poses.registry import pose_effects
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 ALLOWED = {
@@ -25,10 +25,10 @@ ALLOWED = {
     'measured/': 'recipes count the effects that the commands named',
     'poses/effects/': 'the room of effects of trackers that give poses alone',
     'calibration/sensor_parameters.py': 'parameters of a fit below the effects, as they are named',
-    'calibration/survey_records.py': 'writes records as `docs/interfaces.md` names them, from '
+    'calibration/sensor_records.py': 'writes records as `docs/interfaces.md` names them, from '
     'below the effects: a scan finds what is wrong with itself by its own fit',
-    'calibration/one_place.py': 'the same, of a body of many sensors at one place',
-    'calibration/source_size.py': 'the same, of the sizes of magnets',
+    'apps/lab/one_place.py': 'the same, of a body of many sensors at one place',
+    'apps/lab/calibration_engines.py': 'the same, of the sizes of magnets',
 }
 GENERAL = {
     'apparatus', 'base', 'body_term', 'correction', 'effect', 'prediction', 'registry', 'term',
@@ -36,9 +36,9 @@ GENERAL = {
 }  # fmt: skip
 """Modules in the room of effects that are about no single one; others may import these."""
 MAY_IMPORT = {
-    'diagnosis/wiring.py': {'sensor_polarity', 'wiring'},
-    'diagnosis/noise.py': {'excess_noise', 'outliers'},
-    'diagnosis/remainder.py': {'metal_remainder'},
+    'diagnosis/screening.py': {'sensor_polarity', 'wiring'},
+    'diagnosis/findings.py': {'excess_noise', 'outliers'},
+    'diagnosis/fit.py': {'metal_remainder'},
     'diagnosis/departure.py': {'departed_metal', 'metal_path'},
 }
 """Modules of single effects that a file may import, as it makes their terms without the search:
@@ -157,7 +157,7 @@ def test_the_walk_sees_imports_of_effects():
         'from anser_ros.effects import coil_moved',
         'import anser_ros.effects.coil_moved as moved',
         'def f():\n    from anser_ros.effects.coil_moved import CoilMoved',
-        'from anser_ros.poses.effects.coil_moved import CoilMoved',
-        'from anser_ros.poses.effects import coil_moved',
+        'from anser_ros.apps.poses.effects.coil_moved import CoilMoved',
+        'from anser_ros.apps.poses.effects import coil_moved',
     ):
         assert list(imports_of_effects(ast.walk(ast.parse(text)))) == ['coil_moved'], text

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from anser_ros.calibration.emitter_drift import at_strength, emitter_strength
-from anser_ros.calibration.survey_records import drift_records
+from anser_ros.calibration.disturbances import at_strength, emitter_strength
+from anser_ros.calibration.sensor_records import drift_records
 from anser_ros.sessions.session import load_session
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'

@@ -15,21 +15,19 @@ import pytest
 from diagnosis_world import world as board_world
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.lab.calibration_engines import with_source_sizes
 from anser_ros.calibration.calibrate import Options, fit_scan
-from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Generator
-from anser_ros.calibration.result import Scan
-from anser_ros.calibration.source_size import with_source_sizes
+from anser_ros.calibration.result import Scan, to_document
 from anser_ros.diagnosis.diagnose import diagnose
 from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.whitening import Spread
+from anser_ros.diagnosis.problem import Spread
 from anser_ros.effects.registry import effect_named
-from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.dipoles import Dipoles, size_parameters, symmetry_axis
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
-from anser_ros.field.symmetry import size_parameters, symmetry_axis
+from anser_ros.physics.rotations import tangents
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.physics.tangent import tangents
 from anser_ros.settings import Accuracy
 
 EFFECT = effect_named('emitter_size')

@@ -6,8 +6,8 @@ from tracking_world import certain_model
 
 from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import flux_basis
-from anser_ros.tracking.error_whitening import error_whitening, source_spacing
 from anser_ros.tracking.solve import RealField
+from anser_ros.tracking.solve_context import error_whitening, source_spacing
 
 POINT, AXIS = np.array([0.02, -0.05, 0.13]), np.array([0.6, 0.0, 0.8])
 

@@ -14,12 +14,11 @@ from anser_ros.cli.main import main
 from anser_ros.errors import BagError
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.baseline import baseline_flux
-from anser_ros.sessions.evaluation import Evaluation, track_session
-from anser_ros.sessions.evaluation_document import to_document
+from anser_ros.sessions.evaluation_files import to_document
 from anser_ros.sessions.follower import RefitSummary
-from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
-from anser_ros.sessions.starting_model import model_for
+from anser_ros.sessions.starting_model import load_model, model_for
+from anser_ros.sessions.tracked_session import Evaluation, track_session
 from anser_ros.tracking.estimate import TrackerSettings
 
 pytestmark = pytest.mark.usefixtures('shared_tables')

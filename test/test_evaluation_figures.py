@@ -6,11 +6,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from anser_ros.cli import evaluation_figures as figures
+from anser_ros.cli import evaluate as figures
 from anser_ros.pose_states import OK
-from anser_ros.sessions.evaluation import Evaluation
-from anser_ros.sessions.evaluation_document import to_document
-from anser_ros.sessions.pose_errors import PoseSeries
+from anser_ros.sessions.evaluation_files import to_document
+from anser_ros.sessions.tracked_session import Evaluation, PoseSeries
 
 FRAMES = 200
 

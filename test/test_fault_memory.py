@@ -1,8 +1,8 @@
 """Faults of the line in words, for as long as an operator needs to read them."""
 
-from anser_ros.nodes.acquisition_parts.fault_memory import MEMORY_S, RecentFaults, device_words
+from anser_ros.nodes.acquisition_status import MEMORY_S, RecentFaults, device_words
 from anser_ros.nodes.runtime.diagnostics import Level
-from anser_ros.wire.records import DeviceState, DeviceStatus, StatusFlag
+from anser_ros.wire.frames import DeviceState, DeviceStatus, StatusFlag
 
 
 def test_a_fault_is_told_with_its_count_and_forgotten_in_time():

@@ -8,8 +8,8 @@ from test_one_place import NAMES, TONES, resting
 from test_still import CENTRES, recorded
 
 from anser_ros import Model
+from anser_ros.apps.lab.measured.recipe import write_frames
 from anser_ros.cli.main import main
-from anser_ros.measured.session_file import write_frames
 from anser_ros.sessions.calibration import is_estimated_jointly
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup

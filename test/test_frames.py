@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 
 from anser_ros.errors import FrameError
 from anser_ros.wire import frames
-from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import encode
-from anser_ros.wire.records import (
+from anser_ros.wire.frames import (
     Channel,
     ChannelKind,
     DeviceState,
@@ -29,7 +27,9 @@ from anser_ros.wire.records import (
     Start,
     StatusFlag,
     Stop,
+    encode,
 )
+from anser_ros.wire.protocols import FrameReader
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
 TONES = tuple(6000.0 + 170 * k for k in range(8))

@@ -8,11 +8,11 @@ from conftest import REPO
 from pose_world import FRAME, SHIFT, World
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.poses.hand_eye import fit_hand_eye
+from anser_ros.apps.poses.importing import write_pose_session
+from anser_ros.apps.poses.sequence import PoseSession, sequence_of
 from anser_ros.cli.main import run_verb
 from anser_ros.errors import DiagnosisError
-from anser_ros.poses.hand_eye_fit import fit_hand_eye
-from anser_ros.poses.recording import write_pose_session
-from anser_ros.poses.sequence import PoseSession, sequence_of
 
 SEEDS = range(4000, 4004)  # nothing was chosen on them
 OFFSET, RATE = 0.03, 800.0

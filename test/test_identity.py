@@ -7,17 +7,14 @@ import pytest
 from tracking_world import anser_board, certain_model, setup_of, triaxial_tool
 
 from anser_ros.errors import ModelFileError
-from anser_ros.field.model import EffectRecord, from_document, to_document
+from anser_ros.field.model import EffectRecord, ReferenceReadings, from_document, to_document
 from anser_ros.field.nominal import nominal_model
-from anser_ros.field.reference_readings import ReferenceReadings
 from anser_ros.fingerprint import fingerprint_of
-from anser_ros.nodes.tracker_parts.model_in_force import ActiveModel
-from anser_ros.nodes.tracker_parts.model_intake import GivenModel
+from anser_ros.nodes.tracker_models import ActiveModel, GivenModel
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import code_of
 from anser_ros.sessions.starting_model import check_emitters, is_nominal, made_for
-from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
-from anser_ros.wire.points import DipolePoints
+from anser_ros.wire.points import DipolePoints, ModelError, decode_model_error, encode_model_error
 from anser_ros.wire.setup import dump_setup, parse_setup
 
 SETUP = setup_of(triaxial_tool())

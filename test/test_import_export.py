@@ -12,8 +12,8 @@ import yaml
 import zstandard
 from scipy.io import loadmat, savemat
 
+from anser_ros.apps.poses.importing import read_pose_session
 from anser_ros.cli.main import main
-from anser_ros.poses.recording import read_pose_session
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from anser_ros.assessment.intervals import (
+from anser_ros.apps.poses.assessment.intervals import (
     cluster_weights,
     deviation_interval,
     independent_for_variance,
     mitk_statistics,
     summarised,
 )
-from anser_ros.assessment.stability import allan_deviation, assess_rest
-from anser_ros.poses.sequence import sequence_of
+from anser_ros.apps.poses.assessment.stability import allan_deviation, assess_rest
+from anser_ros.apps.poses.sequence import sequence_of
 
 pytestmark = pytest.mark.long
 

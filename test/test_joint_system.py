@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from anser_ros.calibration import joint_system
-from anser_ros.calibration.factors import as_real
 from anser_ros.calibration.joint_system import JointSystem, open_directions, tied_parts
+from anser_ros.calibration.least_squares import as_real
 
 FRAMES, SENSORS, EMITTERS, MODES, PARAMETERS = 45, 3, 2, 5, 3
 PARTS = 2 * EMITTERS

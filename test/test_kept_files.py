@@ -14,18 +14,17 @@ from std_msgs.msg import String
 from test_refit_start import given_baseline
 
 from anser_ros.cli import warm_up
-from anser_ros.nodes.field_model_parts.kept_baseline import BASELINE_S, KeptBaseline
+from anser_ros.nodes.field_model_io import BASELINE_S, KeptBaseline
 from anser_ros.nodes.runtime import qos
 from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
 from anser_ros.sessions import kept_tables
-from anser_ros.sessions.drawing import NominalBoard
 from anser_ros.sessions.kept_tables import MOST_TABLES, KeptTables, ReadAhead
-from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
 from anser_ros.sessions.session import sensor_table
-from anser_ros.sessions.volume import stated_volume
-from anser_ros.wire.config_folder import config_path, read_config
+from anser_ros.sessions.starting_model import load_model
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import config_path, read_config
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 

@@ -32,7 +32,7 @@ def test_it_is_full_when_all_has_been_compiled(tmp_path):
 def test_copies_of_the_package_share_kernels_by_content(tmp_path):
     """A second copy loads what the first one compiled; with another source it does not."""
     code = (
-        'import numpy as np; from anser_ros.physics.tangent import fill_tangent as f\n'
+        'import numpy as np; from anser_ros.physics.rotations import fill_tangent as f\n'
         'f(np.array([0.0, 0.0, 1.0]), np.zeros((2, 3)))\n'
         'print(sum(f.stats.cache_hits.values()), sum(f.stats.cache_misses.values()))'
     )

@@ -16,31 +16,32 @@ import yaml
 from scipy.spatial.transform import Rotation
 from tracking_world import NOISE_T, certain_model
 
-from anser_ros.cli.main import main
-from anser_ros.errors import BagError, FitError, ModelFileError
-from anser_ros.known_metal import fit, follower
-from anser_ros.known_metal.fit import learn_metal
-from anser_ros.known_metal.follower import KnownMetalFollower
-from anser_ros.known_metal.known import KnownMetal, from_document, to_document
-from anser_ros.known_metal.lattice import (
+from anser_ros.apps.lab import metal_follower, metal_learning
+from anser_ros.apps.lab.metal_follower import KnownMetalFollower, KnownMetalModels
+from anser_ros.apps.lab.metal_lattice import (
     Coils,
+    KnownMetal,
     Lattice,
     Setting,
     ball_answer,
+    from_document,
     lattice_points,
+    load_known_metal,
     moved,
+    save_known_metal,
     step_between,
+    to_document,
 )
+from anser_ros.apps.lab.metal_learning import learn_metal
+from anser_ros.cli.main import main
+from anser_ros.errors import BagError, FitError, ModelFileError
 from anser_ros.physics.constants import MU_0
 from anser_ros.pose_states import MODEL_DOUBTFUL
-from anser_ros.sessions import metal_frames
-from anser_ros.sessions.chosen_references import with_references
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.known_metal import KnownMetalModels
-from anser_ros.sessions.known_metal_file import load_known_metal, save_known_metal
-from anser_ros.sessions.model_file import save_model
+from anser_ros.sessions.follower import with_references
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import save_model
+from anser_ros.sessions.tracked_session import track_session
 from anser_ros.tracking.estimate import TrackerSettings
 
 TILT = np.log(np.array(certain_model().frequencies_hz) / 6500.0)
@@ -282,15 +283,15 @@ def bags(tmp_path_factory):
 def small():
     """A small lattice of few frames, and a follower that decides soon among few places."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, 'COUNTS', (3, 3, 2))
-        patch.setattr(fit, 'SPACINGS_M', (0.02, 0.03))
-        patch.setattr(fit, 'TRIAL_FRAMES', 6)
-        patch.setattr(fit, 'TRIAL_ROUNDS', 6)
-        patch.setattr(fit, 'ROUNDS', 12)
-        patch.setattr(metal_frames, 'FRAMES', 30)
-        patch.setattr(metal_frames, 'SMOOTHED', 2)
-        patch.setattr(follower, 'CANDIDATES', 2)
-        patch.setattr(follower, 'TRIAL_S', 0.5)
+        patch.setattr(metal_learning, 'COUNTS', (3, 3, 2))
+        patch.setattr(metal_learning, 'SPACINGS_M', (0.02, 0.03))
+        patch.setattr(metal_learning, 'TRIAL_FRAMES', 6)
+        patch.setattr(metal_learning, 'TRIAL_ROUNDS', 6)
+        patch.setattr(metal_learning, 'ROUNDS', 12)
+        patch.setattr(metal_learning, 'FRAMES', 30)
+        patch.setattr(metal_learning, 'SMOOTHED', 2)
+        patch.setattr(metal_follower, 'CANDIDATES', 2)
+        patch.setattr(metal_follower, 'TRIAL_S', 0.5)
         yield
 
 
@@ -299,9 +300,9 @@ def seen():
     """What the refit would find, which takes half a minute to prepare, is stated."""
     with pytest.MonkeyPatch.context() as patch:
         tables = SimpleNamespace(excitation=world.excitation())
-        patch.setattr(metal_frames, 'build_tables', lambda *given, report: tables)
+        patch.setattr(metal_learning, 'build_tables', lambda *given, report: tables)
         patch.setattr(
-            metal_frames, 'LiveRefit', lambda *given, **told: world.RefitThatSees(world.SWEEP)
+            metal_learning, 'LiveRefit', lambda *given, **told: world.RefitThatSees(world.SWEEP)
         )
         yield
 
@@ -349,8 +350,8 @@ class TestLearning:
         assert spacing == pytest.approx(0.02), 'the lump is 10 cm wide, its currents less'
 
     def test_what_no_piece_explains_is_refused(self, bags, seen, monkeypatch):
-        monkeypatch.setattr(fit, 'TRIAL_ROUNDS', 1)
-        monkeypatch.setattr(fit, 'ROUNDS', 2)
+        monkeypatch.setattr(metal_learning, 'TRIAL_ROUNDS', 1)
+        monkeypatch.setattr(metal_learning, 'ROUNDS', 2)
         frames, rng = frames_of(bags, 8), np.random.default_rng(9)
         torn = []
         for frame in frames:
@@ -385,7 +386,7 @@ class TestLearning:
             ),
         ):
             with pytest.raises(BagError, match=words):
-                metal_frames.learn(wrong, 'lump')
+                metal_learning.learn(wrong, 'lump')
 
 
 def volume_of(bags):
@@ -397,7 +398,7 @@ def frames_of(bags, count):
     scan = load_session(bags / 'scan.mcap')
     prepared = prepare(load_session(bags / 'sweep.mcap'), certain_model(), scan)
     refit = world.RefitThatSees(world.SWEEP)
-    return metal_frames.metal_frames(prepared, refit, world.PHASE, count)
+    return metal_learning.metal_frames(prepared, refit, world.PHASE, count)
 
 
 @pytest.mark.long
@@ -508,7 +509,7 @@ class TestFollowing:
         scene, state = subject._scene, subject._chosen.state
         scene.misfit = 1e-6
         at, axes = world.TOOL.placed(dive.tools[0].position[8], dive.tools[0].rotation[8])
-        model, placed = follower.field_of(scene, state, at, 24, 1.0)
+        model, placed = metal_follower.field_of(scene, state, at, 24, 1.0)
         modes = [replace(model, moments=one, modes=None).flux(at, axes) for one in model.modes]
         which = np.r_[0:6, 12 : 12 + len(state.answers)]
         spread = 0.01 * state.covariance[np.ix_(which, which)]
@@ -534,14 +535,14 @@ class TestFollowing:
         for row in range(9, 12):
             subject.take(stamp(dive, row), [])
             assert subject.is_followed
-        seen, real = [], follower.predicted
+        seen, real = [], metal_follower.predicted
 
         def noting(state, seconds):
             seen.append(seconds)
             return real(state, seconds)
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(follower, 'predicted', noting)
+            patch.setattr(metal_follower, 'predicted', noting)
             subject.take(stamp(dive, 12), world.readings(dive, 12))
         assert seen == pytest.approx([0.32]), 'four steps, not one'
         for row in range(13, 21):

@@ -9,7 +9,7 @@ import pytest
 from conftest import REPO
 
 from anser_ros.errors import AnserError, ParameterError, SetupError
-from anser_ros.nodes.runtime.parameter_files import checked
+from anser_ros.nodes.runtime.parameters import checked
 
 NODES = ('tracker', 'recorder')
 MODULES = (

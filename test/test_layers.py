@@ -65,7 +65,7 @@ ROOMS = {
     'rclpy': ('nodes/',),
     'ament_index_python': ('nodes/',),
     'std_srvs': ('nodes/',),
-    'serial': ('wire/port.py', 'wire/serial_line.py'),
+    'serial': ('wire/port.py', 'wire/port.py'),
     'mcap': ('wire/bag.py', 'wire/bag_writer.py'),
     'mcap_ros2': ('wire/bag.py', 'wire/bag_writer.py'),
     'pyigtl': (),

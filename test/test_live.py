@@ -20,9 +20,9 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import process, qos
 from anser_ros.nodes.runtime.handover import DirectSubscription, HandedFlux, Handover, NewestWorker
 from anser_ros.nodes.runtime.node import AnserNode
-from anser_ros.nodes.runtime.parameter_files import names_for
+from anser_ros.nodes.runtime.parameters import names_for
 from anser_ros.nodes.streams.one_source import OneSource
-from anser_ros.nodes.tracker_parts.rehearsal import LONGEST_S, Rehearsal
+from anser_ros.nodes.tracker_models import LONGEST_S, Rehearsal
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from anser_ros.cli.demo import SAMPLE_RATE_HZ
-from anser_ros.cli.loop_result import (
+from anser_ros.apps.lab.cli.loop import (
     MISSED,
     NAMED,
     PARTLY,
@@ -19,17 +18,17 @@ from anser_ros.cli.loop_result import (
     table,
     verdict,
 )
-from anser_ros.cli.loop_run import TONES_HZ
+from anser_ros.apps.lab.cli.loop_run import TONES_HZ
+from anser_ros.cli.demo import SAMPLE_RATE_HZ
 from anser_ros.cli.main import main
 from anser_ros.effects.registry import all_effects, effect_named
 from anser_ros.effects.saturation import FLUX, VOLTAGE
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.recorded_health import ok_share
-from anser_ros.simulation.effect_draw import CATALOGUE, draw
-from anser_ros.simulation.raw_effects import CompressingAmplifier
+from anser_ros.simulation.effects import CATALOGUE, CompressingAmplifier, draw
 from anser_ros.wire.channel_calibration import parse_channels
-from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import read_config
 
 GAIN_SEED = 3
 

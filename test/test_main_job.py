@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from chain import beginning, replay_through_nodes
 
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.tracked_session import track_session
 from anser_ros.wire.setup import topic_of
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'

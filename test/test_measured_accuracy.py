@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from anser_ros.integrity.senders import Senders
-from anser_ros.nodes.acquisition_parts.measured_accuracy import MeasuredAccuracy
-from anser_ros.nodes.streams.measured_keys import without_measured
+from anser_ros.integrity.streams import Senders
+from anser_ros.nodes.acquisition_stream import MeasuredAccuracy
+from anser_ros.nodes.streams.clouds import without_measured
 from anser_ros.sessions.session import measured_noise, stamp_sigma
 from anser_ros.settings import Accuracy
-from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import dump_setup, parse_setup
+from anser_ros.wire.text_files import read_config
 
 SETUP = parse_setup(read_config('demo_setup.yaml'))
 FRAME = SimpleNamespace(window=SimpleNamespace(sigma=np.array([7e-11, np.nan, 8.12e-11, 9e-11])))

@@ -5,10 +5,10 @@ import pytest
 from conftest import SHARED, needs
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.lab.measured import anser_board
 from anser_ros.calibration.error_map import LEAST_GAIN_SIGMAS, learn_error_map
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, FitError
-from anser_ros.measured import anser_board
 
 FOLDER = SHARED / 'measured' / 'anser_board'
 needs_data = needs('measured', 'anser_board')

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from conftest import SHARED, needs
 
-from anser_ros.cli import measured
+from anser_ros.apps.lab.cli import measured
+from anser_ros.apps.lab.measured import ReportRow
+from anser_ros.apps.lab.measured.recipe import Recipe
 from anser_ros.cli.main import main as measured_main
-from anser_ros.measured import ReportRow
-from anser_ros.measured.recipe import Recipe
 
 
 def test_unknown_data_set_and_missing_folder(capsys, tmp_path):

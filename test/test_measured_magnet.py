@@ -7,16 +7,16 @@ import pytest
 from conftest import REPO, SHARED, needs
 from scipy.spatial.transform import Rotation
 
-from anser_ros.cli.main import main
-from anser_ros.errors import BagError, FitError
-from anser_ros.measured import magnet_patch, magnet_step
-from anser_ros.measured.magnet_patch import (
+from anser_ros.apps.lab.measured import magnet_patch, magnet_step
+from anser_ros.apps.lab.measured.magnet_patch import (
     UPWARDS,
     Recording,
     patch_in_fg,
     setup_of,
     write_session,
 )
+from anser_ros.cli.main import main
+from anser_ros.errors import BagError, FitError
 from anser_ros.sessions.session import load_session
 
 FOLDER = SHARED / 'measured' / 'magnet_patch'

@@ -9,11 +9,11 @@ import pytest
 from conftest import SHARED, needs
 from scipy.spatial.transform import Rotation
 
-from anser_ros.cli import measured
+from anser_ros.apps.lab.cli import measured
+from anser_ros.apps.lab.measured import hpi_coils, navion
+from anser_ros.apps.lab.measured.recipe import write_frames
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, FitError
-from anser_ros.measured import hpi_coils, navion
-from anser_ros.measured.session_file import write_frames
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from conftest import SHARED, needs
 
+from anser_ros.apps.lab.measured import transformer
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
-from anser_ros.measured import transformer
-from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import save_model
 
 FOLDER = SHARED / 'measured' / 'transformer'
 MOMENT = np.array([20.0 + 5.0j, -8.0j, 60.0])

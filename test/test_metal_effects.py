@@ -18,8 +18,8 @@ from anser_ros.metal.body import (
     body_spread,
     centre_sigma,
     multipoles,
+    sheet_sources,
 )
-from anser_ros.metal.sheet import sheet_sources
 from anser_ros.physics.constants import MU_0
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from metal_world import dipole_field, dipole_tensor, induced_moments
 
-from anser_ros.metal.sphere import SMALL, sphere_polarisability
+from anser_ros.metal.body import SMALL, sphere_polarisability
 from anser_ros.physics.constants import MU_0
 
 RADIUS = 0.02

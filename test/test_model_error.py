@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from anser_ros.errors import LayoutError
-from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
+from anser_ros.wire.points import ModelError, decode_model_error, encode_model_error
 
 SEED = 51
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anser_ros.cli.session_kinds import snapshot_notes
+from anser_ros.cli.sessions import snapshot_notes
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord, FieldModel, from_document, to_document
-from anser_ros.sessions.model_file import as_saved, is_snapshot, load_model, save_model
+from anser_ros.sessions.starting_model import as_saved, is_snapshot, load_model, save_model
 
 
 def model() -> FieldModel:

@@ -10,8 +10,7 @@ from dataclasses import replace
 from tracking_world import certain_model, setup_of, triaxial_tool
 
 from anser_ros.nodes.streams.model_clouds import ModelWriter
-from anser_ros.nodes.tracker_parts.model_in_force import ActiveModel
-from anser_ros.nodes.tracker_parts.model_intake import ModelIntake
+from anser_ros.nodes.tracker_models import ActiveModel, ModelIntake
 from anser_ros.physics.volume import TrackedVolume
 
 MODEL = certain_model()

@@ -18,19 +18,18 @@ import pytest
 from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, scene
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration.dipole_sites import basis_rows
-from anser_ros.calibration.factors import GramFactor, TriangularFactor, as_complex, as_real
 from anser_ros.calibration.layouts import Layout, place
+from anser_ros.calibration.least_squares import GramFactor, TriangularFactor, as_complex, as_real
 from anser_ros.calibration.moments import MomentFitter
 from anser_ros.calibration.pose_correction import (
+    PoseWhitener,
     most_probable_step,
     moved,
     outlier_weights,
     pose_precision,
     pose_terms,
 )
-from anser_ros.calibration.pose_whitening import PoseWhitener
-from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
+from anser_ros.calibration.readings import basis_rows, frame_blocks, usable_weights, with_pose
 from anser_ros.errors import FitError
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.settings import Accuracy

@@ -18,8 +18,7 @@ from anser_ros.nodes.runtime import parameters
 from anser_ros.nodes.runtime import process as processes
 from anser_ros.nodes.runtime.diagnostics import Throttle, text_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameter_files import complaints
-from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.parameters import complaints, parameter
 
 pytestmark = pytest.mark.light
 
@@ -124,7 +123,7 @@ from dataclasses import dataclass
 from std_srvs.srv import Trigger
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.runtime.parameter_files import complaints
+from anser_ros.nodes.runtime.parameters import complaints
 from anser_ros.nodes.runtime.parameters import parameter
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from anser_ros.calibration.normal_factor import STRIP, NormalFactor, subtract_gram
+from anser_ros.calibration.least_squares import STRIP, NormalFactor, subtract_gram
 from anser_ros.parallel import shared_among
 
 SIZES = (1, 7, STRIP, STRIP + 1, 3 * STRIP - 5)

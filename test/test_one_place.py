@@ -7,19 +7,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.lab.measured.recipe import vector, write_frames
+from anser_ros.apps.lab.one_place import calibrate_at_one_place, is_at_one_place
+from anser_ros.apps.lab.source_calibration import KINDS
 from anser_ros.calibration.layouts import Generator
-from anser_ros.calibration.one_place import calibrate_at_one_place, is_at_one_place
 from anser_ros.calibration.requirements import check_single_coils
-from anser_ros.calibration.sources import KINDS
 from anser_ros.cli.main import main
 from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.whitening import Spread
+from anser_ros.diagnosis.problem import Spread
 from anser_ros.errors import DiagnosisError, FitError, SetupError, TrackingError
 from anser_ros.field.measurements import Measurements
-from anser_ros.measured.session_file import vector, write_frames
 from anser_ros.physics.dipole import flux_basis
-from anser_ros.physics.sensor import SensorTable, Windings
-from anser_ros.physics.windings import PlacedPoints
+from anser_ros.physics.sensor import PlacedPoints, SensorTable, Windings
 from anser_ros.sessions.session import load_session
 from anser_ros.settings import Accuracy
 from anser_ros.tracking.tracker import Tracker

@@ -18,12 +18,13 @@ from std_msgs.msg import String
 
 from anser_ros.errors import ParameterError, PortError
 from anser_ros.nodes.openigtlink import (
+    MOST_CLIENTS,
+    IgtlServer,
     OpenIGTLink,
     OpenIGTLinkParameters,
     check_templates,
     devices_of,
 )
-from anser_ros.nodes.output_parts.igtl_server import MOST_CLIENTS, IgtlServer
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import parse_setup
 

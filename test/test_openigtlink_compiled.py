@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from conftest import REPO
 
-from anser_ros.nodes.output_parts.igtl_server import IgtlServer
+from anser_ros.nodes.openigtlink import IgtlServer
 from anser_ros.wire import igtl
 
 HEADERS = Path('/usr/include/openigtlink')

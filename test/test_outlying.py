@@ -7,7 +7,7 @@ import pytest
 from diagnosis_world import NOISE_T, world
 from scipy.spatial.transform import Rotation
 
-from anser_ros.diagnosis.outlying import clean_start, outlying_share
+from anser_ros.diagnosis.screening import clean_start, outlying_share
 from anser_ros.physics.pose_track import PoseTrack
 
 CHANNEL, HIT = 2, np.arange(20, 500, 40)

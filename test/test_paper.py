@@ -5,25 +5,31 @@ import json
 import numpy as np
 import pytest
 
-from anser_ros.cli.main import main
-from anser_ros.errors import BagError, FitError
-from anser_ros.experiments import article
-from anser_ros.experiments.bound import position_bound
-from anser_ros.experiments.error_maps import board_folder, board_runs
-from anser_ros.experiments.figures import draw_all
-from anser_ros.experiments.methods import article_model, centres_extension, drawn_model
-from anser_ros.experiments.recordings import (
+from anser_ros.apps.lab.experiments import recordings as article
+from anser_ros.apps.lab.experiments.error_maps import board_folder, board_runs
+from anser_ros.apps.lab.experiments.recordings import (
     HEAD_DISTANCES_CM,
     NAMES,
     checkerboard,
     given_recordings,
     missing,
 )
-from anser_ros.experiments.report import write_report
-from anser_ros.experiments.simulated import Raster, simulate_recordings
-from anser_ros.experiments.study import Study, field_errors, outer_planes
-from anser_ros.experiments.tracking_errors import statistics, track
-from anser_ros.measured import anser_board
+from anser_ros.apps.lab.experiments.report import draw_all, write_report
+from anser_ros.apps.lab.experiments.simulated import Raster, simulate_recordings
+from anser_ros.apps.lab.experiments.study import (
+    Study,
+    article_model,
+    centres_extension,
+    drawn_model,
+    field_errors,
+    outer_planes,
+    position_bound,
+    statistics,
+    track,
+)
+from anser_ros.apps.lab.measured import anser_board
+from anser_ros.cli.main import main
+from anser_ros.errors import BagError, FitError
 
 
 @pytest.fixture(scope='module')
@@ -41,7 +47,7 @@ def study(recordings, tmp_path_factory):
     (folder / run.name).symlink_to(run)
     study = Study(recordings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('anser_ros.experiments.study.board_folder', lambda: folder)
+        patch.setattr('anser_ros.apps.lab.experiments.study.board_folder', lambda: folder)
         study.run()
     return study
 

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from anser_ros.diagnosis.whitening import Whitener
+from anser_ros.diagnosis.problem import Whitener
 from anser_ros.parallel import cores, in_order, shared_among, slices
 from anser_ros.physics.dipole import dipole_field, flux_jacobian
 

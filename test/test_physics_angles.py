@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from anser_ros.physics.angles import axis_angles, rotation_angles
+from anser_ros.physics.rotations import axis_angles, rotation_angles
 
 ANGLES = np.array([0.0, 1e-12, 1e-6, 0.3, 1.5, np.pi - 1e-6, np.pi])
 

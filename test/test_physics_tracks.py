@@ -20,9 +20,15 @@ from tracking_world import GEOMETRY, anser_board
 from anser_ros.errors import FitError, SetupError
 from anser_ros.field.nominal import Tolerances, nominal_model
 from anser_ros.physics import board as boards
-from anser_ros.physics.board import Board, build_board, spiral_path
+from anser_ros.physics.board import (
+    Board,
+    build_board,
+    loop_field,
+    loop_moment,
+    segment_field,
+    spiral_path,
+)
 from anser_ros.physics.constants import MU_0
-from anser_ros.physics.tracks import loop_field, loop_moment, segment_field
 
 SEED = 12
 

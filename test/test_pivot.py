@@ -13,17 +13,16 @@ from geometry_msgs.msg import PoseStamped
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from anser_ros.assessment.pivot import PivotLimits, fit_pivot
+from anser_ros.apps.poses.assessment.pivot import PivotLimits, fit_pivot
+from anser_ros.apps.poses.sequence import sequence_of
 from anser_ros.cli.main import run_verb
 from anser_ros.errors import FitError, ParameterError, SetupError
 from anser_ros.nodes import tracker
 from anser_ros.nodes.runtime import qos
 from anser_ros.pose_states import OK
-from anser_ros.poses.sequence import sequence_of
-from anser_ros.tracking.estimate import PoseEstimate, no_pose
-from anser_ros.tracking.tip import Tip
+from anser_ros.tracking.estimate import PoseEstimate, Tip, no_pose
 from anser_ros.wire.setup import dump_setup, parse_setup
-from anser_ros.wire.setup_tips import TipSpec, read_tips, with_tips
+from anser_ros.wire.setup_values import TipSpec, read_tips, with_tips
 
 DEMO = (REPO / 'config' / 'demo_setup.yaml').read_text(encoding='utf-8')
 SEEDS = range(2000, 2012)  # nothing was chosen on them

@@ -8,9 +8,8 @@ import pytest
 from refit_world import anser_world
 
 from anser_ros.cli.main import main
-from anser_ros.refit.clouds import Region
+from anser_ros.refit.clouds import Excitation, Region, region_of
 from anser_ros.refit.design import StatedMetal, choose, expected_errors, family, random_designs
-from anser_ros.refit.excitation import Excitation, region_of
 from anser_ros.settings import RefitSettings
 
 UNCORRECTED_M = 5e-3

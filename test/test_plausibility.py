@@ -14,13 +14,18 @@ from anser_ros.cli.main import main
 from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.sessions.diagnosis import diagnose_session
-from anser_ros.sessions.drawing import NominalBoard
-from anser_ros.sessions.model_file import load_model
-from anser_ros.sessions.plausibility import check_points, plausible_tools
+from anser_ros.sessions.nominal_board import NominalBoard
+from anser_ros.sessions.plausibility import (
+    FLUX_UNITS,
+    LENGTH_UNITS,
+    check_points,
+    plausible_tools,
+    unit_words,
+)
 from anser_ros.sessions.session import load_session
-from anser_ros.sessions.units import FLUX_UNITS, LENGTH_UNITS, unit_words
+from anser_ros.sessions.starting_model import load_model
 from anser_ros.wire.bag import read_bag
-from anser_ros.wire.session_writer import SessionWriter
+from anser_ros.wire.bag_writer import SessionWriter
 
 ROOT = Path(__file__).resolve().parents[1]
 MODEL = ROOT / 'config' / 'demo_model.yaml'

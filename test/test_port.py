@@ -11,10 +11,7 @@ import pytest
 from conftest import PATIENCE_S, wait
 
 from anser_ros.errors import PortError
-from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import encode
-from anser_ros.wire.port import ControlUnitPort, PortState, find_port
-from anser_ros.wire.records import (
+from anser_ros.wire.frames import (
     Channel,
     ChannelKind,
     Hello,
@@ -25,8 +22,10 @@ from anser_ros.wire.records import (
     SampleBlock,
     SetFrequencies,
     Start,
+    encode,
 )
-from anser_ros.wire.stream_control import StreamControl
+from anser_ros.wire.port import ControlUnitPort, PortState, find_port
+from anser_ros.wire.protocols import FrameReader, StreamControl
 
 TONES = (6000.0, 6170.0)
 HELLO = Hello(

@@ -9,15 +9,14 @@ from pose_world import FRAME, SHIFT, World
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.poses import search
+from anser_ros.apps.poses.cli.pose_session import pose_verdict
+from anser_ros.apps.poses.corrector import to_document
+from anser_ros.apps.poses.diagnosis import diagnose_poses
+from anser_ros.apps.poses.effect import PoseSetting, Role, effect_with
+from anser_ros.apps.poses.importing import write_pose_session
 from anser_ros.cli.main import run_verb
-from anser_ros.cli.pose_report import pose_verdict
 from anser_ros.errors import DiagnosisError, PlausibilityError
-from anser_ros.poses import search
-from anser_ros.poses.diagnosis import diagnose_poses
-from anser_ros.poses.document import to_document
-from anser_ros.poses.effect import PoseSetting, Role
-from anser_ros.poses.recording import write_pose_session
-from anser_ros.poses.registry import effect_with
 
 pytestmark = pytest.mark.long
 

@@ -8,22 +8,21 @@ import pytest
 from pose_world import FRAME, SHIFT, World
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.poses.diagnosis import depends_on
+from anser_ros.apps.poses.effect import PoseSetting, Role
+from anser_ros.apps.poses.effects.episodes import PoseMovingMetal
+from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
+from anser_ros.apps.poses.effects.noise import power_law
+from anser_ros.apps.poses.effects.numbers import PoseClockRate
+from anser_ros.apps.poses.effects.stream import ReceiptJitter, stamp_step
+from anser_ros.apps.poses.fit import is_lever_determined
+from anser_ros.apps.poses.hand_eye import one_clock
+from anser_ros.apps.poses.path import OpticalPath
+from anser_ros.apps.poses.search import doubt, with_noise
+from anser_ros.apps.poses.sequence import PoseSession, sequence_of
+from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, started
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
-from anser_ros.poses.clock_records import one_clock
-from anser_ros.poses.effect import PoseSetting, Role
-from anser_ros.poses.effects.clock import PoseClockRate
-from anser_ros.poses.effects.episodes import PoseMovingMetal
-from anser_ros.poses.effects.field_distortion import FieldDistortion
-from anser_ros.poses.effects.noise import power_law
-from anser_ros.poses.effects.stamps import ReceiptJitter, stamp_step
-from anser_ros.poses.lever_arms import is_lever_determined
-from anser_ros.poses.path import OpticalPath
-from anser_ros.poses.prices import doubt
-from anser_ros.poses.search import with_noise
-from anser_ros.poses.sequence import PoseSession, sequence_of
-from anser_ros.poses.start import coarse_offset, first_fit, pose_problem, started
-from anser_ros.poses.structure import depends_on
 
 SETTING = PoseSetting(('sensor_0', 'sensor_1'), 0.0, 40.0, np.zeros(3), 0.06)
 

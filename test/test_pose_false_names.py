@@ -4,11 +4,11 @@ import pytest
 from clean_poses import MOTIONS, STREAMS, clean_world
 from pose_world import World
 
-from anser_ros.poses.diagnosis import diagnose_poses, unconfirmed
-from anser_ros.poses.effects.field_distortion import FieldDistortion
-from anser_ros.poses.fit import fit_poses
-from anser_ros.poses.search import with_noise
-from anser_ros.poses.start import coarse_offset, first_fit, pose_problem
+from anser_ros.apps.poses.diagnosis import diagnose_poses, unconfirmed
+from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
+from anser_ros.apps.poses.fit import fit_poses
+from anser_ros.apps.poses.search import with_noise
+from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem
 
 pytestmark = pytest.mark.long
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.poses.importing import import_poses, read_pose_session
 from anser_ros.cli.main import run_verb
 from anser_ros.errors import BagError, ParameterError, PlausibilityError
-from anser_ros.poses.importing import import_poses
-from anser_ros.poses.recording import read_pose_session
 
 MISSING = '-3.697314E28'
 TURN = Rotation.from_rotvec([0.3, -0.2, 0.5])

@@ -5,7 +5,7 @@ import pytest
 from geometry_msgs import msg
 from rclpy.serialization import deserialize_message
 
-from anser_ros.nodes.tracker_parts.pose_output import PackedMessage
+from anser_ros.nodes.pose_output import PackedMessage
 
 
 @pytest.mark.parametrize('frame_id', ['', 'fg', 'left_fg', 'boards/left/fg'])

@@ -2,7 +2,7 @@
 
 import pytest
 
-from anser_ros.cli.pose_values import sizes
+from anser_ros.apps.poses.cli.pose_session import sizes
 
 
 @pytest.mark.parametrize(

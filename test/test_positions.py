@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from calibration_world import scene
 
-from anser_ros.calibration.dipole_sites import DipoleSites
-from anser_ros.calibration.factors import as_complex
-from anser_ros.calibration.positions import PositionFitter, position_slopes
-from anser_ros.calibration.readings import usable_weights
+from anser_ros.calibration.least_squares import as_complex
+from anser_ros.calibration.placement import PositionFitter, position_slopes
+from anser_ros.calibration.readings import DipoleSites, usable_weights
 from anser_ros.physics.dipole import flux_basis
 
 SEED = 8

@@ -1,12 +1,12 @@
 """How far a command is, where there is no terminal: few lines, with a share and a time."""
 
-from anser_ros.cli import progress
-from anser_ros.cli.progress import LINE_INTERVAL_S, progress_of
+from anser_ros.cli import output
+from anser_ros.cli.output import LINE_INTERVAL_S, progress_of
 
 
 def test_lines_come_now_and_then_with_the_share_and_the_time_that_is_left(monkeypatch, capsys):
     now_s = [100.0]
-    monkeypatch.setattr(progress.time, 'monotonic', lambda: now_s[0])
+    monkeypatch.setattr(output.time, 'monotonic', lambda: now_s[0])
     with progress_of('calibrating') as tell:
         for step in range(1, 11):
             now_s[0] += 0.4 * LINE_INTERVAL_S
@@ -21,7 +21,7 @@ def test_lines_come_now_and_then_with_the_share_and_the_time_that_is_left(monkey
 def test_no_time_is_told_that_loading_and_compiling_would_make(monkeypatch, capsys):
     """The first frame of a session takes as long as the kernels need to be there."""
     now_s = [100.0]
-    monkeypatch.setattr(progress.time, 'monotonic', lambda: now_s[0])
+    monkeypatch.setattr(output.time, 'monotonic', lambda: now_s[0])
     with progress_of('evaluating') as tell:
         now_s[0] += 25.0
         for frame in range(1, 201):
@@ -43,7 +43,7 @@ def test_a_short_command_says_nothing(capsys):
 
 def test_stages_are_lines_of_their_own_once_it_takes_long(monkeypatch, capsys):
     now_s = [100.0]
-    monkeypatch.setattr(progress.time, 'monotonic', lambda: now_s[0])
+    monkeypatch.setattr(output.time, 'monotonic', lambda: now_s[0])
     with progress_of('diagnosing') as say:
         say('a first look')
         now_s[0] += 12.0

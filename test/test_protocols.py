@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from test_port import HELLO, TONES, Wire, receive, wait
 
-from anser_ros.nodes.acquisition_parts.acquisition_parameters import AcquisitionParameters
-from anser_ros.wire.frames import TYPE_OF
-from anser_ros.wire.port import ControlUnitPort, PortState
-from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol
-from anser_ros.wire.records import (
+from anser_ros.nodes.acquisition import AcquisitionParameters
+from anser_ros.wire.frames import (
+    TYPE_OF,
     Identify,
     Record,
     Reply,
@@ -20,7 +18,8 @@ from anser_ros.wire.records import (
     SetFrequencies,
     Start,
 )
-from anser_ros.wire.stream_control import StreamControl
+from anser_ros.wire.port import ControlUnitPort, PortState
+from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol, StreamControl
 
 VERBS = {Identify: 'who', Start: 'go'}
 """The commands that the toy unit has; its tones are fixed."""

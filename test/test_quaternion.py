@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from anser_ros.wire.quaternion import unit_quaternions
+from anser_ros.wire.recorded import unit_quaternions
 
 
 def test_rounded_ones_are_brought_to_unit_length():

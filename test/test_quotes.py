@@ -7,7 +7,7 @@ import pytest
 import yaml
 from conftest import REPO
 
-from anser_ros.experiments.report import write_report
+from anser_ros.apps.lab.experiments.report import write_report
 
 RESULTS = REPO / 'docs' / 'results'
 QUOTES = yaml.safe_load((RESULTS / 'quotes.yaml').read_text())

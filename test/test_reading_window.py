@@ -6,7 +6,7 @@ from tracking_world import triaxial_tool
 
 from anser_ros.errors import FitError
 from anser_ros.frames.intake import Intake
-from anser_ros.refit.baseline import ReadingWindow
+from anser_ros.refit.frame import ReadingWindow
 
 TOOL = triaxial_tool()
 CHANNELS = TOOL.channel

@@ -16,10 +16,9 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import BagError
-from anser_ros.nodes.bag_parts.definitions import definition, message_class, type_hash
-from anser_ros.nodes.bag_parts.recording_log import TopicLog, report
+from anser_ros.nodes.recording import TopicLog, definition, message_class, report, type_hash
 from anser_ros.wire.bag import Salvage, iter_messages
-from anser_ros.wire.bag_metadata import BagRecord
+from anser_ros.wire.bag_writer import BagRecord
 from anser_ros.wire.cdr import DEFINITIONS
 
 pytestmark = pytest.mark.light

@@ -10,7 +10,7 @@ from refit_world import NOISE_T, anser_world, metal_block, three_coil_world, vol
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.frames.intake import Intake
 from anser_ros.integrity.clean_references import check_steady
-from anser_ros.refit.baseline import ReadingWindow
+from anser_ros.refit.frame import ReadingWindow
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.settings import RefitSettings
 

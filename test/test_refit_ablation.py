@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from refit_world import NOISE_T, anser_world, metal_block, volume_points
 
-from anser_ros.experiments.refit_ablation import FREE, FROZEN, SHARED, ablate, plot, spread_out
+from anser_ros.apps.lab.experiments.refit_ablation import (
+    FREE,
+    FROZEN,
+    SHARED,
+    ablate,
+    plot,
+    spread_out,
+)
+from anser_ros.apps.lab.free_dipoles import FreeDipoles
 from anser_ros.field.nominal import nominal_model
-from anser_ros.refit.free import FreeDipoles
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import board_of
 

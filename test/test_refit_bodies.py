@@ -8,9 +8,9 @@ from refit_world import anser_world, metal_block, metal_flux, volume_points
 from scipy.stats import multivariate_normal
 
 from anser_ros.physics.dipole import flux_basis
-from anser_ros.refit import slots as slots_module
+from anser_ros.refit import hypotheses as slots_module
 from anser_ros.refit.clouds import BODY_RADIUS, Region, bodies
-from anser_ros.refit.search import REMAINDER, BodySearch, body_factor
+from anser_ros.refit.tables import REMAINDER, BodySearch, body_factor
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 

@@ -10,9 +10,9 @@ from chain import beginning, replay_through_nodes
 from conftest import made_once
 
 from anser_ros.pose_states import OK
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.tracked_session import track_session
 from anser_ros.wire.setup import topic_of
 
 pytestmark = pytest.mark.usefixtures('shared_tables')

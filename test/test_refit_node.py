@@ -14,14 +14,13 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker
 
 from anser_ros.errors import FitError, FrameError, ModelFileError
-from anser_ros.nodes.field_model_parts.metal_view import centroid_message, metal_markers
-from anser_ros.nodes.field_model_parts.pose_messages import pose_in
+from anser_ros.nodes.field_model_io import centroid_message, metal_markers, pose_in
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level
-from anser_ros.nodes.tracker_parts.model_intake import ModelIntake
+from anser_ros.nodes.tracker_models import ModelIntake
 from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, code_of
-from anser_ros.refit.result import Metal
-from anser_ros.sessions.model_file import load_model
+from anser_ros.refit.model import Metal
+from anser_ros.sessions.starting_model import load_model
 from anser_ros.stamps import stamp_of
 
 pytestmark = pytest.mark.usefixtures('shared_tables')

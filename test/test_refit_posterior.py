@@ -8,16 +8,26 @@ from refit_world import anser_world
 from scipy.stats import multivariate_normal
 
 from anser_ros.refit import health
-from anser_ros.refit.agreement import distance_of, evidence_without, left_out
-from anser_ros.refit.change import Average, NoiseLevel, Pace
-from anser_ros.refit.clouds import Region, below, default_clouds, overhead
-from anser_ros.refit.evidence import STRENGTHS
-from anser_ros.refit.excitation import excitation_for, region_of
+from anser_ros.refit.clouds import (
+    Region,
+    below,
+    default_clouds,
+    excitation_for,
+    overhead,
+    region_of,
+)
+from anser_ros.refit.frame import Average, NoiseLevel, Pace
+from anser_ros.refit.health import distance_of, evidence_without, left_out
 from anser_ros.refit.layer import bottom_layer, box_layer
-from anser_ros.refit.modes import error_level, error_modes
-from anser_ros.refit.posterior import Bank
-from anser_ros.refit.prior import ORIENTED, UPRIGHT, Response, build_prior
-from anser_ros.refit.references import survey_variants, vector_basis
+from anser_ros.refit.posterior import STRENGTHS, Bank, error_level, error_modes
+from anser_ros.refit.prior import (
+    ORIENTED,
+    UPRIGHT,
+    Response,
+    build_prior,
+    survey_variants,
+    vector_basis,
+)
 from anser_ros.settings import Accuracy
 
 pytestmark = pytest.mark.usefixtures('shared_tables')

@@ -14,12 +14,12 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import FitError
-from anser_ros.nodes.field_model_parts import refit_start
-from anser_ros.nodes.field_model_parts.refit_start import RefitStart
+from anser_ros.nodes import field_model_refit
+from anser_ros.nodes.field_model_refit import RefitStart
 from anser_ros.nodes.runtime.diagnostics import Level
 from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
-from anser_ros.sessions.model_file import save_model
+from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.setup import parse_setup
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
@@ -30,7 +30,7 @@ class Held:
 
     def __init__(self, monkeypatch):
         self.let, self.share = threading.Event(), 0.4
-        build, refit = tables.build_tables, refit_start.LiveRefit
+        build, refit = tables.build_tables, field_model_refit.LiveRefit
 
         def held(*given, report, **named):
             report(self.share)
@@ -42,7 +42,7 @@ class Held:
             return refit(*given, **named)
 
         monkeypatch.setattr(tables, 'build_tables', held)
-        monkeypatch.setattr(refit_start, 'LiveRefit', held_refit)
+        monkeypatch.setattr(field_model_refit, 'LiveRefit', held_refit)
 
 
 @pytest.fixture

@@ -50,7 +50,10 @@ def test_a_wheel_of_the_sdist_runs(tmp_path):
     for folder in ('config', 'launch', 'bags'):
         files = {path.name for path in (REPO / folder).iterdir() if path.is_file()}
         assert {f'{share}/{folder}/{file}' for file in files} <= set(listed)
-    page = {f'anser_ros/web/{path.name}' for path in (REPO / 'anser_ros/web').glob('*.[jc]s*')}
+    page = {
+        f'anser_ros/apps/dashboard/{path.name}'
+        for path in (REPO / 'anser_ros/apps/dashboard').glob('*.[jc]s*')
+    }
     assert page and page <= set(listed)
     (entry,) = (path for path in listed if path.endswith('entry_points.txt'))
     scripts = re.findall(r'^(\w+) = ', (target / entry).read_text(), re.MULTILINE)

@@ -22,10 +22,9 @@ from anser_ros.nodes import replay
 from anser_ros.nodes.replay import name_played
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage, iter_messages
-from anser_ros.wire.bag_writer import BagWriter
-from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.bag_writer import BagWriter, SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
-from anser_ros.wire.session_writer import SessionWriter
+from anser_ros.wire.text_files import read_config
 
 START_NS = 1_750_000_000 * 10**9
 PERIOD_NS = 20_000_000

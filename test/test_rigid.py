@@ -5,6 +5,7 @@ import pytest
 from tracking_world import NOISE_T, certain_model, fluxes, random_pose, triaxial_tool
 
 from anser_ros.errors import TrackingError
+from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.rigid import (
     BodyCoils,
@@ -13,10 +14,8 @@ from anser_ros.tracking.rigid import (
     start_from_coils,
     start_from_grid,
 )
-from anser_ros.tracking.rotations import rotation_between, rotation_of_vector
 from anser_ros.tracking.seed import build_grid
-from anser_ros.tracking.solve import RealField
-from anser_ros.tracking.uncertainty import bounded_inverse
+from anser_ros.tracking.solve import RealField, bounded_inverse
 
 SEED = 41
 MODEL = certain_model()

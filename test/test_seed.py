@@ -9,8 +9,7 @@ from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import build_board
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.seed import build_grid, grid_points, scan, solve_cold
-from anser_ros.tracking.solve import RealField, whitening_of
-from anser_ros.tracking.uncertainty import chi2_limit
+from anser_ros.tracking.solve import RealField, chi2_limit, whitening_of
 
 SEED = 31
 MODEL = certain_model()

@@ -8,16 +8,25 @@ import pytest
 from calibration_world import NOISE_T, scene
 
 from anser_ros.calibration import selection
-from anser_ros.calibration.blocks import FOLDS, fold_of_frames
 from anser_ros.calibration.calibrate import Options, best_damped, correct_scan, fit_scan
 from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
 from anser_ros.calibration.held_out import rms
-from anser_ros.calibration.layout_fit import LayoutFitter, LayoutPlacer
-from anser_ros.calibration.layout_score import DAMPINGS, LayoutCandidate, LayoutScorer
+from anser_ros.calibration.layout_fit import (
+    LayoutFitter,
+    LayoutPlacer,
+    Regions,
+    ScaledNominal,
+    emitter_gains,
+)
 from anser_ros.calibration.layouts import Generator, Layout, place
-from anser_ros.calibration.local import Regions
-from anser_ros.calibration.prior import ScaledNominal, emitter_gains
-from anser_ros.calibration.selection import choose_layout, thin_frames
+from anser_ros.calibration.readings import FOLDS, fold_of_frames
+from anser_ros.calibration.selection import (
+    DAMPINGS,
+    LayoutCandidate,
+    LayoutScorer,
+    choose_layout,
+    thin_frames,
+)
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy

@@ -2,7 +2,7 @@
 
 import pytest
 
-from anser_ros.integrity.senders import SILENT_S, Senders
+from anser_ros.integrity.streams import SILENT_S, Senders
 
 PERIOD_S = 0.02
 

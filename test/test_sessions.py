@@ -13,8 +13,7 @@ from anser_ros.diagnosis.diagnose import conclude, confirm, screen, search_scree
 from anser_ros.diagnosis.prepare import test_blocks as held_out_blocks
 from anser_ros.diagnosis.search import SearchSettings
 from anser_ros.errors import BagError, DiagnosisError, ModelFileError
-from anser_ros.field.model import EffectRecord
-from anser_ros.field.plain_data import plain
+from anser_ros.field.model import EffectRecord, plain
 from anser_ros.sessions.baseline import baseline_of
 from anser_ros.sessions.diagnosis import (
     SessionDiagnosis,
@@ -23,18 +22,15 @@ from anser_ros.sessions.diagnosis import (
     spread_of,
     track_held_out,
 )
-from anser_ros.sessions.diagnosis_document import to_document as diagnosis_document
-from anser_ros.sessions.drawing import NominalBoard
-from anser_ros.sessions.evaluation import compare
-from anser_ros.sessions.evaluation_document import to_document as evaluation_document
+from anser_ros.sessions.diagnosis import to_document as diagnosis_document
+from anser_ros.sessions.evaluation_files import POSE_COLUMNS, write_tables
+from anser_ros.sessions.evaluation_files import to_document as evaluation_document
 from anser_ros.sessions.follower import ModelFollower
-from anser_ros.sessions.frames import frames_of
-from anser_ros.sessions.model_file import load_model, save_model
-from anser_ros.sessions.pose_table import POSE_COLUMNS, write_tables
+from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.prepared import correct, prepare
-from anser_ros.sessions.recorded_drift import FOUND_ON, date_drifts
-from anser_ros.sessions.session import empty_session, load_session
-from anser_ros.sessions.tracked_session import track
+from anser_ros.sessions.session import empty_session, frames_of, load_session
+from anser_ros.sessions.starting_model import FOUND_ON, date_drifts, load_model, save_model
+from anser_ros.sessions.tracked_session import compare, track
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 

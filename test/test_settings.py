@@ -14,13 +14,12 @@ from test_setup import document
 from anser_ros.calibration.pose_correction import pose_precision
 from anser_ros.cli import calibrate, diagnose, evaluate
 from anser_ros.errors import ParameterError, SetupError
-from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelParameters
-from anser_ros.nodes.runtime.stated_parameters import stated_by
-from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters
+from anser_ros.nodes.field_model import FieldModelParameters
+from anser_ros.nodes.runtime.parameters import stated_by
+from anser_ros.nodes.tracker import TrackerParameters
 from anser_ros.nodes.watcher import WatcherParameters
 from anser_ros.refit.prior import UPRIGHT, build_prior
 from anser_ros.sessions.diagnosis import spread_of
-from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import (
     load_session,
@@ -29,6 +28,7 @@ from anser_ros.sessions.session import (
     tracking_noise,
 )
 from anser_ros.sessions.starting_model import model_for
+from anser_ros.sessions.tracked_session import track_session
 from anser_ros.settings import (
     SECTIONS,
     VALUES,

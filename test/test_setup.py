@@ -9,10 +9,8 @@ import yaml
 
 from anser_ros.errors import SetupError
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.refit.clouds import default_clouds
-from anser_ros.refit.excitation import region_of
-from anser_ros.sessions.drawing import NominalBoard
-from anser_ros.sessions.volume import stated_volume, tracked_volume
+from anser_ros.refit.clouds import default_clouds, region_of
+from anser_ros.sessions.nominal_board import NominalBoard, stated_volume, tracked_volume
 from anser_ros.wire.setup import dump_setup, parse_setup, topic_of
 
 DEMO = Path(__file__).resolve().parents[1] / 'config' / 'demo_setup.yaml'

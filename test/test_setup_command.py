@@ -10,9 +10,9 @@ from conftest import REPO
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from anser_ros.cli.labels import Label, name_points
+from anser_ros.cli.board_figures import Label, name_points
 from anser_ros.cli.main import main
-from anser_ros.cli.setup_parts import GEOMETRY, coil_of, document_of, emitter_of, text_of
+from anser_ros.cli.setup import GEOMETRY, coil_of, document_of, emitter_of, text_of
 from anser_ros.physics.board import KINDS
 from anser_ros.sessions.starting_model import board_of
 from anser_ros.wire.setup import parse_setup

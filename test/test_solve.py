@@ -5,19 +5,20 @@ import pytest
 from tracking_world import NOISE_T, certain_model
 
 from anser_ros.errors import TrackingError
-from anser_ros.physics.angles import nearest_rotation
+from anser_ros.physics import rotations
 from anser_ros.physics.dipole import flux_jacobian
-from anser_ros.physics.tangent import fill_tangent
+from anser_ros.physics.rotations import fill_tangent, nearest_rotation
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.tracking import rotations
 from anser_ros.tracking.descent import fill_coil_basis
-from anser_ros.tracking.projection import descend_projected
-from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
-from anser_ros.tracking.uncertainty import (
+from anser_ros.tracking.seed import descend_projected
+from anser_ros.tracking.solve import (
     UNKNOWN_VARIANCE,
+    RealField,
     bounded_inverse,
     chi2_limit,
     coil_covariance,
+    solve_coil,
+    whitening_of,
 )
 
 SEED = 21

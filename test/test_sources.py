@@ -9,35 +9,33 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration import sensor_survey
-from anser_ros.calibration.coaxial import coaxial, fit_coaxial
-from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
-from anser_ros.calibration.layouts import Generator, Layout, place
+from anser_ros.apps.lab.source_track import Sources, seen_from
+from anser_ros.calibration import sensor_fit
+from anser_ros.calibration.layouts import Generator, Layout, coaxial, fit_coaxial, place
+from anser_ros.calibration.readings import DipoleSites, basis_rows
 from anser_ros.calibration.requirements import check_kept, check_measurements
+from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.calibration.sensor_survey import SensorFitter
-from anser_ros.calibration.survey_records import corrections, reported_effects
-from anser_ros.diagnosis import decisions, outlying
-from anser_ros.effects.apparatus import Apparatus
+from anser_ros.calibration.sensor_records import corrections, reported_effects
+from anser_ros.diagnosis import decisions, screening
 from anser_ros.effects.correction import Correction
 from anser_ros.effects.registry import effect_named
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.errors import FitError, ModelFileError
+from anser_ros.field.dipoles import symmetry_axis
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
-from anser_ros.field.symmetry import symmetry_axis
 from anser_ros.fingerprint import Identity
+from anser_ros.physics.board import loop_field
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable, clusters_of
-from anser_ros.physics.tracks import loop_field
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OK
 from anser_ros.sessions.starting_model import with_new_survey
 from anser_ros.settings import Accuracy
-from anser_ros.tracking.source_track import Sources, seen_from
 from anser_ros.tracking.tracker import Tracker, TrackerSettings
-from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import read_config
 
 EFFECT = effect_named('sensor_gain_spread')
 NONE = EffectRecord(EFFECT.name, {'channels': [999], 'values': [[1.0, 0.0]]})
@@ -156,8 +154,8 @@ def test_poses_that_are_seconds_apart_say_nothing_of_movement(rate_hz, monkeypat
     def suspicious(time, *others):
         return (time > time[20]) & (time < time[30])
 
-    monkeypatch.setattr(sensor_survey, 'unsteady_tool', suspicious)
-    monkeypatch.setattr(sensor_survey, 'SMALL_STEP', -1.0)  # all steps are taken
+    monkeypatch.setattr(sensor_fit, 'unsteady_tool', suspicious)
+    monkeypatch.setattr(sensor_fit, 'SMALL_STEP', -1.0)  # all steps are taken
     rng = np.random.default_rng(7)
     measured = recorded(array_of_sensors(rng), rng, 60)
     time = np.arange(60) / rate_hz
@@ -367,10 +365,10 @@ class TestGainsInADiagnosis:
     def test_a_reading_of_few_values_is_no_outlier_for_its_noise(self):
         white = np.zeros((3000, 2 * 6))
         white[:, :6] = np.random.default_rng(1).normal(size=(3000, 6))
-        readings = outlying._by_reading(white**2, 6, 1)
-        ratio = outlying._ratio(decisions.READING_RATIO, outlying._values(white**2, 6, 1))
-        assert not outlying._stands_out(readings, ratio).any()
-        assert outlying._ratio(decisions.READING_RATIO, 16) == decisions.READING_RATIO
+        readings = screening._by_reading(white**2, 6, 1)
+        ratio = screening._ratio(decisions.READING_RATIO, screening._values(white**2, 6, 1))
+        assert not screening._stands_out(readings, ratio).any()
+        assert screening._ratio(decisions.READING_RATIO, 16) == decisions.READING_RATIO
 
 
 class TestNewSurvey:

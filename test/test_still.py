@@ -10,19 +10,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration.dipole_sites import DipoleSites
-from anser_ros.calibration.document import to_document
+from anser_ros.apps.lab.still import PLACEMENT, calibrate_still, is_still
+from anser_ros.apps.lab.still_fit import StillFitter
+from anser_ros.apps.lab.still_model import POSE, SmoothBend, StillModel, StillUnknowns
 from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layouts import Generator
-from anser_ros.calibration.smooth_bend import SmoothBend
-from anser_ros.calibration.still import PLACEMENT, calibrate_still, is_still
-from anser_ros.calibration.still_fit import StillFitter
-from anser_ros.calibration.still_model import POSE, StillModel, StillUnknowns
+from anser_ros.calibration.readings import DipoleSites
+from anser_ros.calibration.result import to_document
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import dipole_field
+from anser_ros.physics.rotations import tilted
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.physics.tangent import tilted
 from anser_ros.settings import Accuracy
 
 CENTRES = np.array([[-0.08, 0.02, 0.0], [0.09, -0.01, 0.0], [0.0, 0.1, 0.0]])

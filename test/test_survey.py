@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
 from anser_ros.calibration.population import Likelihood, Population, solve
+from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters
-from anser_ros.calibration.sensor_survey import SensorFitter
-from anser_ros.calibration.survey_records import (
+from anser_ros.calibration.sensor_records import (
     contradiction_words,
     corrections,
     reported_effects,
@@ -21,7 +21,7 @@ from anser_ros.effects.correction import Correction
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
-from anser_ros.physics.tangent import tangents, tilted
+from anser_ros.physics.rotations import tangents, tilted
 from anser_ros.settings import Accuracy
 
 pytestmark = pytest.mark.long

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anser_ros.signals.ticks import TickCheck
+from anser_ros.signals.window import TickCheck
 
 
 def run(ticks_of, blocks=1000, check=None):

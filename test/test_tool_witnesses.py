@@ -5,12 +5,12 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 from tracked_tool import CHANNELS, MODEL, TOOL
 
-from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
+from anser_ros.nodes.field_model_io import ToolWitnesses
 from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode
-from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import read_config
 
 
 class Refit:

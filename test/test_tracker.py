@@ -11,7 +11,7 @@ from tracking_world import NOISE_T, anser_board, fluxes, random_pose, triaxial_t
 
 from anser_ros import pose_states as states
 from anser_ros.field.nominal import nominal_model
-from anser_ros.metal.sphere import sphere_polarisability
+from anser_ros.metal.body import sphere_polarisability
 from anser_ros.physics.board import build_board
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume

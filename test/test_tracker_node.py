@@ -19,17 +19,16 @@ from tracking_world import certain_model, fluxes, random_pose, setup_of
 
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import EffectRecord
+from anser_ros.nodes import pose_output
 from anser_ros.nodes.field_model import FieldModelNode
-from anser_ros.nodes.tracker import TrackerNode
-from anser_ros.nodes.tracker_parts import pose_output
-from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters, settings_of
+from anser_ros.nodes.tracker import TrackerNode, TrackerParameters, settings_of
+from anser_ros.physics.rotations import rotation_of_quaternion
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.sessions.model_file import save_model
+from anser_ros.sessions.prepared import settings_for
 from anser_ros.sessions.session import load_session
-from anser_ros.sessions.tracker_settings import settings_for
-from anser_ros.tracking.rotations import rotation_of_quaternion
+from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.setup import dump_setup
-from anser_ros.wire.setup_tips import TipSpec
+from anser_ros.wire.setup_values import TipSpec
 
 tracker = pytest.fixture(tracker_bench)
 

@@ -12,7 +12,7 @@ from sensor_msgs.msg import PointCloud2
 from tracking_world import certain_model, fluxes, random_pose
 
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.streams.backlog import Backlog
+from anser_ros.nodes.streams.one_source import Backlog
 from anser_ros.tracking.tracker import Tracker
 
 tracker = pytest.fixture(tracker_bench)

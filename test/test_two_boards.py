@@ -8,13 +8,13 @@ import pytest
 from rclpy.parameter import Parameter
 
 from anser_ros.nodes.monitor import Monitor
+from anser_ros.nodes.pose_output import PoseTopic
 from anser_ros.nodes.recorder import Recorder
 from anser_ros.nodes.replay import Replay
-from anser_ros.nodes.tracker_parts.pose_output import PoseTopic
 from anser_ros.wire.bag import read_bag
+from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
-from anser_ros.wire.pose_topics import optical_topic
-from anser_ros.wire.session_writer import SessionWriter
+from anser_ros.wire.recorded import optical_topic
 
 BAG = Path(__file__).resolve().parents[1] / 'bags' / 'moving.mcap'
 SHARED = {'/diagnostics', '/rosout', '/parameter_events'}

@@ -1,6 +1,6 @@
 """The system's clock beside the monotonic one, with clocks of the test's own."""
 
-from anser_ros.nodes.acquisition_parts.wall_clock import WallClock
+from anser_ros.nodes.acquisition_stream import WallClock
 
 
 class Clocks:

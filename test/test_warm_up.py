@@ -11,7 +11,7 @@ HERE = Path(__file__).parent
 FIRST_FRAMES = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from anser_ros.tracking.warm_up import warm_up
+from anser_ros.tracking.tracker import warm_up
 
 def compiled():
     rooms = [m for name, m in sys.modules.items() if name.startswith('anser_ros.tracking.')]

@@ -15,15 +15,14 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.nodes.watcher import Watcher
 from anser_ros.sessions import watch as watching
-from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.session import empty_session, load_session
-from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
+from anser_ros.sessions.session import LIVE, SlidingWindow, empty_session, load_session
+from anser_ros.sessions.starting_model import load_model
 from anser_ros.sessions.watch import OPTICAL, RIGID, Watch
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag import read_bag
+from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints
-from anser_ros.wire.session_writer import SessionWriter
 
 MODEL = REPO / 'config' / 'demo_model.yaml'
 MOVING, FACTORY = (REPO / 'bags' / f'{name}.mcap' for name in ('moving', 'factory'))

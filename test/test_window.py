@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from anser_ros.errors import ParameterError
 from anser_ros.signals.repetition import RepetitionWatch
-from anser_ros.signals.ticks import TickCheck
-from anser_ros.signals.window import WindowCutter
+from anser_ros.signals.window import TickCheck, WindowCutter
 
 
 def cutter_of(window, hop, columns):

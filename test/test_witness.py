@@ -12,12 +12,19 @@ from anser_ros.errors import BagError
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.tables import RefitTables
-from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised
-from anser_ros.refit.witness import CONTRADICTION_S, _Errors, _Filter, _kalman
-from anser_ros.sessions.chosen_references import with_references
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.model_file import load_model
+from anser_ros.refit.witness import (
+    CONTRADICTION_S,
+    CoilErrors,
+    ToolReading,
+    _Errors,
+    _Filter,
+    _kalman,
+    linearised,
+)
+from anser_ros.sessions.follower import with_references
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.tracked_session import track_session
 from anser_ros.settings import RefitSettings, ToolSettings
 
 REPO = Path(__file__).resolve().parents[1]

@@ -4,10 +4,10 @@ import pytest
 import yaml
 
 from anser_ros.errors import ModelFileError, SetupError
-from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.starting_model import load_model
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.setup import parse_setup
-from anser_ros.wire.yaml_text import DEEPEST, MOST_CHARACTERS, read_yaml
+from anser_ros.wire.text_files import DEEPEST, MOST_CHARACTERS, read_yaml
 
 
 def bomb(levels=40):

@@ -3,7 +3,7 @@
 import numpy as np
 from tracking_world import certain_model, random_pose, triaxial_tool
 
-from anser_ros.tracking.rotations import rotation_of_vector
+from anser_ros.physics.rotations import rotation_of_vector
 
 MODEL = certain_model()
 TOOL = triaxial_tool()

@@ -6,8 +6,8 @@ from typing import Any
 
 from anser_ros.api.model import Model
 from anser_ros.calibration.calibrate import Options
-from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
+from anser_ros.calibration.result import to_document
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.errors import FitError
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board

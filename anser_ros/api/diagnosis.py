@@ -5,10 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from anser_ros.api.model import Model
-from anser_ros.sessions import few_poses
-from anser_ros.sessions.calibration import is_estimated_jointly
-from anser_ros.sessions.diagnosis import diagnose_session
-from anser_ros.sessions.diagnosis_document import to_document
+from anser_ros.sessions.diagnosis import diagnose_session, other_way, to_document
 from anser_ros.sessions.session import Session
 
 
@@ -74,9 +71,9 @@ def diagnose(
     >>> found.effects
     ()
     """
-    if is_estimated_jointly(session):
-        few = few_poses.diagnose_few_poses(session, model.field, progress)
-        corrected, figures = few.model, few_poses.to_document(few)
+    if way := other_way(session):
+        other = way.diagnose(session, model.field, progress)
+        corrected, figures = other.model, way.to_document(other)
     else:
         found = diagnose_session(session, model.field, baseline, progress)
         corrected, figures = found.diagnosis.model, to_document(found)

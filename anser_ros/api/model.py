@@ -11,8 +11,8 @@ from anser_ros.api.setup import SetupSource, load_setup
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
-from anser_ros.sessions.drawing import board_of
-from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.nominal_board import board_of
+from anser_ros.sessions.starting_model import load_model, save_model
 
 
 @dataclass(frozen=True)

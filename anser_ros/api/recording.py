@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from anser_ros.api.setup import SetupSource, load_setup
 from anser_ros.errors import ParameterError
 from anser_ros.stamps import NANO
-from anser_ros.wire.pose_topics import optical_topic
-from anser_ros.wire.quaternion import unit_quaternions
-from anser_ros.wire.session_writer import SessionWriter
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.recorded import optical_topic, unit_quaternions
 from anser_ros.wire.setup import Setup, dump_setup
 
 Array = NDArray[np.float64]

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from anser_ros.api.model import Model
 from anser_ros.pose_states import OK
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.evaluation_document import to_document
-from anser_ros.sessions.pose_errors import PoseSeries
+from anser_ros.sessions.evaluation_files import to_document
 from anser_ros.sessions.session import Session
+from anser_ros.sessions.tracked_session import PoseSeries, track_session
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import TrackerSettings
 

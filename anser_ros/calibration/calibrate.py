@@ -11,29 +11,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.blocks import fold_of_frames
-from anser_ros.calibration.held_out import HeldOut, predict_held_out
+from anser_ros.calibration.held_out import HeldOut, gaps_of, predict_held_out
 from anser_ros.calibration.layout_fit import LayoutFit, LayoutFitter
-from anser_ros.calibration.layout_score import DAMPINGS, LayoutCandidate
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.moments import Progress
-from anser_ros.calibration.readings import with_pose
+from anser_ros.calibration.readings import fold_of_frames, with_pose
 from anser_ros.calibration.requirements import check_agreement, check_kept, check_measurements
 from anser_ros.calibration.result import Calibration, Scan, residuals, with_provenance
-from anser_ros.calibration.scan_gaps import gaps_of
 from anser_ros.calibration.selection import (
     COUNTS,
+    DAMPINGS,
     LOSS_FOR_A_THIRD,
+    LayoutCandidate,
     Selection,
     choose_layout,
     thin_frames,
 )
-from anser_ros.calibration.sensor_survey import SensorFitter
-from anser_ros.calibration.survey_records import (
-    contradiction_words,
-    corrections,
-    reported_effects,
-)
+from anser_ros.calibration.sensor_fit import SensorFitter
+from anser_ros.calibration.sensor_records import contradiction_words, corrections, reported_effects
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy

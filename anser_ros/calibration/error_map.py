@@ -1,33 +1,86 @@
-"""Learns a smooth map from tracked to true positions where the true positions are known.
-
-This is the usual calibration of trackers that give poses and no fluxes, and the article's last
-step of distortion compensation (Table V, "compensated and corrected"). The three components of the
-error are Gaussian processes of the tracked position with one squared-exponential covariance
-(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapter 2) on top of a
-constant or affine trend; their mean is the interpolant that `scipy.interpolate.RBFInterpolator`
-solves for. Trend, length and noise are chosen by the error in held-out blocks of space. Further
-blocks that took no part in that choice decide whether the map helps; if not, it is the identity.
-The error that is reported is that of a third set of blocks, which took part neither in the choice
-nor in that decision nor in the fit.
-
-Points of two frames are registered first. Every fit does this with its own points, so that no
-point takes part in the alignment that it tests. If such points lie in a plane, the error across it
-is reported separately and not corrected: a map that flattens the points brings them nearer to the
-plane, but is meaningless above it.
-"""
+"""(keep that of error_map.py)"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RBFInterpolator
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration.blocks import fold_of_frames
-from anser_ros.calibration.position_map import IDENTITY, PositionMap, Shape
+from anser_ros.calibration.readings import fold_of_frames
 from anser_ros.errors import FitError
 
 Array = NDArray[np.float64]
+
+FLAT = 1e-6
+"""A direction in which the points extend less than this part of the largest extent carries no
+trend and no distance: what differs there is the rounding of the numbers."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Describes a choice of map."""
+
+    trend: int  # polynomial degree of the trend; -1 for no map
+    length_m: float  # covariance length, m; 0 for a trend alone
+    noise: float  # noise as a part of the errors' standard deviation about the trend
+
+    def describe(self) -> str:
+        """Return the shape in words for a report."""
+        if self.trend < 0:
+            return 'no correction'
+        trend = 'shift' if self.trend == 0 else 'affine'
+        if self.length_m == 0.0:
+            return trend
+        return f'{trend}, smooth over {1e3 * self.length_m:.0f} mm'
+
+
+IDENTITY = Shape(-1, 0.0, 0.0)
+"""The shape of a map that corrects nothing."""
+
+
+class PositionMap:
+    """Holds what a map of one shape, fitted to some points, adds to tracked positions.
+
+    ``places`` (M, 3): tracked positions, m. ``errors`` (M, 3): true less tracked positions, m.
+    """
+
+    def __init__(self, places: Array, errors: Array, shape: Shape) -> None:
+        self.shape = shape
+        self._middle = places.mean(axis=0)
+        _, spread, axes = np.linalg.svd(places - self._middle, full_matrices=False)
+        self._axes = axes[spread > FLAT * spread[0]]
+        if shape.length_m > 0.0:
+            self._smooth = RBFInterpolator(
+                self._reduced(places),
+                errors,
+                kernel='gaussian',
+                epsilon=np.sqrt(0.5) / shape.length_m,
+                smoothing=shape.noise**2,
+                degree=shape.trend,
+            )
+        elif shape.trend >= 0:
+            columns = _trend_columns(self._reduced(places), shape.trend)
+            self._trend = np.linalg.lstsq(columns, errors, rcond=None)[0]
+
+    def __call__(self, tracked: Array) -> Array:
+        """Return what to add to tracked positions (P, 3), m."""
+        if self.shape.trend < 0:
+            return np.zeros_like(tracked)
+        where = self._reduced(tracked)
+        if self.shape.length_m > 0.0:
+            return np.asarray(self._smooth(where))
+        return np.asarray(_trend_columns(where, self.shape.trend) @ self._trend)
+
+    def _reduced(self, places: Array) -> Array:
+        return np.asarray((places - self._middle) @ self._axes.T)
+
+
+def _trend_columns(places: Array, degree: int) -> Array:
+    ones = np.ones((len(places), 1))
+    return ones if degree == 0 else np.concatenate([ones, places], axis=1)
+
 
 FEWEST_POINTS = 8
 """Points with both positions below which no map is learnt: an affine trend has four parameters a

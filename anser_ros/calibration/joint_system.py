@@ -19,11 +19,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows, flux_slopes
-from anser_ros.calibration.factors import as_complex, as_real
-from anser_ros.calibration.normal_factor import NormalFactor, subtract_gram
+from anser_ros.calibration.least_squares import NormalFactor, as_complex, as_real, subtract_gram
 from anser_ros.calibration.pose_correction import PoseTerms, pose_slopes
-from anser_ros.calibration.readings import frame_blocks
+from anser_ros.calibration.readings import DipoleSites, basis_rows, flux_slopes, frame_blocks
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
 from anser_ros.field.measurements import Measurements
 

@@ -1,4 +1,10 @@
-"""Fits a layout: its dipoles are placed, pulled towards the drawn board, moved if asked."""
+"""Fits a layout: its dipoles are placed, pulled towards the nominal field, moved if asked. The
+nominal model is first scaled by one complex gain per emitter and expressed by the layout's
+dipoles (`ScaledNominal`); the damping pulls towards these moments, so that moments which the
+data do not determine stay as drawn. Dipoles may then be moved (`LayoutPlacer`), and overlapping
+regions of the volume get moments of their own, blended into one finer layer, which is free of
+sources again (`join_regions`). `LayoutFitter` does what several fits have in common once.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,19 +14,149 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.coaxial import fit_coaxial
-from anser_ros.calibration.coil_places import CoilPlacer
-from anser_ros.calibration.dipole_sites import DipoleSites
-from anser_ros.calibration.factors import ComplexArray
-from anser_ros.calibration.layouts import Generator, Layout, place
-from anser_ros.calibration.local import join_regions
+from anser_ros.calibration.layouts import Generator, Layout, fit_coaxial, place
+from anser_ros.calibration.least_squares import ComplexArray, GramFactor, as_complex, as_real
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
-from anser_ros.calibration.positions import PositionFitter
-from anser_ros.calibration.prior import ScaledNominal
+from anser_ros.calibration.placement import CoilPlacer, PositionFitter
+from anser_ros.calibration.readings import DipoleSites, basis_rows, frame_blocks, usable_readings
 from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import along_each_axis
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
+
+POINTS_ALONG = 11
+"""Lattice points along x and y of the volume in which dipoles are to make the nominal field (every
+second one along z): some 2000 equations for at most a few hundred dipoles."""
+MARGIN = 0.3
+"""How far beyond the measured volume the nominal field is followed, as a fraction of its half
+size: a scan as wide as the board then covers the default tracked volume (`volume.REACH`)."""
+LEAST_HALF_SIZE_M = 0.02
+"""Half size of that volume at least, m, for measurements along a line or in a plane: over 2 cm a
+field 10 cm from its coils changes by half, which shows how it falls."""
+LEAST_HEIGHT = 0.8
+"""Lowest point of that volume as a fraction of the lowest reading's height: there the field is at
+most twice as strong, and farther down it changes too fast for a layer of dipoles."""
+PROJECTION_DAMPING = 1e-6
+"""Damping when a known field without noise is expressed by dipoles, as a fraction of the largest
+singular value. It only keeps nearly parallel columns from making huge moments."""
+
+
+class ScaledNominal:
+    """Holds the nominal field in and around a measured volume, scaled to the measurements."""
+
+    def __init__(self, nominal: FieldModel, measurements: Sequence[Measurements]) -> None:
+        self.nominal = nominal
+        self.points, self.axes = volume_lattice(measurements)
+        self.gains = emitter_gains(nominal, measurements)
+        self.flux = nominal.flux(self.points, self.axes) * self.gains
+
+    def moments(self, dipoles: DipoleSites) -> ComplexArray:
+        """Return the moments (N, K), A m^2, with which N dipoles make the drawn field best."""
+        basis = flux_basis(self.points, self.axes, None, dipoles.positions, dipoles.directions)
+        factor = GramFactor(len(dipoles), 2 * self.flux.shape[1])
+        factor.add(basis, as_real(self.flux))
+        return as_complex(factor.spectrum().solve(PROJECTION_DAMPING))
+
+
+def volume_lattice(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
+    """Return a lattice of sensors in and around the volume of the usable readings.
+
+    Returns ``points``, ``axes`` (P, 3): positions (m) and unit axes, frame fg; three sensors along
+    x, y and z at each point.
+    """
+    points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, half = (low + high) / 2.0, (high - low) / 2.0
+    half = np.maximum(half * (1.0 + MARGIN), LEAST_HALF_SIZE_M)
+    steps = np.linspace(-1.0, 1.0, POINTS_ALONG)
+    lattice = np.stack(np.meshgrid(steps, steps, steps[::2], indexing='ij'), axis=3)
+    where = middle + lattice.reshape(-1, 3) * half
+    where[:, 2] = np.maximum(where[:, 2], LEAST_HEIGHT * low[2])
+    return along_each_axis(where)
+
+
+def emitter_gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> ComplexArray:
+    """Return the complex factor of each emitter's drawn field that fits its fluxes best, (K,)."""
+    above, below = np.zeros(len(nominal.emitters), complex), np.zeros(len(nominal.emitters))
+    for points, axes, lengths, flux in usable_readings(measurements):
+        drawn = nominal.flux(points, axes, lengths)
+        above += (drawn.conj() * flux).sum(axis=0)
+        below += (np.abs(drawn) ** 2).sum(axis=0)
+    return np.asarray(above / np.maximum(below, 1e-300))
+
+
+OVERLAP = 0.5
+"""Width of the blend between two regions, as a fraction of the volume's extent. With less overlap
+the field changes more abruptly between regions; with more the regions differ less."""
+LONG_SIDE = 0.5
+"""A side shorter than this fraction of the longest one is not divided: its regions would be flat
+and would not determine the field's change across them."""
+
+
+class Regions:
+    """Divides the volume of points (P, 3), m, smoothly: all regions' weights add up to one."""
+
+    def __init__(self, points: Array) -> None:
+        low, high = points.min(axis=0), points.max(axis=0)
+        self.middle, self.extent = (low + high) / 2.0, np.maximum(high - low, 1e-9)
+        self.divided = np.flatnonzero(self.extent >= LONG_SIDE * self.extent.max())
+
+    def __len__(self) -> int:
+        return int(2**self.divided.size)
+
+    def shares(self, points: Array) -> Array:
+        """Return the weight of each region at each point, shape (P, R); a row adds up to one."""
+        out = np.ones((len(points), 1))
+        for axis in self.divided:
+            along = (points[:, axis] - self.middle[axis]) / (OVERLAP * self.extent[axis])
+            right = 0.5 + 0.5 * np.sin(np.pi * np.clip(along, -0.5, 0.5))
+            out = np.concatenate([out * (1.0 - right)[:, None], out * right[:, None]], axis=1)
+        return out
+
+
+def join_regions(
+    measurements: Sequence[Measurements],
+    dipoles: DipoleSites,
+    fit: MomentFit,
+    damping: float,
+    layer: DipoleSites,
+) -> NDArray[np.complex128]:
+    """Return the moments of a finer layer that make the blended field of the regions.
+
+    ``fit``: the common fit: its poses and weights are kept, and the damping pulls the regions'
+    moments towards its moments. ``layer``: the N' dipoles to express the blended field by.
+    Returns (N', K): moments, A m^2.
+    """
+    regions = Regions(
+        np.concatenate(
+            [m.placed()[0][w > 0.0] for m, w in zip(fit.measurements, fit.weights, strict=True)]
+        )
+    )
+    common = as_real(fit.moments)
+    factors = [GramFactor(len(dipoles), common.shape[1]) for _ in range(len(regions))]
+    for m, weights in zip(fit.measurements, fit.weights, strict=True):
+        for block in frame_blocks(*weights.shape):
+            part = m.frames(block)
+            matrix = basis_rows(part, dipoles)
+            right = as_real(part.flux).reshape(len(matrix), -1)
+            shares = regions.shares(part.placed()[0].reshape(-1, 3))
+            for factor, share in zip(factors, shares.T, strict=True):
+                root = np.sqrt(share * weights[block].ravel())[:, None]
+                factor.add(root * matrix, root * right)
+    moments = [factor.spectrum().solve(damping, common) for factor in factors]
+    points, axes = volume_lattice(measurements)
+    basis = flux_basis(points, axes, None, dipoles.positions, dipoles.directions)
+    shares = regions.shares(points)
+    blended = sum(share[:, None] * (basis @ m) for share, m in zip(shares.T, moments, strict=True))
+    whole = GramFactor(len(layer), common.shape[1])
+    whole.add(
+        flux_basis(points, axes, None, layer.positions, layer.directions), np.asarray(blended)
+    )
+    return as_complex(whole.spectrum().solve(PROJECTION_DAMPING))
+
 
 RICH = Layout('layer', 16, 1.8, 0.0)
 """The layer that corrects poses for sensors that stay well above the coils. It should represent

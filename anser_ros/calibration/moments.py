@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
-from anser_ros.calibration.factors import (
+from anser_ros.calibration.least_squares import (
     GramFactor,
     Spectrum,
     TriangularFactor,
@@ -33,7 +32,13 @@ from anser_ros.calibration.pose_correction import (
     pose_precision,
     pose_terms,
 )
-from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
+from anser_ros.calibration.readings import (
+    DipoleSites,
+    basis_rows,
+    frame_blocks,
+    usable_weights,
+    with_pose,
+)
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.settings import Accuracy

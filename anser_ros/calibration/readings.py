@@ -1,13 +1,20 @@
-"""Takes the usable readings of measurements in blocks of frames that fit into memory."""
+"""Turns measurements into rows: usable readings, the fluxes of dipoles in them, held-out
+blocks. Readings are taken in blocks of frames that fit into memory (`usable_readings`);
+`basis_rows` is the article's matrix of what each dipole does to them; whole frames in cells of
+space are dealt to the folds by which errors are held out (`fold_of_frames`).
+"""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
+from anser_ros.physics.dipole import flux_basis, flux_jacobian
+from anser_ros.physics.sensor import along_each_axis
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -69,3 +76,90 @@ def with_pose(measurements: Measurements) -> Measurements:
     kept = measurements.frames(np.asarray(measurements.usable.any(axis=1)))
     flux = np.where(kept.usable[:, :, None], kept.flux, 0.0)
     return replace(kept, flux=flux)
+
+
+@dataclass(frozen=True)
+class DipoleSites:
+    """Holds positions (m) and unit directions of N virtual dipoles, shape (N, 3), frame fg."""
+
+    positions: Array
+    directions: Array
+
+    def __len__(self) -> int:
+        return int(self.positions.shape[0])
+
+    @staticmethod
+    def of_any_direction(places: Array) -> 'DipoleSites':
+        """Return three dipoles, along x, y and z, at each of P places (P, 3), m."""
+        return DipoleSites(*along_each_axis(places))
+
+    def joined(self, other: 'DipoleSites') -> 'DipoleSites':
+        """Return these dipoles, then the others."""
+        return DipoleSites(
+            np.concatenate([self.positions, other.positions]),
+            np.concatenate([self.directions, other.directions]),
+        )
+
+
+def basis_rows(measurements: Measurements, dipoles: DipoleSites) -> Array:
+    """Return the article's matrix M for all readings, shape (F S, N), T / (A m^2)."""
+    return flux_basis(*_rows(measurements), dipoles.positions, dipoles.directions)
+
+
+def flux_slopes(
+    measurements: Measurements, dipoles: DipoleSites, moments: ComplexArray
+) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """Return modelled fluxes (F, S, K), T, and their derivatives (F, S, 3, K).
+
+    These are by the sensors' centres (T/m) and axes (T).
+    """
+    rows, sites = _rows(measurements), (dipoles.positions, dipoles.directions)
+    flux, by_place, by_axis = flux_jacobian(*rows, *sites, moments)
+    shape = (len(measurements.time), len(measurements.sensors), 3, moments.shape[1])
+    return flux.reshape(*shape[:2], -1), by_place.reshape(shape), by_axis.reshape(shape)
+
+
+def _rows(measurements: Measurements) -> tuple[Array, Array, Array]:
+    points, axes = measurements.placed()
+    lengths = np.tile(measurements.sensors.length, len(points))
+    return points.reshape(-1, 3), axes.reshape(-1, 3), lengths
+
+
+FOLDS = 5
+"""Number of folds. Each fit then uses four fifths of the readings; more folds cost a fit each."""
+CELLS_ALONG = 5
+"""Cells along the longest direction. They must be larger than the distance over which the errors
+of a fit are alike, or held-out errors are too small; with fewer cells each fold is one place."""
+SMALLEST_SHARE = 0.15
+"""A direction is not divided if its extent is a smaller fraction of the longest one's; the cells
+of a flat volume would otherwise hold frames of the same places."""
+
+
+def fold_of_frames(positions: Sequence[Array]) -> list[NDArray[np.int64]]:
+    """Return the fold of every frame.
+
+    Space is cut into equal cells, `CELLS_ALONG` along the longest direction. Cell (i, j, k) goes
+    to fold (i + 2 j + 3 k) mod `FOLDS`, so that a fold is spread over the volume and its cells
+    do not touch. All frames of a cell are held out together, never a single point.
+
+    ``positions`` (F, 3) are the bodies', m, one array per body and session.
+    Returns (F,): folds of the frames, one array per body and session.
+    Raises `FitError` when the frames fill fewer than two folds.
+    """
+    everywhere = np.concatenate(positions)
+    low, high = everywhere.min(axis=0), everywhere.max(axis=0)
+    extent = high - low
+    size = max(float(extent.max()) / CELLS_ALONG, 1e-9)
+    out = []
+    for where in positions:
+        cell = np.floor((where - low) / size).astype(np.int64)
+        cell = np.minimum(cell, CELLS_ALONG - 1)
+        cell[:, extent < SMALLEST_SHARE * extent.max()] = 0
+        out.append(np.asarray(cell @ np.array([1, 2, 3]) % FOLDS, dtype=np.int64))
+    used = np.unique(np.concatenate(out))
+    if used.size < 2:
+        raise FitError(
+            'held-out error needs frames in at least 2 separate cells of space, got 1: '
+            'all frames are at one place'
+        )
+    return out

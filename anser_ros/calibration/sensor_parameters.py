@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.rotations import tangents, tilted
 from anser_ros.physics.sensor import SensorTable, clusters_of
-from anser_ros.physics.tangent import tangents, tilted
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

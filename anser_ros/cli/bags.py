@@ -6,20 +6,20 @@ from pathlib import Path
 
 import numpy as np
 
-from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.stated_values import add_json
+from anser_ros.cli.output import Result, Tell, add_json, make_folder
 from anser_ros.settings import Accuracy
-from anser_ros.simulation.board_source import board_source
-from anser_ros.simulation.manufacture import manufactured
-from anser_ros.simulation.metal import steel_disc
-from anser_ros.simulation.motion import Approach, Lissajous
 from anser_ros.simulation.recording import STATIC_NOISE_T, GridScan, record
-from anser_ros.simulation.world import World
+from anser_ros.simulation.world import (
+    Approach,
+    Lissajous,
+    World,
+    board_source,
+    manufactured,
+    steel_disc,
+)
 from anser_ros.wire.bag import bag_file
-from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import read_config
 
 SCHEMA = 'anser_bags/1'
 RATE_HZ = 25.0

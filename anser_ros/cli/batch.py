@@ -13,13 +13,18 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from anser_ros.cli.commands import OFFLINE
-from anser_ros.cli.folders import make_folder
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, attempt
-from anser_ros.cli.output import Result
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.session_runs import SessionRun, perform, runs_of, summed_up
-from anser_ros.cli.stated_values import add_json, add_out
-from anser_ros.cli.summary import COMMANDS, Outcome, row_of, write_summary
+from anser_ros.cli.output import Result, Tell, add_json, add_out, make_folder
+from anser_ros.cli.sessions import (
+    COMMANDS,
+    Outcome,
+    SessionRun,
+    perform,
+    row_of,
+    runs_of,
+    summed_up,
+    write_summary,
+)
 from anser_ros.errors import ParameterError
 from anser_ros.parallel import ONE_THREAD, cores
 

@@ -9,22 +9,33 @@ from typing import Any
 from rich.table import Table
 
 from anser_ros.calibration.calibrate import Options
-from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
-from anser_ros.calibration.result import Calibration
+from anser_ros.calibration.result import Calibration, to_document
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.cli.calibration_figure import choice_figure
-from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, check_file, loss_notes, terminal_table, write_files
-from anser_ros.cli.populations import population_figure, population_table, populations
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.stated_values import add_json, add_stated_values, stated_values
+from anser_ros.cli.calibration_figures import (
+    choice_figure,
+    population_figure,
+    population_table,
+    populations,
+)
+from anser_ros.cli.output import (
+    Result,
+    Tell,
+    add_json,
+    add_stated_values,
+    check_file,
+    loss_notes,
+    make_folder,
+    stated_values,
+    terminal_table,
+    write_files,
+)
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.constants import DEGREES
-from anser_ros.sessions.calibration import NAMED_KINDS, calibrate_sessions, check_same_board
-from anser_ros.sessions.model_file import save_model
+from anser_ros.sessions.calibration import calibrate_sessions, check_same_board, named_kinds
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import save_model
 
 MOST_LISTED = 40
 """Entries of a list that are shown; of more, their number is."""
@@ -58,7 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         '--estimate', type=_kinds, default=KINDS, metavar='LIST',
         help='errors of sensors and clock to estimate together with the field, where the scan '
         f'supports them; "none" trusts the setup for all; by default {",".join(KINDS)}; '
-        f'{",".join(NAMED_KINDS)} only when named',
+        f'{",".join(named_kinds())} only when named',
     )  # fmt: skip
     parser.add_argument(
         '--damping', type=float, help='damping of the moments; chosen by held-out error by default'
@@ -77,7 +88,7 @@ def _kinds(text: str) -> tuple[str, ...]:
     if text == 'none':
         return ()
     kinds = tuple(part for part in text.split(',') if part)
-    known = (*KINDS, *NAMED_KINDS)
+    known = (*KINDS, *named_kinds())
     unknown = [kind for kind in kinds if kind not in known]
     if unknown or not kinds:
         raise argparse.ArgumentTypeError(f'must be among {",".join(known)}, got {text!r}')

@@ -1,14 +1,17 @@
 """Lists every command of the package with its module and its one line of help: the only list.
 
 A node runs as a process of its own; a composed one, beside it, is several nodes in one process.
-An offline command needs no ROS: its module, wherever it lies in the package, has
-``add_arguments(parser)`` and either ``work(args, tell) -> Result``, which `main` runs under a bar
-of progress, or, where it shows by itself how far it is, ``run(args) -> int``. A kind of session of
-other trackers is an option of ``diagnose`` and ``evaluate``; its module has
-``add_options(parser)``, ``diagnose(args, tell)`` and ``evaluate(args, tell)``.
+An offline command needs no ROS: its module has ``add_arguments(parser)`` and either
+``work(args, tell) -> Result``, which `main` runs under a bar of progress, or, where it shows by
+itself how far it is, ``run(args) -> int``. A kind of session of other trackers is an option of
+``diagnose`` and ``evaluate``; its module has ``add_options(parser)``, ``diagnose(args, tell)`` and
+``evaluate(args, tell)``. Commands of applications are stated in their ``extension.py``.
 `setup.py` makes an executable of each command; as it runs before anything is installed, this
-module imports nothing.
+module imports nothing of the package.
 """
+
+import runpy
+from pathlib import Path
 
 Commands = dict[str, tuple[str, str]]
 
@@ -26,9 +29,7 @@ _NODES = {
     'replay': 'publishes a bag again: replay BAG [--rate R] [--loop]',
     'openigtlink': 'serves the poses to 3D Slicer as OpenIGTLink',
     'cu_simulator': 'a control unit behind a pseudo-terminal',
-    'corrector': 'corrects the poses of another tracker with a model of diagnose --poses',
     'monitor': 'a live table of sensors, rates and latencies',
-    'dashboard': 'a live view in the browser, with the loop of record, diagnose and correct',
     'watcher': 'names the effects that the model lacks, live in /diagnostics',
 }
 _COMPOSED = {
@@ -50,25 +51,15 @@ _CORE = {
     'views': 'write the views of RViz and Foxglove for a setup document',
     'warm_up': 'compile all kernels once, before the first start of a node',
 }
-_POSES = {
-    'accuracy': 'jitter, drift, distances, rotations, latency by published protocols',
-    'handeye': 'frames, lever arm, mount and clocks of two streams of poses, jointly',
-    'import_poses': 'files of poses as trackers write them, to a bag',
-    'pivot': 'the tip of a stylus, from poses while it turns about its tip',
-}
-_LAB = {
-    'error_map': 'learn an error map from tracked and true positions, and apply it to others',
-    'known_metal': 'learn a piece of metal from a session, for evaluate --known-metal',
-    'loop': 'put an effect into simulated samples, find it blind, correct it, measure again',
-    'measured': "other people's measurements: what they contain, and the error before and after",
-    'paper': "redo the article's experiments: Tables II to V, Figs. 2 and 5 to 10",
-}
 
 NODES: Commands = _in('nodes', _NODES)
 COMPOSED: Commands = _in('nodes', _COMPOSED)
-OFFLINE: Commands = dict(
-    sorted({**_in('cli', _CORE), **_in('cli', _POSES), **_in('cli', _LAB)}.items())
-)
-SESSION_KINDS: Commands = {
-    'poses': ('anser_ros.cli.pose_session', 'a session of a tracker that gives poses only'),
-}
+OFFLINE: Commands = _in('cli', _CORE)
+SESSION_KINDS: Commands = {}
+for _path in sorted(Path(__file__).parents[1].glob('apps/*/extension.py')):
+    _app, _stated = f'apps.{_path.parent.name}', runpy.run_path(str(_path))
+    NODES |= _in(f'{_app}.nodes', _stated.get('NODES', {}))
+    OFFLINE |= _in(f'{_app}.cli', _stated.get('OFFLINE', {}))
+    for _name, (_module, _line) in _stated.get('SESSION_KINDS', {}).items():
+        SESSION_KINDS[_name] = (f'anser_ros.{_app}.{_module}', _line)
+OFFLINE = dict(sorted(OFFLINE.items()))

@@ -11,12 +11,18 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, number, terminal_table, write_files
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.stated_values import add_json, add_out
+from anser_ros.cli.output import (
+    Result,
+    Tell,
+    add_json,
+    add_out,
+    make_folder,
+    number,
+    terminal_table,
+    write_files,
+)
 from anser_ros.physics.constants import DEGREES
-from anser_ros.sessions.comparison import (
+from anser_ros.sessions.evaluation_files import (
     Compared,
     ComparedShares,
     check_same_recording,

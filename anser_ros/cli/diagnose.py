@@ -1,22 +1,26 @@
 """Find what a model leaves unexplained on a session, name the effect, correct it."""
 
 import argparse
+import importlib
 
 from anser_ros.cli.diagnosis_report import render
 from anser_ros.cli.diagnosis_words import held_out_rows, verdict
-from anser_ros.cli.few_poses_report import render_few_poses
-from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, loss_notes, terminal_table, write_files
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.session_kinds import add_session_kinds, named_kind, need_model, snapshot_notes
-from anser_ros.cli.stated_values import add_json, add_out, add_session_options, stated_values
-from anser_ros.sessions import few_poses
-from anser_ros.sessions.calibration import is_estimated_jointly
-from anser_ros.sessions.diagnosis import diagnose_session
-from anser_ros.sessions.diagnosis_document import to_document
-from anser_ros.sessions.model_file import save_model
+from anser_ros.cli.output import (
+    Result,
+    Tell,
+    add_json,
+    add_out,
+    add_session_options,
+    loss_notes,
+    make_folder,
+    stated_values,
+    terminal_table,
+    write_files,
+)
+from anser_ros.cli.sessions import add_session_kinds, named_kind, need_model, snapshot_notes
+from anser_ros.sessions.diagnosis import diagnose_session, other_way, to_document
 from anser_ros.sessions.session import load_session
-from anser_ros.sessions.starting_model import model_for
+from anser_ros.sessions.starting_model import model_for, save_model
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,11 +55,11 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     baseline = load_session(args.baseline) if args.baseline else None
     make_folder(args.out)
     names = {'session': args.session, 'model': args.model}
-    if is_estimated_jointly(session):
-        few = few_poses.diagnose_few_poses(session, model, tell)
+    if way := other_way(session):
+        other = way.diagnose(session, model, tell)
         tell('writing the report')
-        document, corrected = few_poses.to_document(few), few.model
-        report = render_few_poses(few, document, **names)
+        document, corrected = way.to_document(other), other.model
+        report = importlib.import_module(way.REPORT).render(other, document, **names)
     else:
         found = diagnose_session(session, model, baseline, tell)
         tell('writing the report')

@@ -23,9 +23,7 @@ from rich.table import Table
 
 from anser_ros.cli.commands import NODES
 from anser_ros.cli.missing import OPTIONAL, PYPI, ROS_REMEDY
-from anser_ros.cli.output import Result, terminal_table
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.stated_values import add_json
+from anser_ros.cli.output import Result, Tell, add_json, terminal_table
 from anser_ros.errors import ParameterError
 
 SCHEMA = 'anser_doctor/1'

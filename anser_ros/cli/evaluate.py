@@ -1,33 +1,234 @@
 """Track recorded sessions and compare their poses with the optical ones."""
 
 import argparse
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from anser_ros import extensions
 from anser_ros.cli.commands import SESSION_KINDS
-from anser_ros.cli.evaluation_figures import ERRORS_HEAD, error_rows, write_figures
-from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, loss_notes, terminal_table, write_files
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.session_kinds import add_session_kinds, named_kind, need_model, snapshot_notes
-from anser_ros.cli.session_runs import perform, runs_of, summed_up
-from anser_ros.cli.stated_values import (
+from anser_ros.cli.output import (
+    Result,
+    Tell,
     add_json,
     add_session_options,
+    loss_notes,
+    make_folder,
+    number,
     stated_values,
+    terminal_table,
+    write_files,
+)
+from anser_ros.cli.page import Html, heading, page, picture, table, top
+from anser_ros.cli.sessions import (
+    add_session_kinds,
+    named_kind,
+    need_model,
+    perform,
+    runs_of,
+    snapshot_notes,
+    summed_up,
 )
 from anser_ros.errors import ParameterError
-from anser_ros.sessions.chosen_references import parse_references, with_references
-from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.evaluation_document import recording_of, to_document
-from anser_ros.sessions.known_metal import models_of
-from anser_ros.sessions.pose_table import write_tables
+from anser_ros.physics.constants import DEGREES
+from anser_ros.pictures import WIDE, legend_below, save, spell_out
+from anser_ros.sessions.evaluation_files import recording_of, to_document, write_tables
+from anser_ros.sessions.follower import parse_references, with_references
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
+from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, track_session
 from anser_ros.tracking.estimate import TrackerSettings
 
+Array = NDArray[np.float64]
+
+MOST_POINTS = 4000
+"""Most points that a figure shows of one coil: more cannot be distinguished, and make files
+large."""
+COVERAGE_SIGMAS = np.linspace(0.0, 4.0, 81)
+"""Multiples of sigma for which the share of errors within is drawn, to where all should be."""
+ERRORS_HEAD = ('sensor', 'frames', 'tracked', 'RMSE mm', 'PRC95 mm', 'RMSE deg', 'PRC95 deg')
+"""Head of the table of `error_rows`."""
+
+
+def _series(evaluation: Evaluation) -> dict[str, PoseSeries]:
+    return {**evaluation.sensors, **evaluation.bodies}
+
+
+def _thinned(count: int) -> slice:
+    return slice(0, None, max(1, -(-count // MOST_POINTS)))
+
+
+def over_time(evaluation: Evaluation) -> Figure:
+    """Draw the position error of every coil and body over time, and which of them had a pose."""
+    found = _series(evaluation)
+    start = min(s.estimates[0].stamp_ns for s in found.values() if s.estimates)
+    figure, (upper, lower) = plt.subplots(
+        2, 1, figsize=(9, 5.6), sharex=True, layout='constrained', height_ratios=(3, 1)
+    )
+    for rank, (name, series) in enumerate(found.items()):
+        stamps = np.array([one.stamp_ns for one in series.estimates], dtype=np.int64)
+        time, keep, colour = 1e-9 * (stamps - start), _thinned(stamps.size), f'C{rank % 10}'
+        error = 1e3 * series.position_error[keep]
+        upper.plot(time[keep], error, '.', ms=3, color=colour, label=name)
+        lost = time[~series.ok]
+        lower.plot(lost, np.full(lost.size, rank), '|', color=colour)
+    upper.set(ylabel='position error, mm', yscale='log')
+    spell_out(upper.yaxis)
+    lower.set(xlabel='time, s', ylabel='no pose', ylim=(-0.8, len(found) - 0.2))
+    lower.set_yticks([])
+    if all(series.ok.all() for series in found.values()):
+        lower.text(0.5, 0.5, 'every frame has a pose', transform=lower.transAxes, ha='center')
+    upper.grid(alpha=0.3)
+    legend_below(figure, upper)
+    return figure
+
+
+def over_space(evaluation: Evaluation) -> Figure:
+    """Draw where the poses were, from above and from the side, coloured by their error."""
+    place, error = [], []
+    for series in evaluation.sensors.values():
+        good = np.isfinite(series.position_error)
+        place += [e.position for e, g in zip(series.estimates, good, strict=True) if g]
+        error.append(series.position_error[good])
+    where = 1e3 * np.array(place).reshape(-1, 3)
+    size = 1e3 * np.concatenate(error) if error else np.zeros(0)
+    keep = _thinned(len(where))
+    figure, panels = plt.subplots(1, 2, figsize=(9, 4.2), layout='constrained')
+    top = float(np.percentile(size, 98)) if size.size else 1.0
+    for panel, up in zip(panels, (1, 2), strict=True):
+        places = where[keep][:, [0, up]]
+        shown = panel.scatter(*places.T, c=size[keep], s=8, vmin=0.0, vmax=top)
+        panel.set(xlabel='x, mm', ylabel=f'{"xyz"[up]}, mm', aspect='equal')
+        panel.grid(alpha=0.3)
+    figure.colorbar(shown, ax=panels, label='position error, mm', extend='max')
+    return figure
+
+
+def by_coil(evaluation: Evaluation) -> Figure:
+    """Draw the distribution of each coil's and body's errors of position and orientation."""
+    found = _series(evaluation)
+    figure, panels = plt.subplots(
+        1, 2, figsize=(9, 1.4 + 0.3 * len(found)), layout='constrained', sharey=True
+    )
+    for panel, scale, kind, unit in (
+        (panels[0], 1e3, 'position', 'mm'), (panels[1], DEGREES, 'orientation', 'deg'),
+    ):  # fmt: skip
+        for row, series in enumerate(found.values(), start=1):
+            error = getattr(series, f'{kind}_error')
+            finite = scale * error[np.isfinite(error)]
+            if not finite.size:
+                continue
+            least, lower, middle, upper, most = np.percentile(finite, (5, 25, 50, 75, 95))
+            panel.hlines(row, least, most, color='0.5')
+            panel.barh(row, upper - lower, 0.6, left=lower, color='C0', alpha=0.6)
+            panel.vlines(middle, row - 0.3, row + 0.3, color='C1', lw=2)
+        panel.set(xlabel=f'{kind} error, {unit}')
+        panel.set_xlim(left=0.0)
+        panel.locator_params(axis='x', nbins=5)
+        panel.grid(alpha=0.3, axis='x')
+    panels[0].set_yticks(np.arange(1, len(found) + 1), list(found))
+    panels[0].invert_yaxis()
+    return figure
+
+
+def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
+    """Draw the errors against the reported sigma, and how many lie within a multiple of it.
+
+    ``jitter_m``, the optical tracker's own error per component, m, is part of the expected error.
+    """
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), layout='constrained')
+    low, high = np.inf, 0.0
+    for rank, (name, series) in enumerate(_series(evaluation).items()):
+        sigma = np.array([estimate.sigma_position_m for estimate in series.estimates])
+        good = np.isfinite(series.position_error) & (sigma > 0)
+        error = 1e3 * series.position_error[good]
+        sigma = 1e3 * np.hypot(sigma[good], math.sqrt(3.0) * jitter_m)
+        if not error.size:
+            continue
+        keep, colour = _thinned(error.size), f'C{rank % 10}'
+        left.plot(sigma[keep], error[keep], '.', ms=3, color=colour, label=name)
+        low, high = min(low, float(sigma.min())), max(high, float(sigma.max()))
+        within = [(error <= k * sigma).mean() for k in COVERAGE_SIGMAS]
+        right.plot(COVERAGE_SIGMAS, within, color=colour)
+    if high > 0:
+        line = np.linspace(low, high)
+        left.plot(line, line, '-', color='0.3', label='error = sigma')
+        left.plot(line, 3 * line, '--', color='0.3', label='error = 3 sigma')
+        left.set(yscale='log')
+        spell_out(left.yaxis)
+        if high > WIDE * low:
+            left.set(xscale='log')
+            spell_out(left.xaxis)
+        else:
+            left.locator_params(axis='x', nbins=5)
+    left.set(xlabel='sigma, with the optical jitter, mm', ylabel='position error, mm')
+    right.set(xlabel='multiple of sigma', ylabel='share of the errors within', ylim=(0, 1.02))
+    for panel in (left, right):
+        panel.grid(alpha=0.3)
+    legend_below(figure, left)
+    return figure
+
+
+FIGURES = {
+    'error_over_time': 'Error over time; marks below: frames without a pose',
+    'error_over_space': 'Error over the volume',
+    'error_by_coil': 'Errors by coil and body: median, quartiles, 5 and 95 %',
+    'sigma_and_error': "Errors against the poses' own sigma and the optical jitter",
+}
+"""Figures by the names of their files, with what they show."""
+
+
+def write_figures(
+    evaluation: Evaluation, document: Mapping[str, Any], folder: Path, *, session: str,
+    model: str, jitter_m: float = 0.0,
+) -> list[Path]:  # fmt: skip
+    """Write every figure and the page that holds them; return the files.
+
+    Without an optical pose there is no error, and nothing is drawn or written.
+    """
+    found = _series(evaluation)
+    if not any(np.isfinite(series.position_error).any() for series in found.values()):
+        return []
+    parts: list[Html] = []
+    files = []
+    drawn = (
+        over_time(evaluation), over_space(evaluation), by_coil(evaluation),
+        against_sigma(evaluation, jitter_m),
+    )  # fmt: skip
+    for (name, title), figure in zip(FIGURES.items(), drawn, strict=True):
+        files.append(folder / f'{name}.png')
+        save(figure, files[-1])
+        parts += [heading(title), picture(files[-1])]
+    head = top('Evaluation', session=session, model=model)
+    text = page('Evaluation', head, table(ERRORS_HEAD, error_rows(document)), parts)
+    files.append(folder / 'evaluation.html')
+    files[-1].write_text(text, encoding='utf-8')
+    return files
+
+
+def error_rows(document: Mapping[str, Any]) -> list[list[str]]:
+    """Return the errors of every sensor, body and source as rows of a table."""
+    return [
+        [
+            f'source seen from {name}' if group == 'sources' else name,
+            str(row['n']),
+            f'{row["tracked_fraction"]:.1%}',
+            *(number(row[f'position_{key}_m'], 1e3) for key in ('rmse', 'prc95')),
+            *(number(row[f'orientation_{key}_rad'], DEGREES) for key in ('rmse', 'prc95')),
+        ]
+        for group in ('sensors', 'bodies', 'sources')
+        for name, row in document.get(group, {}).items()
+    ]
+
+
 ALONE = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', *SESSION_KINDS)
-"""Options that do not go together with ``--known-metal``."""
+"""Options that do not go together with another way to follow metal (`extensions`)."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,11 +264,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='let the refit also use contradictions among the coils of rigid tools; for few '
         'references',
     )  # fmt: skip
-    parser.add_argument(
-        '--known-metal', type=Path, metavar='FILE',
-        help='metal that anser known_metal has learnt: let the model follow it by the tools, '
-        'without references',
-    )  # fmt: skip
+    for extension in extensions.loaded('EVALUATIONS'):
+        extension.add_options(parser)
     parser.add_argument(
         '--in-phase', action='store_true', help="use in-phase fluxes only, the article's way"
     )
@@ -95,10 +293,8 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
 
 def _one(args: argparse.Namespace, tell: Tell) -> Result:
     given = [f'--{name.replace("_", "-")}' for name in ALONE if getattr(args, name)]
-    if args.known_metal is not None and given:
-        raise ParameterError(
-            f'--known-metal follows metal by the tools alone; leave out {", ".join(given)}'
-        )
+    ways = [way.models(args, given) for way in extensions.loaded('EVALUATIONS')]
+    models = next((way for way in ways if way is not None), None)
     if kind := named_kind(args):
         done: Result = kind.evaluate(args, tell)
         return done
@@ -112,11 +308,10 @@ def _one(args: argparse.Namespace, tell: Tell) -> Result:
         session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None
-    known = None if args.known_metal is None else models_of(args.known_metal)
     make_folder(args.out)
     evaluation = track_session(
         session, model, TrackerSettings(gate=args.gate), baseline=baseline, refit=args.refit,
-        in_phase=args.in_phase, witnesses=args.witnesses, models=known,
+        in_phase=args.in_phase, witnesses=args.witnesses, models=models,
         progress=lambda share: tell('tracking', share),
     )  # fmt: skip
     document = {**to_document(evaluation), 'recording': recording_of(session)}
@@ -128,7 +323,7 @@ def _one(args: argparse.Namespace, tell: Tell) -> Result:
     )[-1:]  # fmt: skip
     shown: list[Any] = [terminal_table(ERRORS_HEAD, error_rows(document))]
     if 'refit' in document:
-        shown.append(_refit_line(document['refit'], known is not None))
+        shown.append(_refit_line(document['refit'], models is None))
     notes = (
         *snapshot_notes(args.model, model), *loss_notes(args.session, session.lost),
         *(_few_notes(session) if args.refit else ()),
@@ -148,10 +343,10 @@ def _few_notes(session: Session) -> tuple[str, ...]:
     )
 
 
-def _refit_line(refit: dict[str, dict[str, int]], known: bool) -> str:
-    """What the refit did, in a line."""
+def _refit_line(refit: dict[str, dict[str, int]], is_refit: bool) -> str:
+    """What the refit, or another way to follow metal, did, in a line."""
     states = ', '.join(f'{name} in {count} frames' for name, count in refit['states'].items())
     out = ', '.join(f'{name} in {count}' for name, count in refit['left_out'].items())
-    if known:
+    if not is_refit:
         return f'known metal: {states}'
     return f'refit: {states or "no frame"}; left out: {out or "no reference"}'

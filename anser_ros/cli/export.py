@@ -2,11 +2,8 @@
 
 import argparse
 
-from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, loss_notes
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.stated_values import add_json, add_out
-from anser_ros.sessions.bag_export import CSV, FORMATS, export_bag
+from anser_ros.cli.output import Result, Tell, add_json, add_out, loss_notes, make_folder
+from anser_ros.sessions.import_export import CSV, FORMATS, export_bag
 
 SCHEMA = 'anser_export/1'
 

@@ -3,11 +3,9 @@
 import argparse
 from pathlib import Path
 
-from anser_ros.cli.output import Result, check_new_file, loss_notes
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.stated_values import add_json, add_list
+from anser_ros.cli.output import Result, Tell, add_json, add_list, check_new_file, loss_notes
 from anser_ros.errors import ParameterError
-from anser_ros.sessions.bag_import import import_bag, parse_remaps
+from anser_ros.sessions.import_export import import_bag, parse_remaps
 from anser_ros.sessions.table_import import import_tables
 from anser_ros.wire.text_files import read_text
 

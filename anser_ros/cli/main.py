@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from anser_ros.cli import missing
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
-from anser_ros.cli.folders import remove_empty_folders
+from anser_ros.cli.output import remove_empty_folders
 from anser_ros.errors import AnserError
 from anser_ros.one_line_parser import OneLineParser
 from anser_ros.parallel import ONE_THREAD, cores, shared_among
@@ -116,8 +116,7 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
 
 def _show(name: str, module: Any, args: argparse.Namespace) -> int:
     """Do the work of a command under a bar of progress, and show what came of it."""
-    from anser_ros.cli.output import say
-    from anser_ros.cli.progress import progress_of
+    from anser_ros.cli.output import progress_of, say
 
     with progress_of(name) as tell:
         result = module.work(args, tell)

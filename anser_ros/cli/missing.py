@@ -2,6 +2,7 @@
 
 from importlib.util import find_spec
 
+from anser_ros import extensions
 from anser_ros.errors import AnserError
 
 PYPI = {
@@ -20,9 +21,9 @@ ROS = 'rclpy'
 """Module that every node needs, and that pip does not install with this package."""
 ROS_REMEDY = 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
 NEEDED = {
-    'dashboard': ('nicegui',),
     'recorder': ('mcap',),
     'replay': ('mcap', 'mcap_ros2', 'zstandard'),
+    **{node: needed for table in extensions.tables('NEEDED') for node, needed in table.items()},
 }
 """Nodes that do nothing without one of these; all others need ROS alone."""
 

@@ -1,22 +1,219 @@
-"""Says what a command has done: its document or tables, its notes, the files that it wrote.
-
-A command returns a `Result`; `main` shows it. All figures of tables and pages go through `number`.
+"""Carries a command out: shared options, folders of results, how far it is, and what it has
+done. The steps: options are declared, folders are made before the work begins, progress is
+shown while it lasts, files are written, and the `Result` is shown. Nothing here needs numpy, so
+that `doctor` can tell where that is missing.
 """
 
+import argparse
+import contextlib
+import itertools
 import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
-from anser_ros.cli.folders import make_folder
 from anser_ros.errors import ParameterError
+
+# Nothing that needs numpy is imported here: doctor reports where that is missing.
+
+
+def add_out(parser: argparse.ArgumentParser, what: str = '', **options: Any) -> None:
+    """Declare ``--out``, a folder for what is written; required unless stated otherwise."""
+    words = f'folder for {what}, made if missing' if what else 'folder, made if missing'
+    parser.add_argument('--out', type=Path, help=words, **{'required': True, **options})
+
+
+def add_json(parser: argparse.ArgumentParser, what: str) -> None:
+    """Declare ``--json``, of which ``what`` says what it prints."""
+    parser.add_argument('--json', action='store_true', help=f'print {what}')
+
+
+def add_list(parser: argparse.ArgumentParser, option: str, **options: Any) -> None:
+    """Declare an option that may be repeated; its default is an empty list."""
+    parser.add_argument(option, action='append', default=[], **options)
+
+
+def add_stated_values(parser: argparse.ArgumentParser, *sections: str) -> None:
+    """Declare ``--set``; ``sections`` of `SECTIONS` are those that the command uses."""
+    from anser_ros.settings import SECTIONS
+
+    names = ', '.join(name for section in sections for name in SECTIONS[section])
+    words = 'state a value in place of the setup document and the default; may be repeated. '
+    add_list(parser, '--set', dest='stated', metavar='NAME=VALUE', help=f'{words}Names: {names}')
+
+
+def stated_values(args: argparse.Namespace) -> dict[str, float]:
+    """Return the values that the command line states; raises as `parse_entries`."""
+    from anser_ros.settings import parse_entries
+
+    return parse_entries(args.stated)
+
+
+def add_model(parser: argparse.ArgumentParser, **options: Any) -> None:
+    """Declare ``--model``."""
+    words = "model file, or 'nominal' for the setup's own geometry"
+    parser.add_argument('--model', help=words, **options)
+
+
+def add_session_options(parser: argparse.ArgumentParser) -> None:
+    """Declare what a session is taken with: a model, a baseline, bodies surveyed again."""
+    add_model(parser)
+    parser.add_argument('--baseline', help='distortion-free recording of the same board')
+    add_list(
+        parser, '--resurveyed', metavar='BODY',
+        help='the sensors on BODY are those of the model, and were surveyed again: their '
+        'channels are corrected as the model says, and their places and axes are those of '
+        'the session; may be repeated',
+    )  # fmt: skip
+    add_stated_values(parser, 'accuracy', 'refit', 'tools')
+
+
+_made: list[Path] = []
+"""Folders that this command has made, parents first."""
+
+
+def make_folder(folder: Path | None) -> None:
+    """Make a folder for results before the work begins, where one is wanted.
+
+    Raises `ParameterError` when the folder cannot be made, or nothing can be written there.
+    """
+    if folder is None:
+        return
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(f'no folder {folder}: {error.strerror}') from error
+    _made.extend(reversed(missing))
+    try:  # permissions alone do not tell: a file system may be full, or no place for files
+        with tempfile.TemporaryFile(dir=folder) as stream:
+            stream.write(b'x')
+            stream.flush()
+    except OSError as error:
+        words = os.strerror(error.errno or 0)
+        raise ParameterError(f'nothing can be written into {folder}: {words}') from error
+
+
+def make_new_folder(parent: Path, stem: str) -> Path:
+    """Make and return a folder that was not there; others of the same second get a number.
+
+    Raises `ParameterError` when it cannot be made, or nothing can be written there.
+    """
+    make_folder(parent)
+    for number in itertools.count(1):
+        folder = parent / (stem if number == 1 else f'{stem}_{number}')
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            _made.append(folder)
+            return folder
+    raise AssertionError('the numbers do not end')
+
+
+def remove_empty_folders() -> None:
+    """Remove the folders that were made for results of which there are none."""
+    while _made:
+        with contextlib.suppress(OSError):  # it has files by now
+            _made.pop().rmdir()
+
+
+LINE_INTERVAL_S = 5.0
+"""Time from one line to the next, s: enough to see that it goes on, few enough for a log."""
+LEAST_DONE, LEAST_S = 0.1, 1.0
+"""Finished share of a stage, and time that its later half took, s, from which on the time that is
+left is shown. Before, it would be that of loading and compiling, which do not come again."""
+
+
+class Tell(Protocol):
+    """Takes what has been reached."""
+
+    def __call__(self, stage: str, share: float | None = None) -> None:
+        """Take in the stage and the finished share of it, 0 to 1, where that is known."""
+
+
+@contextmanager
+def progress_of(command: str) -> Iterator[Tell]:
+    """Yield a function that takes how far a command is, which a bar or lines then show."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _Lines(command).tell
+        return
+    columns = (
+        TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(),
+        TextColumn('{task.fields[left]}'),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as bar:
+        task, shown = bar.add_task(command, total=None, left=''), command
+        remaining = _Remaining()
+
+        def tell(stage: str, share: float | None = None) -> None:
+            nonlocal shown
+            if stage != shown:
+                shown = stage
+                bar.reset(task, description=stage)
+            bar.tasks[0].total = None if share is None else 1.0  # without one the bar only moves
+            left = '' if share is None else remaining.words(stage, share)
+            bar.update(task, completed=share or 0.0, left=left)
+
+        yield tell
+
+
+class _Remaining:
+    """How long a stage will take, by the pace of the later half of what is finished."""
+
+    def __init__(self) -> None:
+        self._stage = ''
+        self._past: list[tuple[float, float]] = []
+
+    def words(self, stage: str, share: float) -> str:
+        """Take in how far a stage is; the time that is left, empty while it is not known well."""
+        now_s = time.monotonic()
+        if stage != self._stage:
+            self._stage, self._past = stage, []
+        if not self._past or share > self._past[-1][0]:
+            self._past.append((share, now_s))
+        done, since_s = next(one for one in reversed(self._past) if self._is_early(one, share))
+        took_s = now_s - since_s
+        if share < LEAST_DONE or took_s < LEAST_S or share <= done:
+            return ''
+        return f'about {took_s * (1.0 - share) / (share - done):.0f} s left'
+
+    def _is_early(self, one: tuple[float, float], share: float) -> bool:
+        return one[0] <= 0.5 * share or one is self._past[0]
+
+
+class _Lines:
+    """Says a line on stderr every few seconds; a short command says nothing."""
+
+    def __init__(self, command: str) -> None:
+        self._command, self._remaining = command, _Remaining()
+        self._begin_s = self._shown_s = time.monotonic()
+
+    def tell(self, stage: str, share: float | None = None) -> None:
+        """Take in how far a stage is, and say it where it is time to."""
+        now_s = time.monotonic()
+        if share is None:
+            if now_s - self._begin_s > LINE_INTERVAL_S:
+                self._say(f'{stage}, after {now_s - self._begin_s:.0f} s')
+            return
+        left = self._remaining.words(stage, share)
+        if now_s - self._shown_s < LINE_INTERVAL_S:
+            return
+        self._shown_s = now_s
+        self._say(', '.join(filter(None, (f'{stage}, {share:.0%}', left))))
+
+    def _say(self, words: str) -> None:
+        print(f'{self._command}: {words}', file=sys.stderr, flush=True)
 
 
 def check_file(path: Path) -> None:

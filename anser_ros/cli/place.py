@@ -10,23 +10,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, terminal_table, write_files
-from anser_ros.cli.place_figure import places_figure
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.stated_values import add_json, add_out, add_stated_values, stated_values
+from anser_ros.cli.board_figures import places_figure
+from anser_ros.cli.output import (
+    Result,
+    Tell,
+    add_json,
+    add_out,
+    add_stated_values,
+    make_folder,
+    stated_values,
+    terminal_table,
+    write_files,
+)
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.clouds import Region
+from anser_ros.refit.clouds import Excitation, Region, region_of
 from anser_ros.refit.design import Design, StatedMetal, choose, family, random_designs
-from anser_ros.refit.excitation import Excitation, region_of
-from anser_ros.sessions.drawing import NominalBoard
+from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
+from anser_ros.sessions.plausibility import LENGTH_UNITS, unit_words
 from anser_ros.sessions.session import sensor_table
-from anser_ros.sessions.units import LENGTH_UNITS, unit_words
-from anser_ros.sessions.volume import stated_volume
-from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
-from anser_ros.wire.text_files import numbers_of, read_rows
+from anser_ros.wire.text_files import numbers_of, read_config, read_rows
 
 Array = NDArray[np.float64]
 

@@ -1,41 +1,361 @@
 """Write a setup document by questions or options, check it, and draw it."""
 
 import argparse
+import itertools
 import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
-from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, say, write_files
-from anser_ros.cli.setup_figure import setup_figure
-from anser_ros.cli.setup_parts import (
-    ANSER,
-    COIL_COLUMNS,
-    GEOMETRY,
-    SENSOR_COLUMNS,
-    Document,
-    advice_on,
-    anser_emitter,
-    coil_of,
-    document_of,
-    emitter_of,
-    number_of,
-    numbers_of,
-    rows_of,
-    sensor_of,
-    text_of,
-)
-from anser_ros.cli.setup_questions import ask_all
-from anser_ros.cli.stated_values import (
+import numpy as np
+import yaml
+
+from anser_ros.cli.board_figures import setup_figure
+from anser_ros.cli.output import (
+    Result,
     add_json,
     add_list,
     add_out,
     add_stated_values,
+    make_folder,
+    say,
     stated_values,
+    write_files,
 )
-from anser_ros.errors import ParameterError
-from anser_ros.sessions.drawing import board_of
-from anser_ros.wire.config_folder import read_config
-from anser_ros.wire.setup import Setup, parse_setup
+from anser_ros.errors import AnserError, ParameterError
+from anser_ros.sessions.nominal_board import board_of
+from anser_ros.settings import sections_of
+from anser_ros.wire.setup import FIELD_GENERATOR, SCHEMA, Setup, parse_setup
+from anser_ros.wire.text_files import read_config, read_rows, read_yaml
+
+ANSER, ANSER_FILE = 'anser', 'demo_setup.yaml'
+"""The board that is known by name, and the file of `config/` that has it."""
+SPIRAL = ('turns', 'pitch_m', 'layers', 'thickness_m', 'current_a')
+GEOMETRY = {
+    'square_spiral_pcb': ('side_m', *SPIRAL),
+    'rectangular_spiral_pcb': ('side_x_m', 'side_y_m', *SPIRAL),
+    'rectangular_loop': ('side_x_m', 'side_y_m', 'turns', 'current_a'),
+    'circular_loop': ('radius_m', 'turns', 'current_a'),
+}
+"""What is asked of the coils of a kind of board."""
+WHOLE = ('turns', 'layers')
+DIRECTIONS = {
+    f'{sign}{name}': [factor * float(axis == name) for axis in 'xyz']
+    for name in 'xyz'
+    for sign, factor in (('', 1.0), ('+', 1.0), ('-', -1.0))
+}
+"""Directions that have a name."""
+SENSOR_COLUMNS = ('channel', 'name', 'body', 'x_mm', 'y_mm', 'z_mm', 'axis')
+COIL_COLUMNS = ('name', 'x_mm', 'y_mm', 'z_mm', 'turn_deg', 'tone_hz')
+LEAST_EMITTERS = 6
+"""Emitter coils from which on a single coil can be tracked: a pose has five unknowns."""
+FEWEST_WINDOWS = 1.0
+"""Least distance of two tones, in windows a second: nearer ones leak into each other."""
+PARALLEL = 0.999
+"""Cosine from which on two axes count as parallel, 2.6 degrees."""
+
+Document = dict[str, Any]
+
+
+def number_of(text: str, what: str) -> float:
+    """Return the finite number that a text says; raises `ParameterError` where it is none."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = float('nan')
+    if not np.isfinite(value):
+        raise ParameterError(f'{what} must be a number, got {text.strip()!r}')
+    return value
+
+
+def numbers_of(text: str, count: int, what: str) -> list[float]:
+    """Return so many numbers with commas or blanks between them."""
+    parts = text.replace(',', ' ').split()
+    if len(parts) != count:
+        raise ParameterError(f'{what} takes {count} numbers, got {text.strip()!r}')
+    return [number_of(part, what) for part in parts]
+
+
+def metres(values: Sequence[float]) -> list[float]:
+    """Return lengths in mm in m, without the rounding of the division in the document."""
+    return [round(1e-3 * value, 9) for value in values]
+
+
+def emitter_of(kind: str, geometry: Mapping[str, float], coils: list[Document]) -> Document:
+    """Return the section of a board; its values are checked with the whole document."""
+    if kind not in GEOMETRY:
+        raise ParameterError(f'no board {kind}; there are: {", ".join([ANSER, *GEOMETRY])}')
+    values = {k: int(v) if k in WHOLE and v == int(v) else v for k, v in geometry.items()}
+    return {'kind': kind, **values, 'coils': coils}
+
+
+def anser_emitter() -> Document:
+    """Return the section of the Anser v1 board."""
+    emitter: Document = read_yaml(read_config(ANSER_FILE))['emitter']
+    return emitter
+
+
+def coil_of(name: str, text: str) -> Document:
+    """Return an emitter coil of ``x, y, z, turn about z, tone`` in mm, degrees and Hz."""
+    x, y, z, turn, tone = numbers_of(text, 5, f'coil {name}')
+    return {
+        'name': name, 'centre_m': metres((x, y, z)), 'rotation_deg': turn, 'frequency_hz': tone,
+    }  # fmt: skip
+
+
+def sensor_of(text: str, body: str = '') -> Document:
+    """Return a sensor of ``channel, name, body, x, y, z, axis[, length]``, mm; see `axis_of`.
+
+    If a ``body`` is given, the text does not contain one.
+    """
+    cells = [cell.strip() for cell in text.split(',')]
+    if body:
+        cells.insert(2, body)
+    if len(cells) not in (7, 8):
+        names = [name for name in SENSOR_COLUMNS if not body or name != 'body']
+        raise ParameterError(f'a sensor takes {",".join(names)}[,length_mm], got {text.strip()!r}')
+    what = f'sensor {cells[1]}'
+    channel = number_of(cells[0], f'{what}: channel')
+    if channel != int(channel):
+        raise ParameterError(f'{what}: channel must be a whole number, got {cells[0]}')
+    return {
+        'channel': int(channel), 'name': cells[1], 'body': cells[2],
+        'position_m': metres([number_of(cell, what) for cell in cells[3:6]]),
+        'axis': axis_of(cells[6], what),
+        'length_m': metres([number_of(cells[7], what)])[0] if len(cells) == 8 else 0.0,
+    }  # fmt: skip
+
+
+def axis_of(text: str, what: str) -> list[float]:
+    """Return a direction: x, -z and the like, or three numbers with blanks between them."""
+    if text.lower() in DIRECTIONS:
+        return DIRECTIONS[text.lower()]
+    if len(text.split()) != 3:
+        raise ParameterError(f'{what}: axis is x, -x, ... or three numbers, got {text!r}')
+    values = np.array(numbers_of(text, 3, f'{what}: axis'))
+    length = float(np.linalg.norm(values))
+    if length == 0.0:
+        raise ParameterError(f'{what}: an axis must not have zero length')
+    return [round(float(value), 9) for value in values / length]
+
+
+def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
+    """Return the rows of a CSV file with a head, each as the text that is typed for it."""
+    names, found_rows = read_rows(path)
+    extra = [name for name in names if name == 'length_mm']
+    found = [name for name in names if name not in extra]
+    if set(found) != set(columns):
+        raise ParameterError(f'{path}: columns must be {",".join(columns)}, got {",".join(found)}')
+    rows = [
+        ','.join((row[name] or '').strip() for name in (*columns, *extra)) for row in found_rows
+    ]
+    if not rows:
+        raise ParameterError(f'{path}: no rows')
+    return [row.rstrip(',') for row in rows]
+
+
+def document_of(
+    emitter: Document,
+    sensors: list[Document],
+    rate_hz: float = 50.0,
+    volume_mm: Sequence[float] | None = None,
+    stated: Mapping[str, float] | None = None,
+) -> Document:
+    """Return the whole document as plain data."""
+    document: Document = {
+        'schema': SCHEMA, 'frame_id': FIELD_GENERATOR, 'flux_rate_hz': rate_hz, 'flux_unit': 'T',
+        'emitter': emitter, 'sensors': sensors,
+    }  # fmt: skip
+    if volume_mm is not None:
+        low, high = metres(volume_mm[:3]), metres(volume_mm[3:])
+        document['volume'] = {'low_m': low, 'high_m': high}
+    document |= {name: values for name, values in sections_of(stated or {}).items() if values}
+    return document
+
+
+class _RowDumper(yaml.SafeDumper):
+    """Writes the coils and sensors of a document in a line each, as the files of `config/` do."""
+
+    def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> Any:
+        is_row = 'name' in dict(mapping)
+        return super().represent_mapping(tag, mapping, flow_style=is_row or flow_style)
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> Any:
+        is_vector = all(isinstance(value, int | float) for value in sequence)
+        return super().represent_sequence(tag, sequence, flow_style=is_vector or flow_style)
+
+
+def text_of(document: Document) -> tuple[str, Setup]:
+    """Return the document as YAML, and what readers make of it.
+
+    Raises `SetupError` when the document breaks a rule.
+    """
+    plain = yaml.safe_load(yaml.safe_dump(document))  # nothing in it is shared
+    text = yaml.dump(plain, Dumper=_RowDumper, sort_keys=False, width=200)
+    return text, parse_setup(text)
+
+
+def advice_on(setup: Setup) -> list[str]:
+    """Return what is allowed, and will be missed later; a line each."""
+    found, emitters = [], setup.emitter.coils
+    if len(emitters) < LEAST_EMITTERS:
+        found.append(
+            f'{len(emitters)} emitter coils: tracking a single coil needs at least '
+            f'{LEAST_EMITTERS}'
+        )
+    tones = sorted((coil.frequency_hz, coil.name) for coil in emitters)
+    for (one, name), (other, neighbour) in itertools.pairwise(tones):
+        if other - one < FEWEST_WINDOWS * setup.flux_rate_hz:
+            found.append(
+                f'tones of {name} and {neighbour} are {other - one:g} Hz apart, too close for '
+                f'{setup.flux_rate_hz:g} windows a second to separate them'
+            )
+    for body in setup.bodies:
+        axes = np.array([sensor.axis for sensor in setup.sensors if sensor.body == body])
+        if (np.abs(axes @ axes[0]) > PARALLEL).all():
+            found.append(
+                f'{body}: all coils are parallel, so its roll cannot be determined, nor a 6-DoF '
+                'pose'
+            )
+    count, least = len(setup.reference_sensors), setup.refit.min_references
+    if count < least:
+        found.append(f'{count} reference coils: the refit needs at least {least}, better 16')
+    return found
+
+
+Answer = TypeVar('Answer')
+ONE_TOOL_COIL = {'channel': 0, 'name': 'tool/0', 'body': 'tool', 'position_m': [0, 0, 0],
+                 'axis': [0, 0, 1]}  # fmt: skip
+"""Stands for the sensors while a board is checked before there are any."""
+
+
+def ask_all(ask: Callable[[str], str], say: Callable[[str], object]) -> Document:
+    """Ask for everything, and return the document.
+
+    ``ask`` gives the answer to a question and raises `EOFError` where there is none; ``say`` shows
+    a line.
+    """
+    return _Questions(ask, say).document()
+
+
+class _Questions:
+    """The questions in their order, of which each is asked until its answer can be read."""
+
+    def __init__(self, ask: Callable[[str], str], say: Callable[[str], object]) -> None:
+        self._put, self._say = ask, say
+        self._sensors: list[Document] = []
+
+    def document(self) -> Document:
+        """Ask for board, tools, reference coils, rate and volume."""
+        self._say(
+            'Lengths are in mm, in the frame of the board: origin at its centre, z up to the '
+            'patient.'
+        )
+        self._say('An empty answer accepts the value in [brackets].')
+        self._emitter = self._board()
+        self._say(
+            'Now the tools: coils fixed to a body that moves, places and axes in its own frame.'
+        )
+        while True:
+            body = self._ask('name of a tool, or empty if there are no more', str)
+            if body:
+                self._coils(body)
+            elif self._sensors:
+                break
+            else:
+                self._say('  at least one tool is needed')
+        self._say(
+            'Reference coils are fixed in the frame of the board; with them the model follows '
+            'metal.'
+        )
+        self._coils(FIELD_GENERATOR)
+        rate = self._ask('flux windows a second [50]', lambda t: number_of(t or '50', 'the rate'))
+        volume = self._ask(
+            'corners of the tracked volume, x y z x y z [above the board, by its size]',
+            lambda t: numbers_of(t, 6, 'the volume') if t else None,
+        )
+        return document_of(self._emitter, self._sensors, rate, volume)
+
+    def _ask(self, question: str, read: Callable[[str], Answer]) -> Answer:
+        while True:
+            try:
+                text = self._put(f'{question}: ').strip()
+            except EOFError as error:
+                raise ParameterError(f'no answer to: {question}') from error
+            try:
+                return read(text)
+            except (AnserError, OSError) as error:
+                self._say(f'  {error}')
+
+    def _board(self) -> Document:
+        kinds = [ANSER, *GEOMETRY]
+
+        def kind_of(text: str) -> str:
+            if (text or ANSER) not in kinds:
+                raise ParameterError(f'there are: {", ".join(kinds)}')
+            return text or ANSER
+
+        kind = self._ask(f'board: {", ".join(kinds)} [{ANSER}]', kind_of)
+        if kind == ANSER:
+            return anser_emitter()
+        while True:
+            geometry = {
+                key: self._ask(f'{key} (SI units)', partial(number_of, what=key))
+                for key in GEOMETRY[kind]
+            }
+            words = 'x, y, z, turn about z in degrees, tone in Hz'
+            coils = [
+                self._ask(f'coil{rank}: {words}', partial(coil_of, f'coil{rank}'))
+                for rank in range(self._ask('number of emitter coils [8]', _count(8, 1)))
+            ]
+            emitter = emitter_of(kind, geometry, coils)
+            try:
+                text_of(document_of(emitter, [ONE_TOOL_COIL]))
+            except AnserError as error:
+                self._say(f'  {error}; try again')
+                continue
+            return emitter
+
+    def _coils(self, body: str) -> None:
+        """Take the sensors of one body: typed one after the other, or all of a CSV file."""
+        is_board = body == FIELD_GENERATOR
+        what, usual = ('reference coils', 0) if is_board else (f'coils on {body}', 1)
+        names = tuple(name for name in SENSOR_COLUMNS if name != 'body')
+        columns = ','.join(names)
+
+        def count_or_file(text: str) -> int:
+            if Path(text).suffix != '.csv':
+                return _count(usual, usual)(text)
+            self._add([sensor_of(row, body) for row in rows_of(Path(text), names)])
+            return 0
+
+        count = self._ask(
+            f'number of {what}, or a .csv file of {columns} [{usual}]', count_or_file
+        )
+        for rank in range(count):
+            self._ask(
+                f'{what}, {rank + 1} of {count}: {columns}',
+                lambda text: self._add([sensor_of(text, body)]),
+            )
+
+    def _add(self, found: list[Document]) -> None:
+        """Keep sensors with which the document breaks no rule; it raises where it does."""
+        every = [*self._sensors, *found]
+        if found:
+            text_of(document_of(self._emitter, every))
+        self._sensors = every
+
+
+def _count(usual: int, least: int) -> Callable[[str], int]:
+    def read(text: str) -> int:
+        value = number_of(text or str(usual), 'the number')
+        if value != int(value) or value < least:
+            raise ParameterError(f'must be a whole number of at least {least}, got {text}')
+        return int(value)
+
+    return read
+
 
 RESULT = 'anser_setup_result/1'
 DOCUMENT, PICTURE = 'setup.yaml', 'setup.png'

@@ -10,13 +10,10 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from anser_ros.cli.folders import make_folder
-from anser_ros.cli.output import Result, write_files
-from anser_ros.cli.progress import Tell
-from anser_ros.cli.stated_values import add_json, add_out
+from anser_ros.cli.output import Result, Tell, add_json, add_out, make_folder, write_files
 from anser_ros.errors import ParameterError
-from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import SensorSpec, Setup, parse_setup, topic_of
+from anser_ros.wire.text_files import read_config
 
 SCHEMA = 'anser_views/1'
 RVIZ, FOXGLOVE = 'anser.rviz', 'foxglove_layout.json'

@@ -16,13 +16,13 @@ from typing import Any
 import numba.core.event
 from numba.core.dispatcher import Dispatcher
 
-from anser_ros.cli.progress import LINE_INTERVAL_S
+from anser_ros.cli.output import LINE_INTERVAL_S
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.kernel_cache import KernelCache
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import config_path, read_config
 
 SCHEMA = 'anser_warm_up/1'
 POLL_S = 0.2
@@ -139,7 +139,7 @@ def main(part: str) -> int:
 
 
 def _track() -> None:
-    from anser_ros.tracking.warm_up import warm_up
+    from anser_ros.tracking.tracker import warm_up
 
     warm_up()
 
@@ -165,14 +165,10 @@ def _refit() -> None:
     """Make a refit of the demo's board; its tables, most of the work, are kept for the demo."""
     from anser_ros.refit.live_refit import LiveRefit
     from anser_ros.refit.tables import build_tables
-    from anser_ros.sessions.drawing import NominalBoard
     from anser_ros.sessions.kept_tables import KeptTables, kept_folder
+    from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
     from anser_ros.sessions.session import sensor_table
-    from anser_ros.sessions.volume import stated_volume
-    from anser_ros.simulation.board_source import board_source
-    from anser_ros.simulation.metal import steel_disc
-    from anser_ros.simulation.motion import Approach
-    from anser_ros.simulation.world import World
+    from anser_ros.simulation.world import Approach, World, board_source, steel_disc
 
     setup = parse_setup(read_config('demo_setup.yaml'))
     source, near = board_source(setup), Approach(start_s=-1e3, travel_s=1.0, stay_s=1e6)
@@ -205,7 +201,7 @@ def _watch_samples() -> None:
 
 
 def _demo_model() -> FieldModel:
-    from anser_ros.sessions.model_file import load_model
+    from anser_ros.sessions.starting_model import load_model
 
     return load_model(config_path('demo_model.yaml'))
 

@@ -23,10 +23,8 @@ from anser_ros.diagnosis.decisions import (
     TIME_PARTS,
 )
 from anser_ros.diagnosis.fit import Fit
-from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
-from anser_ros.diagnosis.whitening import parts
-from anser_ros.effects.effect import INEXACT, Family
-from anser_ros.effects.term import Term
+from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, parts
+from anser_ros.effects.effect import INEXACT, Family, Term
 
 Array = NDArray[np.float64]
 

@@ -13,17 +13,16 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.choice import course_of
 from anser_ros.diagnosis.decisions import SOMETHING_LEFT
 from anser_ros.diagnosis.engine import Scorer
-from anser_ros.diagnosis.fit import Fit, Fitter
-from anser_ros.diagnosis.moving_start import course_of
-from anser_ros.diagnosis.outlying import without_outliers
+from anser_ros.diagnosis.fit import Fit, Fitter, Shaping
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.rich_modes import rich_modes
-from anser_ros.diagnosis.shaping import Shaping
-from anser_ros.effects.body_term import Richness
+from anser_ros.diagnosis.screening import without_outliers
 from anser_ros.effects.departed_metal import DepartedMetal, DepartedTerm
+from anser_ros.effects.effect import Richness
 from anser_ros.effects.metal_path import FreePath
 from anser_ros.effects.view import View
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.choice import refit_spreads
 from anser_ros.diagnosis.confirm import Confirmation, doubtful
-from anser_ros.diagnosis.corrected_model import corrected_model
 from anser_ros.diagnosis.decisions import (
     DEPENDENT,
     FEWEST_OUTLIERS,
@@ -16,21 +16,31 @@ from anser_ros.diagnosis.decisions import (
     STRUCTURED,
     UNSTRUCTURED,
 )
-from anser_ros.diagnosis.finding import Finding, fitted_finding
-from anser_ros.diagnosis.fit import Fit, Fitter
-from anser_ros.diagnosis.fluctuating import refit_spreads
-from anser_ros.diagnosis.noise import noise_findings, outlier_findings
-from anser_ros.diagnosis.outlying import clean_start, outlying_share, without_outliers
+from anser_ros.diagnosis.findings import (
+    Finding,
+    corrected_model,
+    fitted_finding,
+    noise_findings,
+    outlier_findings,
+)
+from anser_ros.diagnosis.fit import FINE, Fit, Fitter, settled
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
-from anser_ros.diagnosis.problem import Problem, State, evaluate
-from anser_ros.diagnosis.refine import FINE, settled
-from anser_ros.diagnosis.residuals import expected_rms, rms
+from anser_ros.diagnosis.problem import Problem, State, evaluate, expected_rms, rms
+from anser_ros.diagnosis.screening import (
+    clean_start,
+    outlying_share,
+    wiring_faults,
+    without_outliers,
+)
 from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
-from anser_ros.diagnosis.structure import StructureTest, noise_scale, noise_t, structure_tests
-from anser_ros.diagnosis.whiteness import whiteness
-from anser_ros.diagnosis.wiring import wiring_faults
-from anser_ros.effects.effect import Family
-from anser_ros.effects.term import Term
+from anser_ros.diagnosis.structure import (
+    StructureTest,
+    noise_scale,
+    noise_t,
+    structure_tests,
+    whiteness,
+)
+from anser_ros.effects.effect import Family, Term
 from anser_ros.field.model import FieldModel
 
 Array = NDArray[np.float64]

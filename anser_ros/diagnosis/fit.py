@@ -1,15 +1,31 @@
-"""Fits the parameters of all active effects on fluxes."""
+"""Fits all effects on fluxes jointly, metal in as much detail as the data determine. The fit
+itself; couplings that the data determine; a richer body and path for metal that moves; what
+metal at rest leaves; and all of it together (`settled`).
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.engine import JointFit, descended
-from anser_ros.diagnosis.problem import Problem, State, evaluate
-from anser_ros.effects.effect import Family
-from anser_ros.effects.term import Term
+from anser_ros.diagnosis.decisions import COARSE_REMAINDER, PER_PARAMETER, SOMETHING_LEFT
+from anser_ros.diagnosis.engine import JointFit, descended, joined
+from anser_ros.diagnosis.problem import Problem, State, evaluate, tools_misfit
+from anser_ros.diagnosis.rich_modes import Known, rich_modes, thinned
+from anser_ros.diagnosis.structure import noise_scale
+from anser_ros.effects.effect import BodyTerm, Family, Resting, Richness, SizedShapes, Term
+from anser_ros.effects.metal_remainder import (
+    REMAINDER,
+    Couplings,
+    IlluminationChange,
+    RemainderPart,
+)
+from anser_ros.effects.view import View
+from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
+from anser_ros.metal.scattering import Shapes
+from anser_ros.parallel import in_order
 
 Array = NDArray[np.float64]
 
@@ -53,3 +69,234 @@ class Fitter:
         """Fit all parameters of some terms together, from their values."""
         steps = self.iterations if iterations is None else iterations
         return Fit(*descended(evaluate(self.problem, terms), self.blocks, steps))
+
+
+TRIALS = 3
+"""Iterations after which kinds of bodies are compared; the best one is fitted on. All begin at
+places that have been fitted, and each iteration costs as much as the one before."""
+EVERY_OTHER = 2
+"""Every so many frames are used to compare kinds of bodies: it takes half the time."""
+
+
+@dataclass(frozen=True)
+class Shaping:
+    """Shapes metal that moves in a fit."""
+
+    fitter: Fitter
+    richness: Richness  # how many modes and knots it may have
+
+    def shaped(self, fit: Fit, index: int) -> Fit:
+        """Return the fit with one moving metal shaped; the same fit for any other effect."""
+        body = _body(fit.terms[index])
+        if body is None or body.richness == self.richness:
+            return fit
+        return self.with_freer_course(self._bodied(fit, index, body), index)
+
+    def with_freer_course(self, fit: Fit, index: int) -> Fit:
+        """Return the fit with a freer path, as long as its parameters are worth it."""
+        for knots in self.richness.knots:
+            body = _body(fit.terms[index])
+            if body is None or fit.misfit < self.richness.left * noise_scale(fit.state) ** 2:
+                break
+            freer = body.freer(knots)
+            if freer is None:
+                continue
+            other = self.fitter.fit(_with(fit.terms, index, freer))
+            price = PER_PARAMETER * (freer.placed - body.placed) * max(other.misfit, 1.0)
+            if fit.held_out() - other.held_out() < price:
+                break
+            fit = other
+        return fit
+
+    def _bodied(self, fit: Fit, index: int, first: BodyTerm) -> Fit:
+        """The fit with a richer body.
+
+        A simple body fitted in place of an extended one may have converged to a wrong place, so
+        its start is tried too.
+        """
+        if first.richness is not None:
+            return self.shaped_as(fit, index, first, [first.kind]) or fit
+        half = self.fitter.problem.in_blocks(self.fitter.blocks, EVERY_OTHER)
+        trial = replace(self, fitter=replace(self.fitter, problem=half, iterations=TRIALS))
+        starts, families = [trial.fitter.fit(fit.terms, 0)], [[COMPACT], [*SPACINGS]]
+        restarted = first.restarted()
+        if restarted is not None:
+            linear = trial.fitter.fit(_with(fit.terms, index, restarted.hold()), 1)
+            starts.append(trial.fitter.fit([t.free() for t in linear.terms], 0))
+
+        def shape(pair: tuple[Fit, list[str]]) -> Fit | None:
+            start, kinds = pair
+            body = _body(start.terms[index])
+            return None if body is None else trial.shaped_as(start, index, body, kinds)
+
+        found = in_order(shape, product(starts, families))
+        shaped = [fit for fit in found if fit is not None]
+        if not shaped:
+            return fit
+        best = min(shaped, key=Fit.held_out)
+        body = _body(best.terms[index])
+        assert body is not None
+        best = self.fitter.fit(best.terms, 0)
+        return self.shaped_as(best, index, body, [body.kind]) or best
+
+    def shaped_as(self, fit: Fit, index: int, body: BodyTerm, kinds: Sequence[str]) -> Fit | None:
+        """Return the fit with the best of some kinds of bodies; None if no body is better."""
+        fitter = self.fitter
+        bare = _with(fit.terms, index, body.with_theta(_without_amounts(body)))
+        few = thinned(evaluate(fitter.problem, bare), fitter.blocks)
+        known = self._known(fit, index, body)
+        best: tuple[float, str, Array] | None = None
+        for kind in kinds:
+
+            def unit(view: View, modes: Array, kind: str = kind) -> NDArray[np.inexact]:
+                return body.with_body(kind, modes, np.ones(modes.shape[1])).unit(view)
+
+            most, sizes = self.richness.modes, body_sizes(kind)
+            found = rich_modes(few, known, unit, sizes, fitter.blocks, most)
+            if found is not None and (best is None or found[0] < best[0]):
+                best = (found[0], kind, found[1])
+        if best is None:
+            return None
+        rich = body.shaped(best[1], best[2], self.richness)
+        start = fitter.fit(_with(fit.terms, index, rich.hold()), 1)
+        return fitter.fit(_with(start.terms, index, start.terms[index].free()))
+
+    def _known(self, fit: Fit, index: int, body: BodyTerm) -> Known:
+        """Columns of all terms, of the metal that moves only those of its course."""
+        few = thinned(fit.state, self.fitter.blocks)
+        groups, priors = [], []
+        for i, term in enumerate(fit.terms):
+            columns, prior = few.design(term), term.effect.prior(term)
+            if i == index:
+                columns = [None if c is None else c[..., : body.placed] for c in columns]
+                prior = prior[: body.placed]
+            groups.append(columns)
+            priors.append(prior)
+        return joined(groups), np.concatenate(priors)
+
+
+def _body(term: Term) -> BodyTerm | None:
+    return term.effect.body(term)
+
+
+def _without_amounts(term: Term) -> Array:
+    theta = term.theta.copy()
+    theta[term.effect.amounts(term)] = 0.0
+    return theta
+
+
+def _with(terms: Sequence[Term], index: int, term: Term) -> tuple[Term, ...]:
+    return tuple(term if i == index else t for i, t in enumerate(terms))
+
+
+MODE_ROUNDS = 2
+"""Times that modes are made about where the metal then is; the second hardly ever moves it."""
+NEW_MODES_M = 2e-3
+"""A centre that a fit moves farther than this (m) asks for new modes: modes about a centre that is
+off by a tenth of a body's radius stand for it as well."""
+
+
+@dataclass(frozen=True)
+class Remainders:
+    """Adds what metal at rest leaves to a fit."""
+
+    fitter: Fitter
+    richness: Richness  # how many modes it may have
+
+    def added(self, fit: Fit, index: int) -> Fit:
+        """Return the fit with what one metal at rest leaves; the same fit for any other effect."""
+        plain = fit.terms
+        if plain[index].effect.resting(plain[index]) is None:
+            return fit
+        for _ in range(MODE_ROUNDS):
+            term = fit.terms[index]
+            before = _resting(term)
+            own = self._couplings(fit, term, plain, before.near)
+            if own is None:
+                return fit
+            start = [t if i != index else term for i, t in enumerate(plain)]
+            emitters = self.fitter.problem.apparatus.emitters
+            light = REMAINDER.of(term, IlluminationChange([term, own], emitters))
+            fit = self.fitter.fit([*start, own, light])
+            if np.linalg.norm(_resting(fit.terms[index]).centre - before.centre) < NEW_MODES_M:
+                break
+        return self._extended(fit, index)
+
+    def _extended(self, fit: Fit, index: int) -> Fit:
+        """The fit with a body as large as its distance, where much is left."""
+        term = fit.terms[index]
+        extended = _resting(term).extended
+        if not extended or tools_misfit(fit.state) <= SOMETHING_LEFT * noise_scale(fit.state) ** 2:
+            return fit
+        more = self._couplings(fit, term, fit.terms, extended)
+        if more is None:
+            return fit
+        held = term.hold(fit.covariance_of(index))
+        terms = [held if i == index else t for i, t in enumerate(fit.terms)]
+        return self.fitter.fit([*terms, more])
+
+    def _couplings(
+        self, fit: Fit, term: Term, beside: Sequence[Term], shapes: Sequence[SizedShapes]
+    ) -> Term | None:
+        """The couplings about metal at rest that predict best, given the other terms."""
+        fitter, few = self.fitter, thinned(fit.state, self.fitter.blocks)
+        centre = _resting(term).centre
+        known = (
+            joined([few.design(t) for t in beside]),
+            np.concatenate([t.effect.prior(t) for t in beside]),
+        )
+        best: tuple[float, RemainderPart] | None = None
+        for kind, sizes in shapes:
+
+            def unit(view: View, modes: Array, kind: Shapes = kind) -> NDArray[np.inexact]:
+                return Couplings(kind, centre, modes).unit(view)
+
+            most = self.richness.modes
+            found = rich_modes(few, known, unit, sizes, fitter.blocks, most)
+            if found is not None and (best is None or found[0] < best[0]):
+                best = (found[0], Couplings(kind, centre, found[1]))
+        return None if best is None else REMAINDER.of(term, best[1])
+
+
+def _resting(term: Term) -> Resting:
+    """Where a term of metal at rest is."""
+    found = term.effect.resting(term)
+    assert found is not None, f'{term.label} is not metal at rest'
+    return found
+
+
+COARSE = Richness(50, (17,), COARSE_REMAINDER)
+"""How finely metal is shaped during the search: by what shapes usually leave, about half of the
+modes that the data determine, and a knot in 2.5 s of a session of 40 s."""
+FINE = Richness(90, (17, 25), SOMETHING_LEFT)
+"""How finely metal is shaped in the last fit, which is made once."""
+
+
+def settled(fitter: Fitter, terms: Sequence[Term], richness: Richness = COARSE) -> Fit:
+    """Return the joint fit of some effects, metal shaped and then held where it is.
+
+    ``terms``: start values; remainders of metal among them are made again; ``richness``: how
+    finely metal is shaped.
+    """
+    plain = [term.free() for term in terms if term.effect.family is not Family.REMAINDER]
+    bodies = [term.effect.body(term) for term in plain]
+    # What moves and has its shape already is reshaped below.
+    known = any(body is not None and body.richness is not None for body in bodies)
+    fit = fitter.fit(plain, 1 if known else None)
+    shaping, remainders = Shaping(fitter, richness), Remainders(fitter, richness)
+    for index in range(len(fit.terms)):
+        fit = shaping.shaped(fit, index)
+    for index in range(len(fit.terms)):
+        fit = remainders.added(fit, index)
+    return _held(fit, fitter)
+
+
+def _held(fit: Fit, fitter: Fitter) -> Fit:
+    """The same fit, metal held where it is: what is tried with it is then cheap to fit."""
+    if not any(term.effect.family.is_metal for term in fit.terms):
+        return fit
+    held = [
+        term.hold(fit.covariance_of(index)) if term.effect.family.is_metal else term
+        for index, term in enumerate(fit.terms)
+    ]
+    return fitter.fit(held, 1)

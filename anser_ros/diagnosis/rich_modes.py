@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import TIME_FOLDS
-from anser_ros.diagnosis.problem import Part, State
-from anser_ros.diagnosis.scoring import BlockSums, block_sums, joined
-from anser_ros.diagnosis.whitening import parts
+from anser_ros.diagnosis.engine import BlockSums, block_sums, joined
+from anser_ros.diagnosis.problem import Part, State, parts
 from anser_ros.effects.view import View
 
 Array = NDArray[np.float64]

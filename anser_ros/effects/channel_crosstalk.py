@@ -7,19 +7,18 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
     Effect,
     Remedy,
+    Term,
     needed,
     sigmas,
     unit_matrix,
     whole_numbers,
 )
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 

@@ -5,19 +5,18 @@ from itertools import combinations, permutations
 
 import numpy as np
 
-from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
     Effect,
     Remedy,
+    Term,
     needed,
     sigmas,
     unit_matrix,
     whole_numbers,
 )
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 
 

@@ -6,18 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
     Effect,
     Remedy,
+    Term,
     needed,
     sigmas,
     unit_matrix,
 )
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 
 PROBED_SHARES = (0.1, 0.5, 2.5)

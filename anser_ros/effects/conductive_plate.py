@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     FROZEN,
     Array,
@@ -14,14 +13,14 @@ from anser_ros.effects.effect import (
     Family,
     Remedy,
     Resting,
+    Term,
     needed,
     sigmas,
 )
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord
-from anser_ros.metal.sheet import sheet_shapes, sheet_sizes, sheet_sources
+from anser_ros.metal.body import sheet_shapes, sheet_sizes, sheet_sources
 
 MESH = 12
 """Loops along an edge of the sheet's mesh: a loop is then as wide as a twelfth of the edge, less

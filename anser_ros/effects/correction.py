@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Effect, Remedy
+from anser_ros.effects.effect import Effect, Remedy, Term
 from anser_ros.effects.registry import effect_named
-from anser_ros.effects.term import Term
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack

@@ -1,42 +1,206 @@
-"""Defines what every effect looks like: one interface, and one file for each effect.
-
-The measurement chain that an effect may change runs in this order::
-
-    optical track -> sensor table -> field -> emitters -> channels -> offset -> compression
-
-An effect overrides the stages at which it acts, and gives the derivative of the predicted flux by
-its own parameters. Its forward stages are also what undoes it live
-(`anser_ros.effects.correction`). It also declares what the search for effects needs to know of it
-(`anser_ros.diagnosis`): its family, its rivals, the cost of its parameters, how it is refined, and
-what errors of a reference sensor's survey add to it. Nothing outside this package refers to an
-effect's name or class, or imports its module, except what `test/test_effect_names.py` lists with
-reasons: the stages of the diagnosis that see an effect without the search and so make its term
-themselves, and code that speaks of effects without these classes.
+"""Defines what every effect looks like: one interface, and one file for each effect. A term is
+one effect at one site, with values of its parameters. The measurement chain that an effect may
+change runs in this order::     optical track -> sensor table -> field -> emitters -> channels
+-> offset -> compression An effect overrides the stages at which it acts, and gives the
+derivative of the predicted flux by its own parameters. Its forward stages are also what undoes
+it live (`anser_ros.effects.correction`). It also declares what the search for effects needs to
+know of it (`anser_ros.diagnosis`): its family, its rivals, the cost of its parameters, how it
+is refined, and what errors of a reference sensor's survey add to it. Nothing outside this
+package refers to an effect's name or class, or imports its module, except what
+`test/test_effect_names.py` lists with reasons: the stages of the diagnosis that see an effect
+without the search and so make its term themselves, and code that speaks of effects without
+these classes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.base import BaseEffect
+from anser_ros.effects.base import BaseEffect, BaseTerm
 from anser_ros.effects.base import Remedy as Remedy
-from anser_ros.effects.body_term import BodyTerm, FluctuationTerm
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord
+from anser_ros.metal.body import BODIES, COMPACT, ball_modes
 from anser_ros.metal.scattering import Shapes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 
 Array = NDArray[np.float64]
+
+
+class Site(TypedDict, total=False):
+    """States where an effect acts, by the keys that it needs, in the words of records and reports.
+
+    It is a plain mapping, as it is printed, compared and written; the type checker knows each key
+    and the type of its value.
+    """
+
+    channel: int
+    channels: tuple[int, ...]
+    coil: int  # number of an emitter
+    coils: tuple[int, ...]  # of crosstalk: the one that leaks, and the one that it leaks into
+    read_as: tuple[int, ...]  # for each of the channels or coils, the one whose place it has
+    body: str
+    mutual: Literal[True]  # the leak is the same both ways
+    shape: str  # curve of a saturation
+    sees: str  # what a saturating channel sees: one tone, or all together
+    of: str  # name of the effect whose remainder it is
+    place: tuple[float, ...]  # where resting metal is looked for, m, frame fg
+    z: float  # height of a sheet, m, frame fg
+    edge: float  # length of its edge, m
+
+
+@dataclass(frozen=True)
+class Held:
+    """Marks a term whose parameters that are not linear stay where they are in a fit."""
+
+    # (q, q), of all its parameters, from when they were last free; None where they never were
+    covariance: Array | None = None
+
+
+@dataclass(frozen=True)
+class Term(BaseTerm):
+    """Holds an effect at one site (a channel, a coil, a body, ...) with values of its parameters.
+
+    An effect that needs more data than a site defines a subclass with more fields.
+    """
+
+    effect: 'Effect[Any]'
+    # What tells this candidate from others of the same effect, as reports and records show it
+    site: Site = field(default_factory=lambda: Site())
+    held: Held | None = None  # None where all parameters are free
+
+    def hold(self, covariance: Array | None = None) -> Self:
+        """Return the same term, held; ``covariance`` is kept for its record."""
+        return replace(self, held=Held(covariance))
+
+    def free(self) -> Self:
+        """Return the same term with all parameters free again."""
+        return replace(self, held=None)
+
+    def belongs_to(self, other: 'Term') -> bool:
+        """Return whether this term is part of another one's explanation and goes with that one."""
+        return self.effect.belongs(self, other)
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Return the channels that the site names; none where it is about something else."""
+        one = (int(self.site['channel']),) if 'channel' in self.site else ()
+        return (*one, *(int(c) for c in self.site.get('channels', ())))
+
+
 ComplexArray = NDArray[np.complex128]
+
+LARGEST = 10.0
+"""Prior standard deviation of the amplitudes of a simple body's modes, in units of 1e-4 m^3
+(`anser_ros.metal.scattering.UNIT`). A perfectly conducting ball of 25 mm radius has -1, one of
+54 mm -10: the prior holds nothing back that fits beside a tracked volume, and only keeps modes
+that the data do not determine from growing without bound."""
+
+
+@dataclass(frozen=True)
+class Richness:
+    """States how finely metal is shaped."""
+
+    modes: int  # Most modes of a body
+    knots: tuple[int, ...]  # Numbers of knots that a free course may have, tried in this order
+    left: float  # Misfit over the noise's from which a freer course is tried
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyTerm(Term):
+    """Holds metal of modes: theta is its course, then real and imaginary parts of their
+    amplitudes.
+    """
+
+    kind: str  # Of body (`anser_ros.metal.body.BODIES`)
+    modes: Array  # (c, m), each a combination of the c couplings of the body's shapes
+    # (m,), prior standard deviation of each mode's amplitude, in phase and in quadrature
+    spread: Array
+    # How finely the body was shaped; None for a simple body as it starts
+    richness: Richness | None = None
+
+    @property
+    def shapes(self) -> Shapes:
+        """Return the shapes of the field that the body couples."""
+        return BODIES[self.kind]()
+
+    @property
+    def placed(self) -> int:
+        """Return how many parameters the course has, which come before the amplitudes."""
+        return int(self.theta.size) - 2 * int(self.modes.shape[1])
+
+    @property
+    def knots(self) -> int:
+        """Return knots of a free course; 0 where the course has few parameters of its own kind."""
+        return 0
+
+    @property
+    def course(self) -> Array:
+        """Return the parameters that say where the body is."""
+        return self.theta[: self.placed]
+
+    @property
+    def couplings(self) -> ComplexArray:
+        """Return the complex couplings of the whole body, shape (c,)."""
+        parts = self.theta[self.placed :].reshape(2, -1)
+        return np.asarray(self.modes @ (parts[0] + 1j * parts[1]))
+
+    def unit(self, view: View) -> NDArray[np.inexact]:
+        """Return the flux of each mode of unit amplitude in a view, (F, S, K, m), T."""
+        raise NotImplementedError
+
+    def with_body(self, kind: str, modes: Array, spread: Array) -> Self:
+        """Return the same course with another body, whose amplitudes are still zero."""
+        theta = np.concatenate([self.course, np.zeros(2 * modes.shape[1])])
+        return replace(self, kind=kind, modes=modes, spread=spread, theta=theta)
+
+    def shaped(self, kind: str, modes: Array, richness: Richness) -> Self:
+        """Return the same course, a body of modes of unit prior size; a compact one has a ball's
+        too.
+        """
+        spread = np.ones(modes.shape[1])
+        if kind == COMPACT:
+            ball = ball_modes()
+            modes = np.concatenate([ball, modes], axis=1)
+            spread = np.concatenate([np.full(ball.shape[1], LARGEST), spread])
+        return replace(self.with_body(kind, modes, spread), richness=richness)
+
+    def freer(self, knots: int) -> Self | None:
+        """Return the same body on a freer course near this one; None where no freer one exists."""
+        return None
+
+    def restarted(self) -> Self | None:
+        """Return the body as it is, where its course started from; None where that isn't known."""
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FluctuationTerm(Term):
+    """Holds something constant that fluctuates; theta is empty."""
+
+    # The constant effect at the same site; None for a term from a record
+    constant: Term | None = None
+    # Standard deviation of each of its parameters from frame to frame; None before it is found
+    spread: Array | None = None
+    frames: int = 1  # Frames that the spread was found on
+
+    def columns(self, view: View) -> ComplexArray | None:
+        """Return columns (F, S, K, q) of unit size along which a frame may move."""
+        return None if self.constant is None else self.constant.effect.columns(self.constant, view)
+
+    @property
+    def expected(self) -> Array:
+        """Return each parameter's standard deviation by the constant effect, shape (q,)."""
+        return np.zeros(0) if self.constant is None else self.constant.effect.prior(self.constant)
+
+
 TermT = TypeVar('TermT', bound=Term)
 SizedShapes = tuple[Shapes, Sequence[Array]]
 """Shapes of a field that metal couples, and the prior sizes of their couplings to try."""

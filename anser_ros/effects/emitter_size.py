@@ -5,13 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
-from anser_ros.field.dipoles import Dipoles
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed
+from anser_ros.effects.view import Apparatus, View
+from anser_ros.field.dipoles import Dipoles, size_parameters, spread_along, symmetry_axis
 from anser_ros.field.model import EffectRecord
-from anser_ros.field.symmetry import size_parameters, spread_along, symmetry_axis
 
 UNIT = 1e-4
 """theta counts second moments in units of (10 mm)^2."""

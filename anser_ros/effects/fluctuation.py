@@ -11,27 +11,25 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.body_term import FluctuationTerm
-from anser_ros.effects.coil_gain import CoilGain
+from anser_ros.effects.clocks import TimeOffset
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
     Effect,
     Family,
+    FluctuationTerm,
     Remedy,
+    Site,
+    Term,
     needed,
     recorded_site,
     whole_numbers,
 )
-from anser_ros.effects.registration import Registration
+from anser_ros.effects.gains import CoilGain, SensorGain, ToolGain
+from anser_ros.effects.optical_frame import Registration
 from anser_ros.effects.sensor_axis import SensorAxis
-from anser_ros.effects.sensor_gain import SensorGain
 from anser_ros.effects.sensor_position import SensorPosition
-from anser_ros.effects.term import Site, Term
-from anser_ros.effects.time_offset import TimeOffset
-from anser_ros.effects.tool_gain import ToolGain
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 
 OPEN = 40

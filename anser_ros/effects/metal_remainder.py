@@ -11,8 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Family, Remedy
-from anser_ros.effects.term import Term
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Family, Remedy, Term
 from anser_ros.effects.view import View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord

@@ -7,11 +7,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.body_term import LARGEST, BodyTerm
 from anser_ros.effects.effect import (
     FROZEN,
+    LARGEST,
     Array,
+    BodyTerm,
     ComplexArray,
     Effect,
     Family,
@@ -27,7 +27,7 @@ from anser_ros.effects.metal_path import (
     spline_weights,
 )
 from anser_ros.effects.static_metal import STATIC_METAL
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 from anser_ros.metal.body import COMPACT, SPACINGS, ball_modes, centre_sigma
 from anser_ros.metal.scattering import UNIT

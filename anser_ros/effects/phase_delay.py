@@ -4,10 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 
 UNIT = 1e-6

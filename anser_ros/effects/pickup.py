@@ -5,10 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, sigmas
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed, sigmas
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 
 UNIT = 1e-9

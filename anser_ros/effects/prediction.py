@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.term import Term
+from anser_ros.effects.effect import Term
 from anser_ros.effects.view import View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements

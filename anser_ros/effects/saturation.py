@@ -14,10 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
-from anser_ros.effects.term import Site, Term
-from anser_ros.effects.view import View
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Site, Term, needed
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 
 UNIT = 1e12

@@ -6,22 +6,22 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
     Effect,
     Remedy,
+    Site,
+    Term,
     needed,
     sigmas,
     whole_numbers,
 )
-from anser_ros.effects.term import Site, Term
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
+from anser_ros.physics.rotations import tangents, tilted
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.physics.tangent import tangents, tilted
 
 
 @dataclass(frozen=True, kw_only=True)

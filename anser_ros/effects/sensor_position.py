@@ -1,23 +1,22 @@
-"""One sensor, or one cluster, sits elsewhere in the body than the others say."""
+"""Sensors sit elsewhere in the body than the setup says: one, a cluster, or all of them."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
     Effect,
     Remedy,
+    Term,
     needed,
     recorded_site,
     sigmas,
     whole_numbers,
 )
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
@@ -86,4 +85,32 @@ class SensorPosition(PlacedElsewhere):
         return Term(self, {'channels': whole_numbers(record, 'channels')}, offset)
 
 
-EFFECTS = (SensorPosition(),)
+class LeverArm(PlacedElsewhere):
+    """Shifts all of a body's sensors."""
+
+    name = 'lever_arm'
+    summary = "the sensors sit elsewhere in the body's frame"
+    units = {'offset_m': 'm', 'body': '1'}
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        """Return a candidate for every body that has sensors."""
+        return [
+            Term(self, {'body': table.body[0]}, np.zeros(3))
+            for table in apparatus.tools
+            if len(table)
+        ]
+
+    def rows(self, term: Term, sensors: SensorTable) -> NDArray[np.bool_]:
+        """Return the sensors of the site's body."""
+        return np.array([body == term.site['body'] for body in sensors.body])
+
+    def term(self, record: EffectRecord) -> Term:
+        """Read the body and its offset, m, from a record."""
+        offset = np.asarray(needed(record, 'offset_m'), dtype=np.float64)
+        return Term(self, {'body': str(needed(record, 'body'))}, offset)
+
+
+EFFECTS = (
+    SensorPosition(),
+    LeverArm(),
+)

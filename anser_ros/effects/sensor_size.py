@@ -5,10 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, whole_numbers
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Term,
+    needed,
+    whole_numbers,
+)
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 

@@ -7,23 +7,22 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
     Effect,
     Family,
     Remedy,
+    Term,
     needed,
     sigmas,
     unit_matrix,
 )
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
+from anser_ros.physics.rotations import tilted
 from anser_ros.physics.sensor import SensorTable, clusters_of
-from anser_ros.physics.tangent import tilted
 
 LEAST_SHARED = 0.5
 """Share of the gains' variance in common from which on the channels at one place are one sensor:
@@ -187,7 +186,7 @@ class SensorGainSpread(SensorSpread):
 
 
 class SensorAxisSpread(SensorSpread):
-    """Values are the tilts (rad) of each axis along its two tangents (`physics.tangent`)."""
+    """Values are the tilts (rad) of each axis along its two tangents (`physics.rotations`)."""
 
     name = 'sensor_axis_spread'
     summary = "every sensor's axis is a little off"

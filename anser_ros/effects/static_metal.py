@@ -6,7 +6,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     FROZEN,
     Array,
@@ -15,11 +14,11 @@ from anser_ros.effects.effect import (
     Family,
     Remedy,
     Resting,
+    Term,
     needed,
     sigmas,
 )
-from anser_ros.effects.term import Term
-from anser_ros.effects.view import View
+from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord
 from anser_ros.metal.body import (

@@ -1,6 +1,5 @@
-"""Plugs in wrong sockets: channels or emitters exchanged, and channels that receive nothing.
-
-None has a parameter to fit; they are found before the search (`anser_ros.diagnosis.wiring`).
+"""Plugs in wrong sockets: channels or emitters exchanged, turned round, or receiving nothing.
+None has a parameter to fit; they are found before the search (`anser_ros.diagnosis.screening`).
 """
 
 from typing import cast
@@ -14,11 +13,12 @@ from anser_ros.effects.effect import (
     Effect,
     Family,
     Remedy,
+    Site,
+    Term,
     recorded_site,
     unit_matrix,
     whole_numbers,
 )
-from anser_ros.effects.term import Site, Term
 from anser_ros.field.model import EffectRecord
 
 
@@ -87,4 +87,28 @@ class DeadChannel(Wiring):
 
 
 SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()
-EFFECTS = (SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL)
+
+
+class SensorPolarity(Wiring):
+    """Turns the channels' signs round, without a parameter."""
+
+    name = 'sensor_polarity'
+    summary = 'a sensor is wired the other way round'
+    units = {'channels': '1'}
+    remedy = Remedy.FLUX
+
+    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+        """Return a diagonal matrix with -1 for every reversed channel."""
+        signs = np.where(np.isin(channels, term.site['channels']), -1.0, 1.0)
+        return np.diag(signs).astype(complex)
+
+
+SENSOR_POLARITY = SensorPolarity()
+
+
+EFFECTS = (
+    SWAPPED_CHANNELS,
+    SWAPPED_COILS,
+    DEAD_CHANNEL,
+    SENSOR_POLARITY,
+)

@@ -1,4 +1,7 @@
-"""Defines the field model that all rooms share: virtual dipoles with moments for each emitter."""
+"""Defines the field model that all packages share, and its document. Virtual dipoles with
+moments for each emitter, where their field is uncertain (in the gaps of the scan that it was
+fitted to), and what reference sensors read without metal when it was calibrated.
+"""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -9,18 +12,134 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ModelFileError
-from anser_ros.field.gaps import ScanGaps, gaps_document, parse_gaps
-from anser_ros.field.plain_data import plain
-from anser_ros.field.reference_readings import (
-    ReferenceReadings,
-    parse_readings,
-    readings_document,
-)
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.physics.dipole import flux_basis
 
+
+def plain(value: Any) -> Any:
+    """Return the value with arrays and tuples as lists, numpy's numbers as Python's, keys as
+    strings.
+
+    A complex number becomes the list of its real and imaginary part, because neither JSON nor
+    YAML knows complex numbers.
+    """
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    return value
+
+
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class ReferenceReadings:
+    """Holds mean readings of the reference sensors while nothing distorted the field."""
+
+    name: tuple[str, ...]  # length R
+    # (R, 3), surveyed places, m, frame fg: a sensor that is elsewhere now reads something else
+    position: Array
+    axis: Array  # (R, 3), surveyed unit axes
+    flux: ComplexArray  # (R, K), T
+    sigma_t: float  # Noise of a component of these means, T
+
+
+def readings_document(readings: ReferenceReadings) -> dict[str, Any]:
+    """Return readings as plain lists and mappings, a row per sensor."""
+    parts = np.stack([readings.flux.real, readings.flux.imag], axis=2).reshape(
+        len(readings.name), -1
+    )
+    rows = np.concatenate([readings.position, readings.axis, parts], axis=1)
+    return {
+        'sigma_t': readings.sigma_t,
+        'sensors': [
+            {'name': name, 'row': row}
+            for name, row in zip(readings.name, rows.tolist(), strict=True)
+        ],
+    }
+
+
+def parse_readings(document: Any, emitters: int) -> ReferenceReadings:
+    """Return what `readings_document` wrote; raises `ModelFileError` with the rule it breaks."""
+    try:
+        sensors = document['sensors']
+        names = tuple(str(item['name']) for item in sensors)
+        rows = np.array([item['row'] for item in sensors], dtype=np.float64)
+        sigma = float(document['sigma_t'])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(f'model: references are malformed: {error}') from error
+    if rows.shape != (len(names), 6 + 2 * emitters) or not names:
+        raise ModelFileError(
+            f'model: references must be rows of {6 + 2 * emitters} numbers, got {rows.shape}'
+        )
+    if not (np.isfinite(rows).all() and 0.0 <= sigma < np.inf):
+        raise ModelFileError('model: references hold values that are not finite')
+    flux = np.ascontiguousarray(rows[:, 6::2] + 1j * rows[:, 7::2])
+    return ReferenceReadings(names, rows[:, :3].copy(), rows[:, 3:6].copy(), flux, sigma)
+
+
+@dataclass(frozen=True)
+class ScanGaps:
+    """Holds what a scan leaves open of the field, alike for all emitters."""
+
+    # positions, directions: (N, 3), dipoles, m and unit vectors, frame fg
+    positions: Array
+    directions: Array
+    # (R, N), A m^2. The variance of a phasor component of any emitter's flux is the sum of the
+    # squares of the fluxes of these R combinations of the dipoles.
+    moments: Array
+
+    def sigma_t(self, points: Array, axes: Array, lengths: Array) -> Array:
+        """Return how far the modelled flux may be off, T a phasor component.
+
+        Parameters
+        ----------
+        points, axes : ndarray, shape (F, S, 3)
+            Sensor centres (m) and unit axes, frame fg.
+        lengths : ndarray, shape (S,)
+            Coil lengths, m.
+
+        Returns
+        -------
+        ndarray, shape (F, S)
+        """
+        frames, sensors = points.shape[:2]
+        basis = flux_basis(
+            points.reshape(-1, 3), axes.reshape(-1, 3), np.tile(lengths, frames),
+            self.positions, self.directions,
+        )  # fmt: skip
+        squares = np.sum((basis @ self.moments.T) ** 2, axis=1)
+        return np.asarray(np.sqrt(squares).reshape(frames, sensors))
+
+
+def gaps_document(gaps: ScanGaps) -> list[list[float]]:
+    """Return gaps as plain lists, a row per dipole: place, direction and its R moments."""
+    table: list[list[float]] = np.concatenate(
+        [gaps.positions, gaps.directions, gaps.moments.T], axis=1
+    ).tolist()
+    return table
+
+
+def parse_gaps(document: Any) -> ScanGaps:
+    """Return what `gaps_document` wrote; raises `ModelFileError` with the rule it breaks."""
+    try:
+        table = np.array(document, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ModelFileError('model: gaps are no table of numbers') from error
+    if table.ndim != 2 or table.shape[1] < 7 or not np.isfinite(table).all():
+        raise ModelFileError(
+            f'model: gaps must be rows of at least 7 finite numbers, got {table.shape}'
+        )
+    return ScanGaps(table[:, :3].copy(), table[:, 3:6].copy(), table[:, 6:].T.copy())
+
 
 SCHEMA = 'anser_model/1'
 

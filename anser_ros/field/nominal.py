@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
-from anser_ros.physics.board import Board
+from anser_ros.physics.board import Board, loop_field
 from anser_ros.physics.dipole import field_basis
-from anser_ros.physics.tracks import loop_field
 
 Array = NDArray[np.float64]
 

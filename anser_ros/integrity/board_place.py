@@ -14,8 +14,13 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.clean_references import DRAWING_ERROR, FEWEST_SENSORS, survey_errors
-from anser_ros.integrity.drawn_readings import DrawnReadings, FieldAt
+from anser_ros.integrity.clean_references import (
+    DRAWING_ERROR,
+    FEWEST_SENSORS,
+    DrawnReadings,
+    FieldAt,
+    survey_errors,
+)
 from anser_ros.physics.sensor import SensorTable, along_each_axis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.settings import Accuracy

@@ -1,47 +1,47 @@
-"""Turns samples of a control unit's serial port into fluxes.
-
-It has three threads, none of which waits for another: the port's thread reads and queues, this
-node's worker demodulates and publishes, and the executor serves parameters and diagnostics.
+"""Turns samples of a control unit's serial port into fluxes. It has three threads, none of
+which waits for another: the port's thread reads and queues, this node's worker demodulates and
+publishes, and the executor serves parameters and diagnostics.
 """
 
 import sys
 import threading
 import time
 from collections import Counter
+from dataclasses import dataclass
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, PortError
-from anser_ros.nodes.acquisition_parts.acquisition_parameters import AcquisitionParameters
-from anser_ros.nodes.acquisition_parts.fault_memory import FAULTS, RecentFaults, device_words
-from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame
-from anser_ros.nodes.acquisition_parts.flux_stream import FluxStream, StreamOptions
-from anser_ros.nodes.acquisition_parts.measured_accuracy import MeasuredAccuracy
-from anser_ros.nodes.acquisition_parts.stream_interval import Interval
-from anser_ros.nodes.acquisition_parts.stream_status import (
+from anser_ros.nodes.acquisition_status import (
+    FAULTS,
+    Interval,
+    RecentFaults,
     clock_troubles,
     clock_values,
+    device_words,
     emitter_statuses,
     sensor_statuses,
     signal_troubles,
 )
-from anser_ros.nodes.acquisition_parts.wall_clock import WallClock
+from anser_ros.nodes.acquisition_stream import (
+    FluxFrame,
+    FluxStream,
+    MeasuredAccuracy,
+    StreamOptions,
+    WallClock,
+)
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
+from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.runtime.process import TURN_S, main
-from anser_ros.nodes.streams.backlog import Backlog
 from anser_ros.nodes.streams.clouds import FluxCloud
-from anser_ros.nodes.streams.overload import too_slow
+from anser_ros.nodes.streams.one_source import Backlog, too_slow
 from anser_ros.wire.channel_calibration import parse_channels
-from anser_ros.wire.config_folder import read_config
-from anser_ros.wire.frames import TYPE_OF
-from anser_ros.wire.points import FluxPoints, as_sent
-from anser_ros.wire.port import Batch, ControlUnitPort, PortState, find_port
-from anser_ros.wire.protocols import PROTOCOLS
-from anser_ros.wire.records import (
+from anser_ros.wire.frames import (
+    TYPE_OF,
     DeviceStatus,
     Hello,
     Identify,
@@ -51,8 +51,62 @@ from anser_ros.wire.records import (
     SampleBlock,
     Start,
 )
+from anser_ros.wire.points import FluxPoints, as_sent
+from anser_ros.wire.port import (
+    DEFAULT_BAUD,
+    SILENCE_S,
+    Batch,
+    ControlUnitPort,
+    PortState,
+    find_port,
+)
+from anser_ros.wire.protocols import PROTOCOLS, StreamControl
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
-from anser_ros.wire.stream_control import StreamControl
+from anser_ros.wire.text_files import read_config
+
+
+@dataclass(frozen=True)
+class AcquisitionParameters:
+    """Holds the parameters of the acquisition."""
+
+    device: str = parameter(
+        '/dev/ttyACM0', "the control unit's port, or auto: listen on all ports for its hello"
+    )
+    protocol: str = parameter('anser', 'protocol of the control unit', choices=tuple(PROTOCOLS))
+    baud: int = parameter(
+        DEFAULT_BAUD, 'baud rate of the line; ignored over USB', minimum=9600, maximum=50_000_000
+    )
+    setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')
+    channels_file: str = parameter(
+        'demo_channels.yaml', 'channel calibration: a path, or a file of config/'
+    )
+    window_s: float = parameter(
+        0.02, 'length of a demodulation window, s', minimum=0.005, maximum=0.05, live=True
+    )
+    rate_hz: float = parameter(
+        0.0,
+        'windows a second, may overlap; 0 for the rate of the setup document',
+        minimum=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    mains_hz: float = parameter(
+        0.0,
+        'mains whose harmonics are fitted too; 0 for none',
+        minimum=0.0,
+        maximum=400.0,
+        live=True,
+    )
+    set_frequencies: bool = parameter(
+        True, 'whether the control unit is told to drive the tones of the setup document'
+    )
+    silence_s: float = parameter(
+        SILENCE_S,
+        'time without a byte after which it reports a fault, s',
+        minimum=0.1,
+        maximum=60.0,
+    )
+
 
 AUTO = 'auto'
 ASK_NS = 50_000_000

@@ -18,32 +18,34 @@ from scipy.spatial.transform import Rotation
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.runtime.shared_names import optical_parameter
-from anser_ros.simulation.board_source import board_source
-from anser_ros.simulation.control_unit import BLOCK_SAMPLES, ControlUnit, Piece
-from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
-from anser_ros.simulation.effect_draw import Drawn, draw
-from anser_ros.simulation.faults import (
+from anser_ros.simulation.control_unit import BLOCK_SAMPLES, ControlUnit, FrontEnd, Piece
+from anser_ros.simulation.effects import NONE as NO_EFFECT
+from anser_ros.simulation.effects import Drawn, draw
+from anser_ros.simulation.line import (
     FAULTS,
     NONE,
     OVERRUN,
     SATURATION,
     UNPLUG,
     FaultInjector,
+    PseudoPort,
 )
-from anser_ros.simulation.manufacture import manufactured
-from anser_ros.simulation.metal import MetalBody, steel_disc
-from anser_ros.simulation.motion import Approach, tool_paths
-from anser_ros.simulation.pseudo_port import PseudoPort
-from anser_ros.simulation.sampling import FrontEnd
-from anser_ros.simulation.world import World
+from anser_ros.simulation.world import (
+    Approach,
+    MetalBody,
+    World,
+    board_source,
+    manufactured,
+    steel_disc,
+    tool_paths,
+)
 from anser_ros.stamps import set_stamp
 from anser_ros.wire.channel_calibration import parse_channels
-from anser_ros.wire.config_folder import read_config
-from anser_ros.wire.pose_topics import optical_topic
+from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import Setup, parse_setup
+from anser_ros.wire.text_files import read_config
 
 STRETCH_S = 0.005
 """Stretch of samples that is made at a time, s: it bounds how unevenly they are sent."""

@@ -1,10 +1,11 @@
 """Serves the field model: from a file or drawn from the setup, refitted live to references.
-
-``field_model`` carries the dipoles, ``field_model_error`` their uncertainty with the same stamp.
+``field_model`` carries the dipoles, ``field_model_error`` their uncertainty with the same
+stamp.
 """
 
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,31 +19,89 @@ from anser_ros import pose_states as states
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.nodes.field_model_parts import refit_status
-from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelParameters
-from anser_ros.nodes.field_model_parts.kept_baseline import CONFIRM_S, KeptBaseline
-from anser_ros.nodes.field_model_parts.metal_view import MetalView
-from anser_ros.nodes.field_model_parts.model_output import ModelOutput
-from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
-from anser_ros.nodes.field_model_parts.refit_in_force import ActiveRefit
-from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
+from anser_ros.nodes import field_model_refit
+from anser_ros.nodes.field_model_io import (
+    CONFIRM_S,
+    KeptBaseline,
+    MetalView,
+    ModelOutput,
+    PlaceWatch,
+    ToolWitnesses,
+)
+from anser_ros.nodes.field_model_refit import ActiveRefit
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
+from anser_ros.nodes.runtime.parameters import parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.runtime.stated_parameters import stated_by
-from anser_ros.nodes.streams.flux_reader import read_frame
-from anser_ros.nodes.streams.newest_frame import NewestSource
-from anser_ros.nodes.streams.one_source import LOOK_S, sender_words, setup_source
+from anser_ros.nodes.streams.model_clouds import read_frame
+from anser_ros.nodes.streams.one_source import LOOK_S, NewestSource, sender_words, setup_source
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.baseline import ReadingWindow, check_enough
-from anser_ros.refit.change import Pace
+from anser_ros.refit.frame import MOST_RATE_HZ, Pace, ReadingWindow, check_enough
 from anser_ros.sessions.baseline import clean_flux, clean_mean
 from anser_ros.sessions.kept_tables import ReadAhead, kept_folder
-from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, save_model
 from anser_ros.sessions.session import load_session, sensor_table
-from anser_ros.sessions.starting_model import is_nominal, model_of, starting_model
+from anser_ros.sessions.starting_model import (
+    NOMINAL,
+    SNAPSHOT,
+    as_saved,
+    is_nominal,
+    is_snapshot,
+    model_of,
+    save_model,
+    starting_model,
+)
 from anser_ros.stamps import is_live
 from anser_ros.wire.setup import Setup, parse_setup
+
+
+@dataclass(frozen=True)
+class FieldModelParameters:
+    """Holds the parameters of the field model's server."""
+
+    model_file: str = parameter(
+        NOMINAL,
+        "model to start from: a file, or nominal for that of the setup's own geometry",
+        live=True,
+    )
+    allow_uncalibrated: bool = parameter(
+        False, 'whether trackers may give poses by the nominal model', live=True
+    )
+    refit: bool = parameter(
+        True, 'whether the model follows the reference sensors once a baseline is set', live=True
+    )
+    baseline_file: str = parameter(
+        '', 'distortion-free recording of the same board; empty: wait for set_baseline'
+    )
+    baseline_at_start: bool = parameter(
+        False, 'whether the first readings are the distortion-free ones'
+    )
+    baseline_s: float = parameter(
+        1.0, 'time that a baseline is averaged over, s', minimum=0.05, maximum=60.0
+    )
+    keep_state: bool = parameter(
+        True, 'whether baseline and tables are kept on disk for a node that is started again'
+    )
+    refit_rate_hz: float = parameter(
+        MOST_RATE_HZ, 'most refits a second, by the stamps', minimum=2.0, maximum=1000.0, live=True
+    )
+    witnesses: bool = parameter(
+        False, 'whether contradictions among the coils of rigid tools tell of metal, too'
+    )
+    save_file: str = parameter(
+        'field_model.yaml', 'where the service save writes the model', live=True
+    )
+    flux_noise_t: float = stated('flux_noise_t')
+    reference_position_m: float = stated('reference_position_m')
+    reference_axis_rad: float = stated('reference_axis_rad')
+    reference_gain: float = stated('reference_gain')
+    emitter_drift: float = stated('emitter_drift')
+    min_references: int = stated('min_references')
+    average_frames: int = stated('average_frames')
+    persistence: float = stated('persistence')
+    hold_frames: int = stated('hold_frames')
+    references_age_s: float = stated('references_age_s')
+    error_modes: int = stated('error_modes')
+    seed: int = stated('seed')
 
 
 class FieldModelNode(AnserNode):
@@ -135,7 +194,7 @@ class FieldModelNode(AnserNode):
         elif len(self._references) and table.refit:
             self._look()
             if not (table.baseline_at_start or self._refit.is_making):
-                self.get_logger().warning(refit_status.no_baseline(self.get_namespace()))
+                self.get_logger().warning(field_model_refit.no_baseline(self.get_namespace()))
 
     def _on_flux(self, message: PointCloud2) -> None:
         setup, window, frames = self._setup, self._window, self._frames
@@ -256,7 +315,7 @@ class FieldModelNode(AnserNode):
         """Refit to what differs from a baseline, shape (S, K), T, as soon as that can be done."""
         self._refit.begin(baseline)
         if self._refit.current is None:
-            self.get_logger().info(refit_status.PREPARING)
+            self.get_logger().info(field_model_refit.PREPARING)
         self._no_baseline = ''
         self._announce_changes()
         self.count('baselines')
@@ -267,7 +326,7 @@ class FieldModelNode(AnserNode):
             if not self._refit.take():
                 return
             self._received_s = time.monotonic()
-            self.get_logger().info(refit_status.ACTIVE)
+            self.get_logger().info(field_model_refit.ACTIVE)
         except FitError as error:
             self._refuse_baseline(error)
         self._announce_changes()
@@ -365,11 +424,13 @@ class FieldModelNode(AnserNode):
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values['fingerprint'] = '' if self._base is None else self._base.fingerprint
-        values |= refit_status.model_values(model, self.parameters.model_file)
+        values |= field_model_refit.model_values(model, self.parameters.model_file)
         values |= {'stamp_ns': self._stamp_ns, 'freeze': self._frozen}
         values['refit_time_s'] = self._refit.update_s
         is_wanted, refused = self.parameters.refit, self._no_baseline
-        activity = refit_status.activity(self._refit, self._frozen, is_wanted, refused, values)
+        activity = field_model_refit.activity(
+            self._refit, self._frozen, is_wanted, refused, values
+        )
         if self._is_uncalibrated:
             activity = f'{states.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
         dead = '' if self._frames is None else ', '.join(self._frames.dead)
@@ -385,7 +446,7 @@ class FieldModelNode(AnserNode):
         silent_s, setup = time.monotonic() - self._received_s, self._setup
         if setup is not None and self._follows and silent_s > setup.refit.references_age_s:
             return Status('', Level.ERROR, f'{lost} for {silent_s:.1f} s', values)
-        is_troubled = values.get('refit_state') in refit_status.TROUBLED
+        is_troubled = values.get('refit_state') in field_model_refit.TROUBLED
         is_troubled |= self._refit.is_awaited and self._follows
         is_troubled |= bool(refused and is_wanted)
         level = Level.WARN if is_troubled or self._is_uncalibrated else Level.OK
@@ -393,7 +454,7 @@ class FieldModelNode(AnserNode):
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every reference sensor that the refit looks at."""
-        return refit_status.reference_statuses(self._refit.result)
+        return field_model_refit.reference_statuses(self._refit.result)
 
     def stop_working(self) -> bool:
         """End what is worked on aside, a refit that is being made among it."""

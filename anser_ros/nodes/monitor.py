@@ -17,23 +17,15 @@ from rich.table import Table
 from std_msgs.msg import String
 
 from anser_ros.errors import ParameterError
-from anser_ros.nodes.output_parts.causes import causes
-from anser_ros.nodes.output_parts.traces import (
-    OpticalTrace,
-    Row,
-    Traces,
-    latency_of,
-    middle,
-    targets_of,
-)
+from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
 from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.runtime.shared_names import optical_parameter
-from anser_ros.wire.pose_topics import optical_topic
+from anser_ros.nodes.traces import OpticalTrace, Row, Traces, latency_of, middle, targets_of
+from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 LINE_PERIOD_S = 1.0

@@ -13,15 +13,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import AnserError
-from anser_ros.nodes.bag_parts.definitions import definition, message_class, type_hash
-from anser_ros.nodes.bag_parts.recording_log import TopicLog, report
+from anser_ros.nodes.recording import TopicLog, definition, message_class, report, type_hash
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, tracked_parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.runtime.shared_names import optical_parameter, tracked_parameter
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.bag_metadata import qos_profile, write_metadata
-from anser_ros.wire.bag_writer import BagWriter
+from anser_ros.wire.bag_writer import BagWriter, qos_profile, write_metadata
 
 # How often new topics are looked for, s: what they say before they are found is lost.
 DISCOVERY_PERIOD_S = 0.25

@@ -16,18 +16,16 @@ from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 
 from anser_ros.errors import AnserError, BagError, ParameterError
-from anser_ros.nodes.bag_parts.consumers import Consumers
-from anser_ros.nodes.bag_parts.definitions import message_class
+from anser_ros.nodes.recording import Consumers, message_class
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.nodes.streams.readiness import Readiness
 from anser_ros.stamps import set_stamp
 from anser_ros.wire.bag import RawMessage, Salvage, iter_messages
-from anser_ros.wire.pose_topics import OPTICAL
-from anser_ros.wire.yaml_text import read_yaml
+from anser_ros.wire.recorded import OPTICAL
+from anser_ros.wire.text_files import read_yaml
 
 BAG_NAMESPACE = '/anser/'
 FLUX_ENDINGS = ('/tool/flux', '/reference/flux')

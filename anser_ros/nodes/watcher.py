@@ -13,33 +13,24 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
+from anser_ros import extensions
 from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
+from anser_ros.nodes.operator_words import figures_of, plain_text, title_of, values_of, words_of
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.incoming import pose_numbers
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.runtime.shared_names import optical_parameter
-from anser_ros.nodes.runtime.stated_parameters import stated, stated_by
-from anser_ros.nodes.streams.flux_reader import read_frame
+from anser_ros.nodes.streams.model_clouds import read_frame
 from anser_ros.nodes.streams.one_source import OneSource, sender_words, setup_source
-from anser_ros.nodes.watcher_parts.sighting_words import (
-    figures_of,
-    plain_text,
-    title_of,
-    values_of,
-    words_of,
-)
 from anser_ros.pose_states import TWO_SOURCES
-from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.session import empty_session, load_session
-from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
-from anser_ros.sessions.starting_model import NOMINAL, model_for
+from anser_ros.sessions.session import LIVE, SlidingWindow, empty_session, load_session
+from anser_ros.sessions.starting_model import NOMINAL, load_model, model_for
 from anser_ros.sessions.watch import Sighting, Watch
 from anser_ros.stamps import stamp_of
-from anser_ros.wire.pose_topics import optical_topic
+from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import parse_setup
 
 POLL_S = 0.2
@@ -213,12 +204,10 @@ class FluxStreams:
 
 
 def streams_of(node: 'Watcher', table: WatcherParameters) -> Streams:
-    """Return what the parameters name: poses of another tracker, else this package's fluxes."""
-    if not table.tracked_poses:
-        return FluxStreams(node, table)
-    from anser_ros.nodes.watcher_parts.pose_streams import PoseStreams
-
-    return PoseStreams(node, table)
+    """Return what the parameters ask for: streams of an application, or fluxes."""
+    asked = zip(extensions.entries('STREAMS'), extensions.loaded('STREAMS'), strict=True)
+    made = (make(node, table) for name, make in asked if getattr(table, name))
+    return next(made, None) or FluxStreams(node, table)
 
 
 class Watcher(AnserNode):

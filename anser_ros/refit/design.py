@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.clouds import Cloud, Region, below, overhead
-from anser_ros.refit.excitation import Excitation
+from anser_ros.refit.clouds import Cloud, Excitation, Region, below, overhead
 from anser_ros.refit.layer import bottom_layer_of_board, box_layer
-from anser_ros.refit.prior import UPRIGHT, Response, build_prior
-from anser_ros.refit.reduced import reduced
+from anser_ros.refit.prior import UPRIGHT, Response, build_prior, reduced
 from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]

@@ -16,11 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.agreement import left_out
-from anser_ros.refit.evidence import STRENGTHS, FrameEvidence, log_sum, over_strengths
 from anser_ros.refit.frame import NoiseUnits
-from anser_ros.refit.health import FAULT_ODDS, FAULT_SCALES
-from anser_ros.refit.posterior import Bank
+from anser_ros.refit.health import FAULT_ODDS, FAULT_SCALES, left_out
+from anser_ros.refit.posterior import STRENGTHS, Bank, FrameEvidence, log_sum, over_strengths
 from anser_ros.stamps import NANO
 
 Array = NDArray[np.float64]

@@ -19,8 +19,7 @@ from scipy.linalg import cholesky
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
-from anser_ros.refit.clouds import Cloud, Region
-from anser_ros.refit.excitation import Excitation
+from anser_ros.refit.clouds import Cloud, Excitation, Region
 from anser_ros.refit.kernels import fill_dipole_tensors
 
 Array = NDArray[np.float64]

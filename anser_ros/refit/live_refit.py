@@ -14,22 +14,22 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.integrity.freshness import Freshness
+from anser_ros.integrity.streams import Freshness
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import REFERENCES_DOUBTFUL
 from anser_ros.refit import health
 from anser_ros.refit import tables as refit_tables
-from anser_ros.refit.agreement import distance_of, evidence_without, left_out
-from anser_ros.refit.assembly import Assembly
-from anser_ros.refit.banks import Banks
-from anser_ros.refit.baseline import checked_baseline
-from anser_ros.refit.belief import Belief
-from anser_ros.refit.change import Average, NoiseLevel
-from anser_ros.refit.evidence import FrameEvidence, median
-from anser_ros.refit.excitation import FieldFunction
-from anser_ros.refit.frame import BaselineCheck, NoiseUnits
-from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
+from anser_ros.refit.clouds import FieldFunction
+from anser_ros.refit.frame import Average, BaselineCheck, NoiseLevel, NoiseUnits, checked_baseline
+from anser_ros.refit.health import (
+    ReferenceHealth,
+    ReferenceWatch,
+    distance_of,
+    evidence_without,
+    left_out,
+)
+from anser_ros.refit.hypotheses import SLOTS, Banks, Belief, BodySlots
 from anser_ros.refit.jumps import (
     LARGEST_RATE,
     LEAST_JUMP_POWER,
@@ -37,19 +37,18 @@ from anser_ros.refit.jumps import (
     faults_have_ended,
     jumped,
 )
-from anser_ros.refit.posterior import Bank
-from anser_ros.refit.result import (
+from anser_ros.refit.model import (
     FEW_REFERENCES,
     FROZEN,
     POOR,
     POOR_FIT,
     REFIT,
+    Assembly,
     RefitResult,
     locate_metal,
 )
-from anser_ros.refit.slots import SLOTS, BodySlots
-from anser_ros.refit.tool_readings import ToolReading
-from anser_ros.refit.witness import Witness
+from anser_ros.refit.posterior import Bank, FrameEvidence, median
+from anser_ros.refit.witness import ToolReading, Witness
 from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]

@@ -1,22 +1,22 @@
-"""Keeps the bank of hypotheses: their evidence, and the field's change under each of them.
-
-Every cloud's hypothesis is a Gaussian of the readings, ``y ~ N(0, a C + s^2 N)``: metal of a total
-strength ``a`` distributed as in the cloud, the survey's errors in proportion, and noise. In the
-eigenvectors of C (whitened by N) all of it is diagonal, so the evidence of any strength costs a
-sum, and the strength is integrated over a grid instead of being chosen (MacKay, Neural Computation
-4 (1992) 415). In-phase and quadrature parts share the geometry and have a strength each.
-Hypothesis 0 is that nothing has changed. The *bank* holds all hypotheses with the matrices that
-are computed for them in advance, so that one pass over the readings of a frame gives the evidence
-of each. A *slot* of the bank is an empty place in which a compact body can be put later
-(`refit.slots`). `refit.agreement` compares coils with each other by the same tables, and
-`refit.modes` gives the uncertainty of the change of the field.
-
-N is white noise plus the drift of the emitters: an error of an emitter's measured current changes
-all references in proportion to their baseline, which metal does not.
-
-Readings are in units of the nominal noise throughout this module.
+"""Keeps the bank of hypotheses: their evidence, the field's change under each of them, and its
+uncertainty. Every cloud's hypothesis is a Gaussian of the readings, ``y ~ N(0, a C + s^2 N)``:
+metal of a total strength ``a`` distributed as in the cloud, the survey's errors in proportion,
+and noise. In the eigenvectors of C (whitened by N) all of it is diagonal, so the evidence of
+any strength costs a sum, and the strength is integrated over a grid instead of being chosen
+(MacKay, Neural Computation 4 (1992) 415). In-phase and quadrature parts share the geometry and
+have a strength each. Hypothesis 0 is that nothing has changed. The *bank* holds all hypotheses
+with the matrices that are computed for them in advance, so that one pass over the readings of a
+frame gives the evidence of each. A *slot* of the bank is an empty place in which a compact body
+can be put later (`refit.hypotheses`). `refit.health` compares coils with each other by the same
+tables. N is white noise plus the drift of the emitters: an error of an emitter's measured
+current changes all references in proportion to their baseline, which metal does not. A *mode*
+is one direction in which the refitted model may be wrong: a set of moments whose field has the
+size of one standard deviation. Modes are independent of each other. They are the principal
+directions of random draws of the posterior's error; one number states the remainder. Readings
+are in units of the nominal noise throughout this module.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,12 +24,60 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.evidence import STRENGTHS, FrameEvidence
 from anser_ros.refit.kernels import fill_evidence, fill_precision, fill_products
 from anser_ros.refit.prior import CloudPrior
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
+
+STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
+"""Variances of a reading, in noise variances, that the evidence is summed over."""
+
+
+@dataclass(frozen=True)
+class FrameEvidence:
+    """Holds the evidence of one frame for H hypotheses, at a noise in units of the nominal one.
+
+    Attributes
+    ----------
+    projected : ndarray, shape (H, n, 2)
+        Whitened readings in each hypothesis' eigenvectors; real, imaginary.
+    log_evidence : ndarray, shape (H,)
+    curve : ndarray, shape (H, A, 2)
+        Logarithm of the likelihood of each strength, real and imaginary part.
+    strength : ndarray, shape (H, 2, A)
+        Probability of each strength.
+    noise : float
+    """
+
+    projected: Single
+    log_evidence: Array
+    curve: Array
+    strength: Array
+    noise: float
+
+
+def log_sum(values: Array) -> float:
+    """Return the logarithm of the sum of exponentials."""
+    top = float(values.max())
+    return top + float(np.log(np.exp(values - top).sum()))
+
+
+def median(values: Array) -> float:
+    """Return the median of a few values, in a tenth of the time that numpy takes."""
+    ordered = sorted(values.tolist())
+    middle = len(ordered) // 2
+    return float(0.5 * (ordered[middle] + ordered[-1 - middle]))
+
+
+def over_strengths(curve: Array) -> tuple[Array, Array]:
+    """Return log evidence (H,) and strength probabilities (H, 2, A) of the curves (H, A, 2)."""
+    top = curve.max(axis=1, keepdims=True)
+    weight = np.exp(curve - top)
+    total = weight.sum(axis=1, keepdims=True)
+    evidence = (top + np.log(total / len(STRENGTHS)))[:, 0].sum(axis=1)
+    return evidence, (weight / total).swapaxes(1, 2)
+
 
 MOST_TABLES, MOST_BLOCKS = 12, 128
 """Noise levels and coil blocks that are kept ready."""
@@ -270,3 +318,107 @@ def _whitening(drift: Array) -> Array:
         unit = drift[:, column] / norm[column]
         out -= np.outer(unit, unit) * (1.0 - 1.0 / np.sqrt(1.0 + norm[column] ** 2))
     return out
+
+
+ComplexArray = NDArray[np.complex128]
+
+MOST = len(STRENGTHS) - 1
+"""Index of the largest of the `STRENGTHS`."""
+
+
+@dataclass(frozen=True)
+class ErrorLevel:
+    """Holds the noise with the indices of the strengths of the real and the imaginary part."""
+
+    noise: float
+    strengths: tuple[int, int]
+
+    def growth(self, other: 'ErrorLevel') -> float:
+        """Return by how much an error may be larger at another level, at least 1."""
+        steps = [STRENGTHS[b] / STRENGTHS[a]
+                 for a, b in zip(self.strengths, other.strengths, strict=True)]  # fmt: skip
+        return max(1.0, other.noise / self.noise, math.sqrt(max(steps)))
+
+
+@dataclass(frozen=True)
+class PosteriorModes:
+    """Holds the error of a hypothesis' posterior in units of the noise.
+
+    It is a sum of moments (R, N, K) of the hypothesis' layer with independent normal factors. What
+    they leave has the standard deviation ``rest`` of a phasor component in the middle of the
+    volume: without it a pose would trust the directions that no mode points in.
+    """
+
+    moments: ComplexArray
+    rest: float
+
+
+def error_level(seen: FrameEvidence, hypothesis: int) -> ErrorLevel:
+    """Return the noise and strengths, rounded up, for which an uncertainty is computed."""
+    noise = 2.0 ** float(np.ceil(np.log2(seen.noise) - 0.1))
+    real, imaginary = (int(part.argmax()) for part in seen.strength[hypothesis])
+    strengths = min(real + real % 2, MOST), min(imaginary + imaginary % 2, MOST)
+    return ErrorLevel(noise, strengths)
+
+
+def error_draws(
+    bank: Bank, posterior: Eigenbasis, noise: float, strength: int, part: int
+) -> Array:
+    """Return draws (N K, D) of the posterior's error of the layer's moments in noise units.
+
+    A draw from the prior minus the posterior mean of its own noisy readings is a draw of the
+    posterior's error (Matheron's rule; Wilson et al., JMLR 22 (2021) 105).
+    """
+    prior, power = posterior.prior, STRENGTHS[strength]
+    count = prior.draw_readings.shape[1]
+    drawn = noise * _noise_draws(count, bank.drift, part)
+    readings = np.sqrt(power) * prior.draw_readings[bank.rows] + drawn
+    gain = power / (power * posterior.values + noise**2)
+    weights = gain[:, None] * (posterior.basis.T @ readings)
+    return np.asarray(np.sqrt(power) * prior.draw_moments - posterior.synthesis @ weights)
+
+
+def _noise_draws(count: int, drift: Array, part: int) -> Array:
+    """Return repeatable draws of the readings' noise and drift, (n, D)."""
+    rng = np.random.default_rng(1 + part)
+    white = rng.standard_normal((len(drift), count))
+    return np.asarray(white + drift @ rng.standard_normal((drift.shape[1], count)))
+
+
+def error_modes(
+    bank: Bank, posterior: Eigenbasis, level: ErrorLevel, count: int
+) -> PosteriorModes:
+    """Return the principal modes of a posterior's error, weighted by its effect on poses.
+
+    The posterior is one of `Bank.posterior`, the level one of `error_level`; ``count`` modes are
+    kept. It takes long and changes nothing, so any thread may do it.
+    """
+    layer = posterior.prior.layer
+    size, width = len(layer.positions), bank.width
+    draws, powers, directions = [], [], []
+    for part in range(2):
+        error = error_draws(bank, posterior, level.noise, level.strengths[part], part)
+        felt = (layer.metric @ error.reshape(size, -1)).reshape(error.shape)
+        power, direction = np.linalg.eigh(felt.T @ felt)
+        draws.append(error)
+        powers.append(power)
+        directions.append(direction / np.sqrt(len(power)))
+    # The real and the imaginary part are independent: each mode is of one of them.
+    half = len(powers[0])
+    largest = np.argsort(-np.concatenate(powers), kind='stable')[:count]
+    moments = np.zeros((len(largest), size, width), dtype=complex)
+    left = np.zeros((len(layer.middle), width))
+    for part, unit in enumerate((1.0, 1j)):
+        ranks = np.flatnonzero(largest // half == part)
+        modes = draws[part] @ directions[part][:, largest[ranks] % half]
+        moments[ranks] = unit * modes.T.reshape(-1, size, width)
+        # What all directions together make of the field, less what the modes do.
+        left += _power_of(layer.middle, draws[part], width) / half
+        left -= _power_of(layer.middle, modes, width)
+    return PosteriorModes(moments, float(np.sqrt(np.median(np.maximum(left, 0.0)) / 2.0)))
+
+
+def _power_of(middle: Array, moments: Array, width: int) -> Array:
+    """Return the power (Q, K) of the field of moments (N K, D), summed over the last axis."""
+    field = middle @ moments.reshape(middle.shape[1], -1)
+    return np.asarray((field.reshape(len(middle), width, -1) ** 2).sum(axis=2))

@@ -1,27 +1,67 @@
-"""Predicts by one hypothesis: the covariance of readings, and the map to the field.
-
-With the excitation B_k(r_j) of emitter k at source j and the coupling G_s(r_j) of coil s, a source
-of the polarisability tensor P_j changes the reading by ``G_s(r_j)^T P_j B_k(r_j)``: the same P_j
-for all emitters. Independent P_j of variance ``a v_j`` (v_j the source's volume) make the readings
-Gaussian with the covariance ``a C``. All that depends on the geometry is computed here, once.
-
-Polarisabilities vary a little with the drive frequency: each source gets a second, independent
-part proportional to log(f_k / f_mean), of `FREQUENCY_SLOPE` times the first one's deviation.
+"""Predicts by one hypothesis: the covariance of readings, the map to the field, and the few
+numbers that poses feel. With the excitation B_k(r_j) of emitter k at source j and the coupling
+G_s(r_j) of coil s, a source of the polarisability tensor P_j changes the reading by
+``G_s(r_j)^T P_j B_k(r_j)``: the same P_j for all emitters. Independent P_j of variance ``a
+v_j`` (v_j the source's volume) make the readings Gaussian with the covariance ``a C``. All that
+depends on the geometry is computed here, once. Polarisabilities vary a little with the drive
+frequency: each source gets a second, independent part proportional to log(f_k / f_mean), of
+`FREQUENCY_SLOPE` times the first one's deviation. A surveyed coil differs slightly from the
+table in place, direction and gain. Without metal this is part of its baseline and cancels; in
+the change caused by metal it leaves an error proportional to the change. To first order it is
+the reading of a few displaced, turned and scaled copies of the coil (`survey_variants`). The
+field of a cloud's thousands of sources, as the layer makes it in the tracked volume, has some
+tens of directions that affect poses (`reduced`). Coordinates along them have unit variance for
+metal of unit strength, so a posterior over metal is a mean and a small covariance matrix, which
+readings of coils that move can update frame by frame. The directions are those of a randomised
+singular value decomposition (Halko, Martinsson & Tropp, SIAM Review 53 (2011) 217).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.metal.body import FREQUENCY_SLOPE
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.rotations import tangents
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Cloud
 from anser_ros.refit.layer import Layer
-from anser_ros.refit.references import survey_variants, vector_basis
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
+
+STEP_M = 1e-4
+"""Step of the numerical derivative by a reference's position, m."""
+
+
+def vector_basis(points: Array, axes: Array, lengths: Array | None, sources: Array) -> Array:
+    """Return each coil's flux per unit moment along x, y and z of each source, (S, M, 3)."""
+    out = np.empty((points.shape[0], sources.shape[0], 3))
+    for component, unit in enumerate(np.eye(3)):
+        directions = np.broadcast_to(unit, sources.shape)
+        out[:, :, component] = flux_basis(points, axes, lengths, sources, directions)
+    return out
+
+
+def survey_variants(
+    references: SensorTable, sources: Array, accuracy: Accuracy
+) -> Iterator[Array]:
+    """Yield the change (S, M, 3) of `vector_basis` by one deviation of each survey error."""
+    p, n, lengths = references.position, references.axis, references.length
+    if accuracy.reference_gain > 0.0:
+        yield accuracy.reference_gain * vector_basis(p, n, lengths, sources)
+    if accuracy.reference_axis_rad > 0.0:
+        across = tangents(n)
+        for side in range(2):
+            yield accuracy.reference_axis_rad * vector_basis(p, across[:, side], lengths, sources)
+    if accuracy.reference_position_m > 0.0:
+        for unit in np.eye(3) * STEP_M:
+            ahead = vector_basis(p + unit, n, lengths, sources)
+            ahead -= vector_basis(p - unit, n, lengths, sources)
+            yield ahead * (accuracy.reference_position_m / (2.0 * STEP_M))
+
 
 N_SAMPLES = 48
 """Draws from the prior, from which the posterior's uncertainty is made. Fewer make the uncertainty
@@ -245,3 +285,99 @@ def _draws(
         readings[:, k] = basis.reshape(len(basis), -1) @ induced
         moments[:, k] = projected.reshape(len(projected), -1) @ induced
     return readings.reshape(-1, N_SAMPLES), moments.reshape(-1, N_SAMPLES)
+
+
+Single = NDArray[np.float32]
+
+DIRECTIONS = 64
+"""Directions that are kept. What more would add, poses feel a thousandth of."""
+OVERSAMPLED = 12
+"""Further directions that are searched in, without which the last ones kept are poor."""
+AT_ONCE = 400
+"""Sources worked out at once: their columns are some tens of megabytes."""
+
+
+@dataclass(frozen=True)
+class ReducedPrior:
+    """Holds the coordinates of a hypothesis.
+
+    Attributes
+    ----------
+    basis : ndarray, shape (N, K D), single precision
+        Moments of the layer by unit coordinates; metal of strength a has coordinates of variance
+        a, independent of each other.
+    cross : ndarray, shape (D, S K)
+        Covariance of the coordinates with all readings of the references.
+    felt : ndarray, shape (D,)
+        What poses feel of unit coordinates (`Layer.metric`); no two feel alike.
+    """
+
+    basis: Single
+    cross: Array
+    felt: Array
+
+
+def reduced(
+    prior: CloudPrior, excitation: Array, frequencies_hz: Array, rng: np.random.Generator
+) -> ReducedPrior:
+    """Return the coordinates of a hypothesis.
+
+    ``excitation`` (M, K, 3): field of the emitters at its sources, T. ``rng``: for the search of
+    the directions.
+    """
+    layer, k = prior.layer, excitation.shape[1]
+    n = len(layer.positions)
+
+    def felt(moments: Array) -> Array:
+        """What poses feel of moments (N K, R)."""
+        return np.asarray((layer.metric @ moments.reshape(n, -1)).reshape(moments.shape))
+
+    wanted = DIRECTIONS + OVERSAMPLED
+    sketch = np.zeros((n * k, wanted))
+    for part in _columns(prior, excitation, frequencies_hz):
+        sketch += part @ rng.standard_normal((part.shape[1], wanted)).astype(np.float32)
+    frame, _ = np.linalg.qr(felt(sketch))
+    # Transposed metric: rows of the layer, emitter by emitter.
+    seen = (layer.metric.T @ frame.reshape(n, -1)).reshape(n * k, -1)
+    moments = np.zeros((n * k, frame.shape[1]))
+    small = seen.astype(np.float32)
+    for part in _columns(prior, excitation, frequencies_hz):
+        moments += part @ (part.T @ small)
+    values, vectors = np.linalg.eigh(frame.T @ felt(moments))
+    values, vectors = values[::-1][:DIRECTIONS], vectors[:, ::-1][:, :DIRECTIONS]
+    keep = values > 1e-12 * values[0]
+    root, vectors = np.sqrt(values[keep]), vectors[:, keep]
+    scale = np.sqrt(prior.scale)
+    basis = (moments @ vectors / (root * scale)).reshape(n, -1).astype(np.float32)
+    # From moments of the layer to coordinates.
+    analysis = (seen @ vectors / root).T * scale
+    return ReducedPrior(basis, np.asarray(analysis @ prior.transfer), root / scale)
+
+
+def _columns(prior: CloudPrior, excitation: Array, frequencies_hz: Array) -> Iterator[Single]:
+    """Yield the layer's moments (N K, C) by each free number of the sources' polarisabilities."""
+    cloud, layer, response = prior.cloud, prior.layer, prior.response
+    tilt = frequency_tilt(frequencies_hz)
+    projected = layer.project(cloud.positions).reshape(len(layer.positions), -1, 3)
+    for start in range(0, len(cloud.positions), AT_ONCE):
+        at = slice(start, start + AT_ONCE)
+        p = projected[:, at].astype(np.float32)
+        b = (excitation[at] * np.sqrt(cloud.volumes[at])[:, None, None]).astype(np.float32)
+        parts = []
+        if response.isotropic > 0.0:
+            along = np.einsum('nma,mka->nkm', p, b, optimize=True)
+            parts.append(np.sqrt(response.isotropic) * along)
+        if response.upright > 0.0:
+            up = p[:, None, :, 2] * b[None, :, :, 2].swapaxes(1, 2)
+            parts.append(np.sqrt(response.upright) * up)
+        if response.tensor > 0.0:
+            for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+                one = p[:, None, :, i] * b[None, :, :, j].swapaxes(1, 2)
+                if i != j:
+                    one = one + p[:, None, :, j] * b[None, :, :, i].swapaxes(1, 2)
+                    one *= np.sqrt(0.5)
+                parts.append(np.sqrt(response.tensor) * one)
+        for part in parts:
+            yield part.reshape(-1, part.shape[2])
+            tilted = part * tilt[:, None].astype(np.float32)
+            yield tilted.reshape(-1, part.shape[2])

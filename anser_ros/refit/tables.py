@@ -1,8 +1,15 @@
-"""Computes a refit's tables once: driving field, layers and predictions of all clouds."""
+"""Computes a refit's tables once, and turns them into plain arrays and back, so that they need
+not be computed again. Tables are the driving field, the layers, the predictions of all clouds,
+and for the search of compact bodies the few directions of the space of readings that each
+body's readings lie in: with them alone, and one variance for the remainder, its evidence costs
+a hundredth of the full one. Stored is what takes seconds; the emitters' field and the clouds
+are worked out anew, in a fraction of that.
+"""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +17,124 @@ from numpy.typing import NDArray
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.refit.clouds import Cloud, Region, bodies, default_clouds
-from anser_ros.refit.excitation import Excitation, FieldFunction, excitation_for
+from anser_ros.refit.clouds import (
+    Cloud,
+    Excitation,
+    FieldFunction,
+    Region,
+    bodies,
+    default_clouds,
+    excitation_for,
+)
+from anser_ros.refit.kernels import fill_products, fill_scores
 from anser_ros.refit.layer import Layer, body_layer, bottom_layer, box_layer, pose_weight
-from anser_ros.refit.prior import BODY, ORIENTED, UPRIGHT, CloudPrior, Response, build_prior
-from anser_ros.refit.reduced import ReducedPrior, reduced
-from anser_ros.refit.search import COARSE, body_factor
+from anser_ros.refit.prior import (
+    BODY,
+    ORIENTED,
+    UPRIGHT,
+    CloudPrior,
+    ReducedPrior,
+    Response,
+    build_prior,
+    reduced,
+    vector_basis,
+)
 from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+DIRECTIONS = 16
+"""Directions of the space of readings that are looked at for each body."""
+COARSE = 7
+"""Sources of a body that they are made from: its centre and six around it."""
+REMAINDER = 1e-3
+"""Variance of a reading that those directions leave, over the mean one."""
+
+
+def _symmetric() -> Array:
+    """Return an orthonormal basis of the symmetric tensors, (6, 3, 3)."""
+    out = np.zeros((6, 3, 3))
+    for component, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
+        out[component, i, j] = out[component, j, i] = 1.0 if i == j else np.sqrt(0.5)
+    return out
+
+
+def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Single:
+    """Return the readings of a body's coarse sources, a column for each tensor component.
+
+    Of shape (S K, 6 COARSE), scaled so that the readings have a mean variance of 1.
+    ``excitation`` (COARSE, K, 3) is the field of the emitters at the first sources, T.
+    """
+    basis = vector_basis(
+        references.position, references.axis, references.length, cloud.positions[:COARSE]
+    )
+    columns = np.einsum('sma,cab,mkb->skmc', basis, _symmetric(), excitation, optimize=True)
+    factor = columns.reshape(len(references) * excitation.shape[1], -1)
+    factor /= np.sqrt((factor**2).sum() / len(factor))
+    return np.asarray(factor, dtype=np.float32)
+
+
+@dataclass
+class BodySearch:
+    """Holds the directions of the bodies' readings for the coils in use.
+
+    Attributes
+    ----------
+    factors : sequence of ndarray, shape (all readings, c)
+        From `body_factor`.
+    rows : ndarray of int, shape (n,)
+        Readings in use.
+    whitening : ndarray, shape (n, n)
+        Makes noise and drift of the readings white.
+    strengths : ndarray, shape (A,)
+        Variances of a reading that the evidence is summed over.
+    """
+
+    factors: tuple[Single, ...]
+    rows: NDArray[np.int64]
+    whitening: Array
+    strengths: Array
+    _tables: dict[float, tuple[Single, Array, Array]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = min(DIRECTIONS, self.factors[0].shape[1], len(self.rows))
+        stacked = np.empty((len(self.factors), count, len(self.rows)), dtype=np.float32)
+        self._power = np.empty((len(self.factors), count))
+        white = self._white = np.ascontiguousarray(self.whitening.T, dtype=np.float32)
+        for body, factor in enumerate(self.factors):
+            seen = white @ factor[self.rows]
+            values, vectors = np.linalg.eigh(seen.T @ seen)
+            top = np.maximum(values[::-1][:count], 1e-12 * values[-1])
+            stacked[body] = (seen @ (vectors[:, ::-1][:, :count] / np.sqrt(top))).T
+            self._power[body] = top
+        self._directions = stacked.reshape(-1, len(self.rows))
+        self._left = REMAINDER * float(np.mean((white**2).sum(axis=1)))
+
+    def _table(self, noise: float) -> tuple[Single, Array, Array]:
+        """Return precisions (L, A, r), those (A,) of the rest, and log determinants (L, A)."""
+        if noise not in self._tables:
+            self._tables.clear()
+            rest = self.strengths * self._left + noise**2
+            inside = self.strengths[:, None] * self._power[:, None, :] + rest[:, None]
+            others = len(self.rows) - inside.shape[2]
+            log_det = np.log(inside).sum(axis=2) + others * np.log(rest)
+            self._tables[noise] = ((1.0 / inside).astype(np.float32), 1.0 / rest, log_det)
+        return self._tables[noise]
+
+    def scores(self, readings: Array, noise: float) -> Array:
+        """Return the approximate log evidence of every body, (L,); arguments as in
+        `Bank.evaluate`.
+        """
+        inside, rest, log_det = self._table(noise)
+        white = np.empty((len(self.rows), 2), dtype=np.float32)
+        fill_products(self._white, np.ascontiguousarray(readings.T, dtype=np.float32), white)
+        white = np.ascontiguousarray(white.T)
+        scores = np.empty(len(self._power))
+        fill_scores(self._directions, white, inside, rest, log_det, scores)
+        return scores
+
+
 Hypothesis = tuple[Cloud, Response, Layer]
 """Where metal may be, how it answers, and what stands for its field."""
 ReportShare = Callable[[float], None]
@@ -135,3 +251,84 @@ def hypotheses_of(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[H
         if len(cloud.positions) <= MOST_ORIENTED:
             out.append((cloud, ORIENTED, layer))
     return tuple(out)
+
+
+Arrays = Mapping[str, NDArray[Any]]
+"""Arrays by name; a number or a text is an array of no axes, and what is None is not there."""
+
+
+def arrays_of(tables: RefitTables) -> dict[str, NDArray[Any]]:
+    """Return what `tables_of` makes the tables from again."""
+    out: dict[str, NDArray[Any]] = {'weight': tables.weight}
+    out |= {f'factor{i}': factor for i, factor in enumerate(tables.factors)}
+    for i, layer in enumerate(tables.layers):
+        out |= _plain(f'layer{i}', layer)
+    for i, prior in enumerate(tables.priors):
+        out |= _plain(f'prior{i}', prior)
+    return out
+
+
+def tables_of(
+    arrays: Arrays,
+    model: FieldModel,
+    references: SensorTable,
+    settings: RefitSettings,
+    drawing: FieldFunction | None,
+    volume: TrackedVolume | None = None,
+) -> RefitTables:
+    """Return the tables whose arrays these are; the other arguments are those of `build_tables`.
+
+    Raises
+    ------
+    KeyError
+        When an array is missing.
+    FitError
+        As `excitation_for`.
+    """
+    excitation, region = excitation_for(model, drawing, volume)
+    bottom, box = (Layer(**_given(f'layer{i}', Layer, arrays)) for i in range(2))
+    hypotheses = hypotheses_of(default_clouds(region), bottom, box)
+    priors = tuple(
+        CloudPrior(
+            cloud=cloud, response=response, layer=layer, **_given(f'prior{i}', CloudPrior, arrays)
+        )
+        for i, (cloud, response, layer) in enumerate(hypotheses)
+    )
+    return RefitTables(
+        excitation,
+        region,
+        (bottom, box),
+        priors,
+        model.frequencies_hz,
+        tuple(arrays[f'factor{i}'] for i in range(len(bodies(region)))),
+        references,
+        settings,
+        arrays['weight'],
+    )
+
+
+def _plain(prefix: str, thing: Layer | CloudPrior) -> dict[str, NDArray[Any]]:
+    """Return the arrays, numbers and texts of a layer or hypothesis under their names."""
+    values = {f.name: getattr(thing, f.name) for f in fields(thing)}
+    return {
+        f'{prefix}.{name}': np.asarray(value)
+        for name, value in values.items()
+        if isinstance(value, np.ndarray | float | str)
+    }
+
+
+def _given(prefix: str, kind: type[Layer | CloudPrior], arrays: Arrays) -> dict[str, Any]:
+    """Return the values that `_plain` stored; None for what may be None and was."""
+    out: dict[str, Any] = {}
+    for name in (f.name for f in fields(kind) if f.name not in NOT_STORED):
+        stored = arrays.get(f'{prefix}.{name}')
+        if stored is None and name not in MAY_BE_NONE:
+            raise KeyError(f'{prefix}.{name}')
+        out[name] = stored.item() if stored is not None and stored.ndim == 0 else stored
+    return out
+
+
+NOT_STORED = 'cloud', 'response', 'layer', '_projected'
+"""Fields that are worked out anew."""
+MAY_BE_NONE = 'rows', 'inverse'
+"""Fields of a layer that only some have."""

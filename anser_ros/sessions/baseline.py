@@ -8,16 +8,14 @@ from numpy.typing import NDArray
 
 from anser_ros.effects.correction import needs_correction
 from anser_ros.errors import BagError, FitError, ModelFileError
-from anser_ros.field.model import FieldModel
-from anser_ros.field.reference_readings import ReferenceReadings
+from anser_ros.field.model import FieldModel, ReferenceReadings
 from anser_ros.integrity.board_place import BoardPlace
 from anser_ros.integrity.clean_references import check_as_calibrated, check_as_drawn, check_steady
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.baseline import ReadingWindow
-from anser_ros.sessions.drawing import NominalBoard
+from anser_ros.refit.frame import ReadingWindow
+from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import is_nominal
-from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.setup import Setup
 
 ComplexArray = NDArray[np.complex128]

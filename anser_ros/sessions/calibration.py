@@ -1,8 +1,11 @@
 """Calibrates recorded sessions of one board by the first engine that accepts them."""
 
+import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from anser_ros import extensions
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS
@@ -11,13 +14,18 @@ from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.calibration_engine import SCAN, Engine
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import made_for
-from anser_ros.sessions.still_engines import ENGINES as STILL_ENGINES
 from anser_ros.wire.setup import Setup
 
-ENGINES: tuple[Engine, ...] = (*STILL_ENGINES, SCAN)
-"""What calibrates, in the order of asking; the last accepts everything."""
-NAMED_KINDS = (*EXTRA_KINDS, *(kind for engine in ENGINES for kind in engine.kinds))
-"""Kinds of errors that are looked for only when they are named."""
+
+@functools.cache
+def all_engines() -> tuple[Engine, ...]:
+    """Return what calibrates, in the order of asking; the last, a scan's, accepts everything."""
+    return (*itertools.chain(*extensions.loaded('ENGINES')), SCAN)
+
+
+def named_kinds() -> tuple[str, ...]:
+    """Return the kinds of errors that are looked for only when they are named."""
+    return (*EXTRA_KINDS, *(kind for engine in all_engines() for kind in engine.kinds))
 
 
 def check_same_board(sessions: list[Session]) -> None:
@@ -40,10 +48,8 @@ def _difference(one: Setup, other: Setup) -> str:
     return 'the geometry of the coils'
 
 
-def _engine_for(
-    sessions: Sequence[Session], options: Options, engines: Sequence[Engine]
-) -> Engine:
-    return next(engine for engine in engines if engine.accepts(sessions, options))
+def _engine_for(sessions: Sequence[Session], options: Options) -> Engine:
+    return next(engine for engine in all_engines() if engine.accepts(sessions, options))
 
 
 def is_estimated_jointly(session: Session) -> bool:
@@ -52,14 +58,13 @@ def is_estimated_jointly(session: Session) -> bool:
     Emitters that can be drawn are left to a model of their drawing, whatever the session.
     """
     options = Options(session.setup.accuracy, is_joint=True)
-    return _engine_for([session], options, ENGINES).is_joint
+    return _engine_for([session], options).is_joint
 
 
 def calibrate_sessions(
     sessions: Sequence[Session],
     options: Options,
     progress: Callable[[str, float], None] | None = None,
-    engines: Sequence[Engine] = ENGINES,
 ) -> Calibration:
     """Calibrate on all tool sensors of the sessions.
 
@@ -69,8 +74,8 @@ def calibrate_sessions(
     compared.
     """
     options = replace(options, accuracy=sessions[0].setup.accuracy)
-    chosen = _engine_for(sessions, options, engines)
-    for engine in () if chosen.is_joint else engines:
+    chosen = _engine_for(sessions, options)
+    for engine in () if chosen.is_joint else all_engines():
         if asked := [kind for kind in options.estimate if kind in engine.kinds]:
             raise FitError(f'{", ".join(asked)}: can be determined only from {engine.needs}')
     calibration = chosen.fit(sessions, options, progress)

@@ -8,16 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
-from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
-from anser_ros.calibration.emitter_drift import at_strength, emitter_strength
+from anser_ros.calibration.disturbances import (
+    at_strength,
+    emitter_strength,
+    outside,
+    spans_of,
+    unsteady_references,
+)
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.requirements import check_single_coils
 from anser_ros.calibration.result import Calibration
-from anser_ros.calibration.survey_records import drift_records
+from anser_ros.calibration.sensor_records import drift_records
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.drawing import NominalBoard
+from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.scan_metal import without_resting_metal
 from anser_ros.sessions.session import Session
 from anser_ros.wire.setup import Setup

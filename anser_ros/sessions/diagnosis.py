@@ -1,30 +1,31 @@
 """Diagnoses a recorded session, and tracks its held-out part without and with what was found.
-
-The stages are `prepare`, `correct`, `problem_of`, `anser_ros.diagnosis.diagnose.diagnose` (which
-screens, searches, confirms and concludes), `held_out_part` and `track_held_out`; each can be
-called alone, and `diagnose_session` runs all of them. `diagnosis_document` writes their results.
+The stages are `prepare`, `correct`, `problem_of`, `anser_ros.diagnosis.diagnose.diagnose`
+(which screens, searches, confirms and concludes), `held_out_part` and `track_held_out`; each
+can be called alone, and `diagnose_session` runs all of them. `diagnosis_document` is the
+document of it.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros import extensions
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
+from anser_ros.diagnosis.findings import SCHEMA
 from anser_ros.diagnosis.prepare import build_problem, test_blocks
-from anser_ros.diagnosis.problem import Problem
-from anser_ros.diagnosis.whitening import Spread
+from anser_ros.diagnosis.problem import Problem, Spread
 from anser_ros.errors import DiagnosisError
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import EffectRecord, FieldModel, plain
 from anser_ros.parallel import in_order
-from anser_ros.sessions.evaluation import compare
 from anser_ros.sessions.follower import ModelFollower
 from anser_ros.sessions.prepared import PreparedSession, correct, prepare
-from anser_ros.sessions.recorded_drift import date_drifts
 from anser_ros.sessions.session import Session
-from anser_ros.sessions.starting_model import made_for
-from anser_ros.sessions.tracked_session import track
+from anser_ros.sessions.starting_model import date_drifts, made_for
+from anser_ros.sessions.tracked_session import compare, track
 from anser_ros.tracking.estimate import TrackerSettings
 
 Array = NDArray[np.float64]
@@ -184,3 +185,74 @@ def _rms(errors: list[Array]) -> float | None:
     values = np.concatenate(errors)
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+
+DEPENDENCIES = (
+    'time', 'position', 'orientation', 'speed', 'emitter', 'channel', 'amplitude', 'frequency',
+)  # fmt: skip
+"""Variables on which a remainder may depend in words; other tests are for the report only."""
+MODEL_FILE_ONLY = ('groups', 'knots_s', 'course', 'couplings_m3')
+"""Parameters that only a program needs: lists of hundreds of numbers. They are left out here and
+stand in the model file."""
+
+
+def to_document(result: SessionDiagnosis) -> dict[str, Any]:
+    """Return what was found as plain data."""
+    found, before, after = result.diagnosis, result.before, result.after
+    return document_of(
+        (found.flux_rms_before_t, found.flux_rms_after_t, found.flux_rms_floor_t),
+        (before.position_rmse_m, after.position_rmse_m),
+        (before.orientation_rmse_rad, after.orientation_rmse_rad),
+        [effect_figures(one.record, one.flux_rms_without_t) for one in found.findings],
+        (found.unexplained, [name for name in found.depends_on if name in DEPENDENCIES]),
+    )
+
+
+def document_of(
+    flux_t: tuple[float, float, float],
+    position_m: tuple[float | None, float | None],
+    orientation_rad: tuple[float | None, float | None],
+    effects: list[dict[str, Any]],
+    unexplained: tuple[float, list[str]],
+) -> dict[str, Any]:
+    """Return the document of errors before and after, of effects, and of what is unexplained.
+
+    Of fluxes there is the error of noise alone too; the last are the share that is unexplained,
+    and what that depends on.
+    """
+    return {
+        'schema': SCHEMA,
+        'held_out': {
+            'flux_rms_before_t': flux_t[0],
+            'flux_rms_after_t': flux_t[1],
+            'flux_rms_floor_t': flux_t[2],
+            'position_rmse_before_m': position_m[0],
+            'position_rmse_after_m': position_m[1],
+            'orientation_rmse_before_rad': orientation_rad[0],
+            'orientation_rmse_after_rad': orientation_rad[1],
+        },
+        'effects': effects,
+        'unexplained': {'fraction': unexplained[0], 'depends_on': unexplained[1]},
+    }
+
+
+def effect_figures(record: EffectRecord, without_t: float) -> dict[str, Any]:
+    """Return an effect as plain data; ``without_t``: held-out residual with all but it, T."""
+    short = {key: value for key, value in record.parameters.items() if key not in MODEL_FILE_ONLY}
+    return {
+        'name': record.name,
+        'parameters': plain(short),
+        'uncertainty': plain(dict(record.uncertainty)),
+        'evidence': plain(dict(record.evidence)),
+        'flux_rms_without_t': without_t,
+    }
+
+
+def other_way(session: Session) -> ModuleType | None:
+    """Return the module of an application that diagnoses sessions of this kind, None for no other.
+
+    It has ``accepts(session)``, ``diagnose(session, model, progress)`` whose result has a
+    ``model``, ``to_document(result)``, and the name of a module ``REPORT`` with
+    ``render(result, document, session=, model=)``.
+    """
+    return next((way for way in extensions.loaded('DIAGNOSES') if way.accepts(session)), None)

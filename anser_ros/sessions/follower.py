@@ -1,24 +1,105 @@
-"""Lets the field model follow a recorded session's reference sensors, as it does live."""
+"""Lets the field model follow a recorded session's reference sensors, as it does live, by all
+of them or by chosen ones.
+"""
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-from anser_ros.errors import BagError, FitError
-from anser_ros.integrity.ageing import UNCHANGED_MODEL, FrameModel, ModelAge
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.correction import Correction
+from anser_ros.errors import BagError, FitError, ParameterError
+from anser_ros.frames.faults import GOOD, reading_codes
+from anser_ros.integrity.model_trust import UNCHANGED_MODEL, FrameModel, ModelAge
 from anser_ros.pose_states import OK, REFERENCES_LOST, Withheld
-from anser_ros.refit.baseline import check_enough
-from anser_ros.refit.change import Pace
+from anser_ros.refit.frame import Pace, check_enough
 from anser_ros.refit.live_refit import LiveRefit
-from anser_ros.refit.result import RefitResult
+from anser_ros.refit.model import RefitResult
+from anser_ros.refit.witness import ToolReading
 from anser_ros.sessions.baseline import Baseline
-from anser_ros.sessions.frames import FrameReadings, SessionFrame
+from anser_ros.sessions.nominal_board import stated_volume
 from anser_ros.sessions.prepared import PreparedSession
-from anser_ros.sessions.session import tracking_noise
-from anser_ros.sessions.tool_readings import tool_readings
-from anser_ros.sessions.volume import stated_volume
+from anser_ros.sessions.session import FrameReadings, Session, SessionFrame, tracking_noise
 from anser_ros.tracking.estimate import PoseEstimate
+
+NONE = 'none'
+"""The word for no reference sensor at all."""
+
+
+def parse_references(text: str) -> tuple[int, ...]:
+    """Return the channels of a list ``CHANNEL,...``, none for the word ``none``.
+
+    Raises
+    ------
+    ParameterError
+        When an entry is no channel or appears twice.
+    """
+    if text.strip() == NONE:
+        return ()
+    entries = [entry.strip() for entry in text.split(',')]
+    if not all(entry.isascii() and entry.isdigit() for entry in entries):
+        raise ParameterError(f"references must be CHANNEL,... or '{NONE}', got {text!r}")
+    channels = tuple(int(entry) for entry in entries)
+    if len(set(channels)) != len(channels):
+        raise ParameterError(f'references: a channel appears twice in {text!r}')
+    return channels
+
+
+def with_references(session: Session, channels: Sequence[int]) -> Session:
+    """Return a session that has only the reference sensors on some channels, in its own order.
+
+    Raises
+    ------
+    BagError
+        When it has no reference fluxes, or none on one of the channels.
+    """
+    reference = session.reference
+    if reference is None:
+        raise BagError(f'{session.path}: the session has no reference fluxes to choose from')
+    there = reference.sensors.channel
+    missing = sorted(set(channels) - set(there.tolist()))
+    if missing:
+        raise BagError(
+            f'{session.path}: no reference sensor on channel '
+            f'{", ".join(map(str, missing))}; there are {", ".join(map(str, there.tolist()))}'
+        )
+    kept = np.flatnonzero(np.isin(there, np.asarray(channels, dtype=np.int64)))
+    return replace(session, reference=reference.sensors_only(kept))
+
+
+ToolPose = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Position (3,), m, and rotation (3, 3) of a body in frame fg."""
+
+
+def tool_readings(
+    correction: Correction,
+    channels: NDArray[np.int64],
+    flux: NDArray[np.complex128],
+    flags: NDArray[np.int64],
+    poses: Mapping[str, ToolPose],
+) -> list[ToolReading]:
+    """Return what the usable coils of each body with a pose read.
+
+    ``flux`` (S, K), T, is as measured; the correction is that of the tools' sensors, by the
+    effects of the model. Bodies without a coil in the frame are left out.
+    """
+    if correction.changes_flux:
+        # The time matters to a recorded drift alone, which references follow where there are any.
+        flux = correction.flux(0.0, channels, flux)
+    row_of = {channel: row for row, channel in enumerate(channels.tolist())}
+    usable = reading_codes(flux, flags) == GOOD
+    sensors, readings = correction.sensors(), []
+    for body, (position, rotation) in poses.items():
+        table = sensors.of_body(body)
+        rows = [row_of.get(channel, -1) for channel in table.channel.tolist()]
+        kept = [i for i, row in enumerate(rows) if row >= 0 and usable[row]]
+        if kept:
+            taken = flux[[rows[i] for i in kept]]
+            readings.append(ToolReading(table.select(kept), taken, position, rotation))
+    return readings
 
 
 class FrameModels(Protocol):

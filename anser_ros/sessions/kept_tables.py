@@ -20,10 +20,8 @@ from anser_ros.field.model import FieldModel
 from anser_ros.fingerprint import fingerprint_of
 from anser_ros.kernel_cache import PACKAGE
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.stored_tables import arrays_of, tables_of
-from anser_ros.refit.tables import RefitTables
-from anser_ros.sessions.drawing import NominalBoard
-from anser_ros.sessions.volume import stated_volume
+from anser_ros.refit.tables import RefitTables, arrays_of, tables_of
+from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
 from anser_ros.wire.setup import Setup
 
 TABLES = 'refit_tables_'

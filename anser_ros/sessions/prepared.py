@@ -1,8 +1,7 @@
-"""Prepares a session: everything about it is worked out once and then only read.
-
-All that evaluates or diagnoses a session starts with `prepare` and hands its result on: the board,
-the noise, the baseline and the corrections are the same wherever they are needed, and the model
-has been checked against the session.
+"""Prepares a session: everything about it is worked out once and then only read. All that
+evaluates or diagnoses a session starts with `prepare` and hands its result on: the board, the
+noise, the baseline and the corrections are the same wherever they are needed, and the model has
+been checked against the session. `settings_for` takes what a setup says about tracking.
 """
 
 from dataclasses import dataclass, replace
@@ -15,11 +14,22 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.baseline import Baseline, baseline_of
-from anser_ros.sessions.drawing import NominalBoard
-from anser_ros.sessions.recorded_drift import is_recorded
-from anser_ros.sessions.session import Session, measured_noise
-from anser_ros.sessions.starting_model import check_fits
-from anser_ros.sessions.volume import tracked_volume
+from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
+from anser_ros.sessions.session import Session, measured_noise, stamp_sigma, tracking_noise
+from anser_ros.sessions.starting_model import check_fits, is_recorded
+from anser_ros.tracking.estimate import TrackerSettings
+from anser_ros.wire.setup import Setup
+
+
+def settings_for(setup: Setup, settings: TrackerSettings) -> TrackerSettings:
+    """Return settings with what the setup states or measured, and its volume if they have none."""
+    return replace(
+        settings,
+        flux_noise_t=tracking_noise(setup),
+        stamp_sigma_s=stamp_sigma(setup),
+        tools=setup.refit.tools,
+        volume=settings.volume or tracked_volume(setup),
+    )
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
-from anser_ros.physics.angles import axis_angles, rotation_angles
+from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.session import Session
 from anser_ros.stamps import NANO, stamp_of
-from anser_ros.wire.quaternion import pose_numbers
-from anser_ros.wire.recorded import PoseStream
+from anser_ros.wire.recorded import PoseStream, pose_numbers
 from anser_ros.wire.setup import topic_of
 
 Array = NDArray[np.float64]

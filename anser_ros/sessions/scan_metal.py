@@ -17,13 +17,12 @@ from anser_ros.calibration.disturbances import spans_of
 from anser_ros.calibration.result import Calibration, Scan
 from anser_ros.diagnosis.departure import KNOWN, Departure, departure
 from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Problem
-from anser_ros.diagnosis.whitening import Spread
+from anser_ros.diagnosis.problem import Problem, Spread
 from anser_ros.effects.prediction import tool_view
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.drawing import NominalBoard
+from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session, shifted
 
 Array = NDArray[np.float64]

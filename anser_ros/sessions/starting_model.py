@@ -1,20 +1,75 @@
-"""Chooses the field model that a command starts from: a file, or the nominal one of the setup."""
+"""Reads, writes and chooses the field model that a command starts from, and checks what it is
+of.
+"""
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from anser_ros.effects.correction import drifts
 from anser_ros.effects.effect import Remedy
 from anser_ros.effects.registry import effect_named
 from anser_ros.errors import ModelFileError
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import FieldModel, from_document, to_document
 from anser_ros.field.nominal import nominal_model
 from anser_ros.fingerprint import Identity
-from anser_ros.sessions.drawing import board_of
-from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.nominal_board import board_of
 from anser_ros.sessions.session import Session
 from anser_ros.wire.setup import Setup
+from anser_ros.wire.text_files import read_document, write_document
+
+SNAPSHOT = 'snapshot of a refit with metal in force'
+"""Source of a model that was saved while it held more than the one it started from."""
+
+
+def load_model(path: str | os.PathLike[str], snapshot: bool = False) -> FieldModel:
+    """Read a model file; a snapshot of a refit, which is no calibration, only if it is wanted.
+
+    Raises
+    ------
+    ModelFileError
+        With the file's name and the rule that it breaks.
+    """
+    try:
+        model = from_document(read_document(path))
+        if is_snapshot(model) and not snapshot:
+            raise ModelFileError(
+                f'a {SNAPSHOT} (stamp_ns {model.provenance.get("stamp_ns")}) is not a '
+                'calibration; load the model that the refit started from'
+            )
+    except ModelFileError as error:
+        text = str(error)
+        raise ModelFileError(
+            text if text.startswith(os.fspath(path)) else f'{path}: {text}'
+        ) from error
+    return model
+
+
+def save_model(path: str | os.PathLike[str], model: FieldModel) -> None:
+    """Write a model file whole or not at all; raises `ModelFileError`."""
+    write_document(path, to_document(model))
+
+
+def is_snapshot(model: FieldModel) -> bool:
+    """Return whether a model, or one it was made from, was saved with a refit's change in it."""
+    return model.provenance.get('source') == SNAPSHOT
+
+
+def as_saved(model: FieldModel, base: FieldModel, stamp_ns: int) -> FieldModel:
+    """Return a model as it is written, active since a stamp: with its source, if not the base.
+
+    The base is the one that the refit started from.
+    """
+    parts = ('positions', 'directions', 'moments')
+    if all(np.array_equal(getattr(model, part), getattr(base, part)) for part in parts):
+        return model
+    provenance = {
+        'source': SNAPSHOT, 'stamp_ns': stamp_ns, 'started_from': dict(base.provenance)
+    }  # fmt: skip
+    return replace(model, provenance=provenance)
+
 
 NOMINAL = 'nominal'
 """Name of the model of the setup's own geometry, given where a model file's path may stand."""
@@ -177,3 +232,24 @@ def check_fits(model: FieldModel, session: Session) -> None:
             f'the session {session.path} at {list(session.setup.frequencies_hz)} Hz'
         )
     check_made_for(model, session.setup, f'the session {session.path}')
+
+
+FOUND_ON = 'session_start_ns'
+"""Key in a drift's evidence: the first stamp, ns, of the session on which it took its course."""
+
+
+def date_drifts(model: FieldModel, session: Session) -> FieldModel:
+    """Return the model, its drifts without a date dated by the session they were found on."""
+    effects = tuple(
+        replace(effect, evidence={**effect.evidence, FOUND_ON: session.start_ns})
+        if drifts(effect) and FOUND_ON not in effect.evidence
+        else effect
+        for effect in model.effects
+    )
+    return replace(model, effects=effects)
+
+
+def is_recorded(model: FieldModel, session: Session) -> bool:
+    """Return whether this is the session on which one of the model's drifts was found."""
+    found = [effect.evidence.get(FOUND_ON) for effect in model.effects if drifts(effect)]
+    return session.start_ns in found

@@ -1,24 +1,43 @@
-"""Tracks the poses of a recorded session as the live nodes would."""
+"""Evaluates a recorded session: tracks its poses as the live nodes would, and compares them.
+The stages are `prepare`, `track` and `compare`; each can be called alone, and `track_session`
+runs all of them. `evaluation_files` writes their results.
+"""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
-from anser_ros.errors import BagError
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros import extensions
+from anser_ros.errors import BagError, ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.ageing import UNCHANGED_MODEL
+from anser_ros.integrity.model_trust import UNCHANGED_MODEL
+from anser_ros.physics.rotations import axis_angles, rotation_angles
+from anser_ros.pose_states import OK
+from anser_ros.sessions.baseline import check_place
 from anser_ros.sessions.follower import FrameModels, ModelFollower, RefitSummary
-from anser_ros.sessions.frames import frames_of
-from anser_ros.sessions.prepared import PreparedSession
-from anser_ros.sessions.tracker_settings import settings_for
+from anser_ros.sessions.prepared import PreparedSession, prepare, settings_for, with_truth
+from anser_ros.sessions.session import Session, frames_of
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
-from anser_ros.tracking.source_track import Sources
-from anser_ros.tracking.tracker import Tracker
+from anser_ros.tracking.tracker import Observer, Tracker
 
 Progress = Callable[[float], None]
-SOURCES = 'sources'
-"""Kind of tracked things: the source as a body sees it, place and axis in the body's frame, where
-the field is the same all around an axis."""
+
+
+class SessionObserver(Observer, Protocol):
+    """Follows what an application tracks besides coils and bodies, and compares it afterwards."""
+
+    KIND: str  # of what is tracked, as documents and tables name it
+    found: dict[str, PoseEstimate]  # by body, in the last frame
+
+    @staticmethod
+    def compare(
+        prepared: PreparedSession, estimates: Mapping[str, Sequence[PoseEstimate]]
+    ) -> 'dict[str, PoseSeries]':
+        """Compare the estimates of all frames, by body, with the optical poses."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +45,7 @@ class TrackedSession:
     """Holds the estimates of every sensor and body by its name, one per frame by its stamp.
 
     The seconds are the mean wall time that a frame took, the refit included; ``further`` is what
-    else was tracked, by kind and name: `SOURCES`.
+    else was tracked, by kind and name.
     """
 
     estimates: dict[str, tuple[PoseEstimate, ...]]
@@ -64,12 +83,15 @@ def track(
             f'{prepared.session.path}: the session has no tool fluxes to track, on a topic that '
             f'ends with /tool/flux'
         )
-    seen = Sources()
+    observers: list[SessionObserver] = [make() for make in extensions.loaded('OBSERVERS')]
     tracker = _tracker(
-        prepared, settings or TrackerSettings(), seen, follows=isinstance(follower, ModelFollower)
+        prepared,
+        settings or TrackerSettings(),
+        observers,
+        follows=isinstance(follower, ModelFollower),
     )
     estimates: dict[str, list[PoseEstimate]] = {}
-    sources: dict[str, list[PoseEstimate]] = {}
+    further: dict[str, dict[str, list[PoseEstimate]]] = {one.KIND: {} for one in observers}
     frames = list(frames_of(prepared.session))
     start = time.perf_counter()
     for count, frame in enumerate(frames, start=1):
@@ -85,19 +107,28 @@ def track(
                 follower.witnessed(tools, found)
             for estimate in found:
                 estimates.setdefault(estimate.name, []).append(estimate)
-            for body, source in seen.found.items():
-                sources.setdefault(body, []).append(source)
+            for observer in observers:
+                for body, estimate in observer.found.items():
+                    further[observer.KIND].setdefault(body, []).append(estimate)
         if progress is not None:
             progress(count / len(frames))
     seconds = (time.perf_counter() - start) / max(len(frames), 1)
     by_name = {name: tuple(given) for name, given in estimates.items()}
     summary = None if follower is None else follower.summary
-    further = {SOURCES: {name: tuple(given) for name, given in sources.items()}}
-    return TrackedSession(by_name, seconds, summary, further if sources else {})
+    others = {
+        kind: {name: tuple(given) for name, given in group.items()}
+        for kind, group in further.items()
+        if group
+    }
+    return TrackedSession(by_name, seconds, summary, others)
 
 
 def _tracker(
-    prepared: PreparedSession, settings: TrackerSettings, seen: Sources, *, follows: bool
+    prepared: PreparedSession,
+    settings: TrackerSettings,
+    observers: Sequence[Observer],
+    *,
+    follows: bool,
 ) -> Tracker:
     """A tracker that knows the session's noise, and a drift's course if nothing else does."""
     return Tracker(
@@ -108,5 +139,159 @@ def _tracker(
             recorded_drift=prepared.recorded_drift and not follows,
             volume=settings.volume or prepared.volume,
         ),
-        [seen],
+        observers,
     )
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PoseSeries:
+    """Holds the estimates of one sensor or body, one a frame, and their errors where known."""
+
+    name: str
+    estimates: tuple[PoseEstimate, ...]
+    position_error: Array
+    orientation_error: Array
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """Return the mask (F,) of the frames in which a pose was given."""
+        return np.array([estimate.state == OK for estimate in self.estimates], dtype=bool)
+
+
+def pose_series(
+    name: str, estimates: Sequence[PoseEstimate], position: Array, orientation: Array
+) -> PoseSeries:
+    """Compare F poses of a sensor or body with where it truly was, m, frame fg; NaN if unknown."""
+    of_body = orientation.ndim == 3
+    distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
+    for i, estimate in enumerate(estimates):
+        if estimate.state != OK or (of_body and estimate.rotation is None):
+            continue
+        distance[i] = np.linalg.norm(estimate.position - position[i])
+        if of_body:
+            assert estimate.rotation is not None
+            angle[i] = rotation_angles(estimate.rotation.T @ orientation[i])
+        else:
+            angle[i] = axis_angles(estimate.axis, orientation[i])
+    return PoseSeries(name, tuple(estimates), distance, angle)
+
+
+def metrics(series: PoseSeries) -> dict[str, Any]:
+    """Return the figures of one sensor or body as the evaluation document has them.
+
+    These are the number of compared poses, the share of frames with a pose, and the RMSE, mean
+    error, 50th and 95th percentile (equation 7 of the article) of position and orientation; None
+    where nothing could be compared.
+    """
+    result: dict[str, Any] = {
+        'n': int(np.isfinite(series.position_error).sum()),
+        'tracked_fraction': float(series.ok.mean()) if series.ok.size else 0.0,
+    }
+    for key, unit, errors in (
+        ('position', 'm', series.position_error),
+        ('orientation', 'rad', series.orientation_error),
+    ):
+        for statistic, value in _statistics(errors[np.isfinite(errors)]).items():
+            result[f'{key}_{statistic}_{unit}'] = value
+    return result
+
+
+def _statistics(errors: Array) -> dict[str, float | None]:
+    if not errors.size:
+        return dict.fromkeys(('rmse', 'me', 'prc50', 'prc95'))
+    return {
+        'rmse': float(np.sqrt(np.mean(errors**2))),
+        'me': float(errors.mean()),
+        'prc50': float(np.percentile(errors, 50)),
+        'prc95': float(np.percentile(errors, 95)),
+    }
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Holds tracked poses and their errors, by the names of sensors, and of bodies in six degrees.
+
+    The seconds are the mean wall time of a frame; ``refit`` is what the refit did, None where the
+    model did not follow the references, and ``further`` what else was tracked, by kind and
+    name.
+    """
+
+    sensors: dict[str, PoseSeries]
+    bodies: dict[str, PoseSeries]
+    seconds_per_frame: float
+    refit: RefitSummary | None = None
+    further: dict[str, dict[str, PoseSeries]] = field(default_factory=dict)
+
+    @property
+    def groups(self) -> dict[str, dict[str, PoseSeries]]:
+        """Return all series by kind, sensors and bodies first."""
+        return {'sensors': self.sensors, 'bodies': self.bodies, **self.further}
+
+
+def track_session(
+    session: Session,
+    model: FieldModel,
+    settings: TrackerSettings | None = None,
+    baseline: Session | None = None,
+    refit: bool = False,
+    in_phase: bool = False,
+    progress: Progress | None = None,
+    witnesses: bool = False,
+    models: Callable[[PreparedSession], FrameModels] | None = None,
+) -> Evaluation:
+    """Track every tool sensor and body of a session at every frame, and compare with the optics.
+
+    A baseline is a distortion-free recording of the same board. With ``refit`` the model follows
+    the references as it does live, with witnesses also what the coils of rigid tools contradict;
+    ``models`` gives each frame's model in another way, instead of a refit. In phase, only these
+    fluxes and moments are used (the article's way). Progress gets the finished share, 0 to 1.
+
+    Raises
+    ------
+    BagError
+        When the session has no tool fluxes, or a refit lacks references or a baseline.
+    ParameterError
+        When such models are to be used beside a refit, or with one phase of the fluxes.
+    ModelFileError
+        When the model's emitters are not the session's, or the session's references locate the
+        board elsewhere. With the gate switched off the latter is not checked.
+    """
+    if models is not None and (refit or in_phase):
+        raise ParameterError(
+            "models of their own are used without a refit, with both of the fluxes' phases"
+        )
+    if settings is None or settings.has_gate:
+        check_place(model, session)
+    used = in_phase_model(model) if in_phase else model
+    prepared = prepare(session, used, baseline if refit else None)
+    follower = None if models is None else models(prepared)
+    if refit:
+        follower = ModelFollower(prepared, witnesses)
+    tracked = track(prepared, settings, follower, in_phase, progress)
+    return compare(prepared, tracked)
+
+
+def compare(prepared: PreparedSession, tracked: TrackedSession) -> Evaluation:
+    """Compare tracked poses with the optical ones, as the model's corrections place these."""
+    sensors: dict[str, PoseSeries] = {}
+    bodies: dict[str, PoseSeries] = {}
+    for tool in prepared.session.tools:
+        true = with_truth(tool, prepared.correction)
+        position = np.where(true.has_pose[:, None], true.position, np.nan)
+        centres, axes = true.sensors.placed(position, true.rotation)
+        for column, name in enumerate(true.sensors.name):
+            given = tracked.estimates.get(name, ())
+            sensors[name] = pose_series(name, given, centres[:, column], axes[:, column])
+        if tool.body in tracked.estimates:
+            given = tracked.estimates[tool.body]
+            bodies[tool.body] = pose_series(tool.body, given, position, true.rotation)
+    further = {
+        observer.KIND: series
+        for observer in extensions.loaded('OBSERVERS')
+        if observer.KIND in tracked.further
+        and (series := observer.compare(prepared, tracked.further[observer.KIND]))
+    }
+    return Evaluation(sensors, bodies, tracked.seconds_per_frame, tracked.refit, further)

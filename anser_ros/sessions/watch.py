@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.diagnose import diagnose
 from anser_ros.diagnosis.prepare import FEWEST_POSED_FRAMES
-from anser_ros.diagnosis.problem import Problem, State, evaluate
-from anser_ros.diagnosis.residuals import rms
+from anser_ros.diagnosis.problem import Problem, State, evaluate, rms
 from anser_ros.diagnosis.search import SearchSettings
-from anser_ros.effects.term import Term
+from anser_ros.effects.effect import Term
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.pose_states import OK

@@ -1,20 +1,17 @@
-"""Converts phasors in codes to fluxes in tesla, referred to the measured coil currents.
-
-A coil of N turns and area A behind an amplifier of gain G turns a flux density B exp(+j w t) along
-its axis into the voltage (Faraday's law; the winding sense makes the sign positive)
-
-    V = j w a B exp(-j w d),    a = N A G,    d = delay of the channel
-
-and the channel of the summed currents has the current I_k of emitter k at that emitter's tone, so
-
-    B_k = V_k / (j w_k a exp(-j w_k d)) * I_nominal,k exp(-j w_k d_I) / I_k
-
-is the flux density at nominal current, with the phase of the measured current as its zero. A drift
-of the current and the unknown start of the window cancel.
+"""Converts phasors in codes to fluxes in tesla, referred to the measured coil currents. A coil
+of N turns and area A behind an amplifier of gain G turns a flux density B exp(+j w t) along its
+axis into the voltage (Faraday's law; the winding sense makes the sign positive)     V = j w a B
+exp(-j w d),    a = N A G,    d = delay of the channel and the channel of the summed currents
+has the current I_k of emitter k at that emitter's tone, so     B_k = V_k / (j w_k a exp(-j w_k
+d)) * I_nominal,k exp(-j w_k d_I) / I_k is the flux density at nominal current, with the phase
+of the measured current as its zero. A drift of the current and the unknown start of the window
+cancel. Rates of change of the fluxes, for windows too short to fit them, come from earlier
+windows.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,3 +127,46 @@ class FluxConverter:
         relative = np.divide(current_sigma, magnitude, where=driven, out=np.zeros_like(magnitude))
         sigma = np.hypot(sensor_sigma, np.abs(flux) * relative)
         return FluxWindow(flux, sigma, current, current_sigma, driven)
+
+
+REACH_S = 0.03
+"""Time over which the straight line is fitted, s. A tool's velocity hardly changes meanwhile; a
+shorter time makes the slopes noisier, a longer one makes them late."""
+LONGEST_WINDOW_GAP_S = 0.05
+"""Longest time from one window to the next, s; after a longer gap the windows before it say
+nothing about the present motion."""
+FEWEST_WINDOWS = 3
+"""Windows that a slope needs at least, so that the noise of a single one does not make it."""
+
+
+class FluxRates:
+    """Finds the slopes of the fluxes over the last windows, by a straight line through them.
+
+    Over `REACH_S` the slopes are determined so well that subtracting their effect from a short
+    window adds hardly any noise.
+    """
+
+    def __init__(self) -> None:
+        self._past: deque[tuple[float, NDArray[np.complex128]]] = deque()
+
+    def add(self, time_s: float, flux: NDArray[np.complex128]) -> None:
+        """Take in the fluxes (S, K), T, of a window at the time of its middle.
+
+        A gap or a step back in time discards the windows before.
+        """
+        past = self._past
+        if past and not 0 < time_s - past[-1][0] <= LONGEST_WINDOW_GAP_S:
+            past.clear()
+        past.append((time_s, flux))
+        while len(past) > FEWEST_WINDOWS and time_s - past[0][0] > REACH_S:
+            past.popleft()
+
+    def at(self, time_s: float) -> NDArray[np.complex128] | None:
+        """Return the rates (S, K), T/s, at a time, or None without enough recent windows."""
+        past = self._past
+        if len(past) < FEWEST_WINDOWS or not 0 < time_s - past[-1][0] <= LONGEST_WINDOW_GAP_S:
+            return None
+        times = np.array([moment for moment, _ in past])
+        weights = times - times.mean()
+        weights /= weights @ weights
+        return np.asarray(np.tensordot(weights, np.array([flux for _, flux in past]), axes=1))

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.settings import Accuracy
-from anser_ros.simulation.motion import Pose
-from anser_ros.simulation.world import World
+from anser_ros.simulation.world import Pose, World
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.pose_topics import optical_topic
-from anser_ros.wire.session_writer import SessionWriter
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import dump_setup
 
 Array = NDArray[np.float64]

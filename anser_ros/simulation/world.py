@@ -1,22 +1,138 @@
 """Simulates the world around a control unit: a board, moving tools, reference coils and metal.
-
-It gives the true flux of every sensor at any time. Samples, noise and bytes are added elsewhere.
+It gives the true flux of every sensor at any time. Bodies move on paths; metal is a rigid cloud
+of conducting and permeable spheres; the board's field is that of all tracks of its coils, which
+may differ from the drawing as manufactured boards do. Samples, noise and bytes are added
+elsewhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from anser_ros.metal.body import sphere_polarisability
 from anser_ros.physics.dipole import GAUSS_OFFSET, flux_basis
-from anser_ros.simulation.metal import MetalBody
-from anser_ros.simulation.motion import Path, Pose, tool_paths
+from anser_ros.sessions.nominal_board import board_of
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
 
 Array = NDArray[np.float64]
+Pose = tuple[Array, Array]
+"""A position (3,), m, and a rotation matrix (3, 3) from the body's frame to fg."""
+
+Path = Callable[[float], Pose]
+"""A function from a time in seconds to a pose."""
+
+
+@dataclass(frozen=True)
+class Lissajous:
+    """Describes a path of a sine in each coordinate and each component of the rotation vector."""
+
+    # centre_m, amplitude_m, period_s: centre (m), amplitude (m) and period (s) of x, y and z in fg
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.15)
+    amplitude_m: tuple[float, float, float] = (0.08, 0.08, 0.03)
+    period_s: tuple[float, float, float] = (9.0, 12.5, 7.0)
+    # turn_rad, turn_period_s: amplitude (rad) and period (s) of the components of the rotation
+    # vector
+    turn_rad: tuple[float, float, float] = (0.5, 0.4, 0.8)
+    turn_period_s: tuple[float, float, float] = (11.0, 8.0, 17.0)
+    phase_rad: float = 0.0  # phase at the start, so that two bodies need not move alike
+
+    def __call__(self, time_s: float) -> Pose:
+        """Return the pose at a time, s."""
+        angle = 2 * np.pi * time_s / np.array(self.period_s) + self.phase_rad
+        position = np.array(self.centre_m) + np.array(self.amplitude_m) * np.sin(angle)
+        turn = 2 * np.pi * time_s / np.array(self.turn_period_s) + self.phase_rad
+        rotation = Rotation.from_rotvec(np.array(self.turn_rad) * np.sin(turn))
+        return position, np.asarray(rotation.as_matrix())
+
+
+BODY_PHASE_RAD = 0.7
+"""Phase difference between the paths of one body and the next, so that they stay apart."""
+
+
+def tool_paths(bodies: Sequence[str], phase_rad: float = 0.0) -> Mapping[str, Path]:
+    """Return the default path of each body, by its name."""
+    return {
+        body: Lissajous(phase_rad=phase_rad + BODY_PHASE_RAD * rank)
+        for rank, body in enumerate(bodies)
+    }
+
+
+@dataclass(frozen=True)
+class Approach:
+    """Describes a path that comes near, stays, and leaves again, each way along a smooth ramp."""
+
+    # far_m, near_m: positions between which it moves, m, frame fg
+    far_m: tuple[float, float, float] = (0.05, -0.03, -0.6)
+    near_m: tuple[float, float, float] = (0.05, -0.03, -0.08)
+    # start_s, travel_s, stay_s: time of the start, time for one way, and time near, s
+    start_s: float = 8.0
+    travel_s: float = 5.0
+    stay_s: float = 6.0
+    period_s: float = 0.0  # time after which the visit repeats, s; 0 for a single visit
+
+    def __call__(self, time_s: float) -> Pose:
+        """Return the pose at a time, s; the orientation is constant."""
+        local = time_s - self.start_s
+        if self.period_s > 0 and local > 0:
+            local %= self.period_s
+        inward = local / self.travel_s
+        outward = (2 * self.travel_s + self.stay_s - local) / self.travel_s
+        share = float(np.clip(min(inward, outward), 0.0, 1.0))
+        smooth = share * share * (3 - 2 * share)
+        far, near = np.array(self.far_m), np.array(self.near_m)
+        return far + smooth * (near - far), np.eye(3)
+
+
 ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class MetalBody:
+    """Moves a rigid cloud of equal spheres, which do not drive each other, on a path."""
+
+    offsets: Array  # (M, 3): centres of the spheres in the body's frame, m
+    # radius_m, conductivity_s_per_m, relative_permeability: radius (m), conductivity (S/m) and
+    # relative permeability of each sphere
+    radius_m: float
+    conductivity_s_per_m: float
+    relative_permeability: float
+    path: Path  # pose of the body over time
+
+    def centres(self, time_s: float) -> Array:
+        """Return the centres of the spheres at a time, shape (M, 3), m, frame fg."""
+        position, rotation = self.path(time_s)
+        return np.asarray(position + self.offsets @ rotation.T)
+
+    def polarisability(self, frequencies_hz: Array) -> ComplexArray:
+        """Return the polarisability of one sphere at each drive tone, shape (K,), A m^2 / T."""
+        return sphere_polarisability(
+            self.radius_m,
+            self.conductivity_s_per_m,
+            self.relative_permeability,
+            2 * np.pi * frequencies_hz,
+        )
+
+
+def steel_disc(path: Path | None = None, *, radius_m: float = 0.06, rings: int = 3) -> MetalBody:
+    """Return a disc of touching steel balls, like the foot of a stand or the head of a C-arm.
+
+    ``path``: pose over time; by default it approaches and leaves again. ``radius_m``: radius of
+    the disc, m. ``rings``: rings of balls around the one in the middle.
+    """
+    ball = radius_m / (2 * rings + 1)
+    centres = [np.zeros(3)]
+    for ring in range(1, rings + 1):
+        angles = 2 * np.pi * np.arange(6 * ring) / (6 * ring)
+        circle = 2 * ball * ring * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+        centres += list(circle)
+    return MetalBody(np.array(centres), ball, 5e6, 200.0, path or Approach())
+
+
 FieldSource = Callable[[Array], ComplexArray]
 """A function from points (P, 3), m, to each emitter's field at nominal current (P, 3, K), T."""
 
@@ -117,3 +233,43 @@ def _by_body(sensors: Sequence[SensorSpec]) -> dict[str, NDArray[np.intp]]:
         body: np.array([row for row, s in enumerate(sensors) if s.body == body], np.intp)
         for body in bodies
     }
+
+
+def board_source(setup: Setup) -> FieldSource:
+    """Return the field of a setup's board, without the dipoles that models express it by.
+
+    Raises `SetupError` when the setup's geometry does not describe a board.
+    """
+    board = board_of(setup)
+
+    def field(points: NDArray[np.float64]) -> NDArray[np.complex128]:
+        return np.asarray(board.field(points).transpose(0, 2, 1), complex)
+
+    return field
+
+
+SHIFT_M = 0.2e-3
+"""Standard deviation of a coil's position along each axis, m: an assumption about printed boards,
+smaller than the tolerances of the nominal model (0.5 mm)."""
+TURN_DEG = 0.1
+"""Standard deviation of a coil's rotation about z, degrees, an assumption as well."""
+CURRENT_SHARE = 0.01
+"""Fraction by which all currents are too large, half of the nominal model's tolerance of gains."""
+
+
+def manufactured(setup: Setup, rng: np.random.Generator) -> Setup:
+    """Return a setup with random errors of its coils' places and a slightly too large current.
+
+    The setup document keeps the drawing, so that the nominal model is wrong for such a board.
+    """
+    coils = tuple(
+        replace(
+            coil,
+            centre_m=tuple(np.array(coil.centre_m) + rng.normal(scale=SHIFT_M, size=3)),
+            rotation_deg=coil.rotation_deg + float(rng.normal(scale=TURN_DEG)),
+        )
+        for coil in setup.emitter.coils
+    )
+    geometry = dict(setup.emitter.geometry)
+    geometry['current_a'] = float(geometry.get('current_a', 1.0)) * (1 + CURRENT_SHARE)
+    return replace(setup, emitter=replace(setup.emitter, coils=coils, geometry=geometry))

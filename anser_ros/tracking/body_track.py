@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.stamps import NANO
-from anser_ros.tracking.body_descent import step_to_coils
 from anser_ros.tracking.coil_track import CoilResult, take_errors
 from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.tracking.rigid import (
@@ -18,12 +18,12 @@ from anser_ros.tracking.rigid import (
     solve_body,
     start_from_coils,
     start_from_grid,
+    step_to_coils,
 )
-from anser_ros.tracking.rotations import rotation_between, rotation_of_vector
 from anser_ros.tracking.seed import SAME_PLACE_M
+from anser_ros.tracking.solve import bounded_inverse
 from anser_ros.tracking.solve_verdict import RARE
 from anser_ros.tracking.track import Freedom, SolveFrame, Start, Track
-from anser_ros.tracking.uncertainty import bounded_inverse
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.physics.dipole import GAUSS_OFFSET
-from anser_ros.physics.tangent import fill_tangent
+from anser_ros.physics.rotations import fill_tangent
 
 LARGEST_MOVE_M, LARGEST_TURN = 0.04, 0.6
 """Longest step of the descent: of the position, m, and of the axis, rad. Over this distance the

@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
-from anser_ros.integrity import rigidity
-from anser_ros.integrity.continuity import Continuity, MotionBounds, Place
-from anser_ros.integrity.model_record import ModelRecord
-from anser_ros.integrity.rigidity import SurveyErrors
+from anser_ros.integrity import pose_checks
+from anser_ros.integrity.model_trust import ModelRecord
+from anser_ros.integrity.pose_checks import Continuity, MotionBounds, Place, SurveyErrors
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_track import BodyResult
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils
-from anser_ros.tracking.uncertainty import add_motion
+from anser_ros.tracking.solve import add_motion
 
 Array = NDArray[np.float64]
 Estimates = list[PoseEstimate]
@@ -134,7 +133,7 @@ def _judge_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -
     used = set(fit.used.tolist())
     coils = body.coils.subset(np.array(members))
     tools = settings.tools
-    away = rigidity.distances(
+    away = pose_checks.distances(
         (estimate.position, fit.solution.rotation, estimate.covariance),
         coils.offsets, coils.axes,
         (
@@ -145,7 +144,7 @@ def _judge_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -
         SurveyErrors(tools.tool_coil_position_m, tools.tool_coil_axis_rad, tools.tool_coil_gain),
     )  # fmt: skip
     for row, one, (distance, away_m, angle) in zip(rows, own, away.T.tolist(), strict=True):
-        allowed_m = rigidity.allowed_m(one.sigma_position_m, tools.tool_coil_position_m)
-        if not (distance <= rigidity.GATE and away_m <= allowed_m):
-            reason = rigidity.reason(distance, away_m, angle)
+        allowed_m = pose_checks.allowed_m(one.sigma_position_m, tools.tool_coil_position_m)
+        if not (distance <= pose_checks.GATE and away_m <= allowed_m):
+            reason = pose_checks.reason(distance, away_m, angle)
             found[row] = replace(one, state=states.INCONSISTENT, reason=reason)

@@ -1,10 +1,10 @@
-"""Solves for the 6-DoF pose of a rigid tool from all of its coils at once.
-
-The rotation moves by a rotation vector in fg, R <- exp([w]) R, so no attitude is singular. Model
-errors are common to all coils; they enter as a low-rank part of the residuals' covariance
-(Woodbury's identity), so coils that share an error don't count as independent.
+"""Solves for the 6-DoF pose of a rigid tool from all of its coils at once. The steps: errors
+that coils share become a low-rank part of the residuals' covariance (Woodbury's identity);
+every coil's flux and its slopes; damped steps of translation and rotation vector in fg, R <-
+exp([w]) R, so that no attitude is singular; starts from the coils' own poses, or from the grid.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,12 +13,208 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
-from anser_ros.physics.angles import nearest_rotation
+from anser_ros.kernel_cache import kernel
 from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.physics.rotations import nearest_rotation
 from anser_ros.physics.sensor import along_each_axis
-from anser_ros.tracking.body_descent import descend_body, fill_common
+from anser_ros.tracking.descent import (
+    CONVERGED_CHI2,
+    FIRST_DAMPING,
+    LEAST_RAISED,
+    TRUSTED_CHI2,
+    damped_step,
+    fill_coil_basis,
+    limit_step,
+)
 from anser_ros.tracking.seed import SeedGrid
 from anser_ros.tracking.solve import Array, RealField
+
+
+@kernel
+def fill_common(modes, inverse_sigma, common):  # type: ignore[no-untyped-def]
+    """Write E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E``; False when D is not finite.
+
+    ``modes`` (S, R, 2K): fluxes (T) that make D when divided by the noise.
+    """
+    coils, count, width = modes.shape
+    for r in range(count):
+        for s in range(coils):
+            for k in range(width):
+                common[r, s * width + k] = modes[s, r, k] * inverse_sigma[s, k]
+    gram = np.dot(common, common.T)
+    for r in range(count):
+        # Cholesky factor of I + D D^T row by row, and its inverse times D on the way.
+        for q in range(r + 1):
+            total = gram[r, q]
+            for p in range(q):
+                total -= gram[r, p] * gram[q, p]
+            if q < r:
+                gram[r, q] = total / gram[q, q]
+            elif total + 1.0 > 0.0 and math.isfinite(total):
+                gram[r, r] = math.sqrt(total + 1.0)
+            else:
+                return False
+        for q in range(r):
+            for i in range(common.shape[1]):
+                common[r, i] -= gram[r, q] * common[q, i]
+        for i in range(common.shape[1]):
+            common[r, i] /= gram[r, r]
+    return True
+
+
+@kernel
+def fill_body(  # type: ignore[no-untyped-def]
+    position, rotation, offsets, axes, lengths, flux, inverse_sigma, dipoles, moments, basis,
+    residual, white,
+):  # fmt: skip
+    """Write a pose's residual (S, 2K) and ``white`` (7, S 2K).
+
+    Row 0 of ``white``: the whitened residual; rows 1 to 6: the whitened flux's derivatives by the
+    translation and the turn, both in fg. ``basis`` (7 S, N) is written over.
+    """
+    coils, width = flux.shape
+    arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
+    for s in range(coils):
+        fill_coil_basis(
+            position + arms[s], turned[s], lengths[s], dipoles, basis[7 * s : 7 * s + 7]
+        )
+    model = np.dot(basis, moments)
+    for s in range(coils):
+        m = model[7 * s : 7 * s + 7]
+        for k in range(width):
+            w, column = inverse_sigma[s, k], s * width + k
+            residual[s, k] = flux[s, k] - m[0, k]
+            white[0, column] = w * residual[s, k]
+            for i in range(3):
+                j, n = (i + 1) % 3, (i + 2) % 3
+                turn = arms[s, j] * m[1 + n, k] - arms[s, n] * m[1 + j, k]
+                turn += turned[s, j] * m[4 + n, k] - turned[s, n] * m[4 + j, k]
+                white[1 + i, column] = w * m[1 + i, k]
+                white[4 + i, column] = w * turn
+
+
+@kernel
+def _products(white, common):  # type: ignore[no-untyped-def]
+    """``W C^-1 W^T`` (7, 7) for the covariance I + D^T D."""
+    products = np.dot(white, white.T)
+    if common.shape[0] > 0:
+        shared = np.dot(common, white.T)
+        products -= np.dot(shared.T, shared)
+    return products
+
+
+@kernel
+def _turned(vector, rotation):  # type: ignore[no-untyped-def]
+    """A rotation after a further turn by a rotation vector, rad, kept orthonormal."""
+    x, y, z = vector[0], vector[1], vector[2]
+    square = x * x + y * y + z * z
+    angle = math.sqrt(square)
+    if angle < 1e-4:
+        a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
+    else:
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
+    turn = np.empty((3, 3))
+    turn[0, 0], turn[0, 1], turn[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z
+    turn[0, 2] += a * y
+    turn[1, 0], turn[1, 1], turn[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z
+    turn[1, 2] -= a * x
+    turn[2, 0], turn[2, 1], turn[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0
+    turn[2, 2] -= b * (x * x + y * y)
+    new = np.dot(turn, rotation)
+    # One step towards the nearest rotation takes off what rounding has added.
+    return 1.5 * new - 0.5 * np.dot(new, np.dot(new.T, new))
+
+
+@kernel
+def descend_body(  # type: ignore[no-untyped-def]
+    position, rotation, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments,
+    low, high, budget, residual, white, information,
+):  # fmt: skip
+    """Move ``position`` and ``rotation`` (in place) to the least chi-square near them.
+
+    ``residual``, ``white`` as `fill_body` leaves them at the last look, ``information`` (6, 6).
+    Returns chi-square, evaluations used, whether it converged.
+    """
+    basis = np.empty((7 * offsets.shape[0], dipoles.shape[1]))
+    trial_residual, trial_white = np.empty_like(residual), np.empty_like(white)
+    step, factor, gradient = np.empty(6), np.empty((6, 6)), np.empty(6)
+    trial_position = np.empty(3)
+    fill_body(
+        position, rotation, offsets, axes, lengths, flux, inverse_sigma, dipoles, moments, basis,
+        residual, white,
+    )  # fmt: skip
+    products = _products(white, common)
+    chi2, used, damping, converged = products[0, 0], 1, FIRST_DAMPING, False
+    information[:] = products[1:, 1:]
+    gradient[:] = products[1:, 0]
+    while used < budget and not converged and damping < 1e10:
+        if not damped_step(information, gradient, damping, factor, step):
+            damping = max(10.0 * damping, LEAST_RAISED)
+            continue
+        short = limit_step(step)
+        promised = np.dot(step, 2.0 * gradient - np.dot(information, step))
+        for i in range(3):
+            trial_position[i] = min(max(position[i] + step[i], low[i]), high[i])
+        trial_rotation = _turned(step[3:], rotation)
+        negligible = promised < CONVERGED_CHI2 + 1e-9 * chi2
+        if negligible or (short and promised < TRUSTED_CHI2):
+            position[:] = trial_position
+            rotation[:] = trial_rotation
+            return chi2 - promised, used, True
+        fill_body(
+            trial_position, trial_rotation, offsets, axes, lengths, flux, inverse_sigma,
+            dipoles, moments, basis, trial_residual, trial_white,
+        )  # fmt: skip
+        used += 1
+        products = _products(trial_white, common)
+        fall = chi2 - products[0, 0]
+        if fall >= 0.0:
+            converged = fall < CONVERGED_CHI2 + 1e-9 * chi2
+            damping *= 0.1 if fall > 0.5 * promised else 0.5
+            chi2 = products[0, 0]
+            position[:] = trial_position
+            rotation[:] = trial_rotation
+            residual[:] = trial_residual
+            white[:] = trial_white
+            information[:] = products[1:, 1:]
+            gradient[:] = products[1:, 0]
+        else:
+            damping = max(5.0 * damping, LEAST_RAISED)
+    return chi2, used, converged
+
+
+@kernel
+def step_to_coils(  # type: ignore[no-untyped-def]
+    position, rotation, offsets, axes, coil_positions, coil_axes, normals, low, high
+):  # fmt: skip
+    """Move ``position`` and ``rotation`` (in place) to where single coils' own poses agree best.
+
+    ``normals`` (S, 6, 6) weigh each coil's position and free axis vector. It is the first step of
+    the descent, from the slopes that the coils' own solves have found already.
+    """
+    slopes, apart = np.zeros((6, 6)), np.empty(6)
+    normal, gradient = np.zeros((6, 6)), np.zeros(6)
+    arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
+    for i in range(3):
+        slopes[i, i] = 1.0
+    for s in range(offsets.shape[0]):
+        for i in range(3):
+            j, n = (i + 1) % 3, (i + 2) % 3
+            apart[i] = coil_positions[s, i] - position[i] - arms[s, i]
+            apart[3 + i] = coil_axes[s, i] - turned[s, i]
+            # A turn w moves a vector v by w x v.
+            slopes[i, 3 + j], slopes[i, 3 + n] = arms[s, n], -arms[s, j]
+            slopes[3 + i, 3 + j], slopes[3 + i, 3 + n] = turned[s, n], -turned[s, j]
+        weighted = np.dot(slopes.T, normals[s])
+        normal += np.dot(weighted, slopes)
+        gradient += np.dot(weighted, apart)
+    step, factor = np.empty(6), np.empty((6, 6))
+    if damped_step(normal, gradient, FIRST_DAMPING, factor, step):
+        limit_step(step)
+        for i in range(3):
+            position[i] = min(max(position[i] + step[i], low[i]), high[i])
+        rotation[:] = _turned(step[3:], rotation)
+
 
 MAX_EVALUATIONS = 30
 """Evaluations of the residuals after which a descent is given up as not converged. Good starts

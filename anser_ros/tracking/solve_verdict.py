@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
 from anser_ros.tracking.estimate import USUAL_GATE, NoiseScale, TrackerSettings
+from anser_ros.tracking.solve import chi2_limit
 from anser_ros.tracking.solve_context import SolveContext
-from anser_ros.tracking.uncertainty import chi2_limit
 
 Array = NDArray[np.float64]
 

@@ -1,8 +1,10 @@
-"""Turns fluxes into poses with a state each, for the live node and the offline evaluation alike.
-
-A frame gives one estimate for every tool sensor (5-DoF) and for every body whose coils fix all six
-degrees of freedom. A pose is good only when its state is ``ok``; only good poses start the next
-frame's solve, and a warm solve that misses the gate is repeated without any guess.
+"""Turns fluxes into poses with a state each, for the live node and the offline evaluation
+alike. The steps of a frame, in order: intake and freshness judge the readings; effects of the
+model are undone; each coil is solved by itself (`coil_track`), then each body by all of its
+coils (`body_track`), then what an application follows besides (`Observer`); poses are compared
+with each other and with their past (`judgement`). A pose is good only when its state is ``ok``;
+only good poses start the next frame's solve, and a warm solve that misses the gate is repeated
+without any guess.
 """
 
 from collections import Counter
@@ -21,18 +23,24 @@ from anser_ros.errors import TrackingError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE, value_codes
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.integrity.freshness import Freshness
+from anser_ros.integrity.streams import Freshness
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import Withheld
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, track_body
-from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTrack, track_coil
-from anser_ros.tracking.emitters import FEWEST_EMITTERS, ReducedScene, without_dead
+from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTrack, solve_warm, track_coil
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
 from anser_ros.tracking.rigid import BodyCoils
-from anser_ros.tracking.solve_context import SolveContext, build_context, depends_on
-from anser_ros.tracking.warm_solve import solve_warm
+from anser_ros.tracking.solve_context import (
+    FEWEST_EMITTERS,
+    ReducedScene,
+    SolveContext,
+    build_context,
+    depends_on,
+    without_dead,
+)
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -431,3 +439,35 @@ def _checked(sensors: SensorTable) -> SensorTable:
     if len(set(sensors.name)) != len(sensors):
         raise TrackingError('a name appears twice in the sensors')
     return sensors
+
+
+def warm_up() -> None:
+    """Track a small made-up tool until its motion is carried on, with and without uncertainty."""
+    side = np.linspace(-0.1, 0.1, 3)
+    x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+    positions = np.stack([x, y, np.zeros(9)], axis=1)
+    directions = np.tile([0.0, 0.0, 1.0], (9, 1))
+    names = tuple(f'coil{k}' for k in range(9))
+    moments = 0.02 * np.eye(9, dtype=np.complex128)
+    modes = np.stack([1e-4 * moments, 1e-4j * moments])
+    sensors = SensorTable(
+        channel=np.arange(3),
+        name=('a', 'b', 'c'),
+        body=('tool', 'tool', 'tool'),
+        position=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.01], [0.0, 0.01, 0.0]]),
+        axis=np.eye(3),
+        length=np.array([0.0, 0.008, 0.0]),
+    )
+    settings = TrackerSettings(volume=TrackedVolume((-0.1, -0.1, 0.1), (0.1, 0.1, 0.2)))
+    for uncertainty in (None, modes):
+        model = FieldModel(
+            positions, directions, moments, names, tuple(1000.0 + k for k in range(9)), 0.0,
+            uncertainty,
+        )  # fmt: skip
+        rng = np.random.default_rng(0)
+        flux = model.flux(sensors.position + [0.01, 0.02, 0.15], sensors.axis, sensors.length)
+        tracker = Tracker(model, sensors, settings)
+        for stamp_ns in (1, 2, 3):
+            # New noise each time, for a reading that repeats is no reading.
+            noise = settings.flux_noise_t * rng.standard_normal((2, *flux.shape))
+            tracker.update(stamp_ns, sensors.channel, flux + noise[0] + 1j * noise[1])

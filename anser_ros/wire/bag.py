@@ -24,9 +24,14 @@ from mcap_ros2.decoder import DecoderFactory
 from anser_ros.errors import BagError, LayoutError, SetupError
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
-from anser_ros.wire.pose_topics import optical_stem
-from anser_ros.wire.quaternion import pose_numbers, unit_quaternions
-from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
+from anser_ros.wire.recorded import (
+    Bag,
+    PoseStream,
+    RecordedFluxes,
+    optical_stem,
+    pose_numbers,
+    unit_quaternions,
+)
 from anser_ros.wire.setup import parse_setup
 
 _BROKEN = (

@@ -1,22 +1,150 @@
-"""Writes MCAP bags that survive a crash and a full disk, with or without ROS.
-
-Whatever happens, the data up to the last flush stay readable: a flush ends a chunk and hands all
-of it to the system in one go, and a write that fails is taken back. So that even a full disk
-leaves a bag with an index, a file without a name keeps the space for it.
+"""Writes MCAP bags that survive a crash and a full disk, with or without ROS. The steps: an
+account is kept of topics, counts and times, which becomes rosbag2's ``metadata.yaml``; messages
+are gathered in chunks; a session is setup, fluxes and poses. Whatever happens, the data up to
+the last flush stay readable: a flush ends a chunk and hands all of it to the system in one go,
+and a write that fails is taken back. So that even a full disk leaves a bag with an index, a
+file without a name keeps the space for it.
 """
 
 import contextlib
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
+import numpy as np
+import yaml
 from mcap.well_known import Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
-from anser_ros.wire.bag_metadata import BagRecord, TopicRecord, plain_yaml
+from anser_ros.wire import cdr
+from anser_ros.wire.points import STALE, FluxPoints, PointFieldTuple, encode_flux
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec
+from anser_ros.wire.text_files import DUMPER, read_yaml
+
+METADATA_VERSION = 9
+"""Version of rosbag2's metadata.yaml that is written, as ROS 2 Jazzy reads it."""
+# What rosbag2 calls "for ever".
+FOREVER = {'sec': 9223372036, 'nsec': 854775807}
+
+
+def qos_profile(*, reliable: bool = True, latched: bool = False, depth: int = 1) -> dict[str, Any]:
+    """Return an offered quality of service as rosbag2 (version 9) writes it."""
+    return {
+        'history': 'keep_last',
+        'depth': depth,
+        'reliability': 'reliable' if reliable else 'best_effort',
+        'durability': 'transient_local' if latched else 'volatile',
+        'deadline': FOREVER,
+        'lifespan': FOREVER,
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': FOREVER,
+        'avoid_ros_namespace_conventions': False,
+    }
+
+
+@dataclass
+class TopicRecord:
+    """Records a topic of a bag and how much of it was written."""
+
+    name: str
+    type_name: str
+    type_hash: str
+    qos: Sequence[Mapping[str, Any]]
+    messages: int = 0
+
+
+@dataclass
+class BagRecord:
+    """Records what a bag holds so far; times are log times in ns."""
+
+    topics: dict[int, TopicRecord] = field(default_factory=dict)
+    messages: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+    @property
+    def duration_s(self) -> float:
+        """Return the time between the first and the last message, s."""
+        return (self.last_ns - self.first_ns) * 1e-9
+
+
+def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bool = True) -> None:
+    """Write ``metadata.yaml`` of the folder that holds one MCAP file, in place of an older one.
+
+    The bag may still be written: then it is not ``is_closed``.
+    """
+    times = {
+        'duration': {'nanoseconds': record.last_ns - record.first_ns},
+        'starting_time': {'nanoseconds_since_epoch': record.first_ns},
+        'message_count': record.messages,
+    }
+    document = {
+        'rosbag2_bagfile_information': {
+            'version': METADATA_VERSION,
+            'storage_identifier': 'mcap',
+            **times,
+            'topics_with_message_count': [_topic(topic) for topic in record.topics.values()],
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [path.name],
+            'files': [{'path': path.name, **times}],
+            'custom_data': {'closed': 'true' if is_closed else 'false'},
+            'ros_distro': ros_distro,
+        }
+    }
+    target = path.with_name('metadata.yaml')
+    draft = path.with_name('.metadata.yaml.new')
+    try:
+        draft.write_text(plain_yaml(document), encoding='utf-8')
+        draft.replace(target)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def bag_summary(folder: Path) -> dict[str, Any]:
+    """Return ``duration_s``, ``messages`` and ``closed`` of a bag's ``metadata.yaml``; {} if none.
+
+    A bag that was not closed may hold more than that; its readers do not use this file.
+    """
+    try:
+        document = read_yaml((folder / 'metadata.yaml').read_text('utf-8'))
+        info = document['rosbag2_bagfile_information']
+        return {
+            'duration_s': 1e-9 * float(info['duration']['nanoseconds']),
+            'messages': int(info['message_count']),
+            'closed': info['custom_data']['closed'] == 'true',
+        }
+    except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError):
+        return {}
+
+
+def plain_yaml(document: Any) -> str:
+    """Return a document as YAML without anchors, which not every reader follows."""
+    return yaml.dump(document, Dumper=_Dumper, sort_keys=False)
+
+
+class _Dumper(DUMPER):  # type: ignore[misc]
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _topic(topic: TopicRecord) -> dict[str, Any]:
+    return {
+        'topic_metadata': {
+            'name': topic.name,
+            'type': topic.type_name,
+            'serialization_format': 'cdr',
+            'offered_qos_profiles': [dict(profile) for profile in topic.qos],
+            'type_description_hash': topic.type_hash,
+        },
+        'message_count': topic.messages,
+    }
+
 
 CHUNK_BYTES = 256 * 1024
 """Size of a chunk, bytes. A recording that is cut off loses at most its last chunk; smaller chunks
@@ -193,3 +321,92 @@ class BagWriter:
             self.path.unlink()
             raise
         return descriptor
+
+
+SETUP_TOPIC, SETUP_TYPE = '/anser/setup', 'std_msgs/msg/String'
+FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
+"""Topics of a session's fluxes, and whether their sensors are fixed to the field generator."""
+
+
+class SessionWriter(BagWriter):
+    """Writes a session without ROS: setup, fluxes and poses of one frame, log time = stamp.
+
+    Raises
+    ------
+    BagError
+        The file exists already, or cannot be made.
+    """
+
+    def __init__(self, path: str | Path, frame_id: str = 'fg') -> None:
+        super().__init__(path)
+        self._frame_id = frame_id
+        self._channels: dict[str, int] = {}
+
+    def write_setup(self, text: str, stamp_ns: int) -> None:
+        """Write the setup document."""
+        channel = self.channel(SETUP_TOPIC, SETUP_TYPE)
+        self.write(channel, stamp_ns, cdr.string_bytes(text))
+
+    def write_readings(
+        self, sensors: Sequence[SensorSpec], stamp_ns: int, flux: NDArray[np.complex128]
+    ) -> None:
+        """Write one window, stamped with its middle: a message of tools, and one of references.
+
+        Fluxes are (S, K), T, of the S sensors that are given: NaN where there is no reading, and
+        for emitters without current.
+        """
+        for topic, fixed in FLUX_TOPICS.items():
+            rows = [i for i, s in enumerate(sensors) if (s.body == FIELD_GENERATOR) == fixed]
+            if rows:
+                points = _points([sensors[i] for i in rows], flux[rows])
+                fields, step, data = encode_flux(points)
+                self.write_flux(topic, stamp_ns, fields, step, len(rows), data)
+
+    def write_flux(
+        self,
+        topic: str,
+        stamp_ns: int,
+        fields: Sequence[PointFieldTuple],
+        point_step: int,
+        width: int,
+        data: bytes,
+    ) -> None:
+        """Write one window's cloud, as `anser_ros.wire.points.encode_flux` packs it."""
+        channel = self.channel(topic, 'sensor_msgs/msg/PointCloud2')
+        frame = self._frame_id
+        message = cdr.cloud_bytes(stamp_ns, frame, fields, point_step, width, data)
+        self.write(channel, stamp_ns, message)
+
+    def write_pose(
+        self,
+        topic: str,
+        stamp_ns: int,
+        position: Sequence[float],
+        quaternion_xyzw: Sequence[float],
+    ) -> None:
+        """Write one pose: position in m, unit quaternion."""
+        channel = self.channel(topic, 'geometry_msgs/msg/PoseStamped')
+        message = cdr.pose_bytes(stamp_ns, self._frame_id, position, quaternion_xyzw)
+        self.write(channel, stamp_ns, message)
+
+    def channel(self, topic: str, type_name: str, definition: str = '') -> int:
+        """Return the channel of a topic, announced when it is first asked for; a setup is latched.
+
+        The types of a session need no definition.
+        """
+        if topic not in self._channels:
+            latched = topic.endswith('/setup')
+            qos = [qos_profile(latched=latched, depth=1 if latched else 100)]
+            text = cdr.DEFINITIONS.get(type_name, definition)
+            self._channels[topic] = self.add_topic(topic, type_name, text, qos)
+        return self._channels[topic]
+
+
+def _points(sensors: Sequence[SensorSpec], flux: NDArray[np.complex128]) -> FluxPoints:
+    """One window's cloud; a sensor lacks its reading where it has none of a driven emitter.
+
+    The place of a sensor that moves is not known to its fluxes.
+    """
+    known, rows = np.isfinite(flux), SensorRows.of(sensors, fixed_only=True)
+    lacks = (known != known.any(axis=0)).any(axis=1) | ~known.any()
+    return FluxPoints(rows.channel, np.where(lacks, STALE, 0), flux, rows.position, rows.axis)

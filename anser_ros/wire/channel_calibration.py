@@ -17,7 +17,7 @@ import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import SetupError
-from anser_ros.wire.yaml_text import read_yaml
+from anser_ros.wire.text_files import read_yaml
 
 SCHEMA = 'anser_channels/1'
 _KEYS = ('area_m2', 'delay_s')

@@ -18,7 +18,7 @@ import zstandard
 
 from anser_ros.errors import BagError
 from anser_ros.wire.bag import Salvage, iter_messages
-from anser_ros.wire.yaml_text import read_yaml
+from anser_ros.wire.text_files import read_yaml
 
 ZSTD = '.zstd'
 """Ending of a file that rosbag2 has compressed as a whole."""

@@ -1,11 +1,69 @@
-"""Holds a recorded session as arrays; reading one from a file is the business of `wire.bag`."""
+"""Holds a recorded session as arrays, names topics of poses, and judges quaternions from
+outside. Reading a session from a file is the business of `wire.bag`, without which this can be
+imported.
+"""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from anser_ros.wire.setup import Setup
+from anser_ros.wire.setup import Setup, topic_of
+
+LENGTH_TOLERANCE = 1e-2
+"""How far the length of a quaternion may be from 1. Components rounded to two decimals make it
+wrong by up to this, and normalising mends that; angles, or columns of something else, are farther
+off. Smaller refuses rounded files; larger takes other numbers for quaternions."""
+
+
+def unit_quaternions(given: ArrayLike) -> NDArray[np.float64]:
+    """Return quaternions (..., 4) of unit length, and NaN in place of what is none."""
+    quaternions = np.asarray(given, dtype=np.float64)
+    length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    with np.errstate(invalid='ignore', divide='ignore'):
+        unit = np.where(abs(length - 1.0) <= LENGTH_TOLERANCE, quaternions / length, np.nan)
+    return np.asarray(unit)
+
+
+def pose_numbers(pose: Any) -> tuple[float, ...]:
+    """Return x y z and the quaternion x y z w of a ``geometry_msgs/Pose``, whoever decoded it."""
+    p, q = pose.position, pose.orientation
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+TRACKED, OPTICAL = '/tracked/', '/optical/'
+"""What the topics of tracked and of optical poses begin with."""
+ENDING = '/pose'
+"""What the topics of poses end with."""
+BODY = 'body'
+"""What a body is called without a name."""
+SCHEMA = 'anser_poses/1'
+"""Schema of the setup document of a session of poses."""
+
+
+def tracked_topic(sensor: str) -> str:
+    """Return the topic of a sensor of a tracker that gives poses."""
+    return f'{TRACKED}{topic_of(sensor)}{ENDING}'
+
+
+def optical_topic(body: str, namespace: str = OPTICAL) -> str:
+    """Return the topic of a body's optical poses; a second board has another namespace."""
+    return f'{namespace.rstrip("/")}/{topic_of(body)}{ENDING}'
+
+
+def optical_stem(topic: str) -> str:
+    """Return the stem of the body whose optical poses a topic has, in whatever namespace.
+
+    It is empty for a topic of anything else.
+    """
+    return topic.partition(OPTICAL)[2].removesuffix(ENDING)
+
+
+def pose_setup(sensors: Iterable[str], body: str) -> str:
+    """Return the setup document of a session of poses, as text."""
+    return f'schema: {SCHEMA}\nsensors: [{", ".join(sensors)}]\nbody: {body}\n'
 
 
 @dataclass(frozen=True)

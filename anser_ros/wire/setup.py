@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, sections_of, settings_from
-from anser_ros.wire.setup_tips import TipSpec, dump_tips, parse_tips, refuse_unknown_bodies
 from anser_ros.wire.setup_values import (
+    TipSpec,
     Vector,
     Winding,
+    dump_tips,
+    parse_tips,
     read_axis,
     read_mapping,
     read_name,
@@ -29,9 +31,10 @@ from anser_ros.wire.setup_values import (
     read_windings,
     refuse_misspelt,
     refuse_repeats,
+    refuse_unknown_bodies,
     take,
 )
-from anser_ros.wire.yaml_text import DUMPER, read_yaml
+from anser_ros.wire.text_files import DUMPER, read_yaml
 
 SCHEMA = 'anser_setup/1'
 KEYS = (

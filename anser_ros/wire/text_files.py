@@ -1,15 +1,22 @@
-"""Reads text files from anybody: one clear line for a file that is no text, or cannot be read."""
+"""Reads text files from anybody: plain text, tables, lists of points, YAML within bounds, model
+files. A file that cannot be read, or is no text of its kind, is one clear line.
+"""
+
+from __future__ import annotations
 
 import csv
 import io
 import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
-from anser_ros.errors import AnserError, ParameterError
+from anser_ros.errors import AnserError, BagError, ModelFileError, ParameterError, SetupError
 
 
 def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterError) -> str:
@@ -69,3 +76,142 @@ def numbers_of(
     if not (with_gaps or np.isfinite(values).all()):
         raise ParameterError(f'{os.fspath(path)}: the columns {", ".join(names)} must be finite')
     return values
+
+
+def read_fiducials(path: Path) -> NDArray[np.float64]:
+    """Return the positions (P, 3), m, of a list of fiducials.
+
+    Raises
+    ------
+    BagError
+        When the file has no table of fiducials.
+    """
+    lines = read_text(path).splitlines()
+    rows = [line.split(',') for line in lines if line.strip() and not line.startswith('#')]
+    try:
+        places = np.array([[float(value) for value in row[1:4]] for row in rows])
+    except ValueError as error:
+        raise BagError(f'{path}: no table of fiducials: {error}') from error
+    if not places.size or places.shape[1] != 3:
+        raise BagError(f'{path}: no table of fiducials')
+    return np.asarray(1e-3 * places)
+
+
+# libyaml's are several times as fast, where it is there.
+_LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+DUMPER: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+"""What plain data is written with."""
+MOST_CHARACTERS = 32_000_000
+"""Longest text that is read. A model of 4000 dipoles with forty modes is half as long; the time to
+read grows with it, by a second for each megabyte."""
+DEEPEST = 40
+"""Deepest nesting. No document here has more than eight levels; the parser's own recursion ends
+the process from some ten thousand on."""
+MOST_NODES = 5_000_000
+"""Most values of a document, with aliases written out, as whoever prints or copies it does. Thirty
+lines of aliases of aliases stand for a thousand million."""
+
+
+def read_yaml(text: str) -> Any:
+    """Return a document as plain data.
+
+    Raises
+    ------
+    yaml.YAMLError
+        When it is no YAML, has a tag of its own, or is beyond a bound.
+    """
+    if len(text) > MOST_CHARACTERS:
+        raise yaml.YAMLError(f'{len(text)} characters are too long, the most is {MOST_CHARACTERS}')
+    _check(text)
+    return yaml.load(text, Loader=_LOADER)
+
+
+def _check(text: str) -> None:
+    """Walk through the events of a document, which takes no recursion and builds nothing."""
+    sizes: dict[str, int] = {}
+    open_nodes: list[tuple[str | None, int]] = []
+    total = 0
+    for event in yaml.parse(text, Loader=_LOADER):
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = open_nodes.pop()
+            if anchor is not None:
+                sizes[anchor] = total - before
+            continue
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in sizes:
+                raise yaml.YAMLError(
+                    f'the alias {event.anchor} is not defined, or contains itself'
+                )
+            total += sizes[event.anchor]
+        elif isinstance(event, yaml.NodeEvent):
+            total += 1
+            if isinstance(event, yaml.CollectionStartEvent):
+                open_nodes.append((event.anchor, total - 1))
+            elif event.anchor is not None:
+                sizes[event.anchor] = 1
+        if len(open_nodes) > DEEPEST:
+            raise yaml.YAMLError(f'nested deeper than {DEEPEST} levels')
+        if total > MOST_NODES:
+            raise yaml.YAMLError(f'more than {MOST_NODES} values, aliases written out')
+
+
+def read_document(path: str | os.PathLike[str]) -> Any:
+    """Parse a model file; raises `ModelFileError` when it can't be read or is no YAML."""
+    name = os.fspath(path)
+    try:
+        with open(name, encoding='utf-8') as stream:
+            return read_yaml(stream.read(MOST_CHARACTERS + 1))
+    except OSError as error:
+        raise ModelFileError(f'{name}: {error.strerror}') from error
+    except UnicodeError as error:
+        raise ModelFileError(f'{name}: not a text: {error}') from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise ModelFileError(f'{name}: not YAML: {" ".join(str(error).split())}') from error
+
+
+def write_document(path: str | os.PathLike[str], document: Any) -> None:
+    """Write a model file whole or not at all; raises `ModelFileError` when it can't be written."""
+    name = os.fspath(path)
+    try:
+        folder = os.path.dirname(os.path.abspath(name))
+        os.makedirs(folder, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=folder, suffix='.tmp')
+        with os.fdopen(handle, 'w', encoding='utf-8') as stream:
+            yaml.dump(document, stream, Dumper=DUMPER, sort_keys=False, width=4000)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, name)
+    except OSError as error:
+        raise ModelFileError(f'{name}: {error.strerror}') from error
+
+
+_PACKAGE = 'anser_ros'
+
+
+def config_path(name: str) -> Path:
+    """Return the path of a file: `name` itself where it exists, else the one in `config/`.
+
+    Raises
+    ------
+    SetupError
+        When there is neither.
+    """
+    given = Path(name).expanduser()
+    if given.is_file():
+        return given
+    if given.name == name:
+        for folder in Path(__file__).resolve().parents:
+            for candidate in (folder / 'config', folder / 'share' / _PACKAGE / 'config'):
+                if (candidate / name).is_file():
+                    return candidate / name
+    raise SetupError(f'no file {name}, and none of that name among the files of config/')
+
+
+def read_config(name: str) -> str:
+    """Return the text of a file that `config_path` finds.
+
+    Raises
+    ------
+    SetupError
+        When there is none, or it is no text.
+    """
+    return read_text(config_path(name), SetupError)

@@ -19,8 +19,8 @@ from typing import Any
 
 from anser_ros.calibration.calibrate import Options
 from anser_ros.sessions.calibration import calibrate_sessions
-from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import save_model
 
 REPO = Path(__file__).resolve().parents[2]
 SESSIONS, WORKERS, MOST = 10, 2, 0.6

@@ -42,23 +42,20 @@ sys.path[1:1] = [str(HERE.parents[1]), str(HERE)]
 from bench_refit import LAYOUT, recordings  # noqa: E402
 from bound_block import Block  # noqa: E402
 
+from anser_ros.apps.lab.experiments.refit_ablation import spread_out  # noqa: E402
 from anser_ros.calibration.calibrate import Options  # noqa: E402
-from anser_ros.experiments.refit_ablation import spread_out  # noqa: E402
 from anser_ros.field.model import FieldModel  # noqa: E402
 from anser_ros.physics.dipole import flux_jacobian  # noqa: E402
+from anser_ros.physics.rotations import tangents  # noqa: E402
 from anser_ros.physics.sensor import SensorTable  # noqa: E402
-from anser_ros.physics.tangent import tangents  # noqa: E402
-from anser_ros.refit.excitation import Excitation, excitation_for  # noqa: E402
-from anser_ros.refit.tool_readings import (  # noqa: E402
-    FREE_M,
-    FREE_RAD,
-    ToolReading,
-    linearised,
-)
+from anser_ros.refit.clouds import Excitation, excitation_for  # noqa: E402
+from anser_ros.refit.witness import FREE_M, FREE_RAD, ToolReading, linearised  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.drawing import NominalBoard  # noqa: E402
+from anser_ros.sessions.nominal_board import (  # noqa: E402
+    NominalBoard,
+    stated_volume,
+)
 from anser_ros.sessions.session import Session, load_session  # noqa: E402
-from anser_ros.sessions.volume import stated_volume  # noqa: E402
 
 PATHS = {
     'online/approach': (6.0, 30.0, (0.0, 0.0, -0.30), (0.0, 0.0, -0.006)),

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from anser_ros.apps.poses.corrector import MODEL_SCHEMA, PoseCorrector
+from anser_ros.apps.poses.effects.field_distortion import UNIT_M, FieldDistortion, monomials
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.corrector import MODEL_SCHEMA, PoseCorrector
-from anser_ros.poses.effects.field_distortion import UNIT_M, FieldDistortion, monomials
 
 SENSOR = 'tip'
 DEGREE = 2

@@ -25,8 +25,8 @@ from bench_refit import JITTER_M, LAYOUT, recordings
 
 from anser_ros.calibration.calibrate import Options
 from anser_ros.sessions.calibration import calibrate_sessions
-from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.session import Session, load_session
+from anser_ros.sessions.tracked_session import track_session
 
 WRONG_M = 1e-3
 BEFORE_S, AFTER_S = 4.0, 8.0

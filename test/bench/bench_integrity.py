@@ -18,7 +18,7 @@ from bench_refit import LAYOUT
 
 from anser_ros.calibration.calibrate import Options
 from anser_ros.frames.intake import Intake
-from anser_ros.integrity.freshness import Freshness
+from anser_ros.integrity.streams import Freshness
 from anser_ros.sessions.calibration import calibrate_sessions
 from anser_ros.sessions.session import load_session
 from anser_ros.tracking import judgement

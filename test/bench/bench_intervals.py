@@ -20,7 +20,12 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 
-from anser_ros.assessment.hummel import VOLUMES, Grid, distance_errors, have_common_errors
+from anser_ros.apps.poses.assessment.hummel import (
+    VOLUMES,
+    Grid,
+    distance_errors,
+    have_common_errors,
+)
 
 FIRST_SEED, TRUTH_SEED, TRUE_BOARDS = 9000, 8999, 3000
 NOISE_M, DISTORTION_M = 3e-4, 1e-3

@@ -20,15 +20,15 @@ sys.path[1:1] = [str(HERE.parents[1]), str(HERE), str(HERE / 'world')]
 from bench_references import judged, thinned  # noqa: E402
 from bench_refit import JITTER_M, recordings  # noqa: E402
 
+from anser_ros.apps.lab.metal_follower import KnownMetalModels  # noqa: E402
+from anser_ros.apps.lab.metal_lattice import KnownMetal  # noqa: E402
+from anser_ros.apps.lab.metal_learning import learn  # noqa: E402
 from anser_ros.calibration.calibrate import Options  # noqa: E402
 from anser_ros.field.model import FieldModel  # noqa: E402
-from anser_ros.known_metal.known import KnownMetal  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.evaluation import track_session  # noqa: E402
-from anser_ros.sessions.known_metal import KnownMetalModels  # noqa: E402
-from anser_ros.sessions.metal_frames import learn  # noqa: E402
 from anser_ros.sessions.prepared import prepare  # noqa: E402
 from anser_ros.sessions.session import Session, load_session  # noqa: E402
+from anser_ros.sessions.tracked_session import track_session  # noqa: E402
 
 EVERY = 4
 PAIRS = (

@@ -16,9 +16,11 @@ sys.path[1:1] = [str(HERE), str(HERE.parents[1]), str(HERE.parent)]
 from pose_faults import KINDS  # noqa: E402
 from pose_world import World  # noqa: E402
 
-from anser_ros.poses.corrector import PoseCorrector  # noqa: E402
-from anser_ros.poses.diagnosis import diagnose_poses  # noqa: E402
-from anser_ros.poses.document import to_model  # noqa: E402
+from anser_ros.apps.poses.corrector import (  # noqa: E402
+    PoseCorrector,
+    to_model,
+)
+from anser_ros.apps.poses.diagnosis import diagnose_poses  # noqa: E402
 
 
 def rows() -> Iterator[dict[str, Any]]:

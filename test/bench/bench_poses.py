@@ -33,7 +33,7 @@ from clean_poses import clean_worlds  # noqa: E402
 from pose_faults import KINDS, Truth  # noqa: E402
 from pose_world import World  # noqa: E402
 
-from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses  # noqa: E402
+from anser_ros.apps.poses.diagnosis import PoseDiagnosis, diagnose_poses  # noqa: E402
 
 REPORTED, REPEATED = (351,), (352,)
 REPEATS = 24  # sessions of a kind by which sigmas are judged: their rms is then known to 14 %

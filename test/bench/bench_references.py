@@ -32,13 +32,15 @@ from bench_refit import JITTER_M, LAYOUT, recordings, rms_mm  # noqa: E402
 from laboratory import FLUX_NOISE_T, Laboratory, measured, read_fluxes  # noqa: E402
 from motions import Wander  # noqa: E402
 
+from anser_ros.apps.lab.experiments.refit_ablation import spread_out  # noqa: E402
 from anser_ros.calibration.calibrate import Options  # noqa: E402
-from anser_ros.experiments.refit_ablation import spread_out  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.chosen_references import with_references  # noqa: E402
-from anser_ros.sessions.evaluation import track_session  # noqa: E402
-from anser_ros.sessions.pose_errors import PoseSeries  # noqa: E402
+from anser_ros.sessions.follower import with_references  # noqa: E402
 from anser_ros.sessions.session import Session, load_session  # noqa: E402
+from anser_ros.sessions.tracked_session import (  # noqa: E402
+    PoseSeries,
+    track_session,
+)
 
 COUNTS = (0, 2, 4, 8, 16, 32)
 KINDS = ('approach', 'sweep', 'beside', 'over', 'two_metals')

@@ -22,13 +22,13 @@ sys.path.insert(0, str(REPO / 'test'))
 
 from refit_world import anser_world, metal_block  # noqa: E402
 
+from anser_ros.apps.lab.experiments import refit_ablation as ablation  # noqa: E402
 from anser_ros.calibration.calibrate import Options  # noqa: E402
 from anser_ros.calibration.layouts import Layout  # noqa: E402
-from anser_ros.experiments import refit_ablation as ablation  # noqa: E402
 from anser_ros.refit.live_refit import LiveRefit  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.evaluation import track_session  # noqa: E402
 from anser_ros.sessions.session import load_session  # noqa: E402
+from anser_ros.sessions.tracked_session import track_session  # noqa: E402
 from anser_ros.tracking.tracker import Tracker, TrackerSettings  # noqa: E402
 from anser_ros.wire.points import DipolePoints, encode_field_model  # noqa: E402
 

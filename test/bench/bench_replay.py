@@ -24,11 +24,16 @@ from chain import replay_through_nodes  # noqa: E402
 
 from anser_ros.calibration.calibrate import Options  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.evaluation import track_session  # noqa: E402
-from anser_ros.sessions.model_file import load_model, save_model  # noqa: E402
-from anser_ros.sessions.pose_errors import metrics  # noqa: E402
 from anser_ros.sessions.session import load_session  # noqa: E402
-from anser_ros.sessions.starting_model import model_for  # noqa: E402
+from anser_ros.sessions.starting_model import (  # noqa: E402
+    load_model,
+    model_for,
+    save_model,
+)
+from anser_ros.sessions.tracked_session import (  # noqa: E402
+    metrics,
+    track_session,
+)
 from anser_ros.wire.setup import topic_of  # noqa: E402
 
 

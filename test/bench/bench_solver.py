@@ -16,8 +16,7 @@ from tracking_world import NOISE_T, certain_model
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.seed import build_grid, solve_cold
-from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
-from anser_ros.tracking.uncertainty import chi2_limit
+from anser_ros.tracking.solve import RealField, chi2_limit, solve_coil, whitening_of
 
 WARM_POINTS = 100
 WARM_REPEATS = 5

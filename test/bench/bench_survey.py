@@ -39,8 +39,8 @@ from calibration_world import (  # noqa: E402
 
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan  # noqa: E402
 from anser_ros.calibration.layouts import Layout  # noqa: E402
+from anser_ros.calibration.sensor_fit import SensorFitter  # noqa: E402
 from anser_ros.calibration.sensor_parameters import KINDS  # noqa: E402
-from anser_ros.calibration.sensor_survey import SensorFitter  # noqa: E402
 from anser_ros.settings import Accuracy  # noqa: E402
 from anser_ros.tracking.estimate import TrackerSettings  # noqa: E402
 from anser_ros.tracking.tracker import Tracker  # noqa: E402

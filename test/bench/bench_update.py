@@ -18,12 +18,11 @@ import numpy as np
 from live_chain import METAL_FROM_S, world
 
 from anser_ros.refit.live_refit import LiveRefit
-from anser_ros.sessions.drawing import NominalBoard
-from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
 from anser_ros.sessions.session import sensor_table
-from anser_ros.sessions.volume import stated_volume
+from anser_ros.sessions.starting_model import load_model
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.config_folder import config_path
+from anser_ros.wire.text_files import config_path
 
 SECONDS, FRAME_S = 60.0, 0.02
 TARGETS_MS = {50: None, 99: 3.0, 100: 6.0}

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from anser_ros.apps.lab.metal_lattice import Coils, Lattice, Setting, ball_answer, lattice_points
 from anser_ros.field.model import FieldModel
-from anser_ros.known_metal.lattice import Coils, Lattice, Setting, ball_answer, lattice_points
-from anser_ros.refit.excitation import Excitation
+from anser_ros.refit.clouds import Excitation
 
 SPACING_M, GRID = 0.035, (7, 7, 3)
 BALL = ball_answer(SPACING_M)

@@ -19,19 +19,14 @@ from pathlib import Path
 import numpy as np
 
 from anser_ros.cli.demo import BOARD_SEED
-from anser_ros.cli.supervisor import Child, Supervisor
-from anser_ros.simulation.board_source import board_source
+from anser_ros.cli.processes import Child, Supervisor
 from anser_ros.simulation.control_unit import ControlUnit
-from anser_ros.simulation.manufacture import manufactured
-from anser_ros.simulation.metal import steel_disc
-from anser_ros.simulation.motion import Approach
-from anser_ros.simulation.pseudo_port import PseudoPort
-from anser_ros.simulation.world import World
+from anser_ros.simulation.line import PseudoPort
+from anser_ros.simulation.world import Approach, World, board_source, manufactured, steel_disc
 from anser_ros.wire.channel_calibration import parse_channels
-from anser_ros.wire.config_folder import config_path, read_config
-from anser_ros.wire.frames import encode
-from anser_ros.wire.records import Start
+from anser_ros.wire.frames import Start, encode
 from anser_ros.wire.setup import parse_setup, topic_of
+from anser_ros.wire.text_files import config_path, read_config
 
 WINDOW_S = 0.02
 BLOCK_S = 0.001
@@ -97,9 +92,9 @@ import sys, os, termios, tty
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from anser_ros.nodes.runtime import qos
-from anser_ros.wire.frame_reader import FrameReader
+from anser_ros.wire.protocols import FrameReader
 from anser_ros.wire.frames import encode
-from anser_ros.wire.records import SampleBlock, Start
+from anser_ros.wire.frames import SampleBlock, Start
 
 def main():
     link, blocks, topics = sys.argv[1], int(sys.argv[2]), sys.argv[3:]

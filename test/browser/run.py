@@ -25,10 +25,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from chromium import BROWSER_OPTIONS, browser_of
 
 from anser_ros.cli.demo import BOARD_SEED, SAMPLE_RATE_HZ, node_command
-from anser_ros.cli.supervisor import Child, Supervisor, tail
+from anser_ros.cli.processes import Child, Supervisor, tail
 from anser_ros.settings import Accuracy
-from anser_ros.simulation.effect_draw import CATALOGUE
-from anser_ros.wire.config_folder import config_path
+from anser_ros.simulation.effects import CATALOGUE
+from anser_ros.wire.text_files import config_path
 
 PATIENCE_S = 180.0
 """Time for the chain to start and for a command to end, s."""

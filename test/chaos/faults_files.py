@@ -7,9 +7,9 @@ from fault import Command
 from faults_graph import bomb
 
 from anser_ros.wire.bag import read_bag
-from anser_ros.wire.config_folder import config_path
+from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import Bag
-from anser_ros.wire.session_writer import SessionWriter
+from anser_ros.wire.text_files import config_path
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 

@@ -11,7 +11,7 @@ from fault import Fault, Off, nothing
 from rig import RATE_HZ, Rig
 
 from anser_ros.field.model import FieldModel
-from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.starting_model import load_model
 
 PERIOD_S = 1.0 / RATE_HZ
 """Time between two messages of somebody who publishes beside the chain, s."""

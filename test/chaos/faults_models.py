@@ -10,9 +10,8 @@ from rig import BOARD_SEED, Rig
 
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.field.nominal import nominal_model
-from anser_ros.sessions.model_file import is_snapshot, load_model, save_model
-from anser_ros.sessions.starting_model import board_of
-from anser_ros.simulation.manufacture import manufactured
+from anser_ros.sessions.starting_model import board_of, is_snapshot, load_model, save_model
+from anser_ros.simulation.world import manufactured
 
 
 def _served(change: Callable[[Rig, FieldModel], FieldModel], **more: object) -> Callable[..., Off]:

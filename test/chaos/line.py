@@ -17,9 +17,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from anser_ros.simulation.control_unit import TICK_HZ, Piece
-from anser_ros.simulation.pseudo_port import PseudoPort
-from anser_ros.wire.frames import CRC, HEADER, MAGIC, OVERHEAD, decode_payload, encode
-from anser_ros.wire.records import Hello, SampleBlock
+from anser_ros.simulation.line import PseudoPort
+from anser_ros.wire.frames import (
+    CRC,
+    HEADER,
+    MAGIC,
+    OVERHEAD,
+    Hello,
+    SampleBlock,
+    decode_payload,
+    encode,
+)
 
 Tamper = Callable[[list[bytes], float], list[bytes]]
 """Takes the records that came and the time, s, that it has been on; gives what arrives."""

@@ -16,9 +16,9 @@ from line import Line
 from witness import WINDOW_S, Witness
 
 from anser_ros.cli.demo import BOARD_SEED, METAL_RADIUS_M, SAMPLE_RATE_HZ, node_command
-from anser_ros.cli.supervisor import Child, Supervisor, tail
-from anser_ros.wire.config_folder import config_path, read_config
+from anser_ros.cli.processes import Child, Supervisor, tail
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import config_path, read_config
 
 RATE_HZ = 25.0
 """Rate of the fluxes, Hz; low enough for all processes together on two cores."""

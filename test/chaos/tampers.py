@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from line import Tamper, inside, with_crc
 
-from anser_ros.wire.records import Channel, ChannelKind, Hello, SampleBlock
+from anser_ros.wire.frames import Channel, ChannelKind, Hello, SampleBlock
 
 TOOL, REFERENCE = slice(0, 9), slice(9, 41)
 """Columns of the demo's nine tool coils, and of its 32 reference coils; the current is last."""

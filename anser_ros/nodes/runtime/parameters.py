@@ -1,20 +1,26 @@
-"""Defines a node's parameter table: a frozen dataclass of fields made by :func:`parameter`.
-
-The dataclass is the only place that knows a parameter's name, type, default, range and meaning.
-The node declares it, ``--help`` prints it, and an instance of it is what the node reads::
-
-    @dataclass(frozen=True)
-    class TrackerParameters:
-        gate: float = parameter(4.0, 'largest residual in standard deviations', minimum=0.0)
+"""Defines a node's parameter table: a frozen dataclass of fields made by :func:`parameter`. The
+dataclass is the only place that knows a parameter's name, type, default, range and meaning. The
+node declares it, ``--help`` prints it, and an instance of it is what the node reads::
+@dataclass(frozen=True)     class TrackerParameters:         gate: float = parameter(4.0,
+'largest residual in standard deviations', minimum=0.0) Then follow the parameters that several
+nodes have: values that the setup document may state too (0, the default, leaves them to it),
+names outside a node's namespace, and what parameter files say.
 """
 
 import dataclasses
+import difflib
+import itertools
 import math
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+import yaml
+
 from anser_ros.errors import ParameterError
+from anser_ros.settings import VALUES, settings_from
+from anser_ros.wire.recorded import OPTICAL, TRACKED
+from anser_ros.wire.text_files import config_path, read_config, read_text, read_yaml
 
 LIST_ITEMS = {tuple[float, ...]: float, tuple[int, ...]: int, tuple[str, ...]: str}
 SCALARS = (bool, int, float, str)
@@ -151,3 +157,122 @@ def describe(table: type) -> str:
         notes += ' (may change while it runs)' if rule.live else ''
         lines.append(f'  {field.name} = {default!r}{notes}\n      {rule.description}')
     return '\n'.join(lines) or '  none'
+
+
+def stated(name: str) -> Any:
+    """Return the field of a parameter table for a value of `VALUES`; see `parameter`."""
+    item = VALUES[name]
+    meaning, high = item.metadata['meaning'], item.metadata['high']
+    text = f'{meaning}; 0 for that of the setup document, or {item.default:.4g} without one'
+    return parameter(item.type(0), text, minimum=0.0, maximum=high)  # type: ignore[operator]
+
+
+def stated_by(table: Any) -> dict[str, float]:
+    """Return the values that a node's parameters state, without those that are 0.
+
+    Raises `ParameterError` when a value is out of its range.
+    """
+    names = [field.name for field in dataclasses.fields(table) if field.name in VALUES]
+    values = {name: getattr(table, name) for name in names if getattr(table, name) != 0}
+    settings_from(values)
+    return values
+
+
+STALE_AFTER_S = 0.3
+"""Time without fluxes, or poses, s, after which a sensor is stale, unless parameters differ."""
+
+
+def optical_parameter() -> Any:
+    """Return the parameter of a node that has to do with optical poses."""
+    return parameter(OPTICAL.rstrip('/'), 'namespace of the optical poses: NAMESPACE/BODY/pose')
+
+
+def tracked_parameter() -> Any:
+    """Return the parameter of a node that has to do with the poses of another tracker."""
+    return parameter(
+        TRACKED.rstrip('/'), "namespace of another tracker's poses: NAMESPACE/SENSOR/pose"
+    )
+
+
+OPTION = '--params-file'
+LEAF = 'ros__parameters'
+WILDCARDS = ('*', '**')
+
+
+def _documents(arguments: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """Yield the path and content of each parameter file among a process's arguments.
+
+    Files that cannot be read or are not YAML are left out: rclpy refuses them.
+    """
+    for option, value in itertools.pairwise(arguments):
+        if option != OPTION:
+            continue
+        try:
+            document = read_yaml(read_text(value))
+        except (ParameterError, yaml.YAMLError):
+            continue
+        yield value, document
+
+
+def complaints(arguments: Sequence[str], node: str) -> list[str]:
+    """Return one line for each parameter file without a section for a node.
+
+    rclpy ignores such a file silently, and the node runs with its defaults. A file that is not a
+    parameter file is left to rclpy, which refuses it.
+    """
+    found = []
+    for value, document in _documents(arguments):
+        keys = [key for key, _ in _sections(document)]
+        names = [key.rsplit('/', 1)[-1] for key in keys]
+        if node in names or any(name in WILDCARDS for name in names):
+            continue
+        close = difflib.get_close_matches(node, names, n=1)
+        hint = f"is '{keys[names.index(close[0])]}' meant?" if close else f'it has: {_list(keys)}'
+        found.append(f'{value} has nothing for {node}; {hint}')
+    return found
+
+
+def names_for(arguments: Sequence[str], node: str) -> Iterator[str]:
+    """Yield the names of the values that parameter files have in sections of just this node."""
+    for _, document in _documents(arguments):
+        for key, values in _sections(document):
+            if key.rsplit('/', 1)[-1] == node and isinstance(values, dict):
+                yield from map(str, values)
+
+
+def checked(name: str, nodes: Collection[str]) -> str:
+    """Return the path of a parameter file for several nodes: a path, or a file of `config/`.
+
+    Raises `SetupError`: there is no such file, and `ParameterError`: it is no YAML, holds no
+    section, or one whose node is not among ``nodes``: all would start with their defaults then.
+    """
+    path = str(config_path(name))
+    try:
+        document = read_yaml(read_config(name))
+    except (ValueError, yaml.YAMLError) as error:
+        raise ParameterError(f'{path}: not YAML: {" ".join(str(error).split())}') from error
+    keys = [key for key, _ in _sections(document)]
+    if not keys:
+        raise ParameterError(f'{path}: no section with {LEAF}')
+    for key in keys:
+        last = key.rsplit('/', 1)[-1]
+        if last not in (*nodes, *WILDCARDS):
+            close = difflib.get_close_matches(last, nodes, n=1)
+            hint = f', is {close[0]} meant?' if close else f'; there are: {", ".join(nodes)}'
+            raise ParameterError(f'{path}: no node {key}{hint}')
+    return path
+
+
+def _sections(document: Any, path: str = '') -> Iterator[tuple[str, Any]]:
+    """Yield the full name of every section that holds parameters, and what it holds."""
+    if not isinstance(document, dict):
+        return
+    if LEAF in document:
+        yield path, document[LEAF]
+    for key, value in document.items():
+        if key != LEAF:
+            yield from _sections(value, f'{path}/{key}' if path else str(key))
+
+
+def _list(keys: Sequence[str]) -> str:
+    return ', '.join(keys) or 'no section at all'

@@ -1,6 +1,12 @@
-"""Runs the process of one node: its arguments, its signals, its executor and its exit code."""
+"""Runs the process of one or several nodes: memory, arguments, signals, executor and exit code.
+The allocator is set so that a node that runs for days does not break its memory into pieces:
+glibc gives blocks of 128 KiB and more back when they are freed, but raises this bound to the
+size of the largest block that was freed so far, and gives each thread a heap of its own.
+`field_model` had 612 MB after twenty minutes, in steps of megabytes, and has 511 so.
+"""
 
 import argparse
+import ctypes
 import gc
 import os
 import signal
@@ -20,12 +26,32 @@ from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.runtime import parameters
-from anser_ros.nodes.runtime.allocator import keep_in_one_piece
 from anser_ros.nodes.runtime.handover import Handover
 from anser_ros.nodes.runtime.node import AnserNode
-from anser_ros.nodes.runtime.parameter_files import complaints, names_for
+from anser_ros.nodes.runtime.parameters import complaints, names_for
 from anser_ros.one_line_parser import OneLineParser
-from anser_ros.wire.config_folder import config_path
+from anser_ros.wire.text_files import config_path
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
+"""Parameters of glibc's ``mallopt``, as <malloc.h> numbers them."""
+LARGE = 4 * 1024 * 1024
+"""Bytes from which on a block has pages of its own, which are given back. What is made for a frame
+is smaller: with 256 KiB, `field_model` asks for 9000 pages a second and waits for them."""
+MOST_FREE = 64 * 1024 * 1024
+"""Free bytes at the end of the heap that are kept, as many as glibc itself comes to keep; with
+8 MiB the same node still asks for 3000 pages a second."""
+
+
+def keep_in_one_piece() -> None:
+    """Set the allocator of this process so; do nothing where it is not glibc's."""
+    try:
+        set_option = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):
+        return
+    set_option(M_ARENA_MAX, 1)
+    set_option(M_MMAP_THRESHOLD, LARGE)
+    set_option(M_TRIM_THRESHOLD, MOST_FREE)
+
 
 # How long a signal may go unnoticed by an idle node.
 SPIN_SLICE_S = 0.1

@@ -1,17 +1,101 @@
-"""Subscribes to a topic, uses a single publisher of it, and reports when there are more."""
+"""Subscribes to a topic: a single publisher is believed, and late frames give way to the
+newest. Poses that are late by several windows are useless for guidance, so a node that is
+slower than its input discards the waiting messages, takes the newest and reports so. A node
+that only paused may catch up, and loses nothing.
+"""
 
+import os
 import time
+from collections import deque
 from collections.abc import Callable, Hashable, Mapping
+from statistics import median
 from types import MappingProxyType
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
-from anser_ros.integrity.senders import Senders
+from anser_ros.integrity.streams import Senders
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.handover import HandedFlux
+from anser_ros.nodes.runtime.incoming import opened
 from anser_ros.nodes.runtime.node import AnserNode
-from anser_ros.nodes.streams.measured_keys import without_measured
+from anser_ros.nodes.streams.clouds import without_measured
+from anser_ros.stamps import NANO, SECOND_NS, is_live, stamp_of
+
+
+def too_slow(skipped: int, worked: int) -> str:
+    """Return what part of the windows since the last look gave way to newer ones; empty for none.
+
+    The load is the system's own mean over the last minute, in processes that need a core; the
+    number of cores is given with it.
+    """
+    if not skipped:
+        return ''
+    share = 100 * skipped / (skipped + worked)
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    percent = f'{share:.0f} %' if share >= 1 else 'less than 1 %'
+    return f'computer too slow: {percent} of windows skipped, load {load:.1f} on {cores} cores'
+
+
+LATE_WINDOWS = 3.0
+"""Age of a message, in the spacing of messages, from which it may be late. Smaller, and the jitter
+of a loaded machine looks like a backlog; larger, and poses are that many windows old."""
+SHORTEST_LATE_S = 0.05
+"""Age, s, below which no message is late, however fast messages come: the executor has delays."""
+CATCH_UP_S = 1.0
+"""A backlog that will be gone within this time is worked off."""
+MEMORY = 25
+"""Messages that typical figures are taken of, so that a few slow ones say nothing."""
+FEWEST_MESSAGES = 10
+"""Messages that must have been worked on before a backlog is judged: the first ones are slow."""
+MOST_LEFT_OUT = 2
+"""Frames in a row that are left out by what gives way to newer ones. Fewer, and poses of a
+computer that is a tenth too slow fall behind; more, and the model is older than metal in a hand
+allows."""
+
+
+class Backlog:
+    """Estimates the typical spacing of messages, and the time that each takes."""
+
+    def __init__(self, spacing_s: float | None = None) -> None:
+        known = () if spacing_s is None else (spacing_s,)
+        self._spacing_s: deque[float] = deque(known, maxlen=MEMORY)
+        self._work_s: deque[float] = deque(maxlen=MEMORY)
+        self._last = (0, 0)
+        self._left_out = 0
+
+    def arrived(self, received_ns: int, stamp_ns: int) -> None:
+        """Note when the middleware received the message that is worked on next, and its stamp.
+
+        A burst of messages does not count as faster than its stamps.
+        """
+        last, self._last = self._last, (received_ns, stamp_ns)
+        if last[0]:
+            self._spacing_s.append(max(received_ns - last[0], stamp_ns - last[1], 0) * NANO)
+
+    def worked(self, seconds: float) -> None:
+        """Note how long a message took."""
+        self._work_s.append(seconds)
+
+    def is_hopeless(self, age_s: float) -> bool:
+        """Return whether a message of this age shows a backlog that will not be gone soon."""
+        if age_s < SHORTEST_LATE_S or len(self._work_s) < FEWEST_MESSAGES:
+            return False
+        spacing_s, work_s = median(self._spacing_s), median(self._work_s)
+        if age_s < LATE_WINDOWS * spacing_s:
+            return False
+        share = work_s / max(spacing_s, 1e-9)
+        return share >= 1.0 or age_s * share / (1.0 - share) > CATCH_UP_S
+
+    def gives_way(self, age_s: float) -> bool:
+        """Return whether to leave out, of a frame so old, work that can wait for newer ones."""
+        behind = bool(self._spacing_s) and age_s > median(self._spacing_s)
+        is_left_out = behind and self._left_out < MOST_LEFT_OUT
+        self._left_out = self._left_out + 1 if is_left_out else 0
+        return is_left_out
+
 
 LOOK_S = 0.1
 """How often the graph is asked at most, s, while messages go on as before: it takes 15 us.
@@ -132,3 +216,64 @@ def setup_source(node: AnserNode, callback: Callable[[Any], None]) -> OneSource:
 def sender_words(sources: list[OneSource]) -> str:
     """Return the topics with several senders, in words; empty if each has one."""
     return '; '.join(filter(None, [source.complaint for source in sources]))
+
+
+class NewestSource(OneSource):
+    """Subscribes to fluxes; a frame that is late beyond hope gives way to the newest.
+
+    What can be caught up with shows how long frames take: the callback's time, or what a caller
+    that works on frames later reports to the ``backlog``.
+    """
+
+    def __init__(
+        self,
+        node: AnserNode,
+        topic: str,
+        callback: Callable[[Any], None],
+        doubted: Callable[..., None] | None = None,
+        works_later: bool = False,
+    ) -> None:
+        self._work, self._works_later, self.backlog = callback, works_later, Backlog()
+        super().__init__(
+            node, PointCloud2, topic, self._on_frame, qos.STREAM, doubted, informed=True
+        )
+
+    def _on_frame(self, message: PointCloud2 | HandedFlux, info: Mapping[str, Any]) -> None:
+        newest = message
+        if not isinstance(message, HandedFlux):  # what is handed over has no queue
+            newest = self._newest(message, info)
+        begin_s = time.perf_counter()
+        if newest is not None:
+            self._work(newest)
+        if not self._works_later:
+            self.backlog.worked(time.perf_counter() - begin_s)
+
+    def _newest(self, message: PointCloud2, info: Mapping[str, Any]) -> PointCloud2 | None:
+        """The message, or the newest that waits; None where those that wait are another's."""
+        received_ns = info.get('received_timestamp') or info.get('source_timestamp') or 0
+        now_ns, stamp_ns = time.time_ns(), stamp_of(message)
+        self.backlog.arrived(received_ns, stamp_ns)
+        # Nobody steers by a recording that is played: it is worked off whole.
+        live = is_live(stamp_ns, now_ns)
+        age_s = (now_ns - received_ns) / SECOND_NS
+        if not (live and received_ns and self.backlog.is_hopeless(age_s)):
+            return message
+        waiting = take_waiting(self.subscription)
+        believed = [self.accepts(about) for _, about in waiting]
+        if not all(believed):
+            return None
+        if not waiting:
+            return message
+        self._node.count('frames_skipped', len(waiting))
+        return opened(waiting[-1][0], PointCloud2)
+
+
+def take_waiting(subscription: Any) -> list[tuple[bytes, dict[str, int]]]:
+    """Take the messages that wait in a queue, oldest first, as bytes with their information."""
+    taken: list[tuple[bytes, dict[str, int]]] = []
+    with subscription.handle:
+        while True:
+            item = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if item is None:
+                return taken
+            taken.append((item[0], item[1]))

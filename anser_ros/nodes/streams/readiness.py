@@ -14,16 +14,17 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 
+from anser_ros import extensions
 from anser_ros.errors import SetupError
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import statuses_in
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.wire.setup import parse_setup, topic_of
-from anser_ros.wire.setup_tips import tip_name
+from anser_ros.wire.setup_values import tip_name
 
 TRACKER, FIELD_MODEL = 'tracker', 'field_model'
 # They take what there is, and nobody waits for them alone.
-PASSIVE = ('recorder', 'openigtlink', 'monitor', 'watcher', 'dashboard')
+PASSIVE = ('recorder', 'openigtlink', 'monitor', 'watcher', *extensions.entries('PASSIVE'))
 LOOK_S = 3.3
 """Least time to look for others: nodes that are not ours announce themselves a few times at their
 start and then every three seconds, and who joins in between does not know them before."""

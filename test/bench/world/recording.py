@@ -18,8 +18,8 @@ from laboratory import (
 from motions import Wander, raster
 from scipy.spatial.transform import Rotation, Slerp
 
+from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
-from anser_ros.wire.session_writer import SessionWriter
 
 FLUX_HZ, OPTICAL_HZ, LENGTH_S = 25.0, 60.0, 40.0
 SECOND_NS = 1_000_000_000

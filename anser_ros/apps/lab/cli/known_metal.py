@@ -1,0 +1,70 @@
+"""Learn a piece of metal from a recorded session, to follow it in others."""
+
+import argparse
+from pathlib import Path
+
+from anser_ros.apps.lab.metal_lattice import save_known_metal
+from anser_ros.apps.lab.metal_learning import learn
+from anser_ros.cli.output import (
+    Result,
+    Tell,
+    add_json,
+    add_model,
+    add_stated_values,
+    check_file,
+    loss_notes,
+    stated_values,
+)
+from anser_ros.errors import ParameterError
+from anser_ros.sessions.prepared import prepare
+from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import model_for
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = (
+        'example: anser known_metal bags/metal.mcap --model config/demo_model.yaml'
+        ' --baseline bags/scan.mcap --name c_arm --out c_arm.yaml'
+    )
+    parser.add_argument(
+        'session', metavar='BAG',
+        help='bag in which one rigid piece of metal moves, seen by reference sensors and a tool '
+        'with optical poses',
+    )  # fmt: skip
+    add_model(parser, required=True)
+    parser.add_argument(
+        '--baseline', required=True, help='recording of the same board without the metal'
+    )
+    parser.add_argument('--name', required=True, help='name of the metal')
+    parser.add_argument(
+        '--out', required=True, type=Path, help='file to write; its folder is made if missing'
+    )
+    add_stated_values(parser, 'accuracy', 'refit', 'tools')
+    add_json(parser, 'what was learnt on stdout')
+
+
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Learn the metal of the session, and write it."""
+    if not args.name.strip():
+        raise ParameterError('--name must not be empty')
+    session = load_session(args.session).with_stated(stated_values(args))
+    model = model_for(args.model, session)
+    prepared = prepare(session, model, load_session(args.baseline))
+    check_file(args.out)
+    known = learn(prepared, args.name.strip(), tell)
+    save_known_metal(args.out, known)
+    document = {
+        'name': known.name,
+        'points': len(known.lattice),
+        'misfit': known.misfit,
+        'strongest_t': known.strongest_t,
+        'nearest_m': known.nearest_m,
+    }
+    size = known.lattice.points.max(axis=0) - known.lattice.points.min(axis=0)
+    words = (
+        f'{known.name}: {len(known.lattice)} points over '
+        f'{" x ".join(f"{side * 1e2:.0f}" for side in size)} cm; in frames that took no part '
+        f"{known.misfit:.1%} of the references' readings are left"
+    )
+    return Result(document, loss_notes(args.session, session.lost), (words,), (args.out,))

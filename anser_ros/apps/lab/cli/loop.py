@@ -1,0 +1,365 @@
+"""Runs the loop: an effect in simulated samples is found blind, corrected and measured again."""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from anser_ros.apps.lab.cli.loop_run import (
+    AFTER,
+    BEFORE,
+    UNGATED,
+    LoopFiles,
+    Run,
+    make_world,
+    record,
+)
+from anser_ros.cli import missing
+from anser_ros.cli.output import add_json, add_out, make_new_folder, say_written, write_files
+from anser_ros.cli.processes import LAST_DOMAIN, own_domain
+from anser_ros.cli.warm_up import compile_kernels
+from anser_ros.effects.correction import Correction
+from anser_ros.errors import DiagnosisError, ParameterError
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.constants import DEGREES
+from anser_ros.sessions.prepared import prepare
+from anser_ros.sessions.recorded_health import (
+    first_warnings,
+    kept_share,
+    last_words,
+    ok_share,
+    overload,
+)
+from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
+from anser_ros.sessions.session import Session, load_session
+from anser_ros.sessions.starting_model import load_model
+from anser_ros.settings import Accuracy
+from anser_ros.simulation.effects import CATALOGUE, NONE, RANDOM
+from anser_ros.stamps import NANO
+
+NAMED, PARTLY, UNEXPLAINED = 'named', 'named in part', 'said unexplained'
+MISSED, WRONG = 'missed', 'wrong name'
+SITES = ('channel', 'channels', 'coil', 'coils')
+TRACKERS = ('ungated', 'before', 'after')
+
+
+def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
+    """Return how right a diagnosis is; empty for a clean run that was found clean.
+
+    An effect that the diagnosis knows must be named, at its site, and nothing else. One that it
+    does not know must be reported as unexplained: completely, or in part among other names.
+
+    ``truth`` has name, parameters and answers of the effect that was put in, ``diagnosis`` is the
+    document of the diagnosis.
+    """
+    names = [effect['name'] for effect in diagnosis['effects']]
+    unexplained = diagnosis['unexplained']['fraction'] > 0.0
+    answers = list(truth['answers'])
+    if truth['name'] == 'none':
+        return WRONG if names else ''
+    if answers and names and set(names) <= set(answers):
+        same = all(_same_site(truth['parameters'], e['parameters']) for e in diagnosis['effects'])
+        return NAMED if same else WRONG
+    if not names:
+        return UNEXPLAINED if unexplained else MISSED
+    return PARTLY if unexplained and not answers else WRONG
+
+
+def _same_site(truth: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
+    return all(found[key] == truth[key] for key in SITES if key in truth and key in found)
+
+
+def parameter_errors(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
+    """Return each parameter that truth and finding share, with its error and standard deviation.
+
+    The error of a list is its largest difference, that of a position the distance.
+    """
+    out: dict[str, Any] = {}
+    for effect in diagnosis['effects']:
+        if effect['name'] not in truth['answers']:
+            continue
+        for key, put_in in truth['parameters'].items():
+            found = effect['parameters'].get(key)
+            if key in SITES or found is None or np.shape(found) != np.shape(put_in):
+                continue
+            difference = np.asarray(found, float) - np.asarray(put_in, float)
+            size = np.linalg.norm if key == 'position_m' else lambda d: np.abs(d).max()
+            out[key] = {
+                'put_in': put_in,
+                'found': found,
+                'error': float(size(difference)),
+                'sigma': effect['uncertainty'].get(key),
+            }
+    return out
+
+
+def second_run(session: Session, corrected: FieldModel, known: FieldModel) -> dict[str, Any]:
+    """Return each tracker's live errors over all sensors and bodies, and its share of poses.
+
+    A tracker with a wrong model withholds the poses that its gate catches, so that its error must
+    be judged together with the share of poses that it published of those that it judged;
+    `ungated` has the withheld poses as well.
+    """
+    figures, words = {}, last_words(session.path)
+    for name, namespace, model in (
+        ('ungated', UNGATED, known), ('before', BEFORE, known), ('after', AFTER, corrected)
+    ):  # fmt: skip
+        errors = list(live_errors(prepare(session, model), namespace).values())
+        share = ok_share(words, f'{namespace}/tracker'.strip('/'))
+        figures[name] = {'published_share': share, **_figures(errors)}
+    return figures
+
+
+def _figures(errors: list[LiveErrors]) -> dict[str, float | None]:
+    out: dict[str, float | None] = {}
+    for key, unit in (('position', 'm'), ('orientation', 'rad')):
+        values = np.concatenate([getattr(error, key) for error in errors])
+        has = bool(values.size)
+        out[f'{key}_rmse_{unit}'] = float(np.sqrt(np.mean(values**2))) if has else None
+        out[f'{key}_prc95_{unit}'] = float(np.percentile(values, 95)) if has else None
+    return out
+
+
+def table(rounds: list[dict[str, Any]], console: Console) -> None:
+    """Print a line for every round, and the signs of an overloaded machine."""
+    out = Table(title='live error of the second run, on another path (simulated)')
+    for heading in ('put in', 'found', 'verdict', 'parameters'):
+        out.add_column(heading, overflow='fold')
+    for heading in ('no gate\nmm', 'before\nmm', 'after\nmm', 'before\ndeg', 'after\ndeg'):
+        out.add_column(heading, justify='right')
+    for heading in ('published\nbefore', 'published\nafter', 'unexplained'):
+        out.add_column(heading, justify='right')
+    for one in rounds:
+        live, hidden = one['second_run_live'], one['too_busy']
+        out.add_row(
+            one['truth']['name'],
+            ', '.join(effect['name'] for effect in one['found']) or '-',
+            'machine too busy' if hidden else one['verdict'],
+            '\n'.join(_parameter(key, value) for key, value in one['parameters'].items()),
+            *(_number(live[n]['position_rmse_m'], 1e3, hidden) for n in TRACKERS),
+            *(_number(live[n]['orientation_rmse_rad'], DEGREES, hidden) for n in TRACKERS[1:]),
+            *(f'{100 * live[n]["published_share"]:.1f} %' for n in TRACKERS[1:]),
+            f'{100 * one["unexplained"]["fraction"]:.2g} %',
+        )
+    console.print(out)
+    for number, one in enumerate(rounds, 1):
+        for name, after_s in one['watcher_said_after_s'].items():
+            text = (
+                f'round {number}: the watcher reported {name} {after_s:.0f} s after the first flux'
+            )
+            console.print(text, highlight=False)
+    for number, one in enumerate(rounds, 1):
+        for name, signs in one['machine'].items():
+            text = '; '.join(signs)
+            console.print(f'round {number}, {name} run: {text}', style='yellow', highlight=False)
+
+
+def _number(value: float | None, scale: float, hidden: bool) -> str:
+    return '-' if value is None or hidden else f'{scale * value:.3f}'
+
+
+def _parameter(key: str, value: Mapping[str, Any]) -> str:
+    error, sigma = value['error'], value['sigma']
+    if np.ndim(value['found']):
+        return f'{key}: off by {error:.2g}'
+    text = f'{key}: {value["put_in"]:.5g} put in, {value["found"]:.5g} found'
+    return text + (f' (1 sigma {sigma:.1g})' if isinstance(sigma, float) else '')
+
+
+SCHEMA = 'anser_loop/1'
+ALL = 'all'
+CLEAN_S = 6.0
+"""Duration of the clean recording, s: 150 frames, whose mean is the references' baseline."""
+SECOND_SHARE = 0.6
+"""Duration of the second run as a fraction of the first one's."""
+OTHER_PATH_RAD = 2.0
+"""Phase of the second run's path, rad, so that the correction is tested at other poses."""
+LEAST_KEPT = 0.85
+"""Fraction of whole frames below which a recording shows the load of the machine rather than the
+effect."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = 'example: anser loop --effect sensor_gain --seed 31'
+    known = ', '.join(sorted(CATALOGUE))
+    parser.add_argument(
+        '--effect', nargs='+', default=[RANDOM], metavar='NAME',
+        choices=[RANDOM, ALL, NONE, *sorted(CATALOGUE)],
+        help=f'{RANDOM}, {ALL} (one after the other), {NONE}, or some of: {known}',
+    )  # fmt: skip
+    parser.add_argument('--seed', type=int, help='seed of the effect; random by default')
+    parser.add_argument(
+        '--duration', type=float, default=30.0, metavar='S', help='duration of the first run'
+    )
+    parser.add_argument(
+        '--clean', type=float, default=CLEAN_S, metavar='S',
+        help='duration of the clean recording that is the baseline of the references; 0 for none',
+    )  # fmt: skip
+    parser.add_argument(
+        '--watch', action='store_true', help='also report what the watcher found in the first run'
+    )
+    add_out(
+        parser, 'a new folder with all results (%(default)s)', required=False,
+        default=Path('recordings'), metavar='DIR',
+    )  # fmt: skip
+    add_json(parser, 'only the result, as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the loop and return the exit code.
+
+    Raises `ParameterError` when the duration or the seed is out of range, `DiagnosisError` when a
+    run records nothing or a diagnosis fails.
+    """
+    seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
+    effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
+    _check(args, seed)
+    missing.check('recorder')
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    # A ROS system that runs already must neither receive nor be received by what is simulated
+    # here.
+    ours = os.getpid() % LAST_DOMAIN
+    domains = [1 + (ours + k) % LAST_DOMAIN for k in range(LAST_DOMAIN)]
+    with own_domain(domains):
+        return _run(args, effects, seed)
+
+
+def _run(args: argparse.Namespace, effects: list[str], seed: int) -> int:
+    folder = make_new_folder(args.out, time.strftime('loop_%Y%m%d_%H%M%S'))
+    say = Console(stderr=True, highlight=False)
+    compile_kernels(say.print)
+    world, clean = make_world(folder), None
+    if args.clean:
+        say.print(f'a clean recording, {args.clean:g} s')
+        clean = record(Run(folder / 'clean', world.setup, args.clean))
+    rounds: list[dict[str, Any]] = []
+    document = {'schema': SCHEMA, 'data': 'simulated', 'folder': str(folder), 'rounds': rounds}
+    for count, effect in enumerate(effects):
+        say_of = partial(_say_of, say, f'round {count + 1} of {len(effects)}: ')
+        found = _round(
+            folder / f'{count + 1:02d}', world, clean, effect, seed + count, args.duration,
+            args.watch, say_of,
+        )  # fmt: skip
+        rounds.append(found)
+        write_files(folder, {'loop.json': document})
+    if args.json:
+        print(json.dumps(document, indent=1))
+    else:
+        table(rounds, Console(width=None if os.isatty(1) else 200))
+        say_written(folder)
+    return 0
+
+
+def _say_of(console: Console, where: str, text: str) -> None:
+    console.print(where + text)
+
+
+def _check(args: argparse.Namespace, seed: int) -> None:
+    if not 10.0 <= args.duration <= 600.0:
+        raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
+    if args.clean and not 2.0 <= args.clean <= 600.0:
+        raise ParameterError(f'--clean must be 0 or 2 to 600 s, got {args.clean:g}')
+    if seed < 1:
+        raise ParameterError(f'--seed must be at least 1, got {seed}')
+
+
+def _round(
+    folder: Path,
+    world: LoopFiles,
+    clean: Path | None,
+    effect: str,
+    seed: int,
+    duration_s: float,
+    is_watched: bool,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Run the loop for one effect, from the raw samples to the error of the second run."""
+    model, truth_file = world.model, folder / 'truth.json'
+    folder.mkdir()
+    unit = {'effect': effect, 'effect_seed': seed, 'effect_file': truth_file}
+    say(f'{duration_s:g} s with an effect that only truth.json knows')
+    noisy = {'optical_noise_m': Accuracy.optical_position_m, 'seed': 2}
+    watched = None
+    if is_watched:
+        watched = {'model_file': model} | ({'baseline_file': clean} if clean else {})
+    first = record(
+        Run(folder / 'first', world.setup, duration_s, {**unit, **noisy}, watched=watched)
+    )
+    say('diagnosis')
+    began_s = time.monotonic()
+    diagnosis = _diagnose(first, clean, model, folder / 'diagnosis')
+    took_s = time.monotonic() - began_s
+    corrected = folder / 'diagnosis' / 'model.yaml'
+    second_s = SECOND_SHARE * duration_s
+    follows = clean is not None and _drifts(corrected, first)
+    say(f'the corrected model is served, {second_s:g} s on another path')
+    other = {'path_phase_rad': OTHER_PATH_RAD, 'seed': 3}
+    baseline = clean if follows else None
+    unit |= other
+    second = record(
+        Run(folder / 'second', world.setup, second_s, unit, corrected, baseline, model)
+    )
+    truth = json.loads(truth_file.read_text(encoding='utf-8'))  # not before all is analysed
+    return {
+        'truth': truth,
+        'found': diagnosis['effects'],
+        'verdict': verdict(truth, diagnosis),
+        'parameters': parameter_errors(truth, diagnosis),
+        'unexplained': diagnosis['unexplained'],
+        'first_run_held_out': diagnosis['held_out'],
+        'second_run_live': second_run(
+            load_session(second), load_model(corrected), load_model(model)
+        ),
+        'follows_references': follows,
+        'diagnosis_s': took_s,
+        **_recorded(first, second),
+    }
+
+
+def _recorded(first: Path, second: Path) -> dict[str, Any]:
+    """Return what the watcher reported in the first run, and how the machine kept up."""
+    bags = {'first': first, 'second': second}
+    sessions = {name: load_session(bag) for name, bag in bags.items()}
+    kept = {name: kept_share(session) for name, session in sessions.items()}
+    return {
+        'watcher_said_after_s': {
+            name: NANO * (warned_ns - sessions['first'].start_ns)
+            for name, warned_ns in first_warnings(first, f'{AFTER}/watcher'.strip('/')).items()
+        },
+        'kept_share': kept,
+        'too_busy': min(kept.values()) < LEAST_KEPT,
+        'machine': {name: signs for name, bag in bags.items() if (signs := overload(bag))},
+    }
+
+
+def _drifts(model_file: Path, session: Path) -> bool:
+    """Return whether a model has effects that vary, so that only references can follow them."""
+    model, sensors = load_model(model_file), load_session(session).tools[0].sensors
+    return bool(Correction.of(model.effects, sensors, model.frequencies_hz).drifting)
+
+
+def _diagnose(bag: Path, clean: Path | None, model: Path, out: Path) -> dict[str, Any]:
+    """Run the diagnosis in another process, which knows only the bags and the model."""
+    command = [
+        sys.executable, '-P', '-m', 'anser_ros.cli.main', 'diagnose', str(bag),
+        '--model', str(model), '--out', str(out),
+    ]  # fmt: skip
+    if clean is not None:
+        command += ['--baseline', str(clean)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise DiagnosisError(f'the diagnosis failed: {done.stderr.strip()[-500:]}')
+    document = json.loads((out / 'diagnosis.json').read_text(encoding='utf-8'))
+    assert isinstance(document, dict)
+    return document

@@ -1,0 +1,164 @@
+"""Analyses other people's measurements and compares errors before and after."""
+
+import argparse
+import contextlib
+import io
+import math
+import os
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from anser_ros.apps.lab.measured import (
+    anser_board,
+    hpi_coils,
+    magnet_patch,
+    magnet_step,
+    navion,
+    transformer,
+)
+from anser_ros.apps.lab.measured.recipe import Recipe, ReportRow
+from anser_ros.cli import main
+from anser_ros.cli.output import Result, add_json, add_out, make_folder, say, write_files
+from anser_ros.errors import ParameterError
+
+RECIPES: dict[str, Recipe] = {
+    recipe.name: recipe
+    for recipe in (
+        navion.RECIPE, magnet_patch.RECIPE, magnet_step.RECIPE, hpi_coils.RECIPE,
+        anser_board.RECIPE, transformer.RECIPE,
+    )
+}  # fmt: skip
+"""Data sets that the shipped commands are run on."""
+SHARED = 'ANSER_SHARED'
+SCHEMA = 'anser_measured/1'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = 'example: anser measured anser_board --out measured/'
+    words = f'some of {", ".join(RECIPES)}; all by default'
+    parser.add_argument('datasets', nargs='*', metavar='DATASET', help=words)
+    words = f'folder with measured/ (${SHARED}, or ../shared of the source)'
+    parser.add_argument('--shared', type=Path, help=words)
+    add_out(parser, 'measured.json and what the commands write', required=False)
+    words = 'folder for sessions of the data, made if missing'
+    parser.add_argument('--bags', type=Path, help=words)
+    words = 'print only the table, without the commands'
+    parser.add_argument('--quiet', action='store_true', help=words)
+    add_json(parser, 'measured.json on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command and return the exit code."""
+    wrong = [name for name in args.datasets if name not in RECIPES]
+    if wrong:
+        raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(RECIPES)}')
+    shared = shared_folder(args.shared)
+    console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
+    make_folder(args.out)
+    make_folder(args.bags)
+    names = args.datasets or _present(shared, console)
+    if args.bags is not None:
+        for name in names:
+            for path in RECIPES[name].write_sessions(RECIPES[name].data(shared), args.bags):
+                console.print(f'wrote {path}', highlight=False)
+    rows = [row for name in names for row in _cook(RECIPES[name], shared, args, console)]
+    document = to_document(rows)
+    write_files(args.out, {'measured.json': document})
+    written = () if args.out is None else (args.out,)
+    if not args.json:
+        console.print(table(rows))
+    say('measured', Result(document, written=written), as_json=args.json)
+    return 0
+
+
+def _present(shared: Path, console: Console) -> list[str]:
+    """The data sets whose folders are there; says of the others that they are left out."""
+    names = []
+    for name, recipe in RECIPES.items():
+        if recipe.data(shared).is_dir():
+            names.append(name)
+        else:
+            console.print(f'{name} left out: no {recipe.data(shared)}', highlight=False)
+    return names
+
+
+def _cook(
+    recipe: Recipe, shared: Path, args: argparse.Namespace, console: Console
+) -> list[ReportRow]:
+    """Run a recipe's commands; the figures that they give."""
+    folder = recipe.data(shared)
+    with tempfile.TemporaryDirectory(prefix='anser_measured_') as made:
+        out = Path(made) if args.out is None else args.out / recipe.name
+        make_folder(out)
+        bags = recipe.write_sessions(folder, Path(made) / 'bags')
+        for command in recipe.commands(bags, out):
+            if not args.quiet:
+                console.print(f'$ anser {" ".join(command)}', highlight=False, soft_wrap=True)
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+                code = main.main(command)
+            if code:
+                last = (printed.getvalue().strip().splitlines() or ['nothing said'])[-1]
+                words = f'anser {command[0]} ended with {code}: {last}'
+                raise ParameterError(f'{recipe.name}: {words}')
+        return recipe.rows(folder, bags, out)
+
+
+def shared_folder(given: Path | None) -> Path:
+    """Return the folder that contains ``measured/``.
+
+    Raises `ParameterError` when there is no such folder.
+    """
+    source = main.PACKAGE_FOLDER.parents[1] / 'shared'
+    folder = given or Path(os.environ.get(SHARED, source))
+    if not (folder / 'measured').is_dir():
+        raise ParameterError(f'no measured data: {folder} has no folder measured; use --shared')
+    return folder
+
+
+def to_document(rows: list[ReportRow]) -> dict[str, Any]:
+    """Return the rows as plain data, with null for a missing number."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, float | np.floating):
+            return float(value) if math.isfinite(value) else None
+        return value
+
+    return {
+        'schema': SCHEMA,
+        'rows': [
+            {
+                'name': f'{row.dataset}: {row.figure}',
+                **{key: plain(value) for key, value in asdict(row).items()},
+            }
+            for row in rows
+        ],
+    }
+
+
+def table(rows: list[ReportRow]) -> Table:
+    """Return the rows as a table for the terminal."""
+    out = Table(title='Measured data: before and after, on held-out data')
+    figures = ('before', 'after', 'special', 'target')
+    for heading in ('data set', 'figure', *figures, 'met', 'chosen on'):
+        number = heading in figures
+        out.add_column(heading, justify='right' if number else 'left', overflow='fold')
+    for row in rows:
+        met = {None: '', True: 'yes', False: 'no'}[row.met]
+        values = [_number(value) for value in (row.before, row.after, row.special, row.target)]
+        values = [f'{value} {row.unit}'.strip() if value else '' for value in values]
+        out.add_row(row.dataset, row.figure, *values, met, row.chosen_on)
+    return out
+
+
+def _number(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return ''
+    return f'{value:.8f}' if 0.99 < value < 1.0 else f'{value:.3g}'

@@ -1,0 +1,185 @@
+"""Compares the refit's error by number of references with simpler methods.
+
+All methods have the same references and start from the same calibrated model: the frozen model,
+free dipoles for every emitter (`free_dipoles`), and the shared polarisability. No gate withholds
+a pose here, so that wrong poses count as such.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.apps.lab.free_dipoles import FreeDipoles
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.sessions.baseline import baseline_flux
+from anser_ros.sessions.nominal_board import NominalBoard
+from anser_ros.sessions.session import Session
+from anser_ros.settings import Accuracy
+from anser_ros.stamps import NANO
+from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
+
+Array = NDArray[np.float64]
+
+REACH_M = 0.15
+"""Largest distance of a solution from the optical position, m; a wrong model may not lead a pose
+farther astray."""
+COUNTS = (4, 8, 16, 32)
+"""Numbers of reference coils that are compared; the demo's board has 32."""
+FROZEN, FREE, SHARED = 'frozen model', 'free dipoles', 'shared polarisability'
+
+
+@dataclass(frozen=True)
+class AblationRow:
+    """Holds the error of one method with one number of references on one session.
+
+    Attributes
+    ----------
+    session : str
+    method : str
+    references : int
+    rmse_m : float
+        Of all tool coils tracked singly, against the optical pose.
+    """
+
+    session: str
+    method: str
+    references: int
+    rmse_m: float
+
+
+def spread_out(references: SensorTable, count: int) -> NDArray[np.int64]:
+    """Return the rows of some references, each as far as possible from those before it.
+
+    Coils at the place of another one come last, in the order of how different their axes are.
+    """
+    chosen = [0]
+    while len(chosen) < min(count, len(references)):
+        gap = references.position[:, None] - references.position[None, chosen]
+        distance = np.linalg.norm(gap, axis=2).min(axis=1)
+        across = 1.0 - np.abs(references.axis @ references.axis[chosen].T).max(axis=1)
+        score = distance + 1e-3 * across
+        score[chosen] = -1.0
+        chosen.append(int(score.argmax()))
+    return np.sort(np.array(chosen, dtype=np.int64))
+
+
+def ablate(
+    session: Session,
+    name: str,
+    model: FieldModel,
+    baseline: Session,
+    counts: Sequence[int] = COUNTS,
+    every: int = 7,
+) -> list[AblationRow]:
+    """Track a session by every method with every number of references.
+
+    Parameters
+    ----------
+    session : Session
+        With references, and one tool with an optical pose.
+    name : str
+    model : FieldModel
+    baseline : Session
+    counts : sequence of int
+    every : int
+        Only every so many frames are tracked; best no common divisor of the rates, or all of them
+        meet an optical pose whose jitter no interpolation has smoothed.
+    """
+    if session.reference is None or not session.tools:
+        return []
+    clean = baseline_flux(baseline, session.reference.sensors)
+    rows = [AblationRow(name, FROZEN, 0, _rmse(session, [model], every))]
+    for count in counts:
+        if count > len(session.reference.sensors):
+            continue
+        chosen = spread_out(session.reference.sensors, count)
+        for method in (FREE, SHARED):
+            models = _models(session, model, clean, chosen, method, every)
+            rows.append(AblationRow(name, method, count, _rmse(session, models, every)))
+    return rows
+
+
+def _models(
+    session: Session,
+    model: FieldModel,
+    clean: NDArray[np.complex128],
+    chosen: NDArray[np.int64],
+    method: str,
+    every: int,
+) -> list[FieldModel]:
+    """Return the model of every frame that is tracked."""
+    reference = session.reference
+    assert reference is not None
+    sensors, drawing = reference.sensors.select(chosen), NominalBoard.of(session.setup).field
+    flux = reference.flux[::every, chosen]
+    if method == FREE:
+        free = FreeDipoles(model, sensors, clean[chosen], drawing)
+        return [free.update(frame) for frame in flux]
+    refit = LiveRefit(model, sensors, clean[chosen], drawing=drawing)
+    stamps = session.start_ns + np.round(reference.time[::every] / NANO).astype(np.int64)
+    pairs = zip(stamps.tolist(), flux, strict=True)
+    return [refit.update(stamp, sensors.channel, frame).model for stamp, frame in pairs]
+
+
+def _rmse(session: Session, models: Sequence[FieldModel], every: int) -> float:
+    """Return the position RMSE (m) of the first tool's coils, by one model or one a frame.
+
+    The solve starts at the optical pose, since the models are compared and not the search.
+    """
+    tool = session.tools[0]
+    centres, axes = tool.placed()
+    whitening = whitening_of(np.full(2 * tool.flux.shape[2], Accuracy.flux_noise_t))
+    errors = []
+    for step, frame in enumerate(range(0, len(tool.time), every)):
+        if not tool.has_pose[frame]:
+            continue
+        model = models[min(step, len(models) - 1)]
+        field = RealField.of(model.positions, model.directions, model.moments)
+        values = np.ascontiguousarray(tool.flux[frame]).view(np.float64)
+        for coil in np.flatnonzero(tool.valid[frame]):
+            start, axis = centres[frame, coil], axes[frame, coil]
+            solution = solve_coil(
+                field, values[coil], whitening, start, axis, start - REACH_M, start + REACH_M,
+                float(tool.sensors.length[coil]),
+            )  # fmt: skip
+            errors.append(float(np.linalg.norm(solution.position - start)))
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def plot(rows: Sequence[AblationRow], path: Path, titles: Mapping[str, str] | None = None) -> None:
+    """Draw the error over the number of references with a panel for each session.
+
+    ``titles`` tell readers what a session is, where its name does not.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter, ScalarFormatter
+
+    from anser_ros.pictures import legend_below, save
+
+    sessions = list(dict.fromkeys(row.session for row in rows))
+    figure = Figure(figsize=(4.2 * len(sessions), 3.9), layout='constrained')
+    for panel, session in enumerate(sessions):
+        axes = figure.add_subplot(1, len(sessions), panel + 1)
+        here = [row for row in rows if row.session == session]
+        for method, style in ((FREE, 'o--'), (SHARED, 's-')):
+            points = [(row.references, 1e3 * row.rmse_m) for row in here if row.method == method]
+            axes.plot(*zip(*points, strict=True), style, label=method)
+        frozen = next(1e3 * row.rmse_m for row in here if row.method == FROZEN)
+        axes.axhline(frozen, color='0.5', label=FROZEN)
+        axes.set_xscale('log', base=2)
+        axes.set_yscale('log')
+        axes.set_xticks(sorted({row.references for row in here if row.references}))
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(ScalarFormatter())
+            axis.set_minor_formatter(NullFormatter())
+        axes.set_title((titles or {}).get(session, session))
+        axes.set_xlabel('reference coils')
+        axes.set_ylabel('position RMSE / mm')
+        axes.grid(True, which='both', alpha=0.3)
+    legend_below(figure, figure.axes[0])
+    save(figure, path)

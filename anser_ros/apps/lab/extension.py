@@ -1,0 +1,13 @@
+"""States what this application adds to the core; `anser_ros.extensions` describes the tables."""
+
+OFFLINE = {
+    'error_map': 'learn an error map from tracked and true positions, and apply it to others',
+    'known_metal': 'learn a piece of metal from a session, for evaluate --known-metal',
+    'loop': 'put an effect into simulated samples, find it blind, correct it, measure again',
+    'measured': "other people's measurements: what they contain, and the error before and after",
+    'paper': "redo the article's experiments: Tables II to V, Figs. 2 and 5 to 10",
+}
+ENGINES = ('calibration_engines:ENGINES',)
+DIAGNOSES = ('few_poses',)
+OBSERVERS = ('source_track:SessionSources',)
+EVALUATIONS = ('cli.known_metal_option',)

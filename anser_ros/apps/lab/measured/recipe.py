@@ -1,0 +1,137 @@
+"""Describes how somebody else's data are tried: the sessions made of them, the commands run on
+them, and the figures.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.recorded import optical_topic
+from anser_ros.wire.setup import Setup, dump_setup
+from anser_ros.wire.setup_values import Vector
+
+Array = NDArray[np.float64]
+
+
+def vector(values: Array) -> Vector:
+    """Return three plain numbers, as a setup document has them."""
+    return (float(values[0]), float(values[1]), float(values[2]))
+
+
+def write_frames(
+    path: Path,
+    setup: Setup,
+    stamp_ns: Sequence[int],
+    flux: NDArray[np.complex128],
+    poses: Mapping[str, tuple[Array, Array]] | None = None,
+) -> None:
+    """Write one flux message of tools, one of references and the poses of the bodies a frame.
+
+    Parameters
+    ----------
+    path : Path
+        The ``.mcap`` file; it must not exist yet.
+    setup : Setup
+    stamp_ns : sequence of int, length F
+    flux : ndarray, shape (F, S, K), complex
+        T, sensors in the order of the setup.
+    poses : mapping, optional
+        Body to its positions (F, 3), m, and quaternions (F, 4), x y z w, frame fg.
+
+    Raises
+    ------
+    BagError
+        When the file exists already.
+    """
+    with SessionWriter(path) as writer:
+        writer.write_setup(dump_setup(setup), int(stamp_ns[0]))
+        for frame, stamp in enumerate(stamp_ns):
+            writer.write_readings(setup.sensors, int(stamp), flux[frame])
+            for body, (position, quaternion) in (poses or {}).items():
+                writer.write_pose(
+                    optical_topic(body),
+                    int(stamp),
+                    position[frame].tolist(),
+                    quaternion[frame].tolist(),
+                )
+
+
+@dataclass(frozen=True)
+class ReportRow:
+    """Holds one line of the table that `anser measured` prints."""
+
+    dataset: str  # folder of the measurement
+    figure: str  # what is measured, in words
+    before: float  # the figure without the effects that were found; nan where there is none
+    after: float  # the figure with them
+    unit: str  # of `before`, `after` and `target`
+    target: float | None  # what `after` should not exceed (a correlation: not fall below)
+    met: bool | None  # whether it does; None without a target
+    chosen_on: str  # what the effects were chosen and fitted on, and the figure was scored on
+    # `after` of code for this data set alone, where a recipe has taken its place: docs/results
+    special: float | None = None
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """States what `anser measured` does with a data set.
+
+    Attributes
+    ----------
+    name : str
+        As `anser measured` calls the data set.
+    write_sessions : callable
+        From the folder of the data and that of the bags to the bags written there.
+    commands : callable
+        From the bags and the folder for results to the command lines, in their order: verb and
+        arguments of `anser`, as anybody would type them.
+    rows : callable
+        From the folder of the data, the bags and the folder for results to the figures, read from
+        what the commands wrote.
+    folder : str
+        Of the data, below ``measured/``; the name, unless another is given.
+    """
+
+    name: str
+    write_sessions: Callable[[Path, Path], list[Path]]
+    commands: Callable[[list[Path], Path], list[list[str]]]
+    rows: Callable[[Path, list[Path], Path], list[ReportRow]]
+    folder: str = ''
+
+    def data(self, shared: Path) -> Path:
+        """Return the folder of the data in the one that contains ``measured/``."""
+        return shared / 'measured' / (self.folder or self.name)
+
+
+def calibrations(bag: Path, out: Path, found: Sequence[str] = ()) -> list[list[str]]:
+    """Return the commands that calibrate a session with sensors as stated, and as found.
+
+    Their models and reports are ``plain`` and ``full``; ``found`` are the options of the second.
+    """
+    return [
+        [
+            'calibrate', str(bag), *options, '--out', str(out / f'{kind}.yaml'),
+            '--report', str(out / kind),
+        ]
+        for kind, options in (('plain', ('--estimate', 'none')), ('full', found))
+    ]  # fmt: skip
+
+
+def ran(folder: Path, name: str) -> dict[str, Any]:
+    """Return the JSON document of this name that a command wrote into its folder."""
+    document: dict[str, Any] = json.loads((folder / name).read_text(encoding='utf-8'))
+    return document
+
+
+def figure(document: dict[str, Any], *keys: str) -> float:
+    """Return a number of a document by its keys; nan where it is null or not there."""
+    value: Any = document
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return float('nan') if value is None else float(value)

@@ -1,0 +1,313 @@
+"""Calibrates emitters without a drawing with few poses of a body of many sensors.
+
+A plate of a hundred three-axis sensors laid at four heights has more readings than many a scan,
+but nothing that a scan has: no poses to average over, and each sensor saw as many places as there
+are poses. Field, sensors, poses and a bend of the plate are found jointly (`still_fit`). The
+held-out error is that of each pose predicted, where it is stated to be, by all the others: field,
+sensors, noise and what is chosen come from those alone. Where errors of the stated poses are
+looked for and found, each half of the sensors is predicted at the pose that the other half finds.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.apps.lab.still_fit import STILL_STEPS, StillFit, StillFitter, figures_of
+from anser_ros.apps.lab.still_model import POSE
+from anser_ros.calibration.held_out import HeldOut, HeldOutTally, rms
+from anser_ros.calibration.layouts import Generator, Layout
+from anser_ros.calibration.least_squares import as_complex
+from anser_ros.calibration.moments import Progress
+from anser_ros.calibration.population import LEAST_EVIDENCE, OpticalNoise, Posterior
+from anser_ros.calibration.pose_correction import (
+    PoseTerms,
+    most_probable_step,
+    moved,
+    pose_precision,
+    pose_terms,
+)
+from anser_ros.calibration.readings import basis_rows, usable_weights, with_pose
+from anser_ros.calibration.requirements import (
+    FEWEST_FRAMES_OF_MANY,
+    FEWEST_SCAN_FRAMES,
+    MANY_SENSORS,
+    check_measurements,
+    usable_frames,
+)
+from anser_ros.calibration.result import Calibration, Scan, residuals, with_provenance
+from anser_ros.calibration.sensor_fit import SensorFit
+from anser_ros.calibration.sensor_parameters import SensorParameters
+from anser_ros.calibration.sensor_records import corrections
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.physics.sensor import clusters_of
+from anser_ros.settings import Accuracy
+
+Array = NDArray[np.float64]
+
+STILL_KINDS = ('gains', 'axes', 'bend', 'poses')
+"""Kinds of errors that few poses of many sensors show. The poses' errors are part of every fit;
+looked for, they are reported, and what is predicted is predicted where they are."""
+STILL_ONLY = ('bend', 'poses')
+"""Those of them that nothing else determines."""
+BEND, PLACEMENT = 'body_bend', 'body_placement'
+"""Names of the effects that the last two of them become."""
+AS_STATED = 'flux_rms_as_stated_t'
+"""The evidence of the second that is the held-out error at the poses as they were stated."""
+WORDS = (
+    'three-component dipoles at 7 places about every emitter, place free, and at {} beside them'
+)
+"""The layout in words, with the number of dipoles beside the emitters."""
+POPULATIONS = ('gains', 'axes')
+"""Those of them that every sensor has a value of."""
+FEWEST_PLACED = 4
+"""Poses from which on their errors are reported. With three, each that is left out leaves two to
+fit to, and what was found on simulated plates was as often further from the truth as nearer."""
+POSE_STEPS = 4
+"""Gauss-Newton steps of a held-out pose from where it is stated: errors are millimetres."""
+
+
+def is_still(measurements: Sequence[Measurements]) -> bool:
+    """Return whether there are few poses of one body with many sensors, and no more."""
+    many = len(measurements) == 1 and len(measurements[0].sensors) >= MANY_SENSORS
+    return many and FEWEST_FRAMES_OF_MANY <= usable_frames(measurements) < FEWEST_SCAN_FRAMES
+
+
+def calibrate_still(
+    measurements: Measurements,
+    name: str,
+    generator: Generator,
+    kinds: Sequence[str],
+    accuracy: Accuracy,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Fit field, sensors, poses and bends of a body's frames.
+
+    Raises `FitError` when the readings lie in one plane, or are all zero.
+    """
+    check_measurements([measurements], 1, field_alone=True)
+    posed = with_pose(measurements)
+    looked_for = tuple(kind for kind in STILL_KINDS if kind in kinds)
+    chosen = tuple(kind for kind in looked_for if kind != 'poses')  # those are in every fit
+
+    def fitter(part: Measurements, kinds: Sequence[str]) -> StillFitter:
+        return StillFitter(part, generator.centres, kinds, accuracy)
+
+    frames = np.arange(len(posed.time))
+    folds = []
+    for frame in frames:
+        if progress is not None:
+            progress('each pose from the others', frame / (len(frames) + 1.0))
+        folds.append(fitter(posed.frames(frames != frame), chosen).fit())
+    # What most folds do not find has no part in what is predicted, so nothing speaks for it.
+    kept = [
+        kind for kind in chosen if 2 * sum(kind in fold.evidence for fold in folds) > len(folds)
+    ]
+    whole = fitter(posed, kept)
+    fit = whole.fit()
+    held_out = _held_out(posed, folds, accuracy, _as_stated)
+    misplaced = []
+    if 'poses' in looked_for and len(posed.time) >= FEWEST_PLACED:
+        gain = whole.evidence_of_poses(fit)
+        elsewhere = _held_out(posed, folds, accuracy, _where_the_other_half_finds_it)
+        if gain >= LEAST_EVIDENCE and rms(elsewhere.error) < rms(held_out.error):
+            evidence = {'log_probability': gain, AS_STATED: rms(held_out.error)}
+            held_out, misplaced = elsewhere, [_misplaced(fit, folds, evidence)]
+    scan = _scan(posed, len(measurements.time), fit, accuracy, (*_bends(fit), *misplaced))
+    model = FieldModel(
+        positions=fit.sites.positions,
+        directions=fit.sites.directions,
+        moments=_moments(fit),
+        emitters=generator.emitters,
+        frequencies_hz=generator.frequencies_hz,
+        flux_error_t=held_out.flux_error_t,
+        shift_sigma_m=0.0 if scan.sensor_fit is None else scan.sensor_fit.shift_sigma_m,
+        effects=scan.corrections,
+    )
+    basis = basis_rows(scan.measurements[0], fit.sites)
+    calibration = Calibration(
+        model=model,
+        fit=figures_of(basis, fit.weights, fit.widths.noise_t, fit.freedom, STILL_STEPS),
+        held_out=held_out,
+        layout=Layout('free', fit.beside, 1.0, 0.0, words=WORDS.format(fit.beside)),
+        damping=0.0,
+        n_measurements=int(posed.usable.sum()),
+        residuals=residuals(scan.measurements, model),
+        scan=scan,
+        undetermined=_not_determined(kinds, len(posed.time)),
+    )
+    return with_provenance(calibration, [name])
+
+
+def _not_determined(kinds: Sequence[str], poses: int) -> tuple[str, ...]:
+    """A line for what was asked for and cannot be found in this way."""
+    others = ', '.join(kind for kind in kinds if kind not in STILL_KINDS)
+    lines = []
+    if others:
+        lines.append(f'{others}: not determined by few poses of many sensors; the setup is kept')
+    if 'poses' in kinds and poses < FEWEST_PLACED:
+        lines.append(f'poses: determined from {FEWEST_PLACED} poses on; there are {poses}')
+    return tuple(lines)
+
+
+def _moments(fit: StillFit) -> NDArray[np.complex128]:
+    found = fit.unknowns.moments
+    return as_complex(found) if fit.model.is_complex else found.astype(complex)
+
+
+def _parameters(
+    measured: Measurements, fit: StillFit
+) -> tuple[SensorParameters, Array, Array, Array]:
+    """The sensors' errors as those of a joint fit: values, standard deviations, prior widths."""
+    parameters, gains = SensorParameters([measured], POPULATIONS), fit.model.gains
+    values, sigma, width = np.zeros((3, len(parameters)))
+    for kind, columns in (('gains', slice(0, gains)), ('axes', slice(gains, None))):
+        own = fit.unknowns.sensors[:, columns]
+        rows = parameters.rows(kind).reshape(len(own), -1)[:, : own.shape[1]]
+        values[rows], sigma[rows] = own, fit.sensor_sigma[:, columns]
+        width[rows] = fit.widths.sensors[columns]
+    return parameters, values, sigma, width
+
+
+def _held_out(
+    posed: Measurements,
+    folds: Sequence[StillFit],
+    accuracy: Accuracy,
+    predicted: Callable[[Measurements, StillFit, Accuracy], PoseTerms],
+) -> HeldOut:
+    """Sum up each frame's residual, its sensors and its field as the other frames predict them."""
+    noise = min(fit.widths.noise_t for fit in folds)
+    tally = HeldOutTally(noise, noise, accuracy, max(len(fit.sites) for fit in folds))
+    for frame, fit in enumerate(folds):
+        part = posed.frames(np.array([frame]))
+        parameters, values, *_ = _parameters(part, fit)
+        sound = parameters.errors_of(part.body, values).apply(part)
+        tally.add(predicted(sound, fit, accuracy), usable_weights(sound), sound.position)
+    return tally.result()
+
+
+def _as_stated(sound: Measurements, fit: StillFit, accuracy: Accuracy) -> PoseTerms:
+    """A frame's readings less those at its stated pose; how good that is plays no part."""
+    return pose_terms(sound, fit.sites, _moments(fit))
+
+
+def _where_the_other_half_finds_it(
+    sound: Measurements, fit: StillFit, accuracy: Accuracy
+) -> PoseTerms:
+    """Readings of each half of the sensors less those at the pose that the other half finds.
+
+    A sensor of several channels is in one half as a whole; the halves take turns over the body.
+    """
+    halves = np.zeros(len(sound.sensors), dtype=bool)
+    for sensor, channels in enumerate(clusters_of(sound.sensors)):
+        halves[channels] = sensor % 2 == 1
+    one, other = (
+        pose_terms(_at_best_pose(sound, fit, accuracy, half), fit.sites, _moments(fit))
+        for half in (halves, ~halves)
+    )
+    residual = np.where(halves[:, None], other.residual, one.residual)
+    return PoseTerms(residual, np.where(halves[:, None, None], other.slope, one.slope))
+
+
+def _at_best_pose(
+    sound: Measurements, fit: StillFit, accuracy: Accuracy, seen: NDArray[np.bool_]
+) -> Measurements:
+    """The frame at the pose that the readings of these sensors make most probable."""
+    weights, precision = usable_weights(sound) * seen, pose_precision(accuracy)
+    offset = np.zeros((len(sound.time), POSE))
+    for _ in range(POSE_STEPS):
+        terms = pose_terms(moved(sound, offset), fit.sites, _moments(fit))
+        offset += most_probable_step(terms, weights, fit.widths.noise_t, precision, offset)[0]
+    return moved(sound, offset)
+
+
+def _scan(
+    posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy,
+    reported: tuple[EffectRecord, ...],
+) -> Scan:  # fmt: skip
+    """The frames as ideal sensors on a flat body would have given them, and what was not ideal;
+    ``frames`` are those of the session, without a pose too.
+    """
+    parameters, values, sigma, width = _parameters(posed, fit)
+    offsets = fit.unknowns.frames[:, :POSE]
+    poses = OpticalNoise(
+        float(np.sqrt(np.mean(offsets[:, :3] ** 2))),
+        float(np.sqrt(np.mean(offsets[:, 3:] ** 2))),
+        float(len(offsets)),
+    )
+    every = np.ones(frames, dtype=bool)
+    evidence = {kind: gain for kind, gain in fit.evidence.items() if kind in POPULATIONS}
+    result = SensorFit(
+        parameters,
+        Posterior(values, width, np.diag(sigma**2), fit.log_evidence),
+        tuple(kind for kind in POPULATIONS if kind not in evidence),
+        evidence, fit.widths.noise_t, poses, {kind: np.zeros(0, np.int64) for kind in POPULATIONS},
+        (every,), (every,), 0.0, {}, float(accuracy.optical_position_m / np.sqrt(len(offsets))),
+    )  # fmt: skip
+    flat = fit.model.unbent(fit.unknowns, fit.sites)
+    sound = result.errors_of(posed.body).apply(flat)
+    return Scan((sound,), accuracy, corrections(result), reported, result)
+
+
+def _bends(fit: StillFit) -> tuple[EffectRecord, ...]:
+    """The bend of the body in each frame, as one record: another session's is another."""
+    if 'bend' not in fit.evidence:
+        return ()
+    bend = fit.model.bend
+    assert bend is not None
+    lift = bend.shape(fit.unknowns.frames[:, POSE:])[0] @ bend.normal
+    return (
+        EffectRecord(
+            BEND,
+            {
+                'body': fit.model.measured.body,
+                'rms_m': np.sqrt(np.mean(lift**2, axis=1)).tolist(),
+                'largest_m': float(np.abs(lift).max()),
+            },
+            {},
+            {
+                'log_probability': fit.evidence['bend'],
+                'summary': 'the body is not flat, and bent otherwise at each pose',
+                'remedy': 'none: at another pose the bend is another',
+            },
+        ),
+    )
+
+
+def _misplaced(
+    fit: StillFit, folds: Sequence[StillFit], evidence: dict[str, float]
+) -> EffectRecord:
+    """How far the body stood from each stated pose, in frame fg."""
+    offset = fit.unknowns.frames[:, :POSE]
+    sigma = np.maximum(fit.frame_sigma[:, :POSE], _jackknifed(offset, folds))
+    return EffectRecord(
+        PLACEMENT,
+        {
+            'body': fit.model.measured.body,
+            'largest_m': float(np.linalg.norm(offset[:, :3], axis=1).max()),
+            'shift_m': offset[:, :3].tolist(),
+            'rotation_rad': offset[:, 3:].tolist(),
+        },
+        {'shift_m': sigma[:, :3].tolist(), 'rotation_rad': sigma[:, 3:].tolist()},
+        {
+            **evidence,
+            'summary': 'the body does not stand where its poses are stated; the mean over all '
+            'poses is kept, since the field could be shifted as well',
+            'remedy': 'none: at another pose the error is another; measure the poses',
+        },
+    )
+
+
+def _jackknifed(offset: Array, folds: Sequence[StillFit]) -> Array:
+    """Standard deviation of poses' errors (F, 6) by how they change when one pose is left out.
+
+    It knows of what the model of field and bend misses, which the posterior does not (Efron, The
+    Jackknife, the Bootstrap and Other Resampling Plans, 1982, equation 3.5).
+    """
+    count, power = len(offset), np.zeros_like(offset)
+    for frame, fit in enumerate(folds):
+        rest = np.arange(count) != frame
+        change = fit.unknowns.frames[:, :POSE] - (offset[rest] - offset[rest].mean(axis=0))
+        power[rest] += change**2
+    return np.asarray(np.sqrt((count - 1) / count * power))

@@ -1,0 +1,249 @@
+"""Fit registration, lever arm, mount and clocks of two streams of poses, jointly."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import yaml
+from matplotlib.figure import Figure
+
+from anser_ros.apps.poses.assessment.source import PoseSource, read_poses
+from anser_ros.apps.poses.cli.import_poses import add_form_options
+from anser_ros.apps.poses.cli.pose_session import add_topic_options, load_poses
+from anser_ros.apps.poses.convention import reading_words
+from anser_ros.apps.poses.corrector import finite
+from anser_ros.apps.poses.hand_eye import HandEye, fit_hand_eye, matrix_of, turn_of
+from anser_ros.apps.poses.importing import import_poses
+from anser_ros.apps.poses.sequence import PoseSession, missing_words
+from anser_ros.cli.output import (
+    Result,
+    Tell,
+    add_json,
+    add_out,
+    make_folder,
+    number,
+    terminal_table,
+    write_files,
+)
+from anser_ros.cli.page import heading, listed, page, paragraph, picture, table, top
+from anser_ros.errors import ParameterError
+from anser_ros.field.model import plain
+from anser_ros.physics.constants import DEGREES
+from anser_ros.pictures import legend_beside
+
+SCHEMA = 'anser_handeye/1'
+BAGS = ('.mcap', '.db3', '.bag')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = (
+        'example: anser handeye bags/moving.mcap --model config/demo_model.yaml --out result/;\n'
+        'with files of poses: anser handeye em.csv --reference optical.tum --out result/'
+    )
+    parser.add_argument(
+        'tracked', nargs='+', type=Path,
+        help='a bag with both streams, or files of tracked poses (CSV, TUM, ToolTracker .tsv)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--reference', nargs='+', type=Path, default=[],
+        help='files of the second stream, as many and in the same order',
+    )  # fmt: skip
+    add_topic_options(parser, 'stream')
+    parser.add_argument(
+        '--model', default='', help="track the bag's fluxes with this model (or 'nominal')"
+    )
+    parser.add_argument(
+        '--body', default='', help='with --model: which tool, if there are several'
+    )
+    parser.add_argument(
+        '--pairs', action='store_true',
+        help='poses at rest: pair the n-th of one stream with the n-th of the other, without '
+        'clocks',
+    )  # fmt: skip
+    add_form_options(parser, 'for files: ')
+    add_out(parser, 'handeye.yaml, handeye.json and report.html', required=False)
+    add_json(parser, 'handeye.json on stdout')
+
+
+def work(args: argparse.Namespace, tell: Tell) -> Result:
+    """Fit both streams."""
+    session = _session(args)
+    make_folder(args.out)
+    found = fit_hand_eye(session, pairs=args.pairs, progress=tell)
+    document = to_document(found)
+    written: tuple[Path, ...] = ()
+    if args.out is not None:
+        plain_yaml = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
+        report = render(found, document)
+        files = {'handeye.yaml': plain_yaml, 'handeye.json': document, 'report.html': report}
+        written = write_files(args.out, files)
+    notes = [session.lost] if session.lost else []
+    if found.convention is not None:
+        notes.append(reading_words(found.convention))
+    notes += filter(None, map(missing_words, session.streams.values()))
+    rows = [[row[column] for column in SHOWN_COLUMNS] for row in _rows(document, 1)]
+    table = terminal_table([HEAD[column] for column in SHOWN_COLUMNS], rows)
+    for column in table.columns:
+        column.no_wrap = True
+    lines = (*clock_words(document), *left_out_words(document))
+    shown = (table, *lines, *(f'not determined: {words}' for words in found.undetermined))
+    return Result(document, tuple(f'{session.path}: {note}' for note in notes), shown, written)
+
+
+def _session(args: argparse.Namespace) -> PoseSession:
+    first = args.tracked[0]
+    if first.is_dir() or first.suffix in BAGS:
+        if len(args.tracked) > 1 or args.reference:
+            raise ParameterError('one bag has both streams; --reference is for files of poses')
+        if args.model:
+            if args.topics or args.optical:
+                raise ParameterError('--model tracks the fluxes of a body and takes no topics')
+            return read_poses(first, PoseSource(model=args.model, body=args.body)).session
+        return load_poses(first, args)
+    if args.topics or args.optical or args.model:
+        raise ParameterError('--tracked, --model and --optical need a bag')
+    return import_poses(
+        args.tracked, args.reference, stamps=args.stamps, unit=args.unit,
+        quaternion=args.quaternion,
+    )  # fmt: skip
+
+
+def to_document(found: HandEye) -> dict[str, Any]:
+    """Return the result as plain data; null if it is not determined."""
+    vector, quaternion = turn_of(found.rotation)
+    offset, rate = (pair or (None, None) for pair in (found.offset_s, found.rate_ppm))
+    document: dict[str, Any] = {
+        'schema': SCHEMA,
+        'recording': found.session.path,
+        'registration_rotation_deg': vector,
+        'registration_rotation_sigma_deg': np.rad2deg(found.rotation_sigma_rad).tolist(),
+        'registration_quaternion_xyzw': quaternion,
+        'registration_translation_m': found.translation_m.tolist(),
+        'registration_translation_sigma_m': found.translation_sigma_m.tolist(),
+        'registration_matrix': matrix_of(found.rotation, found.translation_m).tolist(),
+        'clock': {
+            'offset_s': offset[0],
+            'offset_sigma_s': offset[1],
+            'rate_ppm': rate[0],
+            'rate_sigma_ppm': rate[1],
+            'middle_s': found.middle_s,
+        },
+        'sensors': {},
+        'undetermined': list(found.undetermined),
+        'convention': None if found.convention is None else plain(found.convention.parameters),
+    }
+    for name, one in found.sensors.items():
+        turned = (None, None) if one.mount is None else turn_of(one.mount)
+        document['sensors'][name] = {
+            'lever_arm_m': one.lever_m.tolist(),
+            'lever_arm_sigma_m': one.lever_sigma_m.tolist(),
+            'mount_rotation_deg': turned[0],
+            'mount_rotation_sigma_deg': np.rad2deg(one.mount_sigma_rad).tolist(),
+            'mount_quaternion_xyzw': turned[1],
+            'n': one.n, 'n_compared': one.n_compared,
+            'position_rmse_m': one.rms[0], 'orientation_rmse_rad': one.rms[1],
+            'heldout_position_rmse_m': one.held_out[0],
+            'heldout_orientation_rmse_rad': one.held_out[1],
+        }  # fmt: skip
+    return dict(finite(document))
+
+
+def left_out_words(document: dict[str, Any]) -> list[str]:
+    """Return how many poses of each sensor contradict the others, where some do."""
+    return [
+        f'{name}: {one["n_compared"] - one["n"]} of {one["n_compared"]} poses contradict the '
+        f'others, and are counted only in the held-out error'
+        for name, one in document['sensors'].items()
+        if one['n'] < one['n_compared']
+    ]
+
+
+def clock_words(document: dict[str, Any]) -> list[str]:
+    """Return what is known of the clocks, in lines."""
+    lines, clock = [], document['clock']
+    if clock['offset_s'] is not None:
+        late = 'late' if clock['offset_s'] > 0 else 'early'
+        lines.append(
+            f'clocks: tracked stamps are {1e3 * abs(clock["offset_s"]):.1f} '
+            f'± {1e3 * clock["offset_sigma_s"]:.1f} ms {late}'
+        )
+    if clock['rate_ppm'] is not None:
+        gains = 'gains' if clock['rate_ppm'] > 0 else 'loses'
+        lines.append(
+            f'clocks: the tracked one {gains} {abs(clock["rate_ppm"]):.0f} '
+            f'± {clock["rate_sigma_ppm"]:.0f} ppm'
+        )
+    return lines
+
+
+HEAD = ('sensor', 'lever arm, mm', '1 sigma', 'mount, deg', '1 sigma', 'rms, mm', 'held out, mm',
+        'held out, deg')  # fmt: skip
+
+
+def _rows(document: dict[str, Any], digits: int) -> list[list[str]]:
+    def triple(values: list[float | None] | None, scale: float) -> str:
+        return ' '.join(number(v, scale, f'.{digits}f') for v in values or [None])
+
+    return [
+        [
+            name, triple(one['lever_arm_m'], 1e3), triple(one['lever_arm_sigma_m'], 1e3),
+            triple(one['mount_rotation_deg'], 1.0), triple(one['mount_rotation_sigma_deg'], 1.0),
+            number(one['position_rmse_m'], 1e3, '.2f'),
+            number(one['heldout_position_rmse_m'], 1e3, '.2f'),
+            number(one['heldout_orientation_rmse_rad'], DEGREES, '.2f'),
+        ]
+        for name, one in document['sensors'].items()
+    ]  # fmt: skip
+
+
+SHOWN_COLUMNS = (0, 1, 2, 3, 6)
+"""Columns of `HEAD` that fit into a terminal of eighty letters."""
+
+
+def render(found: HandEye, document: dict[str, Any]) -> str:
+    """Return the page as HTML: frames, clocks, what is open, and what is left over time."""
+    columns = [
+        (document[f'registration_{key}'], scale)
+        for key, scale in (
+            ('translation_m', 1e3), ('translation_sigma_m', 1e3), ('rotation_deg', 1.0),
+            ('rotation_sigma_deg', 1.0),
+        )
+    ]  # fmt: skip
+    lines = [*clock_words(document), *left_out_words(document)]
+    is_open = bool(found.undetermined)
+    return page(
+        'Hand-eye',
+        top(
+            'Hand-eye calibration',
+            '; '.join(lines) or 'the clocks were not compared',
+            recording=found.session.path,
+        ),
+        paragraph(reading_words(found.convention) if found.convention else '', 'note'),
+        heading('Sensors on the body'),
+        table(HEAD, _rows(document, 2)),
+        heading("From the optical frame to the tracker's"),
+        table(
+            ['axis', 'translation, mm', '1 sigma', 'rotation vector, deg', '1 sigma'],
+            [
+                [axis, *(number(values[k], scale) for values, scale in columns)]
+                for k, axis in enumerate('xyz')
+            ],
+        ),
+        [heading('Not determined'), listed(found.undetermined)] if is_open else [],
+        heading('Residuals over time'),
+        picture(_over_time(found)),
+    )
+
+
+def _over_time(found: HandEye) -> Figure:
+    figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
+    for part in found.fit.state.parts:
+        size = 1e3 * np.linalg.norm(part.residual[part.used, :3], axis=1)
+        axes.plot(part.view.time[part.used], size, '.', ms=2, label=part.view.sensor)
+    axes.set(xlabel='time, s', ylabel='distance, mm', yscale='log')
+    legend_beside(figure)
+    return figure

@@ -1,0 +1,387 @@
+"""Diagnoses a session of poses: convention, hand-eye, search, and what held-out poses say. The
+stages are those of a diagnosis of fluxes: read and set up, search on four fifths of the blocks
+of time, judge on the fifth that took no part; then the parameters are fitted to all poses.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.apps.poses.convention import read_rightly
+from anser_ros.apps.poses.effect import (
+    PoseResiduals,
+    PoseTerm,
+    PoseView,
+    Role,
+    Sensing,
+    pose_effects,
+)
+from anser_ros.apps.poses.fit import (
+    PoseFit,
+    fit_poses,
+    knows_levers,
+    most_poses,
+    noise_of,
+    unexplained_poses,
+    with_time_constants,
+)
+from anser_ros.apps.poses.hand_eye import records_of
+from anser_ros.apps.poses.jitter import floor_of
+from anser_ros.apps.poses.problem import PosePart, PoseProblem, PoseState
+from anser_ros.apps.poses.search import LEAST_MAP_M, PoseSearch, frame_terms, search_effects
+from anser_ros.apps.poses.sequence import PoseSession
+from anser_ros.apps.poses.start import (
+    coarse_offset,
+    first_fit,
+    frames_from_places,
+    pose_problem,
+    put_back,
+    swapped_spans,
+    train_blocks,
+    untangled,
+)
+from anser_ros.diagnosis.prepare import TEST_EVERY
+from anser_ros.errors import PlausibilityError
+from anser_ros.field.model import EffectRecord
+
+Array = NDArray[np.float64]
+
+FEWEST_RECORDINGS = 8
+"""Recordings at rest from which each is judged by a fit of others: of fewer the rest does not
+determine all frames."""
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """Holds held-out errors of all sensors, and by sensor: distance (m) and angle (rad), rms."""
+
+    position_m: float
+    orientation_rad: float
+    by_sensor: dict[str, tuple[float, float]]
+
+
+def judged(problem: PoseProblem, fit: PoseFit) -> PoseProblem:
+    """Return a problem with the noise of a fit, and without the poses that stand out from it."""
+    every = tuple(np.ones(s.size) for s in problem.sensors)
+    noisy = replace(problem, weight=every, noise=fit.state.problem.noise)
+    out = unexplained_poses(noisy.state(fit.terms))
+    return replace(noisy, weight=tuple(np.where(mask, 0.0, 1.0) for mask in out))
+
+
+def errors_of(state: PoseState) -> HeldOutErrors:
+    """Return the errors of a state, rms."""
+    every = state.rms()
+    return HeldOutErrors(*every, {p.view.sensor: state.rms(p.view.sensor) for p in state.parts})
+
+
+def held_out(
+    problem: PoseProblem, found: PoseFit, test: NDArray[np.int64]
+) -> tuple[PoseState, PoseState, HeldOutErrors]:
+    """Return held-out poses before and after, and what registration alone leaves of them."""
+    folds = [(found, test)]
+    if problem.path.is_at_rest and np.unique(problem.blocks[0]).size >= FEWEST_RECORDINGS:
+        every, known = np.unique(np.concatenate(problem.blocks)), judged(problem, found)
+        parts = [every[k::TEST_EVERY] for k in range(min(TEST_EVERY, every.size))]
+        folds = [
+            (fit_poses(known.in_blocks(np.setdiff1d(every, part)), found.terms), part)
+            for part in parts
+        ]
+    before, after, squares = [], [], []
+    for fit, part in folds:
+        exact = tuple(replace(n, stamp_s=0.0) for n in fit.state.problem.noise)
+        frames = fit_poses(replace(fit.state.problem, noise=exact), frame_terms(fit.terms))
+        unseen = judged(problem.in_blocks(part), fit)
+        before.append(unseen.state(frames.terms))
+        after.append(unseen.state(fit.terms))
+        squares.append(_registered(frames, unseen))
+    first, last = _joined(before), _joined(after)
+    by_sensor = {
+        part.view.sensor: np.concatenate([square[k] for square in squares])
+        for k, part in enumerate(last.parts)
+    }
+
+    def rms(square: Array) -> float:
+        return float(np.sqrt(square.mean())) if square.size else float('nan')
+
+    registered = HeldOutErrors(
+        rms(np.concatenate(list(by_sensor.values()))),
+        last.rms()[1],
+        {name: (rms(square), last.rms(name)[1]) for name, square in by_sensor.items()},
+    )
+    return first, last, registered
+
+
+def _joined(states: list[PoseState]) -> PoseState:
+    """One state of several of the same sensors, in the order of time."""
+    if len(states) == 1:
+        return states[0]
+    parts = []
+    for same in zip(*(state.parts for state in states), strict=True):
+        order = np.argsort(np.concatenate([p.view.time for p in same]), kind='stable')
+
+        def put(values: Sequence[NDArray[Any]], order: NDArray[np.int64] = order) -> NDArray[Any]:
+            return np.concatenate(values)[order]
+
+        poses = {
+            field.name: put([getattr(p.view, field.name) for p in same])
+            for field in fields(PoseView)
+            if field.name not in ('sensor', 'frame', 'lever')
+        }
+        parts.append(
+            PosePart(
+                replace(same[0].view, **poses), put([p.residual for p in same]),
+                put([p.weight for p in same]), same[0].noise, put([p.blocks for p in same]),
+                put([p.places for p in same]),
+            )
+        )  # fmt: skip
+    return replace(states[0], parts=tuple(parts))
+
+
+def _registered(frames: PoseFit, unseen: PoseProblem) -> list[Array]:
+    """Squared distances that registering the places of each sensor alone leaves, with no lever
+    arm; the rotations are those of a mount, which positions do not determine.
+    """
+    squares = []
+    for fitted, part in zip(frames.state.parts, unseen.state(frames.terms).parts, strict=True):
+        optical, place = fitted.view.optical[fitted.used], fitted.view.measured[fitted.used]
+        off = part.view.measured[part.used]
+        if len(place):
+            rotation = frames_from_places(place, optical)
+            shift = np.mean(place - optical @ rotation.T, axis=0)
+            off = off - part.view.optical[part.used] @ rotation.T - shift
+        squares.append(np.sum(off**2, axis=1))
+    return squares
+
+
+GROUPS = 6  # groups of neighbours by which a dependence is looked for
+LEAST_OF_MEANS = 0.1
+"""Share (0 to 1) of the squared residual that groups' means must explain beyond chance to be
+reported; without it the error would be 5 % less."""
+FEWEST_POSES = 30  # poses of a sensor by which a dependence is judged
+TWICE = 1 / 3
+"""Share by which halves of poses differ, of their sum, if one has twice the squared error of the
+other; a tracker's error grows a little with the distance."""
+
+
+def depends_on(state: PoseState) -> tuple[str, ...]:
+    """Return names of what the residual depends on, the strongest first.
+
+    The distance is that from the tracker's origin, which is at its field generator.
+    """
+    shares = {}
+    parts = [part for part in state.parts if np.count_nonzero(part.used) > FEWEST_POSES]
+    for name in ('time', 'position', 'orientation', 'speed', 'distance') if parts else ():
+        shares[name] = float(np.median([_share(part, name) for part in parts]))
+    if shares.get('distance', 0.0) < TWICE:
+        shares.pop('distance', None)
+    ordered = sorted(shares, key=lambda name: -shares[name])
+    return tuple(name for name in ordered if shares[name] > LEAST_OF_MEANS)
+
+
+def _share(part: PosePart, name: str) -> float:
+    """Share of the squared residual that means of groups explain, less what chance gives."""
+    used = part.used
+    residual = part.residual[used, :3]
+    if name in ('speed', 'distance'):
+        values = part.view.velocity[:, :3] if name == 'speed' else part.view.measured
+        along = np.linalg.norm(values[used], axis=1)
+        size = np.sum(residual**2, axis=1)
+        upper = along > np.median(along)
+        if not upper.any():  # all is at rest
+            return 0.0
+        low, high = float(size[~upper].mean()), float(size[upper].mean())
+        return max((high - low) / max(high + low, 1e-18), 0.0)
+    groups = _groups(part, used, name)
+    explained, count = 0.0, 0
+    for group in np.unique(groups):
+        rows = residual[groups == group]
+        explained += len(rows) * float(np.sum(rows.mean(axis=0) ** 2))
+        count += 1
+    total = float(np.sum(residual**2))
+    return explained / max(total, 1e-18) - count / max(len(residual), 1)
+
+
+def _groups(part: PosePart, used: NDArray[np.bool_], name: str) -> NDArray[np.int64]:
+    if name == 'time':
+        time = part.view.time[used]
+        return np.asarray(np.argsort(np.argsort(time)) * GROUPS**2 // time.size, dtype=np.int64)
+    if name == 'position':
+        values = part.view.measured[used]
+    else:
+        turns = Rotation.from_matrix(part.view.measured_rotation[used])
+        values = (turns.mean().inv() * turns).as_rotvec()
+    code = np.zeros(len(values), dtype=np.int64)
+    for axis in range(3):
+        rank = np.argsort(np.argsort(values[:, axis]))
+        code = 4 * code + rank * 4 // len(values)
+    return code
+
+
+ABOVE_FLOOR = 1.3
+"""Factor of the held-out error over the jitter from which something stays unexplained. What is no
+jitter is then 0.8 of it (the root of 1.3 squared less one)."""
+
+LEAST_REPORTED_M = 0.3e-3
+"""Held-out error, m, below which nothing is said to be unexplained: no tracker promises less. Of
+one place at rest, which jitters by micrometres, something always is."""
+
+
+@dataclass(frozen=True)
+class PoseDiagnosis:
+    """Holds what a session of poses was found to contain."""
+
+    session: PoseSession  # as it is meant (units, order of quaternions)
+    fit: PoseFit  # the two frames and all effects, on all poses
+    records: tuple[EffectRecord, ...]  # the effects that are named
+    # Held out: with the registration alone, with hand-eye, with the effects.
+    registered: HeldOutErrors
+    before: HeldOutErrors
+    after: HeldOutErrors
+    floor_m: float  # what jitter alone would leave, m
+    unexplained: float  # share of the squared error above the jitter that stays
+    depends_on: tuple[str, ...]
+    refused: tuple[tuple[str, str], ...]
+    states: tuple[PoseState, PoseState]  # the held-out poses before and after
+    left_out: tuple[str, ...]  # sensors that have too few poses at times with a reference
+    # Whether the motion determines enough of a lever arm to look for effects of place.
+    knows_levers: bool
+
+
+def diagnose_poses(
+    session: PoseSession, progress: Callable[[str], None] | None = None
+) -> PoseDiagnosis:
+    """Find what a tracker of poses lacks on a session.
+
+    Raises `DiagnosisError` when there are too few poses with a reference.
+    Raises `PlausibilityError` when tracked and optical poses fit in no reading.
+    """
+    say = progress or (lambda text: None)
+    say('conventions')
+    exchanged: list[EffectRecord] = []
+    try:
+        session, convention = read_rightly(session)
+    except PlausibilityError:
+        # Nothing fits all of a session whose sensors were exchanged for half of it.
+        session, exchanged = untangled(session)
+        if not exchanged:
+            raise
+        session, convention = read_rightly(session)
+    problem = pose_problem(session)
+    train, test = train_blocks(problem)
+    say('hand-eye')
+    alone = session.reference is None
+    training = problem.in_blocks(train)
+    first = first_fit(training, coarse_offset(training), alone)
+    swaps = swapped_spans(problem, first)
+    session, swapped = put_back(session, swaps)
+    if swaps:
+        problem = pose_problem(session)
+        training = problem.in_blocks(train)
+        first = first_fit(training, coarse_offset(training), alone)
+    search = search_effects(first, session, say)
+    say('held out')
+    state = search.fit.state
+    # A clock may stand for what else there is besides jitter.
+    if not search.knows_levers and state.rms()[0] > ABOVE_FLOOR * floor_of(state):
+        alone_fit = fit_poses(state.problem, frame_terms(search.fit.terms))
+        search = replace(search, fit=alone_fit, evidence=(None,) * len(alone_fit.terms))
+    search = _confirmed(search, problem, test)
+    found = search.fit
+    whole = with_time_constants(fit_poses(judged(problem, found), found.terms))
+    before, after, registered = held_out(problem, found, test)
+    floor = floor_of(after)
+    residuals = _residuals(session, problem, whole)
+    records = records_of(whole, search.evidence, session)
+    is_known = search.knows_levers and knows_levers(whole, most_poses(session))
+    for effect in pose_effects().values():
+        if effect.needs_levers and not is_known:
+            continue
+        words = {'summary': effect.summary, 'advice': effect.advice}
+        records += [
+            replace(r, evidence={**words, **r.evidence}) for r in effect.observed(residuals)
+        ]
+    records += [*exchanged, *swapped]
+    if convention is not None:
+        records.append(convention)
+    errors = errors_of(after)
+    excess = max(errors.position_m**2 - floor**2, 0.0)
+    possible = max(errors_of(before).position_m ** 2 - floor**2, excess, 1e-18)
+    significant = errors.position_m > max(ABOVE_FLOOR * floor, LEAST_REPORTED_M)
+    return PoseDiagnosis(
+        session=session,
+        fit=whole,
+        records=tuple(records),
+        registered=registered,
+        before=errors_of(before),
+        after=errors,
+        floor_m=floor,
+        unexplained=excess / possible if significant else 0.0,
+        depends_on=(depends_on(after) or depends_on(whole.state)) if significant else (),
+        refused=search.refused,
+        states=(before, after),
+        left_out=tuple(
+            name
+            for name, poses in session.sensors.items()
+            if poses is not most_poses(session) and name not in problem.setting.sensors
+        ),
+        knows_levers=search.knows_levers,
+    )
+
+
+def _confirmed(search: PoseSearch, problem: PoseProblem, test: NDArray[np.int64]) -> PoseSearch:
+    """The search without effects of place that positions do not confirm."""
+    fit = search.fit
+    for index, term in enumerate(fit.terms):
+        if not term.effect.blocks_in_space:
+            continue
+        rest = fit_poses(fit.state.problem, [t for t in fit.terms if t is not term])
+        why = unconfirmed(rest, fit, term, judged(problem.in_blocks(test), fit))
+        if why:
+            evidence = tuple(e for k, e in enumerate(search.evidence) if k != index)
+            refused = (*search.refused, (term.label, why))
+            left = replace(search, fit=rest, evidence=evidence, refused=refused)
+            return _confirmed(left, problem, test)
+    return search
+
+
+def unconfirmed(rest: PoseFit, fit: PoseFit, term: PoseTerm, unseen: PoseProblem) -> str:
+    """Return why an effect of place is not believed beside the rest; empty where it is.
+
+    ``rest`` is the fit without it, and ``unseen`` the held-out poses.
+
+    Poses near each other err alike, and a few places may ask for what no others confirm. Where
+    stamps jitter, an error of places weighs little beside one across the velocity or of turns; a
+    map that moves poses but takes nothing off their errors makes up for frames that it has moved.
+    """
+    if _square(unseen.state(rest.terms), term) < _square(unseen.state(fit.terms), term):
+        return 'held-out poses are worse with it'
+    taken = _square(rest.state, term) - _square(fit.state, term)
+    if term.role is Role.MAP and taken < LEAST_MAP_M**2:
+        return f'takes less than {1e3 * LEAST_MAP_M:g} mm off the errors of positions'
+    return ''
+
+
+def _square(state: PoseState, term: PoseTerm) -> float:
+    """Mean squared error of the positions, m^2, of the sensors that a term is about."""
+    parts = [p for p in state.parts if term.acts_on(p.view.sensor)]
+    total = sum(float(np.sum(p.residual[p.used, :3] ** 2)) for p in parts)
+    return total / max(sum(np.count_nonzero(p.used) for p in parts), 1)
+
+
+def _residuals(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseResiduals:
+    """What the last fit leaves; what stands out of it, and not of the one before, is out."""
+    known, sensings = judged(problem, whole), []
+    for part, weight in zip(known.state(whole.terms).parts, known.weight, strict=True):
+        noise, cost = noise_of(part)
+        gain = noise_of(part, with_stamps=False)[1] - cost
+        sensings.append(
+            Sensing(
+                part.view, part.residual, part.used, weight == 0.0, noise.position_m,
+                noise.orientation_rad, noise.stamp_s, gain,
+            )
+        )  # fmt: skip
+    return PoseResiduals(session, problem.setting, tuple(sensings))

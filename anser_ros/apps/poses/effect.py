@@ -1,0 +1,323 @@
+"""Defines what an effect of a tracker of poses looks like: one interface, one file for each
+effect. A tracked pose is predicted from the optical one in this order::     clock -> optical
+track -> optical pose -> hand-eye -> tracked pose and what the tracker's own map of space does
+(a distortion) is undone on the measured side. Prior, cost and record of an effect are those of
+`anser_ros.effects.base`, as for effects on fluxes.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import cache
+from typing import Literal, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+import anser_ros.apps.poses.effects as package
+from anser_ros.apps.poses.path import OpticalPath
+from anser_ros.apps.poses.sequence import PoseSession
+from anser_ros.calibration.error_map import PositionMap, Shape
+from anser_ros.effects.base import BaseEffect, BaseTerm
+from anser_ros.effects.effect import needed, sigmas
+from anser_ros.effects.registry import effects_in
+from anser_ros.field.model import EffectRecord
+
+SMOOTH = 'smooth'
+"""The kind of such a map: it is determined by the points that it was learnt from."""
+
+
+def smooth_map(record: EffectRecord) -> PositionMap:
+    """Return the map of a record: what is added to tracked positions.
+
+    Raises `EffectError` when a parameter is missing.
+    """
+    places, errors = (
+        np.asarray(needed(record, key), dtype=np.float64).reshape(-1, 3)
+        for key in ('places_m', 'errors_m')
+    )
+    values = [needed(record, key) for key in ('trend', 'length_m', 'noise')]
+    shape = Shape(int(values[0]), float(values[1]), float(values[2]))
+    return PositionMap(places, errors, shape)
+
+
+Array = NDArray[np.float64]
+
+
+class PoseSite(TypedDict, total=False):
+    """States where an effect acts, in the words of records and reports."""
+
+    sensor: str  # name of a sensor; all of them where there is none
+    degree: int  # of a map's polynomial
+    lowest: int  # lowest degree in it
+    centre_m: list[float]  # where the polynomial's coordinates are zero, frame of the tracker
+    size_m: float  # what they are divided by
+    middle_s: float  # time at which a clock's offset is its offset
+    two_sided: Literal[True]  # a filter that looks ahead as far as back
+
+
+@dataclass(frozen=True)
+class PoseSetting:
+    """Holds what effects may know of a session before they are fitted."""
+
+    sensors: tuple[str, ...]
+    start: float  # time of the first tracked pose, s
+    duration: float  # from it to the last, s
+    centre: Array  # (3,), middle of the tracked positions, m, tracker's frame
+    size: float  # their rms distance from it, m
+
+
+@dataclass(frozen=True)
+class PoseView:
+    """Holds predicted poses of one sensor, n of them, with what derivatives need."""
+
+    sensor: str
+    time: Array  # (n,), stamps of the tracked poses, s
+    measured: Array  # (n, 3), tracked positions as they were reported, m, tracker's frame
+    measured_rotation: Array  # (n, 3, 3), reported with them
+    optical: Array  # (n, 3), place of the body in the optical frame, m
+    turn: Array  # (n, 3, 3), its rotation there
+    frame: Array  # (3, 3), rotation from the optical frame to the tracker's
+    lever: Array  # (3,), the sensor in the body's frame, m
+    position: Array  # (n, 3), predicted, m, tracker's frame
+    rotation: Array  # (n, 3, 3), predicted
+    velocity: Array  # (n, 6), of the prediction, m/s and rad/s along the tracker's axes
+
+
+class Role(Enum):
+    """Names what an effect is to the others, who ask for this and for no effect by its name."""
+
+    PLAIN = 'plain'
+    REGISTRATION = 'frame of the reference'
+    """Where the reference's frame lies in the tracker's; in every fit, and no error."""
+    MOUNT = 'frame of a sensor'
+    """Where and how a sensor sits on the body; in every fit, and no error. Records
+    both frames."""
+    OFFSET = 'offset'
+    """Moves the times of poses by a constant; every fit starts with it."""
+    RATE = 'rate'
+    """Moves the times of poses by a share of the time."""
+    READING = 'reading'
+    """Another convention than a stream states, by which it is read before anything is fitted."""
+    SWAP = 'swap'
+    """Sensors under each other's names, which are put back before anything is searched for."""
+    FILTER = 'filter'
+    """A low pass with a time constant: no slopes, tried at some of them when the rest is found."""
+    SCALE = 'scale'
+    """One scale of all positions, which is a part of a map."""
+    MAP = 'map'
+    """A map of the places, that a map of a higher degree contains."""
+
+    @property
+    def is_frame(self) -> bool:
+        """Return whether it is one of the two unknown frames, which are no effects."""
+        return self in (Role.REGISTRATION, Role.MOUNT)
+
+    @property
+    def is_clock(self) -> bool:
+        """Return whether it moves times.
+
+        Such an effect is found before a filter is judged, whose first order is a delay.
+        """
+        return self in (Role.OFFSET, Role.RATE)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Holds the two frames between the reference and one sensor."""
+
+    rotation: Array  # (3, 3), from the optical frame to the tracker's
+    translation: Array  # (3,), m
+    mount: Array  # (3, 3), rotation from the sensor's frame to the body's
+    lever: Array  # (3,), the sensor in the body's frame, m
+
+
+PoseMap = Callable[[str, Array], tuple[Array, float]]
+"""What a model adds to the position (3,), m, of a sensor of that name, and its variance, m^2."""
+
+
+@dataclass(frozen=True)
+class PoseTerm(BaseTerm):
+    """Holds an effect on the poses of one sensor, or of all, with values of its parameters."""
+
+    effect: 'PoseEffect'
+    site: PoseSite = field(default_factory=lambda: PoseSite())
+
+    @property
+    def role(self) -> Role:
+        """Return what its effect is to the others."""
+        return self.effect.role
+
+    @property
+    def sensor(self) -> str | None:
+        """Return the only sensor that it is about; None where it is about all of them."""
+        name = self.site.get('sensor')
+        return None if name is None else str(name)
+
+    def acts_on(self, sensor: str) -> bool:
+        """Return whether it is about a sensor."""
+        return self.sensor in (None, sensor)
+
+
+class PoseEffect(BaseEffect[PoseTerm]):
+    """Changes nothing; it is the base of the effects on poses."""
+
+    role = Role.PLAIN
+    advice = ''
+    """What somebody at the tracker can do about it, in a sentence."""
+    blocks_in_space = False
+    """Whether blocks of space and not of time decide on it."""
+    needs_levers = False
+    """Whether it is seen only where the motion determines a lever arm: one that is not known,
+    times turns that go with place or velocity, makes what looks like it."""
+    makes_jitter = False
+    """Whether poses that jitter more than before are explained by it."""
+
+    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
+        """Return the effect at every site where it may sit, with parameters of zero."""
+        return ()
+
+    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
+        """Return the derivative of predicted less measured pose by the parameters, shape (n, 6,
+        q).
+
+        Rows are m and rad along the axes of the tracker's frame; None where it does nothing.
+        """
+        return None
+
+    def clock(self, term: PoseTerm, sensor: str, time: Array) -> Array:
+        """Return the times on the optical clock, s, at which a sensor's poses apply."""
+        return time
+
+    def at_frame(self, site: PoseSite, place: Array, turn: Array) -> PoseTerm:
+        """Return a frame at a place (3,), m, with a rotation (3, 3)."""
+        raise NotImplementedError
+
+    def framed(self, term: PoseTerm, sensor: str, frames: Frames) -> Frames:
+        """Return the frames of a sensor with the one that the term holds."""
+        return frames
+
+    def moved(self, before: PoseTerm, after: PoseTerm, middle: Array) -> EffectRecord:
+        """Return the record of a frame that has changed; ``middle`` (3,) is where the body is, m,
+        optical frame.
+        """
+        raise NotImplementedError
+
+    def filter(self, term: PoseTerm, path: OpticalPath) -> OpticalPath:
+        """Return the body's path as a tracker that filters sees it."""
+        return path
+
+    def seen(self, term: PoseTerm, position: Array) -> Array:
+        """Return optical positions (n, 3) at the tracker's scale, m."""
+        return position
+
+    def corrected(self, term: PoseTerm, sensor: str, position: Array) -> Array:
+        """Return tracked positions (n, 3), m, without what the effect does to them."""
+        return position
+
+    def seen_at(
+        self, record: EffectRecord, term: PoseTerm, covariance: Array, views: Sequence[PoseView]
+    ) -> EffectRecord:
+        """Return the record of a fitted term with what it amounts to at the poses of a session."""
+        return record
+
+    def observed(self, residuals: 'PoseResiduals') -> Sequence[EffectRecord]:
+        """Return what is seen of the effect without a fit; nothing where parameters are fitted."""
+        return ()
+
+    def frozen(self, session: PoseSession) -> Sequence[EffectRecord]:
+        """Return streams that have stopped while others go on, each with its ``since_s``."""
+        return ()
+
+    def more_jitter(self, factor: float) -> Sequence[EffectRecord]:
+        """Return what is reported where poses jitter so many times as when a watch began."""
+        return ()
+
+    def mapping(self, record: EffectRecord) -> PoseMap | None:
+        """Return the map of a record, which a corrector applies; None for other effects."""
+        return None
+
+    def beside_scale(self, term: PoseTerm) -> PoseTerm | None:
+        """Return what is left of a term beside one scale of all sensors; None where nothing is."""
+        return term
+
+    def whole(self, term: PoseTerm) -> PoseTerm | None:
+        """Return a map with what it lacks beside a scale, with parameters of zero; None for a
+        term that lacks nothing.
+        """
+        return None
+
+    def is_scale(self, term: PoseTerm) -> bool:
+        """Return whether a term is one scale, of a sensor or of all."""
+        return False
+
+    def rival(self, term: PoseTerm) -> PoseTerm:
+        """Return a filter's smoothing without its delay: what a noisy reference asks for."""
+        return term
+
+
+class NumberEffect(PoseEffect):
+    """Changes poses by one number, theta, which a record holds as ``base + factor * theta``."""
+
+    key = ''
+    base, factor = 0.0, 1.0
+    spread = 1.0
+    """Standard deviation of theta before anything is measured."""
+
+    def prior(self, term: PoseTerm) -> Array:
+        """Return the standard deviation of theta before anything is measured, shape (1,)."""
+        return np.full(1, self.spread)
+
+    def record(self, term: PoseTerm, covariance: Array) -> EffectRecord:
+        """Return the number and its standard deviation, and the term's site."""
+        sigma = self.factor * float(sigmas(covariance)[0])
+        value = self.base + self.factor * float(term.theta[0])
+        return EffectRecord(self.name, {**term.site, self.key: value}, {self.key: sigma})
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """Holds what one sensor shows once the frames and effects are fitted."""
+
+    view: PoseView
+    residual: Array  # (n, 6), measured less predicted, m and rad, tracker's frame
+    used: NDArray[np.bool_]  # (n,), poses that have a reference and do not stand out
+    out: NDArray[np.bool_]  # (n,), poses that have a reference and stand out
+    position_m: float = 0.0  # the noise that is left, a coordinate
+    orientation_rad: float = 0.0
+    stamp_s: float = 0.0  # and of the stamps
+    stamp_gain: float = 0.0  # minus twice the log likelihood that an error of the stamps takes off
+
+
+@dataclass(frozen=True)
+class PoseResiduals:
+    """Holds a session and what its fit leaves, by which some effects are seen without a fit."""
+
+    session: PoseSession
+    setting: PoseSetting
+    sensors: tuple[Sensing, ...]
+
+
+def frames_of(terms: Sequence[PoseTerm], sensor: str) -> Frames:
+    """Return the frames of a sensor that some terms hold; the identity where they hold none."""
+    frames = Frames(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
+    for term in terms:
+        frames = term.effect.framed(term, sensor, frames)
+    return frames
+
+
+@cache
+def pose_effects() -> dict[str, PoseEffect]:
+    """Return every effect on poses by its name, in alphabetical order."""
+    return effects_in(package)
+
+
+@cache
+def effect_with(role: Role) -> PoseEffect:
+    """Return the effect that has a role."""
+    return next(effect for effect in pose_effects().values() if effect.role is role)
+
+
+def effect_of_record(record: EffectRecord) -> PoseEffect:
+    """Return the effect of a record; one that changes nothing where none has its name."""
+    return pose_effects().get(record.name, PoseEffect())

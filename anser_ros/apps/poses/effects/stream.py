@@ -1,0 +1,299 @@
+"""What is wrong with a stream: poses repeated, missing or outlying, stamps of receipt or of a
+poll.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.apps.poses.effect import PoseEffect, PoseResiduals, Sensing
+from anser_ros.apps.poses.effects.episodes import in_episode
+from anser_ros.apps.poses.jitter import stamp_step
+from anser_ros.apps.poses.sequence import PoseSequence, PoseSession, jumping_poses
+from anser_ros.diagnosis.decisions import FEWEST_OUTLIERS
+from anser_ros.field.model import EffectRecord
+from anser_ros.physics.pose_track import LONGEST_GAP_S
+from anser_ros.sessions.plausibility import FROZEN_S
+
+Array = NDArray[np.float64]
+
+FEWEST_STALE = 0.02
+"""Share (0 to 1) of poses of a moving body from which repeats are named: one in 60 comes again
+where a tracker of 60 Hz is polled a hertz too fast, which harms nothing."""
+MOVING_M = 5e-4
+"""Way between two poses, m, from which a body moves: trackers resolve a tenth of it."""
+FROZEN_WAY_M = 0.01
+"""Way of another stream, m, while one stands still that is frozen: far more than any tracker's
+jitter."""
+NEAR = 3  # poses before and after that motion is judged by: one wrong neighbour decides nothing
+FEWEST_MISSING = 0.005  # share of poses, or of the time, from which missing ones are named
+FEWEST_MARKED, FEWEST_MARKED_SHARE = 5, 1e-3
+"""Markers for no pose, and their share, from which they are named: a device wrote them itself."""
+LONG_GAPS = 6.0
+"""Gap in median intervals that counts as missing poses: a poll is late by one or two."""
+PAUSE_S, MANY_PAUSES = 2.0, 4
+"""Pauses of this length, s, where there are so many, lie between recordings and are no gaps."""
+FEWEST_OUTLYING_POSES = 3  # outliers that must be there at least: one or two are an accident
+FAR = 14.0
+"""Distance of the median outlier in spreads of a coordinate from which it is one: errors of real
+trackers have tails of half that."""
+
+
+class StalePoses(PoseEffect):
+    """Reports the same pose, number for number, under a new stamp while the body moves."""
+
+    name = 'stale_poses'
+    summary = 'the same pose again under a new stamp'
+    advice = 'Ask the device no more often than it measures, or leave the repeats out.'
+    units = {'fraction': '1', 'runs': '1'}
+
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
+        """Return a record for each stream in which poses come again."""
+        found = []
+        for poses in residuals.session.streams.values():
+            moving = _moving(poses)
+            count = int(np.count_nonzero(moving))
+            if count < 20:
+                continue
+            again = poses.repeated & moving
+            share = float(np.count_nonzero(again)) / count
+            if share < FEWEST_STALE:
+                continue
+            runs = int(np.count_nonzero(np.diff(again.astype(int), prepend=0) == 1))
+            values = {'stream': poses.name, 'fraction': share, 'runs': runs}
+            sigma = float(np.sqrt(share / count))
+            found.append(EffectRecord(self.name, values, {'fraction': sigma}))
+        return found
+
+    def frozen(self, session: PoseSession) -> Sequence[EffectRecord]:
+        """Return streams that give one pose over and over while another moves."""
+        streams, found = session.streams, []
+        for name, poses in streams.items():
+            fresh = np.flatnonzero(~poses.repeated)
+            if not poses.size:
+                continue
+            begin, end = float(poses.time[fresh[-1]]), float(poses.time[-1])
+            if end - begin < FROZEN_S:
+                continue
+            ways = [
+                float(np.linalg.norm(np.ptp(other.position[other.time > begin], axis=0)))
+                for key, other in streams.items()
+                if key != name and np.count_nonzero(other.time > begin) > 1
+            ]
+            if max(ways, default=0.0) > FROZEN_WAY_M:
+                again = poses.size - int(fresh[-1]) - 1
+                values = {'stream': name, 'fraction': again / poses.size, 'runs': 1,
+                          'since_s': begin}  # fmt: skip
+                found.append(EffectRecord(self.name, values, {}))
+        return found
+
+
+class MissingPoses(PoseEffect):
+    """Reports a device's marker for no pose, or no pose for much longer than usual."""
+
+    name = 'missing_poses'
+    summary = 'poses are missing, or marked as such by the device'
+    advice = 'Keep sensors within the volume and markers in view.'
+    units = {'fraction': '1', 'spans': 's'}
+
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
+        """Return a record for each stream that lacks poses."""
+        found = []
+        for poses in residuals.session.streams.values():
+            spans = _gaps(poses)
+            lost = poses.missing.size / max(poses.missing.size + poses.size, 1)
+            length = max(float(np.ptp(poses.time)), 1e-9)
+            silent = sum(b - a for a, b in spans) / length
+            share = max(lost, silent)
+            marked = poses.missing.size >= FEWEST_MARKED and lost > FEWEST_MARKED_SHARE
+            if not marked and (share < FEWEST_MISSING or not (spans or poses.missing.size > 1)):
+                continue
+            found.append(EffectRecord(self.name, {
+                'stream': poses.name, 'fraction': share, 'marked': int(poses.missing.size),
+                'spans': [[round(a, 3), round(b, 3)] for a, b in spans[:20]],
+            }, {}))  # fmt: skip
+        return found
+
+
+class PoseOutliers(PoseEffect):
+    """Reports poses that no explanation reaches, such as a marker seen in its other solution."""
+
+    name = 'outliers'
+    summary = 'poses that fit no model, such as those of a marker in its other solution'
+    advice = 'Do not use these poses; show the marker from another side.'
+    units = {'fraction': '1'}
+
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
+        """Return one record of the outlying poses of all sensors."""
+        found = _leaping(residuals.session.reference)
+        outs = [_alone(sensing, residuals) for sensing in residuals.sensors]
+        out = np.concatenate(outs)
+        used = np.concatenate([s.used for s in residuals.sensors])
+        count = int(np.count_nonzero(out))
+        share = count / max(count + int(np.count_nonzero(used)), 1)
+        if found or share < FEWEST_OUTLIERS or count < FEWEST_OUTLYING_POSES:
+            return found
+        residual = np.concatenate([s.residual for s in residuals.sensors])[out]
+        place, turn = (np.linalg.norm(residual[:, k : k + 3], axis=1) for k in (0, 3))
+        noise = np.repeat(
+            [[s.position_m, s.orientation_rad] for s in residuals.sensors],
+            [np.count_nonzero(mask) for mask in outs],
+            axis=0,
+        )
+        far, turned = place / noise[:, 0], turn / noise[:, 1]
+        if float(np.median(np.maximum(far, turned))) < FAR:
+            return []  # the tail of a distribution, and no poses of their own
+        values = {
+            'fraction': share,
+            'position_m': float(np.median(place)),
+            'orientation_rad': float(np.median(turn)),
+            'by_sensor': {
+                s.view.sensor: int(m.sum()) for s, m in zip(residuals.sensors, outs, strict=True)
+            },
+        }
+        return [EffectRecord(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
+
+
+def _leaping(reference: PoseSequence | None) -> list[EffectRecord]:
+    """A record of the reference's poses that leap."""
+    if reference is None:
+        return []
+    away = jumping_poses(reference)
+    share = float(away.mean()) if away.size else 0.0
+    if share <= FEWEST_OUTLIERS or np.count_nonzero(away) < FEWEST_OUTLYING_POSES:
+        return []
+    values = {'fraction': share, 'stream': reference.name}
+    sigma = float(np.sqrt(share / away.size))
+    return [EffectRecord(PoseOutliers.name, values, {'fraction': sigma})]
+
+
+def _alone(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.bool_]:
+    """Poses of a sensor that stand out, less those of an episode, which are off together."""
+    return np.asarray(sensing.out & ~in_episode(sensing, residuals))
+
+
+def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
+    """Where a body moves between poses, judged by those some before and after."""
+    n = poses.size
+    before = np.maximum(np.arange(n) - NEAR, 0)
+    after = np.minimum(np.arange(n) + NEAR, n - 1)
+    way = np.linalg.norm(poses.position[after] - poses.position[before], axis=1)
+    apart = poses.time[after] - poses.time[before]
+    near = apart < 2 * NEAR * LONGEST_GAP_S
+    return np.asarray(near & (way > 2 * NEAR * MOVING_M))
+
+
+def _gaps(poses: PoseSequence) -> list[tuple[float, float]]:
+    steps = np.diff(poses.time)
+    if steps.size < 10:
+        return []
+    long = max(LONGEST_GAP_S, LONG_GAPS * float(np.median(steps)))
+    gaps = np.flatnonzero(steps > long)
+    pauses = gaps[steps[gaps] > PAUSE_S]
+    if pauses.size >= MANY_PAUSES:
+        gaps = np.setdiff1d(gaps, pauses)
+    return [(float(poses.time[g]), float(poses.time[g + 1])) for g in gaps]
+
+
+LEAST_S = 2e-3
+"""Error of the stamps, s, from which it is named: less moves a hand by a tenth of a millimetre.
+Smaller names what harms nobody; larger leaves errors of a fast hand unnamed."""
+LEAST_LIKELIHOOD_GAIN = 25.0
+"""Minus twice the log likelihood that it must take off in the median sensor; chance takes one, and
+so much once in two million sensors."""
+STEP_SHARE = (0.15, 0.7)
+"""Error over the step that rounding to a step makes: 0.29 if even, more if a poll is late."""
+
+
+def _is_wide(residuals: PoseResiduals) -> tuple[float, float]:
+    """The median error of the stamps over the sensors, and what believing it gains.
+
+    None where fewer than half of the sensors have one: what one of two shows is no clock's.
+    """
+    errors = [s.stamp_s for s in residuals.sensors]
+    if np.percentile(errors, 50, method='lower') < LEAST_S:
+        return 0.0, 0.0
+    return float(np.median(errors)), float(np.median([s.stamp_gain for s in residuals.sensors]))
+
+
+def _sigma(residuals: PoseResiduals) -> float:
+    """Standard deviation of the median error of the stamps, s.
+
+    By Fisher's information about a variance: each pose has one degree of freedom along its
+    velocity, and tells as much of the stamps' error as that is of its error there. Sensors that
+    differ by more than this have errors of their own; those that share stamps share the error.
+    """
+    sensors = residuals.sensors
+    sigmas = [s.stamp_s / np.sqrt(2 * max(np.sum(_stamp_share(s) ** 2), 1.0)) for s in sensors]
+    apart = len({s.view.time.tobytes() for s in sensors})
+    scatter = np.std([s.stamp_s for s in sensors]) / np.sqrt(len(sensors))
+    return float(max(scatter, np.median(sigmas) / np.sqrt(apart)))
+
+
+def _stamp_share(sensing: Sensing) -> Array:
+    """Share (n,) of the variance along the velocity that errors of the stamps make."""
+    velocity = sensing.view.velocity[sensing.used]
+    scale = np.repeat([sensing.position_m, sensing.orientation_rad], 3)
+    moved = sensing.stamp_s**2 * np.sum((velocity / scale) ** 2, axis=1)
+    return np.asarray(moved / (1 + moved))
+
+
+def _step(residuals: PoseResiduals, rms: float) -> float:
+    """The step of the stamps that makes an error of that size, or zero."""
+    for sensing in residuals.sensors:
+        step = stamp_step(residuals.session.sensors[sensing.view.sensor].time)
+        if step and STEP_SHARE[0] * step < rms < STEP_SHARE[1] * step:
+            return step
+    return 0.0
+
+
+class ReceiptJitter(PoseEffect):
+    """Stamps are off at random: poses are off along their own velocity."""
+
+    name = 'stamp_jitter'
+    summary = 'stamps are those of receipt, and jitter'
+    advice = 'Use the counter of the device as stamp (import_poses --stamps device).'
+    units = {'rms_s': 's'}
+    needs_levers = True
+    makes_jitter = True
+
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
+        """Look for a residual that lies along the velocity and grows with it."""
+        rms, gain = _is_wide(residuals)
+        if rms < LEAST_S or gain < LEAST_LIKELIHOOD_GAIN or _step(residuals, rms):
+            return []
+        spread = _sigma(residuals)
+        values = {'rms_s': rms, 'by_sensor': {s.view.sensor: s.stamp_s for s in residuals.sensors}}
+        return [EffectRecord(self.name, values, {'rms_s': spread}, {'likelihood_gain': gain})]
+
+
+class QuantisedStamps(PoseEffect):
+    """Stamps lie on the grid of a poll, and poses are off along their velocity by as much."""
+
+    name = 'quantised_stamps'
+    summary = 'stamps are those of a poll'
+    advice = 'Use the counter of the device as stamp, or poll more often.'
+    units = {'step_s': 's'}
+    needs_levers = True
+    makes_jitter = True
+
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
+        """Look for an error of the stamps that is that of their grid."""
+        rms, gain = _is_wide(residuals)
+        step = _step(residuals, rms) if rms >= LEAST_S and gain >= LEAST_LIKELIHOOD_GAIN else 0.0
+        if not step:
+            return []
+        values = {'step_s': step, 'rms_s': rms}
+        return [
+            EffectRecord(self.name, values, {'step_s': 0.01 * step}, {'likelihood_gain': gain})
+        ]
+
+
+EFFECTS = (
+    StalePoses(),
+    MissingPoses(),
+    PoseOutliers(),
+    ReceiptJitter(),
+    QuantisedStamps(),
+)

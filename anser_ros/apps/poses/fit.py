@@ -1,0 +1,349 @@
+"""Fits frames and active effects with the noise of the rest, and judges what the motion tells.
+Which components of a lever arm the motion determines, and whether all sensors see one scale.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtri
+from scipy.stats import chi2
+
+from anser_ros.apps.poses.effect import PoseTerm, Role
+from anser_ros.apps.poses.jitter import stamp_step
+from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
+from anser_ros.apps.poses.sequence import PoseSequence, PoseSession
+from anser_ros.diagnosis.engine import JointFit, descended, stepped
+from anser_ros.effects.effect import sigmas
+
+Array = NDArray[np.float64]
+
+STUDENT_FREEDOM = 4.0
+"""Degrees of freedom of Student's distribution by which poses are weighted in a robust fit: the
+usual compromise between the mean (infinite) and a distribution without one (1)."""
+REWEIGHTINGS = 5
+"""Fits of a robust fit after the first, each with the weights of the one before. Fewer leave bad
+poses some of their first weight; more cost a fit each and change weights by little."""
+STANDS_OUT, FAR_OUT = 7.0, 25.0
+"""Distances of a pose from its prediction, in robust spreads of a coordinate, from which it stands
+out: where few do (normal ones once in 1e10), and where many do, as what an effect makes."""
+FEW_SHARE = 0.03
+"""Share of a sensor's poses up to which those that stand out are few: between one window and the
+two that metal must be near to be named (`episodes.WINDOWS`)."""
+SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
+FEWEST_BLOCKS = 10
+"""Blocks by whose scores the variance of a time beside a poll is judged. Fewer have no slow
+course; more take errors of stamps as random that are not."""
+SLOW = 6
+"""Tapers of a slow course. Fewer take chance for accuracy; more are as quick as the teeth that end
+in blocks."""
+CHANCE = 0.01
+"""Chance that the poses' own noise makes a slow course that is believed. Larger widens sigmas for
+noise; smaller leaves out a slow beat of poll and tracker."""
+FILTER_STEPS = 3  # Newton's, to a time constant that is known to some percent
+NEAR_TAU = 1.25
+"""Factor by which positions alone may move a time constant. Smaller keeps one that orientations
+have moved; larger follows steps where no filter is, which lead anywhere."""
+LARGEST_STAMP_S = 0.1
+"""Spread of stamps, s, beyond which a time makes no pose of a hand's motion."""
+
+
+@dataclass(frozen=True)
+class PoseFit(JointFit[PoseState]):
+    """Holds the terms of poses at their joint optimum."""
+
+    @property
+    def terms(self) -> tuple[PoseTerm, ...]:
+        """Return all terms with their fitted parameters."""
+        return self.state.terms
+
+    def held_out(self, in_space: bool = False) -> float:
+        """Return the cross-validated sum of squares over blocks of time, or of space."""
+        return self._held_out_in_space if in_space else super().held_out()
+
+    @cached_property
+    def _held_out_in_space(self) -> float:
+        state = self.state.in_space
+        return state.sums(state.numbers).held_out(self.prior, state.folds)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Return the covariance of all parameters, as `BlockSums.covariance`.
+
+        Errors of stamps are not independent where these lie on the grid of a poll: they are a
+        sawtooth, whose mean over many poses is far nearer to half a step than that of random
+        errors. What it adds to the poses' own noise is slow, and is seen in the slow course of the
+        blocks' scores (by sine tapers); the quick course is where teeth end in blocks.
+        """
+        filtered = any(term.role is Role.FILTER for term in self.terms)
+        sums = self.state.sums_with(filter_slopes=True) if filtered else self.sums
+        whole = sums.covariance(self.prior, self.misfit)
+        clocks = np.repeat(
+            [t.role.is_clock for t in self.terms], [t.theta.size for t in self.terms]
+        )
+        blocks = sums.squares.size
+        if not clocks.any() or blocks <= FEWEST_BLOCKS or not self._is_polled():
+            return whole
+        formal = sums.solve(self.prior)[1][clocks]
+        exact = self.state.sums_with(filtered, stamps_exact=True).normal.sum(axis=0)
+        exact += np.diag(1 / self.prior**2)
+        least = np.einsum('ci,ij,cj->c', formal, exact, formal) * max(self.misfit, 1.0)
+        course = np.outer(np.arange(1, SLOW + 1), np.arange(1, blocks + 1))
+        tapers = np.sin(np.pi * course / (blocks + 1)) * np.sqrt(2 * blocks / (blocks + 1))
+        slow = np.mean((tapers @ sums.right @ formal.T) ** 2, axis=0)
+        variance = np.where(slow > least * chi2.ppf(1 - CHANCE, SLOW) / SLOW, slow, least)
+        scale = np.ones(clocks.size)
+        scale[clocks] = np.sqrt(variance / np.diag(whole)[clocks])
+        return np.asarray(whole * scale[:, None] * scale[None, :])
+
+    def _is_polled(self) -> bool:
+        """Whether the stamps of a sensor have errors and lie on a grid."""
+        sensors = zip(self.state.problem.sensors, self.state.parts, strict=True)
+        return any(part.noise.stamp_s and stamp_step(poses.time) for poses, part in sensors)
+
+
+def fit_poses(problem: PoseProblem, terms: Sequence[PoseTerm], iterations: int = 10) -> PoseFit:
+    """Fit all parameters of all terms together, the two frames among them, from their values."""
+    state = problem.state(terms)
+    return PoseFit(*descended(state, state.numbers, iterations))
+
+
+def with_time_constants(fit: PoseFit) -> PoseFit:
+    """Return the fit with the time constants of filters, which lie near, fitted by their slopes.
+
+    Positions alone tell them (`PoseState.sums_with`), so that steps need not lower the sum of
+    squares.
+    """
+    filters = [i for i, term in enumerate(fit.terms) if term.role is Role.FILTER]
+    if not filters:
+        return fit
+    state = fit.state
+    for _ in range(FILTER_STEPS):
+        terms = stepped(state.terms, state.sums_with(filter_slopes=True).step(fit.prior, 0.0))
+        moved = [float(terms[i].theta[0] / fit.terms[i].theta[0]) for i in filters]
+        if not all(1 / NEAR_TAU < factor < NEAR_TAU for factor in moved):
+            return fit
+        state = state.moved(terms)
+    return PoseFit(state, state.sums(state.numbers), fit.prior)
+
+
+def robust_fit(problem: PoseProblem, terms: Sequence[PoseTerm]) -> PoseFit:
+    """Fit with poses weighted by how far they are off, and with the spread that they show."""
+    problem = replace(problem, noise=tuple(_spread(p) for p in problem.state(terms).parts))
+    fit = fit_poses(problem, terms, 4)
+    for _ in range(REWEIGHTINGS):
+        parts = fit.state.parts
+        noise = tuple(_spread(part) for part in parts)
+        weight = tuple(
+            np.where(w > 0, _student(part, n), 0.0)
+            for part, n, w in zip(parts, noise, problem.weight, strict=True)
+        )
+        fit = fit_poses(replace(problem, noise=noise, weight=weight), fit.terms, 4)
+    return fit
+
+
+def _student(part: PosePart, noise: PoseNoise) -> Array:
+    white = noise.whitened(part.residual, part.view.velocity)
+    far = np.sum(white**2, axis=1)
+    return np.asarray(np.sqrt((STUDENT_FREEDOM + 6) / (STUDENT_FREEDOM + far)))
+
+
+def _spread(part: PosePart) -> PoseNoise:
+    """Robust spread of a coordinate: the median of |normal| is 0.6745 of its deviation."""
+    used = part.used
+    if not used.any():
+        return part.noise
+    sizes = np.median(np.abs(part.residual[used]), axis=0) / 0.6745
+    place, turn = np.sqrt(np.mean(sizes[:3] ** 2)), np.sqrt(np.mean(sizes[3:] ** 2))
+    return PoseNoise(
+        max(float(place), SMALLEST_NOISE[0]), max(float(turn), SMALLEST_NOISE[1]), 0.0
+    )
+
+
+def unexplained_poses(state: PoseState) -> tuple[NDArray[np.bool_], ...]:
+    """Return the poses that nothing explains: far beyond the spread of their sensor's others."""
+    found = []
+    for part in state.parts:
+        noise = replace(_spread(part), stamp_s=part.noise.stamp_s)
+        white = noise.whitened(part.residual, part.view.velocity)
+        place = np.linalg.norm(white[:, :3], axis=1)
+        turn = np.linalg.norm(white[:, 3:], axis=1)
+        far = np.maximum(place, turn)
+        few = np.count_nonzero(part.used & (far > STANDS_OUT)) <= FEW_SHARE * np.count_nonzero(
+            part.used
+        )
+        found.append(part.used & (far > (STANDS_OUT if few else FAR_OUT)))
+    return tuple(found)
+
+
+def noise_of(part: PosePart, with_stamps: bool = True) -> tuple[PoseNoise, float]:
+    """Return the likeliest noise of a sensor's residuals, and minus twice its log likelihood."""
+    used = part.used
+    residual, velocity = part.residual[used], part.view.velocity[used]
+    if not len(residual):
+        return part.noise, 0.0
+    squares = np.mean(residual**2, axis=0)
+    own = squares[:3].sum(), squares[3:].sum()
+    start = [max(np.sqrt(s / 3), low) for s, low in zip(own, SMALLEST_NOISE, strict=True)]
+    moved = velocity * residual
+    moved_m, moved_rad = moved[:, :3].sum(axis=1), moved[:, 3:].sum(axis=1)
+    speed_m, speed_rad = (np.sum(part**2, axis=1) for part in np.split(velocity, 2, axis=1))
+
+    def cost(log: Array) -> float:
+        """Sum of the whitened squares (`PoseNoise.whitened`) and of the spreads' logarithms."""
+        place, turn = np.exp(-2 * log[0]), np.exp(-2 * log[1])
+        fixed = own[0] * place + own[1] * turn + 6 * log[0] + 6 * log[1]
+        if not with_stamps:
+            return float(fixed)
+        stamp = np.exp(2 * log[2])
+        along = stamp * (speed_m * place + speed_rad * turn)
+        less = stamp * (moved_m * place + moved_rad * turn) ** 2 / (1 + along)
+        return float(fixed - less.mean() + np.log1p(along).mean())
+
+    if not with_stamps:  # the mean squares are the likeliest
+        plain = PoseNoise(float(start[0]), float(start[1]))
+        return plain, cost(np.log(start)) * len(residual)
+    tries = [np.log([start[0], start[1], stamp]) for stamp in (0.002, 0.02)]
+    best = min((minimize(cost, at, method='Nelder-Mead', options={'xatol': 1e-3, 'fatol': 1e-6,
+               'maxiter': 300}) for at in tries), key=lambda r: float(r.fun))  # fmt: skip
+    values = np.exp(best.x)
+    stamp = min(float(values[2]), LARGEST_STAMP_S)
+    return PoseNoise(float(values[0]), float(values[1]), stamp), float(best.fun) * len(residual)
+
+
+LEAST_JITTER_RAD = 1e-5  # no reference measures turns better; none at all has no inverse
+FEWEST_TURNS = 20  # poses that tell a reference's jitter, to 16 %
+MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
+LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
+"""Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given:
+the motion does not determine it."""
+MUCH_TILT = 0.15
+"""Turns of the body, rad rms, that move a lever arm of 5 cm by 8 mm, as much as a slow filter
+moves a hand."""
+HARDLY_DETERMINED_M = 0.022
+"""Lever arm, m, that would make the median error by turns alone, from which the motion does not
+determine it: beyond this levers of recordings were off by 9 mm and more, below by 4 and less."""
+
+OWN_ERROR_M = 1e-3
+"""Error, m, that a tracker has of itself (data sheets: 0.5 to 1.4 mm). A motion of some seconds
+leaves less, as the frames take up what goes with its turns, and with it wrong levers."""
+
+
+def is_lever_determined(
+    part: PosePart, jitter_rad: float, error_m: float = OWN_ERROR_M
+) -> NDArray[np.bool_]:
+    """Return the mask (3,) of the components of a lever arm that the motion determines.
+
+    The tracker's errors are taken to be ``error_m`` at least.
+    """
+    if not part.used.any():
+        return np.zeros(3, dtype=np.bool_)
+    is_near = lever_reach(part, error_m) < HARDLY_DETERMINED_M
+    return (lever_blur(part, jitter_rad) < MOST_BLUR) & is_near
+
+
+def lever_reach(part: PosePart, error_m: float = 0.0) -> Array:
+    """Return the lever arm (3,), m, that makes the median error by the turns of the body alone, or
+    an error of ``error_m`` if that is larger.
+    """
+    far = max(float(np.median(np.linalg.norm(part.residual[part.used, :3], axis=1))), error_m)
+    information = np.linalg.inv(_turn_information(part) + LEAST_JITTER_RAD**2 * np.eye(3))
+    return np.asarray(far * np.sqrt(np.diag(information)))
+
+
+def _turn_information(part: PosePart) -> Array:
+    """How much turns move a unit lever arm, shape (3, 3), squares, along the body's axes."""
+    turns = Rotation.from_matrix(part.view.turn[part.used])
+    tilt = np.cov((turns.mean().inv() * turns).as_rotvec().T)
+    return np.asarray(np.trace(tilt) * np.eye(3) - tilt)
+
+
+def lever_blur(part: PosePart, jitter_rad: float) -> Array:
+    """Return by which share (3,) the reference's own jitter of orientation shrinks a lever arm.
+
+    Errors of the measured rotations make a lever arm too small by their share of the rotations'
+    variance, whatever its formal uncertainty.
+    """
+    information = _turn_information(part)
+    error = 2 * max(jitter_rad, LEAST_JITTER_RAD) ** 2
+    return np.asarray(error * np.diag(np.linalg.inv(information + 1e-3 * error * np.eye(3))))
+
+
+def turn_jitter(reference: PoseSequence) -> float:
+    """Return the jitter of a reference's orientation, rad a coordinate, from its quietest
+    stretches.
+
+    The squared second difference of noise has six times its variance per coordinate; the lowest
+    quarter of that with three coordinates is at 1.21.
+    """
+    if reference.size < FEWEST_TURNS:
+        return 0.0
+    turns = Rotation.from_quat(reference.rows(~reference.repeated).quaternion)
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    second = np.sum(np.diff(steps, axis=0) ** 2, axis=1)
+    return float(np.sqrt(np.percentile(second, 25) / (6 * 1.21)))
+
+
+def most_poses(session: PoseSession) -> PoseSequence:
+    """Return the reference, or without one the sensor with most poses, which takes its place."""
+    return session.reference or max(session.sensors.values(), key=lambda poses: poses.size)
+
+
+def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
+    """Return whether the motion determines two components of a sensor's lever arm.
+
+    So many are determined by turns about one axis. Where they are not, a body was carried about
+    with hardly a turn, or not moved at all. Much tilt determines them once the effects are found,
+    however large the error is that these make before.
+    """
+    shaking = turn_jitter(reference)
+    parts = {part.view.sensor: part for part in fit.state.parts}
+    for index, term in enumerate(fit.terms):
+        if term.role is Role.MOUNT:
+            part = parts[str(term.sensor)]
+            sigma = sigmas(fit.covariance_of(index))[:3]
+            is_known = (sigma < LEAST_KNOWN_M) & is_lever_determined(part, shaking, 0.0)
+            turns = _turn_information(part) if part.used.any() else np.zeros((3, 3))
+            tilted = np.sqrt(np.diag(turns)) > MUCH_TILT
+            if np.count_nonzero(is_known | tilted) >= 2:
+                return True
+    return False
+
+
+SAME_SCALE = 1 / 370
+"""Chance that noise makes the scales of any two sensors of one reference differ so much: of one
+pair, three standard deviations. Larger takes noise for a difference; smaller misses some."""
+SCALE_DIFFERS = 0.003  # difference of scales that matters: 1 mm in a tracked volume
+
+
+def is_one_scale(fit: PoseFit) -> bool:
+    """Return whether each sensor alone sees the same scale as the others do."""
+    problem, found = fit.state.problem, []
+    if len(problem.sensors) < 2:
+        return True
+    for i, poses in enumerate(problem.sensors):
+        alone = replace(
+            problem,
+            **{key: getattr(problem, key)[i : i + 1]
+               for key in ('sensors', 'blocks', 'places', 'weight', 'noise')},
+        )  # fmt: skip
+        # A map of its own would take up what differs.
+        terms = [
+            t for t in fit.terms
+            if t.acts_on(poses.name) and t.role is not Role.MAP
+        ]  # fmt: skip
+        one = fit_poses(alone, terms)
+        index = next(k for k, t in enumerate(one.terms) if t.role is Role.SCALE)
+        scale = 1e-3 * float(one.terms[index].theta[0])
+        found.append((scale, 1e-3 * float(np.sqrt(one.covariance_of(index)[0, 0]))))
+    pairs = list(combinations(found, 2))
+    times = -float(ndtri(SAME_SCALE / (2 * len(pairs))))
+    return all(
+        abs(scale - other) <= max(times * float(np.hypot(sigma, apart)), SCALE_DIFFERS)
+        for (scale, sigma), (other, apart) in pairs
+    )

@@ -1,0 +1,461 @@
+"""Starts a fit from a session: blocks, a coarse time offset, two frames, exchanged sensors put
+back.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.apps.poses.effect import PoseSetting, PoseSite, PoseTerm, Role, effect_with
+from anser_ros.apps.poses.fit import PoseFit, robust_fit
+from anser_ros.apps.poses.path import OpticalPath
+from anser_ros.apps.poses.problem import PoseNoise, PoseProblem
+from anser_ros.apps.poses.sequence import PoseSequence, PoseSession, jumping_poses
+from anser_ros.calibration.readings import fold_of_frames
+from anser_ros.diagnosis.prepare import BLOCKS, TEST_EVERY
+from anser_ros.errors import DiagnosisError, FitError
+from anser_ros.field.model import EffectRecord
+from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
+from anser_ros.physics.rotations import nearest_rotation
+
+Array = NDArray[np.float64]
+
+PAUSE_S = 2.0
+"""Pause, s, that parts static recordings; where there are several, each is a block."""
+AT_REST_M, POSES_AT_REST = 2e-3, 4
+"""Extent of a recording at rest, m, and the poses of it that are kept."""
+HAND_M = 0.1  # a hand's breadth, m: distance at which an angle counts as the displacement it makes
+AT_REST_SHARE = 0.3  # share of poses kept below which all is recordings at rest
+FEWEST_PARTS = 5  # recordings that make blocks of their own; fewer leave too few to hold out
+FEWEST_HAND_EYE_POSES = 8
+"""Poses with a reference that hand-eye needs: it has twelve unknowns, a pose gives six, and as
+many again have to judge it."""
+MOST_POSES = 900
+"""Poses of a sensor that are fitted at most, evenly over the session: more add nothing of errors
+that are alike for seconds, and a session has to be done within seconds."""
+GOLDEN = (5**0.5 - 1) / 2
+"""Squares of whole numbers times it, less whole numbers, are spread evenly and fall into step with
+nothing. Its multiples fall into step with a poll that goes on by as much from pose to pose."""
+COARSE_S, COARSE_STEP_S = 1.5, 0.05
+"""Range and step of the first look for a time offset, s."""
+COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
+COARSE_OFFSET_MISFIT = 0.8
+"""Share of the misfit at no offset below which a coarse offset is taken. Chance takes off 6 % (the
+least of 61 mean distances of 300 poses); an offset of a step moves a hand many times the
+misfit."""
+START_NOISE = PoseNoise(2e-3, 0.02)  # m, rad: of the first fit, which then finds its own
+
+
+def pose_problem(session: PoseSession) -> PoseProblem:
+    """Set a session up; without a reference the sensor with most poses takes its place.
+
+    Raises `DiagnosisError` when there are too few poses.
+    """
+    sensors = dict(session.sensors)
+    reference = session.reference
+    if reference is None:
+        name = max(sensors, key=lambda s: sensors[s].size)
+        reference = sensors.pop(name)
+        if not sensors:
+            raise DiagnosisError(
+                f'{session.path}: one sensor and no reference; there is nothing to compare'
+            )
+    reference = reference.rows(~jumping_poses(reference))
+    path = OpticalPath.through(reference.track(), is_at_rest=is_at_rest(reference))
+    kept = {name: _thinned(poses) for name, poses in sensors.items()}
+    starts = _pauses(list(kept.values()))
+    if starts.size + 1 >= FEWEST_PARTS:
+        few = {name: _still_ones(poses) for name, poses in kept.items()}
+        rests = sum(p.size for p in few.values()) < AT_REST_SHARE * sum(
+            p.size for p in kept.values()
+        )
+        kept = few
+        if rests:
+            path = OpticalPath.through(
+                _resting(reference, list(sensors.values())), is_at_rest=True
+            )
+    kept = {
+        name: poses for name, poses in kept.items() if _seen(poses, path) >= FEWEST_HAND_EYE_POSES
+    }
+    if not kept:
+        raise DiagnosisError(
+            f'{session.path}: no sensor has {FEWEST_HAND_EYE_POSES} poses '
+            'at times with a reference'
+        )
+    everywhere = np.concatenate([poses.position for poses in kept.values()])
+    centre = np.median(everywhere, axis=0)
+    size = float(np.sqrt(np.mean(np.sum((everywhere - centre) ** 2, axis=1))))
+    start = min(float(poses.time[0]) for poses in kept.values())
+    end = max(float(poses.time[-1]) for poses in kept.values())
+    setting = PoseSetting(tuple(kept), start, max(end - start, 1e-3), centre, max(size, 1e-3))
+    values = tuple(kept.values())
+    return PoseProblem(
+        values,
+        path,
+        setting,
+        _time_blocks(values, starts),
+        _space_blocks(values, starts),
+        tuple(np.ones(poses.size) for poses in values),
+        tuple(START_NOISE for _ in values),
+    )
+
+
+def is_at_rest(poses: PoseSequence) -> bool:
+    """Return whether a body stays where it is: what differs between its poses is noise."""
+    turns = Rotation.from_quat(poses.quaternion)
+    turned = HAND_M * (turns.mean().inv() * turns).as_rotvec()
+    return _extent(np.concatenate([poses.position, turned], axis=1)) < AT_REST_M
+
+
+def _extent(values: Array) -> float:
+    return float(np.linalg.norm(np.ptp(np.percentile(values, [10, 90], axis=0), axis=0)))
+
+
+def _seen(poses: PoseSequence, path: OpticalPath) -> int:
+    return int(np.count_nonzero(path.at(poses.time)[3]))
+
+
+def _thinned(poses: PoseSequence) -> PoseSequence:
+    """The poses that are no repeats, not more than `MOST_POSES`: one of each few neighbours.
+
+    Which of them changes from group to group: every third pose, say, falls into step with a poll,
+    and the mean error of its stamps is then not that of all.
+    """
+    fresh = poses.rows(~poses.repeated)
+    step = max(1, -(-fresh.size // MOST_POSES))
+    groups = np.arange(fresh.size // step)
+    return fresh.rows(step * groups + (step * (GOLDEN * groups**2 % 1)).astype(np.int64))
+
+
+def _pauses(sensors: Sequence[PoseSequence]) -> Array:
+    """Times, s, at which recordings begin that a pause parts from the one before."""
+    every = np.sort(np.concatenate([poses.time for poses in sensors]))
+    return np.asarray(every[1:][np.diff(every) > PAUSE_S])
+
+
+def _still_ones(poses: PoseSequence) -> PoseSequence:
+    """A few poses of each recording at rest: its errors are alike, however many there are."""
+    number = np.searchsorted(_pauses([poses]), poses.time, side='right')
+    keep = []
+    for one in np.unique(number):
+        rows = np.flatnonzero(number == one)
+        if _extent(poses.position[rows]) < AT_REST_M and rows.size > POSES_AT_REST:
+            rows = rows[np.linspace(0, rows.size - 1, POSES_AT_REST).astype(int)]
+        keep.append(rows)
+    return poses.rows(np.concatenate(keep))
+
+
+def _resting(reference: PoseSequence, sensors: Sequence[PoseSequence]) -> PoseTrack:
+    """The reference's track, over the whole of each recording in which it is at rest.
+
+    Two programs that record one after the other share no time, and still the place.
+    """
+    streams = [reference, *sensors]
+    number = [np.searchsorted(_pauses(streams), p.time, side='right') for p in streams]
+    pieces = []
+    for one in np.unique(number[0]):
+        rows = reference.rows(number[0] == one)
+        spans = [p.time[n == one] for p, n in zip(streams, number, strict=True)]
+        if is_at_rest(rows):
+            every = np.concatenate(spans)
+            steps = int(np.ptp(every) / (LONGEST_GAP_S / 2)) + 2
+            time = np.linspace(every.min(), every.max() + 1e-6, steps)
+            middle = _middle(Rotation.from_quat(rows.quaternion))
+            turn = Rotation.from_matrix(middle).as_quat()
+            place = np.median(rows.position, axis=0)
+            pieces.append((time, np.tile(place, (steps, 1)), np.tile(turn, (steps, 1))))
+        else:
+            track = rows.track()
+            pieces.append((track.time, track.position, track.quaternion))
+    return PoseTrack(*(np.concatenate(values) for values in zip(*pieces, strict=True)))
+
+
+def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArray[np.int64], ...]:
+    """Equal stretches of time, or the recordings where there are several."""
+    if starts.size + 1 >= FEWEST_PARTS:
+        return tuple(np.searchsorted(starts, p.time, side='right') for p in sensors)
+    first = min(float(poses.time[0]) for poses in sensors)
+    length = max(max(float(poses.time[-1]) for poses in sensors) - first, 1e-9)
+    return tuple(
+        np.minimum((BLOCKS * (p.time - first) / length).astype(np.int64), BLOCKS - 1)
+        for p in sensors
+    )
+
+
+def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArray[np.int64], ...]:
+    """Cells of space dealt to folds; blocks of time where all is at one place."""
+    places = [poses.position for poses in sensors]
+    every = np.concatenate(places)
+    low, high = np.percentile(every, [1, 99], axis=0)
+    try:
+        return tuple(fold_of_frames([np.clip(p, low, high) for p in places]))
+    except FitError:
+        return _time_blocks(sensors, starts)
+
+
+def train_blocks(problem: PoseProblem) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return blocks of time to choose and fit on, and those that are held out."""
+    every = np.unique(np.concatenate(problem.blocks))
+    held = np.arange(every.size) % TEST_EVERY == TEST_EVERY - 2
+    return every[~held], every[held]
+
+
+def coarse_offset(problem: PoseProblem) -> float:
+    """Return the offset, s, at which tracked places are most nearly linear in the optical pose."""
+    if problem.path.is_at_rest:
+        return 0.0
+    chosen = [p.rows(slice(None, None, max(1, p.size // COARSE_POSES))) for p in problem.sensors]
+    trials = np.arange(-COARSE_S, COARSE_S + COARSE_STEP_S / 2, COARSE_STEP_S)
+    misfits = np.array([_misfit(problem.path, chosen, float(trial)) for trial in trials])
+    still = float(misfits[np.argmin(np.abs(trials))])
+    best = int(np.argmin(misfits))
+    return float(trials[best]) if misfits[best] < COARSE_OFFSET_MISFIT * still else 0.0
+
+
+def _misfit(path: OpticalPath, sensors: Sequence[PoseSequence], offset: float) -> float:
+    """Mean distance, m, of tracked places from a linear function of the optical pose."""
+    total = 0.0
+    for poses in sensors:
+        place, turn, _, known = path.at(poses.time - offset)
+        if np.count_nonzero(known) < FEWEST_HAND_EYE_POSES + 13:
+            continue
+        columns = np.concatenate(
+            [np.ones((known.sum(), 1)), place[known], turn[known].reshape(-1, 9)], axis=1
+        )
+        columns -= columns.mean(axis=0) * (np.arange(13) > 0)
+        columns /= np.linalg.norm(columns, axis=0) + 1e-12
+        tracked, weight, size = poses.position[known], np.ones(len(columns)), np.zeros(0)
+        for _ in range(3):  # towards the median: a few poses may be far off
+            weighted = (columns * weight[:, None]).T
+            normal = weighted @ columns
+            normal += 1e-6 * np.trace(normal) / 13 * np.eye(13)
+            size = np.linalg.norm(
+                tracked - columns @ np.linalg.solve(normal, weighted @ tracked), axis=1
+            )
+            weight = 1 / np.maximum(size, 0.3 * np.median(size) + 1e-9)
+            weight /= weight.mean()
+        total += float(np.mean(size))
+    return total if total > 0 else np.inf
+
+
+def frames_from_places(tracked: Array, optical: Array) -> Array:
+    """Return the rotation (3, 3) that takes optical places (n, 3) to tracked ones."""
+    left, right = tracked - np.median(tracked, axis=0), optical - np.median(optical, axis=0)
+    return nearest_rotation(left.T @ right)
+
+
+def frames_from_turns(tracked: Array, optical: Array) -> Array:
+    """Return the rotation (3, 3) from the optical frame to the tracker's, from quaternions alone.
+
+    ``q_tracked = q_frame q_optical q_mount`` is a rotation of four dimensions, which splits into
+    the two factors.
+    """
+    solution = _turn_of_turns(tracked, optical)
+    # Of all products of units from the left and the right, how much of each is in it: a dyad.
+    units = [Rotation.from_quat(unit) for unit in np.eye(4)]
+    every, matrix = Rotation.from_quat(np.eye(4)), np.zeros((4, 4))
+    for a, b in np.ndindex(4, 4):
+        matrix[a, b] = np.sum((units[a] * every * units[b]).as_quat().T * solution)
+    u, _, _ = np.linalg.svd(matrix)
+    return np.asarray(Rotation.from_quat(u[:, 0]).as_matrix())
+
+
+def turn_misfit(tracked: Array, optical: Array) -> float:
+    """Return the median angle, rad, by which quaternions (n, 4) miss any frame and mount."""
+    agreement = np.einsum('ij,ij->i', tracked, optical @ _turn_of_turns(tracked, optical).T)
+    return float(np.median(2 * np.arccos(np.clip(np.abs(agreement), 0.0, 1.0))))
+
+
+def _turn_of_turns(tracked: Array, optical: Array) -> Array:
+    """The rotation (4, 4) of quaternions, found as any rotation is from pairs."""
+    solution = np.eye(4)
+    sign = np.ones(len(tracked))
+    jumps = np.sign(np.einsum('ij,ij->i', tracked[1:], tracked[:-1]))
+    jumps *= np.sign(np.einsum('ij,ij->i', optical[1:], optical[:-1]))
+    sign[1:] = np.cumprod(np.where(jumps < 0, -1.0, 1.0))
+    for _ in range(10):
+        solution = nearest_rotation((tracked * sign[:, None]).T @ optical)
+        agreement = np.sign(np.einsum('ij,ij->i', tracked, optical @ solution.T))
+        if np.array_equal(agreement, sign):
+            break
+        sign = np.where(agreement == 0, 1.0, agreement)
+    return np.asarray(solution)
+
+
+def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[PoseTerm]:
+    """Return both frames and an offset to start from; a known registration is the identity."""
+    pairs = []
+    for poses in problem.sensors:
+        place, turn, _, known = problem.path.at(poses.time - offset)
+        pairs.append((poses.position[known], poses.rotation[known], place[known], turn[known]))
+    rotation = np.eye(3) if frame is None else frame
+    shift = np.zeros(3)
+    if frame is not None:
+        shift = np.median(
+            np.concatenate([p - o @ rotation.T for p, _, o, _ in pairs if len(p)]), axis=0
+        )
+    terms: list[PoseTerm] = []
+    if frame is not None:
+        terms.append(effect_with(Role.REGISTRATION).at_frame({}, shift, rotation))
+    for poses, (_, turned, _, turn) in zip(problem.sensors, pairs, strict=True):
+        mounts = Rotation.from_matrix(turn.transpose(0, 2, 1) @ (rotation.T @ turned))
+        middle = _middle(mounts)
+        site: PoseSite = {'sensor': poses.name}
+        terms.append(effect_with(Role.MOUNT).at_frame(site, np.zeros(3), middle))
+    return [*terms, PoseTerm(effect_with(Role.OFFSET), {}, np.array([offset]))]
+
+
+def _middle(turns: Rotation) -> Array:
+    """A rotation that most of some agree with: the mean, of those near it, some times over."""
+    mean = turns.mean()
+    for _ in range(5):
+        angle = (mean.inv() * turns).magnitude()
+        weight = 1 / np.maximum(angle, np.median(angle) + 1e-6) ** 2
+        mean = turns.mean(weights=weight)
+    return np.asarray(mean.as_matrix())
+
+
+def first_fit(problem: PoseProblem, offset: float, is_one_frame: bool) -> PoseFit:
+    """Return the best robust fit of the two frames from several starts."""
+    starts = [started(problem, offset, frame) for frame in _frames(problem, offset, is_one_frame)]
+    fits = [robust_fit(problem, terms) for terms in starts]
+    return min(fits, key=first_cost)
+
+
+def _frames(problem: PoseProblem, offset: float, is_one_frame: bool) -> list[Array | None]:
+    if is_one_frame:
+        return [None]
+    poses = max(problem.sensors, key=lambda p: p.size)
+    place, turn, _, known = problem.path.at(poses.time - offset)
+    turned = Rotation.from_matrix(turn[known]).as_quat()
+    return [
+        frames_from_places(poses.position[known], place[known]),
+        frames_from_turns(poses.quaternion[known], turned),
+    ]
+
+
+def first_cost(fit: PoseFit) -> float:
+    """Return the median misfit of a sensor's poses, m, on average over the sensors.
+
+    An angle counts as the displacement that it causes at a hand's breadth.
+    """
+    total = 0.0
+    for part in fit.state.parts:
+        far = np.linalg.norm(part.residual[:, :3], axis=1)
+        far = far + HAND_M * np.linalg.norm(part.residual[:, 3:], axis=1)
+        total += float(np.median(far[part.used])) if part.used.any() else 0.0
+    return total / max(len(fit.state.parts), 1)
+
+
+Mask = NDArray[np.bool_]
+
+FAR, FITS = 8.0, 0.25
+"""Distance of a pose from its own prediction, in spreads, from which it may be another sensor's,
+and the share of it that is left from the other's prediction."""
+EARLY = 0.4
+"""Share of a session by which the sensors' names are meant, where they are exchanged for half of
+it. Smaller determines no lever arms; larger meets the exchange itself."""
+NEAR_S = 1.0  # s; nearer spans are one: nobody swaps two plugs and back in a second
+FEWEST, LEAST_SHARE = 5, 0.01  # poses in a span, and share of a sensor's poses, that are a swap
+
+
+def swapped_spans(
+    problem: PoseProblem, fit: PoseFit
+) -> list[tuple[str, str, list[tuple[float, float]]]]:
+    """Return pairs of sensors, and the spans (s) in which each gives the other's poses."""
+    found = []
+    for a, b in combinations(range(len(problem.sensors)), 2):
+        (mask, rather), (other, _) = (_look_like(problem, fit, *pair) for pair in ((a, b), (b, a)))
+        if min(float(mask.mean()), float(other.mean())) < LEAST_SHARE:
+            continue
+        spans = _runs(problem.sensors[a].time, mask, rather)
+        if spans:
+            found.append((problem.sensors[a].name, problem.sensors[b].name, spans))
+    return found
+
+
+def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
+    """Return the session with sensors put back that were exchanged for about half of it, and the
+    records of it; as it is if there are none.
+
+    Nothing fits all of such a session. Its first part says whose poses are whose.
+    """
+    problem = pose_problem(session)
+    blocks = np.unique(np.concatenate(problem.blocks))
+    early = problem.in_blocks(blocks[: round(EARLY * blocks.size)])
+    if len(problem.sensors) < 2 or session.reference is None:
+        return session, []
+    fit = first_fit(early, coarse_offset(early), False)
+    return put_back(session, swapped_spans(problem, fit))
+
+
+def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Mask, Mask]:
+    """Masks of the poses of sensor i that fit where sensor j should be, and that rather fit there
+    than where i should be."""
+    problem = replace(problem, noise=fit.state.problem.noise)
+    own = problem.state(fit.terms).parts[i]
+    sensors = list(problem.sensors)
+    sensors[i] = replace(sensors[i], name=problem.sensors[j].name)
+    as_other = replace(problem, sensors=tuple(sensors)).state(fit.terms).parts[i]
+    noise = replace(own.noise, stamp_s=0.0)
+    here, there = (
+        np.linalg.norm(noise.whitened(part.residual, own.view.velocity), axis=1)
+        for part in (own, as_other)
+    )
+    return (here > FAR) & (there < FITS * here) & (own.weight > 0), there < here
+
+
+def _runs(time: Array, mask: Mask, rather: Mask) -> list[tuple[float, float]]:
+    """Spans in which a mask holds, as far as poses rather fit the other sensor."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    runs = zip(edges[::2], edges[1::2], strict=True)
+    spans: list[tuple[float, float]] = []
+    for first, last in runs:
+        a, b = int(first), int(last)
+        while a > 0 and rather[a - 1]:
+            a -= 1
+        while b < time.size and rather[b]:
+            b += 1
+        start, end = float(time[a]), float(time[b - 1])
+        if spans and start - spans[-1][1] < NEAR_S:  # a pose between that could be either's
+            start = spans.pop()[0]
+        spans.append((start, end))
+    least = (FEWEST - 1) * float(np.median(np.diff(time)))
+    return [(start, end) for start, end in spans if end - start >= least]
+
+
+def put_back(
+    session: PoseSession, swaps: Sequence[tuple[str, str, list[tuple[float, float]]]]
+) -> tuple[PoseSession, list[EffectRecord]]:
+    """Return the session with exchanged poses under their own names, and the records of it."""
+    sensors, records = dict(session.sensors), []
+    for one, other, spans in swaps:
+        left, right = sensors[one], sensors[other]
+        gap = 0.5 * float(np.median(np.diff(left.time)))
+        masks = [
+            np.any([(p.time > a - gap) & (p.time < b + gap) for a, b in spans], axis=0)
+            for p in (left, right)
+        ]
+        sensors[one] = _merged(left, ~masks[0], right, masks[1])
+        sensors[other] = _merged(right, ~masks[1], left, masks[0])
+        share = float(np.mean(masks[0]))
+        values = {'sensors': [one, other], 'fraction': share, 'spans': [list(s) for s in spans]}
+        effect = effect_with(Role.SWAP)
+        evidence = {'summary': effect.summary, 'remedy': 'the names are put back'}
+        records.append(EffectRecord(effect.name, values, {}, evidence))
+    return replace(session, sensors=sensors), records
+
+
+def _merged(own: PoseSequence, keep: Mask, other: PoseSequence, take: Mask) -> PoseSequence:
+    time = np.concatenate([own.time[keep], other.time[take]])
+    order = np.argsort(time, kind='stable')
+    return replace(
+        own,
+        time=time[order],
+        position=np.concatenate([own.position[keep], other.position[take]])[order],
+        quaternion=np.concatenate([own.quaternion[keep], other.quaternion[take]])[order],
+    )

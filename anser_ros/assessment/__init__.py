@@ -1,1 +1,0 @@
-"""Assesses how good a tracker is by the field's published protocols, and where a tool's tip is."""

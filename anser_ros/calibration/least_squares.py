@@ -1,0 +1,205 @@
+"""Solves least squares: many rows by one small kept factor, large normal matrices in strips.
+`TriangularFactor` and `GramFactor` keep a problem of any number of rows as one small matrix,
+whose `Spectrum` gives the solution for every damping. `NormalFactor` factors the matrix of a
+joint system in strips that threads share. The strips are the same for any number of threads,
+and so are the results, bit by bit, which they are not when the threads of a BLAS divide one
+product among them. The factor is Cholesky's, worked out by blocks (Golub and Van Loan, Matrix
+Computations, section 4.2.9).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from anser_ros.parallel import in_order, slices
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+RIGHT_SCALE = 1e9
+"""Factor of the right-hand sides in a Gram matrix. Fluxes are then in nT, of a size with the
+columns (some 1e-7 / (0.1 m)^3 T / (A m^2)); it only avoids numbers of very different size."""
+
+
+class TriangularFactor:
+    """Keeps a least-squares problem as the triangular factor of its rows, by QR, in blocks."""
+
+    def __init__(self, unknowns: int, right_sides: int) -> None:
+        self.unknowns = unknowns
+        self.rows = 0
+        self.triangle = np.zeros((0, unknowns + right_sides))
+
+    def add(self, matrix: Array, right: Array) -> None:
+        """Take in rows (P, N) with their right-hand sides (P, M)."""
+        self.rows += matrix.shape[0]
+        block = np.concatenate([matrix, right], axis=1)
+        stack = np.concatenate([self.triangle, block])
+        self.triangle = np.asarray(np.linalg.qr(stack, mode='r'))
+
+    def spectrum(self) -> 'Spectrum':
+        """Return the singular value decomposition of the column-scaled problem."""
+        n = self.unknowns
+        matrix, right = self.triangle[:n, :n], self.triangle[:n, n:]
+        scale = np.linalg.norm(matrix, axis=0)
+        scale[scale == 0.0] = 1.0
+        u, s, vt = np.linalg.svd(matrix / scale, full_matrices=False)
+        return Spectrum(scale, s, vt, u.T @ right)
+
+
+class GramFactor:
+    """Keeps the same problem as the inner products of its columns.
+
+    It is several times faster than `TriangularFactor` and has half the digits. That is enough for
+    rounds that only prepare the next one, and for fits whose damping is far above the rounding;
+    the moments of a final fit come from `TriangularFactor`. The parameters are the same.
+    """
+
+    def __init__(self, unknowns: int, right_sides: int) -> None:
+        self.unknowns = unknowns
+        self.rows = 0
+        self.gram = np.zeros((unknowns + right_sides, unknowns + right_sides))
+
+    def add(self, matrix: Array, right: Array) -> None:
+        """Take in rows (P, N) with their right-hand sides (P, M)."""
+        self.rows += matrix.shape[0]
+        block = np.concatenate([matrix, right * RIGHT_SCALE], axis=1)
+        self.gram += block.T @ block
+
+    def spectrum(self) -> 'Spectrum':
+        """Return the singular value decomposition of the problem by eigenvectors."""
+        n = self.unknowns
+        scale = np.sqrt(np.diag(self.gram)[:n])
+        scale[scale == 0.0] = 1.0
+        values, vectors = np.linalg.eigh(self.gram[:n, :n] / np.outer(scale, scale))
+        floor = values[-1] * np.finfo(float).eps * n
+        s = np.sqrt(np.maximum(values, floor))[::-1]
+        v = vectors[:, ::-1].T
+        right = self.gram[:n, n:] / (scale[:, None] * RIGHT_SCALE)
+        return Spectrum(scale, s, v, (v @ right) / s[:, None])
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Keeps a least-squares problem in its singular vectors, which make every damping cheap."""
+
+    scale: Array  # (N,): norms by which the columns were divided
+    values: Array  # (R,): singular values of the scaled matrix, descending
+    vectors: Array  # (R, N): right singular vectors
+    projected: Array  # (R, M): right-hand sides in the left singular vectors
+
+    @property
+    def rank(self) -> int:
+        """Return the number of singular values above the rounding error."""
+        limit = self.values[0] * np.finfo(float).eps * max(self.vectors.shape)
+        return int((self.values > limit).sum())
+
+    def filter(self, damping: float) -> Array:
+        """Return Tikhonov's factors ``s / (s^2 + (damping s_0)^2)``, zero beyond the rank."""
+        s = self.values
+        out = np.zeros_like(s)
+        keep = np.arange(s.size) < self.rank
+        out[keep] = s[keep] / (s[keep] ** 2 + (damping * s[0]) ** 2)
+        return out
+
+    def solve(self, damping: float, prior: Array | None = None) -> Array:
+        """Return the unknowns (N, M), which the damping pulls towards ``prior`` (N, M) or zero."""
+        projected = self.projected
+        if prior is not None:
+            start = self.vectors @ (prior * self.scale[:, None])
+            projected = projected - self.values[:, None] * start
+        step = self.vectors.T @ (self.filter(damping)[:, None] * projected)
+        step /= self.scale[:, None]
+        return np.asarray(step if prior is None else prior + step)
+
+    def freedom(self, damping: float) -> float:
+        """Return the effective number of parameters, the trace of the influence matrix."""
+        return float((self.values * self.filter(damping)).sum())
+
+
+def as_real(values: ComplexArray) -> Array:
+    """Return complex values (..., K) as real ones (..., 2K), real and imaginary by turns."""
+    return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
+
+
+def as_complex(values: Array) -> ComplexArray:
+    """Return real values (..., 2K), as `as_real` makes them, as complex ones (..., K)."""
+    return np.ascontiguousarray(values).view(np.complex128)
+
+
+STRIP = 256
+"""Columns of a strip: fewer make products that are slow for their size, more leave threads without
+work at the end of a matrix of some thousand columns."""
+
+
+def subtract_gram(out: Array, rows: Array) -> None:
+    """Subtract the products of all pairs of columns from the upper triangle of a matrix.
+
+    ``out`` (N, N): changed from the diagonal on, and below it inside the blocks on the diagonal.
+    ``rows`` (R, N).
+    """
+
+    def work(own: slice) -> None:
+        out[own, own.start :] -= rows[:, own].T @ rows[:, own.start :]
+
+    in_order(work, slices(len(out), STRIP))
+
+
+class NormalFactor:
+    """Holds the upper factor U of a positive definite matrix ``U^T U``.
+
+    ``matrix`` (N, N): of which only the upper triangle is read; the factor takes its place.
+    Raises `numpy.linalg.LinAlgError` when it is not positive definite.
+    """
+
+    def __init__(self, matrix: Array) -> None:
+        self._factor = left = matrix
+        self._strips = slices(len(matrix), STRIP)
+        self._inverses: list[Array] = []
+        for at, own in enumerate(self._strips):
+
+            def reduce(other: slice, own: slice = own) -> None:
+                left[own, other] -= left[: own.start, own].T @ left[: own.start, other]
+
+            in_order(reduce, self._strips[at:])
+            corner = left[own, own]
+            corner[:] = np.linalg.cholesky(corner.T).T  # which reads the lower triangle only
+            inverse = _inverse_of_upper(corner).T
+
+            def divide(other: slice, own: slice = own, inverse: Array = inverse) -> None:
+                left[own, other] = inverse @ left[own, other]
+
+            in_order(divide, self._strips[at + 1 :])
+            self._inverses.append(inverse)
+
+    def solve(self, right: Array) -> Array:
+        """Return the solution X (N, Q) of ``matrix X = right``."""
+        factor, out = self._factor, right.copy()
+        pairs = list(zip(self._strips, self._inverses, strict=True))
+        for own, inverse in pairs:
+            out[own] = inverse @ (out[own] - factor[: own.start, own].T @ out[: own.start])
+        for own, inverse in reversed(pairs):
+            out[own] = inverse.T @ (out[own] - factor[own, own.stop :] @ out[own.stop :])
+        return out
+
+    def inverse_diagonal(self) -> Array:
+        """Return the diagonal of the matrix's inverse, shape (N,)."""
+        factor, strips, inverses = self._factor, self._strips, self._inverses
+
+        def work(first: int) -> Array:
+            """Sums of squares of the columns of the factor's inverse, transposed, in a strip."""
+            begin = strips[first].start
+            columns = np.zeros((len(factor) - begin, len(inverses[first])))
+            columns[: len(inverses[first])] = inverses[first]
+            for own, inverse in zip(strips[first + 1 :], inverses[first + 1 :], strict=True):
+                above = columns[: own.start - begin]
+                product = factor[begin : own.start, own].T @ above
+                columns[own.start - begin : own.stop - begin] = -inverse @ product
+            return np.asarray(np.einsum('ij,ij->j', columns, columns))
+
+        return np.concatenate(in_order(work, range(len(strips))))
+
+
+def _inverse_of_upper(factor: Array) -> Array:
+    return np.asarray(scipy.linalg.solve_triangular(factor, np.eye(len(factor))))

@@ -1,0 +1,296 @@
+"""Judges a pose by those before it, and by what the coils of a rigid body say of each other. A
+single residual that passes the gate proves little when most of its neighbours in time do not: a
+few wrong poses pass by chance. So after withheld poses a pose needs consistent ones before it.
+Points that were recorded one by one, further apart than `STREAM_GAP_S`, have no neighbours in
+time, and each is judged alone. A body's pose predicts the place of each of its coils, and each
+coil has its own pose. The two may differ by their errors, by the errors of the body's survey,
+and by the effect of an error of the coil's gain. A coil that differs by more is in another
+place, or is another coil. A coil that took part in the body's solve shares its noise with it:
+the difference of an estimate and one that makes better use of the same data has the
+*difference* of their covariances (Hausman, Econometrica 1978), which the coil's own bounds from
+above. A coil that was left out shares no noise with the body, and the covariances add up.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from anser_ros.kernel_cache import kernel
+from anser_ros.physics.rotations import fill_tangent
+from anser_ros.stamps import NANO
+
+STREAM_GAP_S = 0.5
+"""Frames further apart than this, s, are single points and no stream, as of a robot that stops
+once a second."""
+RECORD_S = 1.0
+"""How far back refusals count, s; after a distortion has ended a tool waits as long."""
+MOST_REFUSED = 0.5
+"""Share (0 to 1) of refused frames in the record from which on a good one needs confirmation: a
+pass is then more likely chance than not."""
+START_FRAMES = 3
+"""Fewest consecutive frames, the last one included, that confirm a pose: 60 ms at 50 Hz. Two wrong
+ones may agree."""
+LONGEST_RUN_S = 0.25
+"""Longest run that is asked for, s; the run is as long as the refusal before it up to this: 12
+frames at 50 Hz all pass by chance once in 5e5 times where a third do."""
+SIGMAS = 3.0
+"""Allowance for the poses' own errors, in units of `Place.sigma_m`, beside the bounds of the
+motion."""
+
+
+class MotionBounds(NamedTuple):
+    """Holds the largest speed (m/s) and acceleration (m/s^2) of a tool."""
+
+    speed_m_s: float
+    acceleration_m_s2: float
+
+
+class Place(NamedTuple):
+    """States where something was, and how well that is known: stamp, position (m), its sigma,
+    m."""
+
+    stamp_ns: int
+    position: Sequence[float]
+    sigma_m: float
+
+
+def motion_contradiction(before: list[Place], now: Place, bounds: MotionBounds) -> str:
+    """State how a place contradicts the places before it, oldest first; empty if it does not.
+
+    Of the last two places and this one: for an acceleration of at most a, the place is no further
+    than ``a dt (dt + dt_before) / 2`` from where the mean velocity before leads.
+    """
+    if not before:
+        return ''
+    last = before[-1]
+    dt = (now.stamp_ns - last.stamp_ns) * NANO
+    away = math.dist(now.position, last.position)
+    error = SIGMAS * math.hypot(now.sigma_m, last.sigma_m)
+    if away > bounds.speed_m_s * dt + error:
+        return f'{1e3 * away:.3g} mm in {1e3 * dt:.3g} ms is a speed of {away / dt:.3g} m/s'
+    if len(before) < 2:
+        return ''
+    first = before[-2]
+    dt_before = (last.stamp_ns - first.stamp_ns) * NANO
+    steps = dt / dt_before
+    led = [b + steps * (b - a) for a, b in zip(first.position, last.position, strict=True)]
+    bent = math.dist(now.position, led)
+    error = SIGMAS * math.hypot(now.sigma_m, (1.0 + steps) * last.sigma_m, steps * first.sigma_m)
+    time = 0.5 * dt * (dt + dt_before)
+    if bent > bounds.acceleration_m_s2 * time + error:
+        return f'an acceleration of {bent / time:.3g} m/s^2'
+    return ''
+
+
+class Continuity:
+    """Judges one sensor's or body's poses through time."""
+
+    def __init__(self) -> None:
+        self._track: list[Place] = []
+        self._run: list[Place] = []
+        self._frames = 0
+        self._began_ns = 0
+        self._last_ns = 0
+        self._record: deque[tuple[int, bool]] = deque()
+        self._refused = 0
+
+    @property
+    def refused_share(self) -> float:
+        """Return the share of the last second's frames that were refused in spite of signals."""
+        return self._refused / max(len(self._record), 1)
+
+    def forget(self) -> None:
+        """Forget all frames that were judged so far."""
+        self._track, self._run, self._frames, self._last_ns = [], [], 0, 0
+        self._record.clear()
+        self._refused = 0
+
+    def judge(
+        self, stamp_ns: int, place: Place | None, refused: bool, bounds: MotionBounds
+    ) -> str:
+        """Judge the next frame.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Of the frame.
+        place : Place or None
+            Of the pose, where it is good by itself.
+        refused : bool
+            Whether there is no pose although there are signals.
+        bounds : MotionBounds
+
+        Returns
+        -------
+        str
+            Why the pose is not confirmed; empty where it is, and where there is no pose.
+        """
+        last_ns = self._last_ns
+        alone = not last_ns or not 0 < stamp_ns - last_ns <= STREAM_GAP_S / NANO
+        if alone:
+            self.forget()
+        self._last_ns = stamp_ns
+        self._note(stamp_ns, place is None and refused, place is not None or refused)
+        if place is None:
+            self._run, self._frames = [], 0
+            return ''
+        contradiction = motion_contradiction(self._track, place, bounds)
+        old = not self._track or stamp_ns - self._track[-1].stamp_ns > RECORD_S / NANO
+        if not (old or contradiction or self._refused > MOST_REFUSED * len(self._record)):
+            self._track, self._frames = [self._track[-1], place], 0
+            return ''
+        if not self._frames or motion_contradiction(self._run, place, bounds):
+            self._run, self._frames, self._began_ns = [], 0, stamp_ns
+        self._run, self._frames = [*self._run[-1:], place], self._frames + 1
+        if alone or self._is_confirmed(stamp_ns):
+            self._track = list(self._run)
+            return ''
+        if contradiction and not old:
+            return contradiction
+        return (
+            f'{100 * self.refused_share:.0f} % of the frames of the last second were refused, '
+            f'and {self._frames} good frames in a row are too few'
+        )
+
+    def _is_confirmed(self, stamp_ns: int) -> bool:
+        """Whether the run is long enough: as long as refusals were lately, up to a bound."""
+        needed_s = min(self.refused_share * RECORD_S, LONGEST_RUN_S)
+        return self._frames >= START_FRAMES and (stamp_ns - self._began_ns) * NANO >= needed_s
+
+    def _note(self, stamp_ns: int, refused: bool, counts: bool) -> None:
+        record = self._record
+        while record and stamp_ns - record[0][0] > RECORD_S / NANO:
+            self._refused -= record.popleft()[1]
+        if counts:
+            record.append((stamp_ns, refused))
+            self._refused += refused
+
+
+Array = NDArray[np.float64]
+
+SELDOM = 1e-6
+"""Probability that a sound coil contradicts its body."""
+GATE = float(chdtri(5, SELDOM))
+"""Squared Mahalanobis distance (three of the position, two of the axis) from which on a coil
+contradicts its body; 36, six sigma in one direction."""
+
+
+HARMFUL_M = 1e-3
+"""An error of a pose that does harm, m, where the pose's own sigma does not say it."""
+BODY_SIGMAS = 3.0
+"""How many of its sigmas a pose may be away from where its body says. An error of a sound pose is
+that large once in 10^5 frames: sigma is that of all three directions together."""
+SURVEYS = 6.0
+"""How many times the stated error of the survey, an axis, a coil may be away, if that is more: one
+of 1e7 coils is, if the survey is as stated."""
+
+
+def allowed_m(sigma_m: float, survey_m: float) -> float:
+    """Return how far, m, a coil may be off its place in the body by its sigma and the survey's."""
+    return max(BODY_SIGMAS * sigma_m, HARMFUL_M, SURVEYS * survey_m)
+
+
+@dataclass(frozen=True)
+class SurveyErrors:
+    """Says how well a tool is known: its coils' places, m an axis, their axes, rad, and gains.
+
+    A field over a board falls with the third power of the distance, so that a coil whose gain is
+    wrong by g seems to be g/3 of its distance from the board elsewhere.
+    """
+
+    position_m: float
+    axis_rad: float
+    gain: float
+
+
+@kernel
+def fill_distances(  # type: ignore[no-untyped-def]
+    position, rotation, covariance, offsets, axes, positions, directions, covariances, took_part,
+    survey, found,
+):  # fmt: skip
+    """Write how far each coil is from its place in the body, ``found`` (3, S).
+
+    The rows are the squared Mahalanobis distance, the distance, m, and the angle, rad.
+
+    ``position`` (3,), ``rotation`` (3, 3), ``covariance`` (6, 6): the body's. ``offsets``,
+    ``axes`` (S, 3): the coils in the body. ``positions``, ``directions`` (S, 3), ``covariances``
+    (S, 6, 6): what the coils say. ``took_part`` (S,). ``survey`` (3,): m, rad, relative gain.
+    """
+    t, slopes, wide = np.empty((2, 3)), np.zeros((5, 6)), np.zeros((5, 6))
+    apart = np.empty(5)
+    arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
+    for s in range(offsets.shape[0]):
+        n, m = turned[s], directions[s]
+        fill_tangent(m, t)
+        cross = np.cross(n, m)
+        sine = math.sqrt(np.dot(cross, cross))
+        angle = math.atan2(sine, np.dot(n, m))
+        for i in range(3):
+            apart[i] = positions[s, i] - position[i] - arms[s, i]
+        for j in range(2):
+            # The rotation vector from n to m lies across m; half a turn is about any such vector.
+            along = np.dot(t[j], cross) / sine if sine > 1e-12 else 1.0 - j
+            apart[3 + j] = along * angle
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            wide[i, i] = slopes[i, i] = 1.0
+            wide[i, 3 + j], wide[i, 3 + k] = arms[s, k], -arms[s, j]
+            wide[3, 3 + i] = slopes[3, 3 + i] = t[0, i]
+            wide[4, 3 + i] = slopes[4, 3 + i] = t[1, i]
+        total = np.dot(np.dot(slopes, covariances[s]), slopes.T)
+        if not took_part[s]:
+            total += np.dot(np.dot(wide, covariance), wide.T)
+        radial = survey[2] * positions[s, 2] / 3.0
+        for i in range(3):
+            total[i, i] += survey[0] * survey[0] + radial * radial
+        for i in range(3, 5):
+            total[i, i] += survey[1] * survey[1]
+        found[0, s] = np.dot(apart, np.linalg.solve(total, apart))
+        found[1, s] = math.sqrt(apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2)
+        found[2, s] = angle
+
+
+def distances(
+    body: tuple[Array, Array, Array],
+    offsets: Array,
+    axes: Array,
+    coils: tuple[Array, Array, Array],
+    took_part: NDArray[np.bool_],
+    survey: SurveyErrors,
+) -> Array:
+    """Return how far each coil's own pose is from its place in the body, (3, S).
+
+    The squared Mahalanobis distance, to be compared with `GATE`; the distance, m; the angle
+    between the axes, rad.
+
+    Parameters
+    ----------
+    body : position (3,), rotation (3, 3), covariance (6, 6)
+        m and rad, frame fg.
+    offsets, axes : ndarray, shape (S, 3)
+        Of the coils, in the body's frame, m and unit vectors.
+    coils : positions (S, 3), axes (S, 3), covariances (S, 6, 6)
+        What the coils say of themselves, frame fg.
+    took_part : ndarray of bool, shape (S,)
+        Whether the body's pose made use of the coil.
+    survey : SurveyErrors
+    """
+    found = np.empty((3, len(offsets)))
+    survey_errors = np.array([survey.position_m, survey.axis_rad, survey.gain])
+    fill_distances(*body, offsets, axes, *coils, took_part, survey_errors, found)
+    return found
+
+
+def reason(distance: float, away_m: float, turned_rad: float) -> str:
+    """Return what is said of a coil that contradicts its body."""
+    sigmas = math.sqrt(distance)
+    return (
+        f'{1e3 * away_m:.2g} mm and {math.degrees(turned_rad):.2g} deg from its place in the '
+        f'body, {sigmas:.2g} sigma'
+    )

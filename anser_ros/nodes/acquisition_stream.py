@@ -1,0 +1,432 @@
+"""Turns one connection's samples into fluxes: windows, demodulation, tesla, flags and stamps.
+Blocks are cut into windows, these demodulated and converted (`FluxStream`); frames wait until
+their stamps are good (`WaitingFrames`). What only the stream shows, noise and the stamps'
+uncertainty, is measured for the setup document, and the system's clock is compared with the
+monotonic one.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError, SetupError
+from anser_ros.nodes.streams.clouds import FLUX_NOISE, STAMP_SIGMA
+from anser_ros.settings import Accuracy
+from anser_ros.signals.clock import SampleClock
+from anser_ros.signals.demodulation import Demodulator, ToneFit
+from anser_ros.signals.flux import FluxConverter, FluxRates, FluxWindow
+from anser_ros.signals.repetition import RepetitionWatch
+from anser_ros.signals.window import TickCheck, Window, WindowCutter
+from anser_ros.wire.channel_calibration import ChannelCalibration
+from anser_ros.wire.frames import FULL_SCALE_CODE, ChannelKind, Hello, SampleBlock
+from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, Setup
+
+PATIENCE_NS = 300_000_000
+"""Host time (0.3 s) that a frame waits for an arrival that confirms its stamp. Stalls of the host
+are shorter, and a new line settles in less; a pose that is older is of little use."""
+
+
+@dataclass(frozen=True)
+class Staleness:
+    """Says why sensors are stale; each array has a place for each of them, shape (S,).
+
+    Attributes
+    ----------
+    age_s : how long before a sensor said the same, s; 0 where what it says is new or constant
+    noiseless : whether it holds too little noise to distinguish new from old
+    """
+
+    age_s: NDArray[np.float64]
+    noiseless: NDArray[np.bool_]
+
+    def __or__(self, later: Staleness) -> Staleness:
+        """What holds of one or the other; of two ages that of the later counts."""
+        age_s = np.where(later.age_s > 0, later.age_s, self.age_s)
+        return Staleness(age_s, self.noiseless | later.noiseless)
+
+
+@dataclass(frozen=True)
+class FluxFrame:
+    """Holds the fluxes of one window.
+
+    Attributes
+    ----------
+    tool, reference : points of the two topics
+    host_ns : middle of the window in the clock of the arrivals; 0 until it is known
+    window : conversion with noise and currents, sensors in the order of `FluxStream.sensors`
+    flags : flag bits of these sensors
+    staleness : why some of them are stale
+    repeats : whether the whole control unit says nothing new
+    """
+
+    tool: FluxPoints
+    reference: FluxPoints
+    host_ns: int
+    window: FluxWindow
+    flags: NDArray[np.int64]
+    staleness: Staleness
+    repeats: bool = False
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """A frame, its middle and end in samples, and when its last block arrived."""
+
+    frame: FluxFrame
+    middle_sample: float
+    end_sample: float
+    arrival_ns: int
+
+
+class WaitingFrames:
+    """Holds frames until a block that was in time has confirmed their stamps.
+
+    On a punctual line no frame waits. A frame that nothing confirms for `PATIENCE_NS` is withheld.
+
+    ``withheld`` counts these.
+    """
+
+    def __init__(self, clock: SampleClock) -> None:
+        self._clock = clock
+        self._queue: deque[_Waiting] = deque()
+        self.withheld = 0
+
+    def __len__(self) -> int:
+        """Return how many frames wait."""
+        return len(self._queue)
+
+    def add(
+        self, frame: FluxFrame, middle_sample: float, end_sample: float, arrival_ns: int
+    ) -> None:
+        """Let a frame wait from the arrival of its last block on."""
+        self._queue.append(_Waiting(frame, middle_sample, end_sample, arrival_ns))
+
+    def release(self, now_ns: int) -> list[FluxFrame]:
+        """Return the frames that need not wait any longer, stamped."""
+        clock, frames = self._clock, []
+        while self._queue:
+            first = self._queue[0]
+            # What repeats itself is marked so; its stamp need not be better than the line is.
+            is_good = clock.is_good(first.end_sample) or (first.frame.repeats and clock.is_settled)
+            if not is_good and now_ns - first.arrival_ns < PATIENCE_NS:
+                break
+            self._queue.popleft()
+            if is_good:
+                host_ns = clock.host_ns(first.middle_sample)
+                frames.append(replace(first.frame, host_ns=host_ns))
+            else:
+                self.withheld += 1
+        return frames
+
+    def forget(self) -> None:
+        """Withhold all that wait: their samples belong to a stream that has ended."""
+        self.withheld += len(self._queue)
+        self._queue.clear()
+
+
+@dataclass(frozen=True)
+class StreamOptions:
+    """States how to demodulate: window and rate, and what to fit besides the tones."""
+
+    window_s: float
+    rate_hz: float
+    mains_hz: float = 0.0
+
+
+class FluxStream:
+    """Turns samples into fluxes; it is made again for every hello that differs from the one
+    before.
+
+    Raises `SetupError` when the control unit has none of the channels, or other emitters than the
+    setup, and `ParameterError` when the window cannot be demodulated.
+
+    Attributes
+    ----------
+    sensors : those of the setup that the control unit has a channel for, tools first
+    missing : those that it has none for
+    rate_hz : windows a second, a whole number of samples apart
+    clock, ticks : host time of the samples, and what the device's own clock says beside them
+    waiting : frames whose stamps are not confirmed yet
+    """
+
+    def __init__(
+        self, hello: Hello, setup: Setup, calibration: ChannelCalibration, options: StreamOptions
+    ) -> None:
+        if len(hello.frequencies_hz) != len(setup.emitter.coils):
+            raise SetupError(
+                f'the control unit drives {len(hello.frequencies_hz)} coils, '
+                f'the setup has {len(setup.emitter.coils)}'
+            )
+        columns = {
+            channel.number: column
+            for column, channel in enumerate(hello.channels)
+            if channel.kind is ChannelKind.SENSE
+        }
+        wanted = (*setup.tool_sensors, *setup.reference_sensors)
+        self.sensors = tuple(s for s in wanted if s.channel in columns)
+        self.missing = tuple(s for s in wanted if s.channel not in columns)
+        if not self.sensors:
+            raise SetupError('the control unit has none of the channels of the setup')
+        self.tones_hz = np.array(hello.frequencies_hz)
+        self.nominal_a = _nominal_currents(setup, hello)
+        rate = hello.sample_rate_hz
+        window = round(options.window_s * rate)
+        hop = max(1, round(rate / options.rate_hz))
+        self.rate_hz = rate / hop
+        self._sample_rate_hz = rate
+        self._block_samples = hello.block_samples
+        self._demodulator = Demodulator(
+            rate, self.tones_hz, window, mains_hz=options.mains_hz or None
+        )
+        self._converter = _converter(hello, self, columns, calibration)
+        self._rates = None if self._demodulator.follows_motion else FluxRates()
+        watch = RepetitionWatch(len(hello.channels), rate, self.tones_hz)
+        self.ticks = TickCheck(rate, hello.tick_hz)
+        self._cutter = WindowCutter(window, hop, watch, self.ticks)
+        self._watch = watch
+        self.counters = self._cutter.counters
+        self.clock = SampleClock(rate)
+        self.waiting = WaitingFrames(self.clock)
+        self._current_column = _current_column(hello)
+        self._newest: Window | None = None
+        self._columns = np.array([columns[s.channel] for s in self.sensors])
+        self._split = sum(s.body != FIELD_GENERATOR for s in self.sensors)
+        self._tool = SensorRows.of(self.sensors[: self._split], fixed_only=True)
+        self._reference = SensorRows.of(self.sensors[self._split :], fixed_only=True)
+
+    @property
+    def blocks_wanted(self) -> int:
+        """Return how many blocks until a frame may be ready: one while frames wait for it."""
+        if self.waiting:
+            return 1
+        return -(-self._cutter.samples_wanted // self._block_samples)
+
+    def restart(self, sent_ns: int | None) -> None:
+        """Start again: the device has answered a start, sent at a host time, with sample 0."""
+        self.waiting.forget()
+        self._cutter.reset()
+        self.clock.restart()
+        if sent_ns is not None:
+            self.clock.bound(0, sent_ns)
+
+    def answered(self, sent_ns: int) -> None:
+        """Take in that the device has just answered a command that was sent at a host time."""
+        self.clock.bound(self._cutter.end_sample + self._block_samples, sent_ns)
+
+    def push(self, block: SampleBlock, arrival_ns: int, *, skips: bool = False) -> list[FluxFrame]:
+        """Take a block and return the frames that are complete and whose stamps are good.
+
+        A frame may wait for its stamp, and be withheld; see `WaitingFrames`. If it ``skips``, a
+        complete window is only counted, in favour of newer ones.
+        """
+        if block.codes.shape[1] != self._cutter.columns:
+            return []
+        restarts, before = self.counters.restarts, self._cutter.end_sample
+        windows = self._cutter.push(block.sequence, block.timestamp_ticks, block.codes)
+        if self.counters.restarts != restarts:
+            self.waiting.forget()
+            self.clock.restart()
+        # What comes twice says nothing about now.
+        if self._cutter.end_sample != before and not self._watch.repeats:
+            self.clock.observe(self._cutter.end_sample, arrival_ns)
+        for window in windows:
+            if skips:
+                self.counters.windows -= 1
+                self.counters.windows_skipped += 1
+                continue
+            try:
+                frame = self._frame(window)
+            except FitError:
+                self.counters.windows -= 1
+                self.counters.windows_lost += 1
+                continue
+            end = window.middle_sample + len(window.codes) / 2
+            self.waiting.add(frame, window.middle_sample, end, arrival_ns)
+        return self.waiting.release(arrival_ns)
+
+    def warm_up(self) -> None:
+        """Demodulate the newest window again, only to keep caches warm; see `Acquisition`."""
+        if self._newest is not None:
+            fit = self._demodulator.demodulate(self._newest.codes, self._newest.present)
+            self._converter.convert(fit)
+
+    def _frame(self, window: Window) -> FluxFrame:
+        self._newest = window
+        fit = self._demodulator.demodulate(window.codes, window.present)
+        converted = self._converted(fit, window.middle_sample / self._sample_rate_hz)
+        staleness = self._staleness(window)
+        saturated = window.saturated[self._columns]
+        stale = window.stuck[self._columns] | window.stuck[self._current_column]
+        stale |= ((staleness.age_s > 0) | staleness.noiseless) & ~saturated
+        flags: NDArray[np.int64] = saturated * SATURATED | stale * STALE
+        if window.dropped:
+            flags |= DROPPED
+        split = self._split
+        return FluxFrame(
+            _points(self._tool, converted.flux[:split], flags[:split]),
+            _points(self._reference, converted.flux[split:], flags[split:]),
+            0,
+            converted,
+            flags,
+            staleness,
+            window.repeats,
+        )
+
+    def _staleness(self, window: Window) -> Staleness:
+        """Why sensors are stale: with the currents all are, since fluxes are divided by them."""
+        # What is constant is stuck without further words.
+        ages = np.where(window.stuck, 0, window.ages)
+        noiseless = window.noiseless & ~window.stuck
+        current = self._current_column
+        age = np.where(ages > 0, ages, ages[current])[self._columns]
+        return Staleness(
+            age / self._sample_rate_hz, (noiseless | noiseless[current])[self._columns]
+        )
+
+    def _converted(self, fit: ToneFit, middle_s: float) -> FluxWindow:
+        """Fluxes of a fit; one too short to follow motion takes it from the windows before."""
+        if self._rates is None:
+            return self._converter.convert(fit)
+        converted = self._converter.convert(fit, self._rates.at(middle_s))
+        self._rates.add(middle_s, converted.flux)
+        return converted
+
+
+def _points(
+    rows: SensorRows, flux: NDArray[np.complex128], flags: NDArray[np.int64]
+) -> FluxPoints:
+    return FluxPoints(rows.channel, flags, flux, rows.position, rows.axis)
+
+
+def _current_column(hello: Hello) -> int:
+    """Column of the sum of the emitters' currents."""
+    return [channel.kind for channel in hello.channels].index(ChannelKind.CURRENT)
+
+
+def _nominal_currents(setup: Setup, hello: Hello) -> NDArray[np.float64]:
+    """Currents that the setup's field is given for; the control unit's where it says nothing."""
+    current = setup.emitter.geometry.get('current_a')
+    if isinstance(current, (int, float)) and current > 0:
+        return np.full(len(hello.currents_a), float(current))
+    return np.array(hello.currents_a)
+
+
+def _converter(
+    hello: Hello, stream: FluxStream, columns: dict[int, int], calibration: ChannelCalibration
+) -> FluxConverter:
+    per_code = np.array([channel.full_scale / FULL_SCALE_CODE for channel in hello.channels])
+    current = _current_column(hello)
+    numbers = [sensor.channel for sensor in stream.sensors]
+    chosen = np.array([columns[number] for number in numbers])
+    return FluxConverter(
+        stream.tones_hz,
+        chosen,
+        per_code[chosen],
+        calibration.areas_m2(numbers),
+        calibration.delays_s(numbers),
+        current_column=current,
+        amperes_per_code=float(per_code[current]),
+        nominal_currents_a=stream.nominal_a,
+        current_delay_s=calibration.current_delay_s,
+    )
+
+
+EARLIEST_S = 10.0
+"""Least time, s, from one setup document to the next for the sake of the stamps: trackers start
+again with it, and a host's load changes within seconds."""
+_FACTOR = 2.0
+"""Ratio by which the stamps' uncertainty must differ from what was published to be published
+again."""
+
+
+class MeasuredAccuracy:
+    """Follows the noise of the first fluxes, and the uncertainty of the stamps."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again: the stream is another one."""
+        self._noise_t: float | None = None
+        self._begun_s = -math.inf
+        self._stated_s = Accuracy.stamp_sigma_s
+        self._squares = 0.0
+        self._frames = 0
+
+    def must_republish(self, frame: FluxFrame, sigma_s: float, now_s: float) -> bool:
+        """Take a frame with its stamp's uncertainty; return whether to publish the setup again."""
+        if math.isfinite(sigma_s):
+            self._squares += sigma_s**2
+            self._frames += 1
+        if self._noise_t is None:
+            noise = frame.window.sigma[np.isfinite(frame.window.sigma)]
+            self._noise_t = float(np.median(noise)) if noise.size else 0.0
+            self._begun_s = now_s
+            return True
+        if now_s - self._begun_s < EARLIEST_S or not self._frames:
+            return False
+        mean_s = math.sqrt(self._squares / self._frames)
+        self._begun_s, self._squares, self._frames = now_s, 0.0, 0
+        if 1 / _FACTOR <= mean_s / self._stated_s <= _FACTOR:
+            return False
+        self._stated_s = float(f'{mean_s:.1g}')
+        return True
+
+    def stated_in(self, setup: Setup, rate_hz: float) -> Setup:
+        """Return the setup with the stream's true rate and what was measured."""
+        measured: dict[str, float] = {}
+        if self._noise_t:
+            measured[FLUX_NOISE] = float(f'{self._noise_t:.2g}')
+        if self._stated_s != Accuracy.stamp_sigma_s:
+            measured[STAMP_SIGMA] = self._stated_s
+        return replace(setup, flux_rate_hz=rate_hz, extra={**setup.extra, **measured})
+
+
+_TRIES = 5
+"""Readings of both clocks of which the closest together counts: between two readings a thread may
+have to wait, and the wait would be taken for a part of the difference."""
+_CLOSE_NS = 20_000
+"""Time (20 us) from one reading to the next that is close enough to try no more."""
+_STEP_NS = 5_000_000
+"""Change of the difference (5 ms) from one look to the next that is no drift but a setting. A
+clock that is being slewed moves by 0.5 ms a second."""
+
+
+class WallClock:
+    """Converts monotonic times to the system's time, which may be set while we run.
+
+    ``sets`` counts how often that happened.
+    """
+
+    def __init__(
+        self,
+        wall_ns: Callable[[], int] = time.time_ns,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._wall_ns, self._monotonic_ns = wall_ns, monotonic_ns
+        self._offset_ns: int | None = None
+        self.sets = 0
+
+    def offset_ns(self) -> int:
+        """Return the system's time minus the monotonic time now, ns."""
+        best_ns, offset_ns = -1, 0
+        for _ in range(_TRIES):
+            before_ns = self._monotonic_ns()
+            wall_ns = self._wall_ns()
+            width_ns = self._monotonic_ns() - before_ns
+            if best_ns < 0 or width_ns < best_ns:
+                best_ns, offset_ns = width_ns, wall_ns - before_ns - width_ns // 2
+            if best_ns <= _CLOSE_NS:
+                break
+        if self._offset_ns is not None and abs(offset_ns - self._offset_ns) > _STEP_NS:
+            self.sets += 1
+        self._offset_ns = offset_ns
+        return offset_ns

@@ -1,1 +1,0 @@
-"""Holds the parts of recorder and replay: message definitions, what was recorded, who listens."""

@@ -1,1 +1,0 @@
-"""Holds the parts of the field_model node: the active refit, its start, its two topics."""

@@ -1,0 +1,138 @@
+"""Puts what nodes report and what a watcher finds into words for an operator, the gravest
+first. A service answers with the same words, because both come from the node concerned.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from anser_ros.nodes.runtime.diagnostics import LastStatus, named
+
+MOST_CAUSES = 4
+"""Causes that are reported at once: what is behind all else is among the gravest."""
+MOST_NAMES = 3
+"""Sensors that are named for one cause; of the others the number is given."""
+MOST_TEXT = 160
+"""Characters of a cause: two lines of a terminal."""
+LEAST_LOSS = 0.05
+"""Share of missing frames that is reported: a rate over a second is off by a few percent."""
+
+
+def causes(
+    statuses: Mapping[str, LastStatus], namespace: str, flux_rate_hz: float = 0.0
+) -> list[str]:
+    """Name what is wrong: nodes that complain, then sensors without pose, by their reasons.
+
+    ``statuses`` has what was reported last, by ``node`` or ``node: part``; the namespace is
+    without slashes around it, and the rate of frames is 0 where it is not known.
+    """
+    found: list[tuple[int, str]] = []
+    silent: dict[tuple[int, str], list[str]] = {}
+    for name, one in statuses.items():
+        node, _, part = name.partition(': ')
+        home, _, short = node.rpartition('/')
+        if home != namespace or not one.level:
+            continue
+        if not part:
+            found.append((-one.level, f'{short}: {one.message}{_loss(one, flux_rate_hz)}'))
+        elif short == 'tracker':
+            silent.setdefault((-one.level, one.message), []).append(part)
+    found.sort(key=lambda item: item[0])
+    reasons = [
+        f'{words} ({named(names, MOST_NAMES)})' for (_, words), names in sorted(silent.items())
+    ]
+    texts = [words for _, words in found] + reasons
+    return [_short(text) for text in texts[:MOST_CAUSES]]
+
+
+def _loss(one: LastStatus, flux_rate_hz: float) -> str:
+    """The share of frames that are missing, where a node states its rate."""
+    try:
+        rate_hz = float(one.values['rate_hz'])
+    except (KeyError, ValueError):
+        return ''
+    share = 1.0 - rate_hz / flux_rate_hz if flux_rate_hz > 0 else 0.0
+    return f'; {share:.0%} of the frames are missing' if share > LEAST_LOSS else ''
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= MOST_TEXT else text[: MOST_TEXT - 3] + '...'
+
+
+if TYPE_CHECKING:  # words must not load the kernels
+    from anser_ros.field.model import EffectRecord
+    from anser_ros.sessions.watch import Sighting
+
+SITES = ('channel', 'channels', 'coil', 'coils', 'body', 'sensor', 'stream')
+MOST_FIGURE_TEXT = 60
+"""Characters of a figure beyond which it is left to the values: a line is read at a glance."""
+
+
+def words_of(seen: 'Sighting') -> str:
+    """Return what was seen as one line for an operator."""
+    size = f'residual {1e12 * seen.flux_rms_t:.0f} pT, {seen.excess**0.5:.1f} x the expected one'
+    if seen.findings:
+        left = f'{seen.excess_left**0.5:.1f} x with it corrected'
+        return f'{findings_words(seen.findings)}; {size}, {left}'
+    if seen.is_clear:
+        return f'nothing found; {size}'
+    cause = seen.remark or 'no known effect explains it'
+    depends = f', it depends on {", ".join(seen.depends_on)}' if seen.depends_on else ''
+    return f'{size}; {cause}{depends}'
+
+
+def values_of(seen: 'Sighting') -> dict[str, object]:
+    """Return the figures of what was seen, by name."""
+    return {
+        'compared_with': seen.truth,
+        'frames_compared': seen.frames,
+        'flux_rms_t': seen.flux_rms_t,
+        'excess': seen.excess,
+        'excess_left': seen.excess_left,
+        'findings': titles_of(seen.findings),
+        'depends_on': ', '.join(seen.depends_on),
+    }
+
+
+def findings_words(findings: Sequence['EffectRecord']) -> str:
+    """Return every effect with its site and its parameters, for a line."""
+    return '; '.join(f'{title_of(record)}: {figures_of(record)}' for record in findings)
+
+
+def titles_of(findings: Sequence['EffectRecord']) -> str:
+    """Return the names and sites of effects, separated by commas."""
+    return ', '.join(title_of(record) for record in findings)
+
+
+def title_of(record: 'EffectRecord') -> str:
+    """Return the name of an effect and where it sits."""
+    sites = [
+        f'{key} {plain_text(record.parameters[key])}' for key in SITES if key in record.parameters
+    ]
+    return f'{record.name} ({", ".join(sites)})' if sites else record.name
+
+
+def figures_of(record: 'EffectRecord') -> str:
+    """Return the parameters that are short enough for a line."""
+    parts = [
+        f'{key} {text}'
+        for key, value in record.parameters.items()
+        if key not in SITES and len(text := plain_text(value)) <= MOST_FIGURE_TEXT
+    ]
+    return ', '.join(parts) or 'found'
+
+
+def plain_text(value: Any) -> str:
+    """Return a parameter as an operator reads it: numbers short, lists and mappings unquoted."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, complex):
+        return f'{value:.4g}'
+    if isinstance(value, (bool, int, np.integer)) or value is None:
+        return str(value)
+    if isinstance(value, (float, np.floating)):
+        return f'{value:.5g}'
+    if isinstance(value, dict):
+        return ', '.join(f'{key} {plain_text(item)}' for key, item in value.items())
+    return '[' + ' '.join(plain_text(item) for item in value) + ']'

@@ -1,0 +1,169 @@
+"""Traces what came in for every sensor and body, and how far it is from the optical truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.rotations import axis_angles
+from anser_ros.stamps import LIVE_WITHIN_S
+from anser_ros.wire.setup import Setup
+
+Array = NDArray[np.float64]
+LONGEST_OPTICAL_GAP_S = 0.1
+"""Gap between optical poses, s, over which none is interpolated to compare with."""
+
+
+def latency_of(now_s: float, stamp_s: float) -> float:
+    """Return how old a pose is as it comes, s; NaN where its stamp is not of now."""
+    age_s = now_s - stamp_s
+    return age_s if abs(age_s) < LIVE_WITHIN_S else float('nan')
+
+
+def middle(values: Sequence[float] | Array, of: Callable[[Array], Any] = np.median) -> float:
+    """Return the median of what is finite, or another figure of it; NaN where nothing is."""
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    return float(of(known)) if known.size else float('nan')
+
+
+@dataclass(frozen=True)
+class Target:
+    """Names a sensor or a body that is tracked.
+
+    ``position_m`` and ``axis`` are in the frame of the body that it sits on; a body's own axis is
+    z.
+    """
+
+    name: str
+    body: str
+    position_m: tuple[float, float, float]
+    axis: tuple[float, float, float]
+
+
+def targets_of(setup: Setup) -> list[Target]:
+    """Return all tool sensors of a setup, and the bodies that carry more than one."""
+    sensors = [Target(s.name, s.body, s.position_m, s.axis) for s in setup.tool_sensors]
+    carried = [sensor.body for sensor in sensors]
+    bodies = [
+        Target(body, body, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+        for body in setup.bodies
+        if carried.count(body) > 1
+    ]
+    return sensors + bodies
+
+
+@dataclass
+class OpticalTrace:
+    """Keeps poses of one body by an optical tracker, or the simulator's truth."""
+
+    stamp_s: list[float] = field(default_factory=list)
+    position: list[tuple[float, ...]] = field(default_factory=list)
+    quaternion: list[tuple[float, ...]] = field(default_factory=list)
+
+    def add(self, stamp_s: float, position: tuple[float, ...], turn: tuple[float, ...]) -> None:
+        """Note a pose; one that is not later than the last is left out."""
+        if not self.stamp_s or stamp_s > self.stamp_s[-1]:
+            self.stamp_s.append(stamp_s)
+            self.position.append(position)
+            self.quaternion.append(turn)
+
+    def forget(self, but: int) -> None:
+        """Keep only the last ``but`` poses."""
+        for values in (self.stamp_s, self.position, self.quaternion):
+            del values[:-but]
+
+    def track(self, since: int = 0) -> PoseTrack | None:
+        """Return the poses from number `since` on, None when there are less than two."""
+        if len(self.stamp_s) - since < 2:
+            return None
+        return PoseTrack(
+            np.array(self.stamp_s[since:]),
+            np.array(self.position[since:]),
+            np.array(self.quaternion[since:]),
+        )
+
+
+@dataclass
+class PoseTrace:
+    """Keeps poses of one target by one tracker.
+
+    Every list has an item per pose; latency is counted from the middle of the window.
+    """
+
+    target: Target
+    stamp_s: list[float] = field(default_factory=list)
+    position: list[tuple[float, ...]] = field(default_factory=list)
+    axis: list[tuple[float, ...]] = field(default_factory=list)
+    sigma_m: list[float] = field(default_factory=list)
+    latency_s: list[float] = field(default_factory=list)
+
+    def errors(self, optical: PoseTrack, since: int = 0) -> tuple[Array, Array]:
+        """Return distance (m) and angle (rad) to the truth of the poses from number `since` on.
+
+        NaN where the optical track does not reach.
+        """
+        stamps = np.array(self.stamp_s[since:])
+        if not stamps.size:
+            return np.zeros(0), np.zeros(0)
+        position, rotation, _ = optical.at(stamps, LONGEST_OPTICAL_GAP_S)
+        true_position = position + rotation @ np.array(self.target.position_m)
+        true_axis = rotation @ np.array(self.target.axis)
+        away = np.linalg.norm(np.array(self.position[since:]) - true_position, axis=1)
+        return away, axis_angles(np.array(self.axis[since:]), true_axis)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Holds the newest of one target, for a table.
+
+    Error, latency and sigma are medians over the interval, NaN without a pose in it, and so is the
+    place.
+    """
+
+    name: str
+    position_m: tuple[float, ...]
+    sigma_m: float
+    error_m: float
+    rate_hz: float
+    latency_s: float
+
+
+class Traces:
+    """Keeps all targets of one chain of nodes."""
+
+    def __init__(self, targets: list[Target]) -> None:
+        self.of = {target.name: PoseTrace(target) for target in targets}
+        self._seen = dict.fromkeys(self.of, 0)
+
+    def rows(self, optical: Mapping[str, OpticalTrace], elapsed_s: float) -> list[Row]:
+        """Return a row for each target about what came since the last call."""
+        recent = {
+            body: trace.track(max(0, len(trace.stamp_s) - 200)) for body, trace in optical.items()
+        }
+        rows = []
+        for name, trace in self.of.items():
+            since, self._seen[name] = self._seen[name], len(trace.stamp_s)
+            count = len(trace.stamp_s) - since
+            track = recent.get(trace.target.body)
+            error = float('nan')
+            if count and track is not None:
+                # the last poses may be newer than the last optical one
+                away = trace.errors(track, max(0, since - 5))[0]
+                error = middle(away)
+            rows.append(
+                Row(
+                    name,
+                    trace.position[-1] if count else (float('nan'),) * 3,
+                    middle(trace.sigma_m[since:]),
+                    error,
+                    count / elapsed_s,
+                    middle(trace.latency_s[since:]),
+                )
+            )
+        return rows

@@ -1,0 +1,172 @@
+"""Turns and compares directions and rotations: planes across an axis, angles, vectors,
+quaternions. Angles are in rad, by arctangent: small ones are exact too. Functions of scipy's
+``Rotation`` are repeated for speed: trackers convert one rotation at a time, several times per
+pose and frame. One call takes 5 to 9 us here, and in scipy 1.17 11 us from a vector or a
+quaternion and 58 us from a matrix, which it makes orthogonal first. Whole tracks are turned by
+scipy.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.kernel_cache import kernel
+
+
+@kernel
+def fill_tangent(n, t):  # type: ignore[no-untyped-def]
+    """Write two unit vectors that complete the unit vector ``n`` to a right-handed frame.
+
+    The first is across ``n`` and the axis of the frame that is most across it. Tilts in model
+    files are along these two.
+    """
+    k = 0
+    for i in range(1, 3):
+        if abs(n[i]) < abs(n[k]):
+            k = i
+    i, j = (k + 1) % 3, (k + 2) % 3
+    norm = math.sqrt(n[i] * n[i] + n[j] * n[j])
+    t[0, k], t[0, i], t[0, j] = 0.0, n[j] / norm, -n[i] / norm
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        t[1, k] = n[i] * t[0, j] - n[j] * t[0, i]
+
+
+def tangents(axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return two unit vectors across each unit axis, shape (S, 2, 3), for axes of shape (S, 3)."""
+    out = np.empty((len(axes), 2, 3))
+    for axis, pair in zip(np.ascontiguousarray(axes), out, strict=True):
+        fill_tangent(axis, pair)
+    return out
+
+
+def tilted(axes: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit axes (S, 3) stepped by ``tilt`` (S, 2), rad, along their `tangents`."""
+    out = axes + np.einsum('st,stj->sj', tilt, tangents(axes))
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+
+Array = NDArray[np.float64]
+
+
+def axis_angles(first: Array, second: Array) -> Array:
+    """Return the angles between axes of any length but zero, shape (...), rad, 0 to pi.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (..., 3)
+        Both in the same frame; NaN where one is not known, which gives NaN.
+    """
+    sine = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.asarray(np.arctan2(sine, np.sum(first * second, axis=-1)))
+
+
+def rotation_angles(matrices: Array) -> Array:
+    """Return the angles of rotation matrices, shape (...), rad, 0 to pi.
+
+    Parameters
+    ----------
+    matrices : ndarray, shape (..., 3, 3)
+        Proper rotations, or NaN, which gives NaN.
+    """
+    transposed = np.swapaxes(matrices, -1, -2)
+    # The skew part has each component of the axis twice, times the sine.
+    sine = np.linalg.norm(matrices - transposed, axis=(-2, -1)) / np.sqrt(8.0)
+    cosine = 0.5 * (np.trace(matrices, axis1=-2, axis2=-1) - 1.0)
+    return np.asarray(np.arctan2(sine, cosine))
+
+
+def nearest_rotation(matrices: Array) -> Array:
+    """Return the proper rotations (..., n, n) nearest to matrices (Kabsch).
+
+    They are ``U diag(1, ..., 1, det) V^T`` of the singular value decomposition.
+    """
+    u, _, vt = np.linalg.svd(matrices)
+    u[..., -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)
+
+
+def rotation_of_vector(vector: NDArray[np.generic]) -> Array:
+    """Return the matrix, shape (3, 3), of a rotation vector, shape (3,), rad (Rodrigues'
+    formula).
+    """
+    v = np.asarray(vector, dtype=np.float64)
+    angle = math.sqrt(float(v @ v))
+    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    if angle < 1e-8:
+        return np.asarray(np.eye(3) + cross)
+    a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    return np.asarray(np.eye(3) + a * cross + b * (cross @ cross))
+
+
+def rotation_between(first: Array, second: Array) -> Array:
+    """Return the rotation vector (3,), rad, in fg, that takes matrix ``first`` to ``second``."""
+    matrix = second @ first.T
+    vector = 0.5 * np.array(
+        [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
+    )
+    sine = math.sqrt(float(vector @ vector))
+    angle = math.atan2(sine, 0.5 * (float(np.trace(matrix)) - 1.0))
+    if sine > 1e-6:
+        return np.asarray(vector * (angle / sine))
+    if angle < 1.0:
+        return vector
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return np.asarray(vectors[:, int(np.argmax(values))] * angle)
+
+
+def quaternion_of_axis(axis: NDArray[np.generic]) -> tuple[float, float, float, float]:
+    """Return the unit quaternion (x, y, z, w) of the shortest rotation of +z to a unit axis.
+
+    The written roll rule of a 5-DoF pose; about +x for the axis -z, where it is not unique.
+    """
+    nx, ny, nz = (float(v) for v in axis)
+    w = math.sqrt(max(0.0, 0.5 * (1.0 + nz)))
+    if w < 1e-9:
+        return 1.0, 0.0, 0.0, 0.0
+    x, y = -0.5 * ny / w, 0.5 * nx / w
+    norm = math.sqrt(x * x + y * y + w * w)
+    return x / norm, y / norm, 0.0, w / norm
+
+
+def quaternion_of_rotation(matrix: NDArray[np.generic]) -> tuple[float, float, float, float]:
+    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation matrix (Shepperd's
+    method).
+    """
+    m = np.asarray(matrix, dtype=np.float64)
+    trace = float(np.trace(m))
+    squares = [1.0 + 2.0 * float(m[i, i]) - trace for i in range(3)] + [1.0 + trace]
+    best = int(np.argmax(squares))
+    q = np.zeros(4)
+    root = math.sqrt(squares[best])
+    q[best] = 0.5 * root
+    half = 0.5 / root
+    if best == 3:
+        q[0], q[1], q[2] = (
+            half * (m[2, 1] - m[1, 2]),
+            half * (m[0, 2] - m[2, 0]),
+            half * (m[1, 0] - m[0, 1]),
+        )
+    else:
+        j, k = (best + 1) % 3, (best + 2) % 3
+        q[j] = half * (m[j, best] + m[best, j])
+        q[k] = half * (m[k, best] + m[best, k])
+        q[3] = half * (m[k, j] - m[j, k])
+    if q[3] < 0:
+        q = -q
+    q /= math.sqrt(float(q @ q))
+    return float(q[0]), float(q[1]), float(q[2]), float(q[3])
+
+
+def rotation_of_quaternion(quaternion: NDArray[np.generic]) -> Array:
+    """Return the matrix, shape (3, 3), of a quaternion (x, y, z, w) of any length but zero."""
+    q = np.asarray(quaternion, dtype=np.float64)
+    x, y, z, w = q / math.sqrt(float(q @ q))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,1 +1,0 @@
-"""Serves trackers that give poses only: sessions, hand-eye, diagnosis, correction."""

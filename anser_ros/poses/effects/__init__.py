@@ -1,1 +1,0 @@
-"""Holds the effects of trackers of poses, one file each."""

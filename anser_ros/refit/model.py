@@ -1,0 +1,426 @@
+"""Assembles the refitted model, calibrated dipoles with a layer's moments and their
+uncertainty, and the result of a frame.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.model import FieldModel
+from anser_ros.pose_states import REFERENCES_DOUBTFUL, REFERENCES_LOST
+from anser_ros.refit import health
+from anser_ros.refit.health import ReferenceHealth
+from anser_ros.refit.hypotheses import BackgroundTask
+from anser_ros.refit.layer import Layer, component_rows
+from anser_ros.refit.posterior import (
+    Bank,
+    ErrorLevel,
+    FrameEvidence,
+    PosteriorModes,
+    error_level,
+    error_modes,
+    make_room,
+)
+from anser_ros.refit.witness import FIRST_SAMPLE_STEP, Witness
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+NEGLIGIBLE = 0.01
+"""Hypotheses less probable than this take no part in the mean."""
+INFLATION_STEP = 1.2
+"""Ratio of neighbouring factors by which modes are inflated. The steps keep modes, and what was
+computed for them, the same for many frames."""
+Uncertainty = tuple[ComplexArray | None, float]
+"""Modes and flux error of a model."""
+
+MOST_MODES = 16
+"""Sets of modes that are kept, which bounds the memory; the oldest is dropped, and is worked out
+again when its coils and hypothesis come back."""
+KEEP_FRAMES = 25
+"""Frames for which an inflation is kept at least before it may fall."""
+RIVAL = 0.05
+"""Probability from which on a second hypothesis adds what it disagrees about."""
+
+
+class Assembly:
+    """Assembles refitted models from the calibrated model and the hypotheses' layers.
+
+    ``phase`` (K,) is that of the emitters' own field, ``unit`` the T of a noise unit.
+    """
+
+    def __init__(self, model: FieldModel, phase: ComplexArray, unit: float, n_modes: int) -> None:
+        self.base, self._scale, self._n_modes = model, phase * unit, n_modes
+        self._modes: dict[tuple[object, ...], PosteriorModes] = {}
+        self._coming: dict[tuple[object, ...], BackgroundTask[PosteriorModes]] = {}
+        self._last: _ErrorBefore | None = None
+        self._interim: tuple[object, Uncertainty] | None = None
+        self._whole: dict[tuple[object, ...], tuple[int, Uncertainty]] = {}
+        self._count = 0
+        self._place: _Dipoles | None = None
+
+    def forget(self) -> None:
+        """Forget the last error: the next frame is of another time."""
+        self._last = self._interim = None
+
+    def model(
+        self,
+        stamp_ns: int,
+        bank: Bank,
+        seen: FrameEvidence,
+        weights: Array,
+        drift: ComplexArray,
+        typical: float,
+        witness: Witness | None = None,
+    ) -> FieldModel:
+        """Return the refitted model of one frame.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Of the frame.
+        bank, seen
+            The hypotheses and what they say.
+        weights : ndarray, shape (H,)
+            Their probabilities.
+        drift : ndarray, shape (K,), complex
+            Relative change of the emitters' strength.
+        typical : float
+            Left-out chi-square per degree of freedom of the typical coil.
+        witness : Witness, optional
+            What tools know of the hypotheses' errors.
+        """
+        active = [h for h in np.flatnonzero(weights > NEGLIGIBLE).tolist() if h > 0]
+        place = self._dipoles_of([bank.prior(h).layer for h in active])
+        moments = np.zeros((len(place.positions), len(drift)), dtype=complex)
+        moments[: len(self.base.moments)] = self.base.moments * (1.0 + drift)
+        scale = self._scale
+        parts = {h: bank.moments(seen, h) * scale for h in active}
+        if witness is not None:
+            parts |= {h: part + witness.moments(bank, h) * scale for h, part in parts.items()}
+        change = _Change(stamp_ns, bank, seen, weights, parts, scale, place)
+        for h, part in parts.items():
+            moments[change.rows(h)] += weights[h] * part
+        modes, rest = self._uncertainty(change, typical, witness)
+        return replace(
+            self.base,
+            positions=place.positions,
+            directions=place.directions,
+            moments=moments,
+            modes=modes,
+            flux_error_t=rest,
+        )
+
+    def _dipoles_of(self, given: list[Layer]) -> '_Dipoles':
+        """Return the dipoles with some layers, in the same arrays while the layers stay."""
+        layers = {layer.name: layer for layer in given}
+        if self._place is not None and [*self._place.rows] == [*layers]:
+            return self._place
+        positions, directions = [self.base.positions], [self.base.directions]
+        rows: dict[str, NDArray[np.int64]] = {}
+        size = len(self.base.positions)
+        for name, layer in layers.items():
+            # A layer that uses dipoles of the model adds only the others.
+            own = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
+            added = len(layer.positions) - own.size
+            rows[name] = np.concatenate([own, np.arange(size, size + added)])
+            positions.append(layer.positions[own.size :])
+            directions.append(layer.directions[own.size :])
+            size += added
+        self._place = _Dipoles(np.concatenate(positions), np.concatenate(directions), rows)
+        return self._place
+
+    def _uncertainty(
+        self, change: '_Change', typical: float, witness: Witness | None
+    ) -> Uncertainty:
+        """Return all modes and the remaining error, unchanged for a while to spare receivers."""
+        bank, weights, n_modes = change.bank, change.weights, self._n_modes
+        ranked = sorted(change.parts, key=lambda h: -float(weights[h]))
+        if not ranked:
+            return self._with_base(np.zeros((0, *change.shape), dtype=complex), 0.0)
+        best = ranked[0]
+        rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
+        steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
+        level = error_level(change.seen, best)
+        names = tuple(bank.prior(h).name for h in ranked[:1] + ([] if rival is None else [rival]))
+        key = (bank.rows.tobytes(), names, level, steps, *change.place.rows)
+        self._count += 1
+        kept = self._whole.get(key)
+        if witness is None and kept is not None and self._count - kept[0] < KEEP_FRAMES:
+            return kept[1]
+        inflation = INFLATION_STEP**steps
+        errors = (
+            self._error(change, best, level, n_modes - 1)
+            if witness is None
+            else witness.modes(bank, best, n_modes - 1)
+        )
+        if errors is None:
+            if self._interim is None or self._interim[0] != key:
+                own, rest = self._until_known(change, best, level, n_modes)
+                self._interim = key, self._with_base(own * inflation, rest * inflation)
+            return self._interim[1]
+        own, rest = change.modes(errors, best, n_modes)
+        own, rest = own * inflation, rest * inflation
+        if rival is not None:
+            own[-1] += np.sqrt(weights[best] * weights[rival]) * change.between(best, rival)
+        whole = self._with_base(own, rest)
+        if witness is None:
+            self._last = _ErrorBefore(bank.rows.tobytes(), best, names[0], level, errors)
+            self._interim = None
+            make_room(self._whole, MOST_MODES)
+            self._whole[key] = (self._count, whole)
+        return whole
+
+    def _with_base(self, own: ComplexArray, rest: float) -> Uncertainty:
+        """Join the error of the change with that of the calibrated model."""
+        base = self.base.modes
+        if base is not None:  # with rows of zeros for the dipoles that were added
+            padded = np.zeros((len(base), *own.shape[1:]), dtype=complex)
+            padded[:, : base.shape[1]] = base
+            own = np.concatenate([padded, own])
+        return own if len(own) else None, float(np.hypot(self.base.flux_error_t, rest))
+
+    def _error(
+        self, change: '_Change', hypothesis: int, level: ErrorLevel, count: int
+    ) -> PosteriorModes | None:
+        """Return the error of a hypothesis in units of the noise; None until it is known."""
+        bank = change.bank
+        key = (bank.rows.tobytes(), bank.prior(hypothesis).name, level, count)
+        if key in self._modes:
+            return self._modes[key]
+        if key not in self._coming:
+            make_room(self._coming, MOST_MODES)
+            work = partial(error_modes, bank, bank.posterior(hypothesis), level, count)
+            self._coming[key] = BackgroundTask(work, change.stamp_ns)
+        if not self._coming[key].is_due(change.stamp_ns):
+            return None
+        make_room(self._modes, MOST_MODES)
+        self._modes[key] = self._coming.pop(key).result()
+        return self._modes[key]
+
+    def _until_known(
+        self, change: '_Change', best: int, level: ErrorLevel, n_modes: int
+    ) -> tuple[ComplexArray, float]:
+        """Return an error for as long as that of the best hypothesis is being worked out.
+
+        It is that of the hypothesis before, as large as the strength may be now, and the whole
+        difference between the two, in any direction. If there is no previous hypothesis, all of
+        the change may be wrong.
+        """
+        last = self._last
+        if last is None or not last.holds(change):
+            own, rest = np.zeros((n_modes, *change.shape), dtype=complex), 0.0
+            own[-1] = change.between(best)
+        else:
+            own, rest = change.modes(last.errors, last.hypothesis, n_modes)
+            if last.hypothesis == best:
+                growth = last.level.growth(level)
+                return own * growth, rest * growth
+            own[-1] += change.between(best, last.hypothesis)
+        return own, float(np.hypot(rest, change.size(best, own[-1])))
+
+
+class _Dipoles(NamedTuple):
+    """The dipoles (N, 3) of a model with some layers, and the rows of each layer by its name."""
+
+    positions: Array
+    directions: Array
+    rows: dict[str, NDArray[np.int64]]
+
+
+@dataclass(frozen=True)
+class _Change:
+    """One frame's hypotheses and what each of them adds to the calibrated model, A m^2."""
+
+    stamp_ns: int
+    bank: Bank
+    seen: FrameEvidence
+    weights: Array
+    parts: dict[int, ComplexArray]
+    scale: ComplexArray
+    place: _Dipoles
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Dipoles N and emitters K of the model."""
+        return len(self.place.positions), len(self.scale)
+
+    def rows(self, hypothesis: int) -> NDArray[np.int64]:
+        """Return the rows of the dipoles of a hypothesis' layer."""
+        return self.place.rows[self.bank.prior(hypothesis).layer.name]
+
+    def modes(
+        self, errors: PosteriorModes, hypothesis: int, n_modes: int
+    ) -> tuple[ComplexArray, float]:
+        """Return a hypothesis' error as modes (R, N, K) of the model, and what they leave, T."""
+        own = np.zeros((n_modes, *self.shape), dtype=complex)
+        own[: len(errors.moments), self.rows(hypothesis)] = errors.moments * self.scale
+        return own, errors.rest * float(np.abs(self.scale[0]))
+
+    def between(self, hypothesis: int, other: int | None = None) -> ComplexArray:
+        """Return what two hypotheses, or one and that of no change, disagree about, (N, K)."""
+        out = np.zeros(self.shape, dtype=complex)
+        out[self.rows(hypothesis)] += self._part(hypothesis)
+        if other is not None:
+            out[self.rows(other)] -= self._part(other)
+        return out
+
+    def size(self, hypothesis: int, moments: ComplexArray) -> float:
+        """Return the rms of a component of the field of moments (N, K) in the volume, T."""
+        points = self.bank.prior(hypothesis).layer.points[::FIRST_SAMPLE_STEP]
+        field = component_rows(points, self.place.positions, self.place.directions) @ moments
+        return float(np.sqrt(np.mean(np.abs(field) ** 2) / 2.0))
+
+    def _part(self, hypothesis: int) -> ComplexArray:
+        known = self.parts.get(hypothesis)
+        return self.bank.moments(self.seen, hypothesis) * self.scale if known is None else known
+
+
+@dataclass(frozen=True)
+class _ErrorBefore:
+    """The last error that was given, and of which hypothesis it is."""
+
+    coils: bytes
+    hypothesis: int
+    name: str
+    level: ErrorLevel
+    errors: PosteriorModes
+
+    def holds(self, change: _Change) -> bool:
+        """Return whether the hypothesis is still there, and the model has its dipoles."""
+        bank = change.bank
+        return (
+            self.coils == bank.rows.tobytes()
+            and bank.names[self.hypothesis] == self.name
+            and bank.prior(self.hypothesis).layer.name in change.place.rows
+        )
+
+
+FROZEN = 'frozen'
+REFIT = 'refit'
+FEW_REFERENCES = 'few_references'
+POOR_FIT = 'poor_fit'
+STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT, REFERENCES_DOUBTFUL)
+"""No change; the model follows one; too few references to know; a change that
+nothing explains; references of which most jumped by themselves."""
+
+POOR = 4.0
+"""Typical left-out distance from which on the state is `POOR_FIT`."""
+
+WITHHELD = {
+    FEW_REFERENCES: REFERENCES_LOST,
+    POOR_FIT: REFERENCES_DOUBTFUL,
+    REFERENCES_DOUBTFUL: REFERENCES_DOUBTFUL,
+}
+"""State that trackers receive in states whose model is none to give poses by."""
+
+
+@dataclass(frozen=True)
+class Metal:
+    """Describes the sources of the change, as the most likely cloud has them.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (M, 3)
+        m, frame fg.
+    polarisability : ndarray, shape (M,), complex
+        A m^2 / T.
+    volumes : ndarray, shape (M,)
+        Volume that each source stands for, m^3.
+    centroid : ndarray, shape (3,)
+        Mean of the space, weighted by the squared magnitude of the polarisability's density: it
+        leans towards the part of the metal that the emitters reach best.
+    standoff_m : float
+        The cloud's distance from the board.
+    """
+
+    positions: Array
+    polarisability: ComplexArray
+    volumes: Array
+    centroid: Array
+    standoff_m: float
+
+
+def locate_metal(
+    bank: Bank, seen: FrameEvidence, weights: Array, flux_noise_t: float
+) -> Metal | None:
+    """Return the sources under the most probable hypothesis with metal; None when all are zero.
+
+    ``weights`` (H,): probability of each hypothesis; the first, that nothing has changed, is
+    passed over. ``flux_noise_t``: nominal noise, T.
+    """
+    best = 1 + int(weights[1:].argmax())
+    values = bank.sources(seen, best) * flux_noise_t
+    polarisability = values[:, 0] + 1j * values[:, 1]
+    cloud = bank.prior(best).cloud
+    power = np.abs(polarisability) ** 2 / cloud.volumes
+    if not power.sum() > 0.0:
+        return None
+    centroid = (cloud.positions * power[:, None]).sum(axis=0) / power.sum()
+    return Metal(cloud.positions, polarisability, cloud.volumes, centroid, cloud.standoff_m)
+
+
+@dataclass(frozen=True)
+class RefitResult:
+    """Holds the result of one frame of the references.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    model : FieldModel
+        The active model; the calibrated one itself while nothing has changed.
+    state : str
+        One of `STATES`, and the `reason` why.
+    judge, find : callable
+        Work out `references` and `metal`.
+    log_odds : float
+        Natural logarithm of the odds that something has changed.
+    weights : mapping of str to float
+        Probability of every cloud, and of ``nothing``.
+    noise_t : float
+        Measured noise of the references' phasor components, T.
+    drift : ndarray, shape (K,), complex
+        Relative change of each emitter's strength; where nothing else changes, zero unless it is
+        significant.
+    reason : str
+    """
+
+    stamp_ns: int
+    model: FieldModel
+    state: str
+    judge: Callable[[], tuple[ReferenceHealth, ...]] = field(repr=False)
+    log_odds: float
+    weights: dict[str, float]
+    noise_t: float
+    drift: ComplexArray
+    reason: str = ''
+    find: Callable[[], Metal | None] | None = field(default=None, repr=False)
+
+    @property
+    def withheld(self) -> str:
+        """Return the state for which poses are withheld; empty where the model may be used."""
+        return WITHHELD.get(self.state, '')
+
+    @property
+    def is_answer(self) -> bool:
+        """Return whether the references gave this frame's model; else it is the last resort."""
+        return not self.withheld
+
+    @cached_property
+    def references(self) -> tuple[ReferenceHealth, ...]:
+        """Return the health of every reference, computed when first asked for."""
+        return self.judge()
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Return the names of the references that took no part."""
+        return tuple(r.name for r in self.references if r.state != health.OK)
+
+    @cached_property
+    def metal(self) -> Metal | None:
+        """Return the sources found, computed when first asked for; None without a change."""
+        return self.find() if self.find is not None else None

@@ -1,0 +1,340 @@
+"""Writes the document and tables that an evaluation leaves, and compares two of the same
+frames. Frames close in time share the causes of their errors, so whole stretches of time are
+resampled (the moving-block idea of Künsch, Annals of Statistics 17, 1989), all coils of a
+stretch together.
+"""
+
+import csv
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import isfinite
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.errors import ParameterError
+from anser_ros.fingerprint import fingerprint_of
+from anser_ros.pose_states import OK
+from anser_ros.sessions.session import Session
+from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, metrics
+from anser_ros.tracking.estimate import PoseEstimate
+from anser_ros.wire.text_files import read_rows, read_text
+
+SCHEMA = 'anser_evaluation/1'
+"""Name of the document's layout, which stands in every such document."""
+
+
+def recording_of(session: Session) -> str:
+    """Return the fingerprint of what was recorded, whatever the file is called."""
+    return fingerprint_of([tool.flux[:, :1] for tool in session.tools])
+
+
+def to_document(evaluation: Evaluation) -> dict[str, Any]:
+    """Return the figures of every sensor and body as plain data.
+
+    Where the model followed the references, the number of frames in each state of the refit, and
+    in how many each reference sensor was left out, are there too.
+    """
+    document: dict[str, Any] = {'schema': SCHEMA}
+    for kind, group in evaluation.groups.items():
+        document[kind] = {name: metrics(series) for name, series in group.items()}
+    if evaluation.refit is not None:
+        document['refit'] = {
+            'states': dict(evaluation.refit.states),
+            'left_out': dict(evaluation.refit.left_out),
+        }
+    return document
+
+
+POSE_COLUMNS = (
+    'stamp_ns', 'sensor', 'x_m', 'y_m', 'z_m', 'ax', 'ay', 'az', 'sigma_position_m', 'residual_t',
+    'status',
+)  # fmt: skip
+"""Columns of the sensors' table; a coil's pose is its centre and its sensitive axis."""
+BODY_COLUMNS = (
+    'stamp_ns', 'body', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw', 'sigma_position_m',
+    'residual_t', 'status',
+)  # fmt: skip
+"""Columns of the bodies' table; the orientation is a quaternion."""
+POSES_FILE, BODIES_FILE, ERRORS_FILE = 'poses.csv', 'bodies.csv', 'errors.csv'
+ERROR_COLUMNS = ('stamp_ns', 'name', 'position_error_m', 'orientation_error_rad')
+"""Columns of the table of errors, of coils and bodies."""
+
+
+def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
+    """Write the tables of poses and of errors into a folder; the files.
+
+    Sensors' poses, or why there is none, are sorted by stamp; those of bodies, and of what else
+    was tracked, are one after the other.
+    """
+    tables = {
+        POSES_FILE: (POSE_COLUMNS, sorted(_sensor_rows(evaluation.sensors), key=itemgetter(0))),
+        BODIES_FILE: (BODY_COLUMNS, _body_rows(evaluation.bodies)),
+        ERRORS_FILE: (ERROR_COLUMNS, _error_rows(evaluation)),
+        **{f'{k}.csv': (POSE_COLUMNS, _sensor_rows(g)) for k, g in evaluation.further.items()},
+    }
+    for name, (columns, rows) in tables.items():
+        with (folder / name).open('w', newline='', encoding='utf-8') as stream:
+            writer = csv.writer(stream)
+            writer.writerow(columns)
+            writer.writerows(rows)
+    return [folder / name for name in tables]
+
+
+def _error_rows(evaluation: Evaluation) -> list[list[Any]]:
+    """The error of every pose that has an optical one."""
+    return [
+        [estimate.stamp_ns, series.name, f'{place:.9g}', f'{turn:.9g}']
+        for group in evaluation.groups.values()
+        for series in group.values()
+        for estimate, place, turn in zip(
+            series.estimates, series.position_error.tolist(), series.orientation_error.tolist(),
+            strict=True,
+        )
+        if isfinite(place)
+    ]  # fmt: skip
+
+
+def _sensor_rows(group: Mapping[str, PoseSeries]) -> list[list[Any]]:
+    """Rows of what has a place and an axis."""
+    return [
+        _row(series, pose, [*pose.position, *pose.axis] if pose.state == OK else None, 6)
+        for series in group.values()
+        for pose in series.estimates
+    ]
+
+
+def _body_rows(group: Mapping[str, PoseSeries]) -> list[list[Any]]:
+    rows = []
+    for series in group.values():
+        for pose in series.estimates:
+            values = None
+            if pose.state == OK and pose.rotation is not None:
+                values = [*pose.position, *Rotation.from_matrix(pose.rotation).as_quat()]
+            rows.append(_row(series, pose, values, 7))
+    return rows
+
+
+def _row(
+    series: PoseSeries, pose: PoseEstimate, values: list[float] | None, count: int
+) -> list[Any]:
+    """One pose of so many numbers, its sigma and residual; empty cells where there is none."""
+    cells = [''] * (count + 2)
+    if values is not None:
+        values = [*values, pose.sigma_position_m, pose.residual_t]
+        cells = [f'{float(value):.9g}' for value in values]
+    return [pose.stamp_ns, series.name, *cells, pose.state]
+
+
+Array = NDArray[np.float64]
+Key = tuple[int, str]
+
+BLOCK_NS = 1_000_000_000
+"""Length of a stretch that is resampled as one, ns: errors of a second ago are hardly related."""
+DRAWS = 2000
+"""Resamples: the ends of a 95 % interval then vary by a few percent of its width."""
+INTERVAL_SHARE = 0.95
+"""Share of the resamples that lie in the interval, as is usual in the field's publications."""
+FEWEST_BLOCKS = 5
+"""Stretches below which an interval means nothing: its ends would be those of single ones."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Holds the interval of a difference, second less first; NaN where stretches are too few."""
+
+    low: float
+    high: float
+
+    MORE_IS_BETTER: ClassVar = False
+
+    @property
+    def verdict(self) -> str:
+        """Return which is better, ``a`` or ``b``; ``neither`` where both may be."""
+        return {0: 'neither', 1 if self.MORE_IS_BETTER else -1: 'b'}.get(self.sign, 'a')
+
+    @property
+    def sign(self) -> int:
+        """Return the sign of the difference where the whole interval has one, else 0."""
+        return int(self.low > 0) - int(self.high < 0)
+
+
+@dataclass(frozen=True)
+class Compared(Difference):
+    """Compares ``n`` pairs of errors, m or rad, of one coil or body, or of all coils.
+
+    ``only_a`` and ``only_b`` are frames that only one of the two has a pose for.
+    """
+
+    n: int
+    only_a: int
+    only_b: int
+    rmse_a: float
+    rmse_b: float
+
+
+@dataclass(frozen=True)
+class ComparedShares(Difference):
+    """Compares the shares, 0 to 1, of ``n`` frames with a pose, of one coil or body."""
+
+    MORE_IS_BETTER = True
+
+    n: int
+    share_a: float
+    share_b: float
+
+
+def check_same_recording(first: Path, second: Path) -> None:
+    """Refuse evaluations of two recordings, of which equal stamps mean nothing.
+
+    Raises
+    ------
+    ParameterError
+        When both state what they are of, and it is not the same.
+    """
+    one, two = _recording(first), _recording(second)
+    if one and two and one != two:
+        raise ParameterError(
+            f'{first} and {second} are evaluations of two different recordings ({one}, {two}), '
+            f'whose frames cannot be paired'
+        )
+
+
+def _recording(folder: Path) -> str:
+    """What an evaluation says that it is of; empty where it does not, as older ones."""
+    path = folder / 'evaluation.json'
+    if not path.is_file():
+        return ''
+    try:
+        return str(json.loads(read_text(path)).get('recording', ''))
+    except (ValueError, AttributeError) as error:
+        raise ParameterError(f'{path}: not a document of anser evaluate') from error
+
+
+def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
+    """Return errors of position (m) and orientation (rad) by stamp and name, of an evaluation.
+
+    Raises
+    ------
+    ParameterError
+        When the folder has none, or the table is not one of ours.
+    """
+    _, _, *kinds = ERROR_COLUMNS
+    errors = [_read(folder, ERRORS_FILE, ERROR_COLUMNS, itemgetter(kind)) for kind in kinds]
+    return {'position': errors[0], 'orientation': errors[1]}
+
+
+def read_states(folder: Path) -> dict[Key, float]:
+    """Return whether there is a pose, 1 or 0, by stamp and name of a coil or body.
+
+    Raises
+    ------
+    ParameterError
+        When the folder lacks a table, or one is not ours.
+    """
+    tables = ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS))
+    found: dict[Key, float] = {}
+    for name, columns in tables:
+        found |= _read(folder, name, columns, lambda row: row['status'] == OK)
+    return found
+
+
+def _read(
+    folder: Path, name: str, columns: tuple[str, ...], value: Callable[[dict[str, str]], Any]
+) -> dict[Key, float]:
+    """A value of each row of a table, by stamp and by the name in its second column."""
+    path = folder / name
+    if not path.is_file():
+        raise ParameterError(f'{folder}: no {name}; is it a folder of anser evaluate?')
+    names, rows = read_rows(path)
+    try:
+        if tuple(names) != columns:
+            raise ValueError(f'columns must be {", ".join(columns)}')
+        return {(int(row['stamp_ns']), row[columns[1]]): float(value(row)) for row in rows}
+    except (ValueError, TypeError) as error:
+        raise ParameterError(f'{path}: {error}') from error
+
+
+def compare_errors(
+    first: dict[Key, float], second: dict[Key, float], rng: np.random.Generator
+) -> dict[str, Compared]:
+    """Compare two evaluations by name; errors of one kind by stamp and name.
+
+    A name without a frame in which both have an error has no pairs, only counts of errors that one
+    of them has alone.
+    """
+    return {name: _compare(first, second, name, rng) for name in _names(first, second)}
+
+
+def compare_shares(
+    first: dict[Key, float], second: dict[Key, float], rng: np.random.Generator
+) -> dict[str, ComparedShares]:
+    """Compare how often two evaluations have a pose; states by stamp and name (`read_states`).
+
+    Raises
+    ------
+    ParameterError
+        When no frame is in both.
+    """
+    if not first.keys() & second.keys():
+        raise ParameterError('the two have no frame in common: are they of the same session?')
+    found = {}
+    for name in _names(first, second):
+        stamps, pairs = _paired(first, second, name)
+        low, high = _interval(stamps, pairs, rng, np.asarray)
+        shares = pairs.mean(axis=1) if stamps.size else np.full(2, np.nan)
+        found[name] = ComparedShares(low, high, stamps.size, float(shares[0]), float(shares[1]))
+    return found
+
+
+def _names(first: dict[Key, float], second: dict[Key, float]) -> list[str]:
+    return list(dict.fromkeys(name for _, name in (*first, *second)))
+
+
+def _paired(
+    first: dict[Key, float], second: dict[Key, float], name: str
+) -> tuple[NDArray[np.int64], Array]:
+    """Stamps (n,) that both have of a name, and their values (2, n)."""
+    both = sorted(stamp for stamp, other in first if other == name and (stamp, name) in second)
+    pairs = [[values[stamp, name] for stamp in both] for values in (first, second)]
+    return np.array(both, dtype=np.int64), np.array(pairs).reshape(2, -1)
+
+
+def _compare(
+    first: dict[Key, float], second: dict[Key, float], name: str, rng: np.random.Generator
+) -> Compared:
+    one, two = (sum(other == name for _, other in errors) for errors in (first, second))
+    both, pairs = _paired(first, second, name)
+    low, high = _interval(both, pairs**2, rng, np.sqrt)
+    root = np.sqrt((pairs**2).mean(axis=1)) if both.size else np.full(2, np.nan)
+    return Compared(
+        low, high, both.size, one - both.size, two - both.size, float(root[0]), float(root[1])
+    )
+
+
+def _interval(
+    stamps: NDArray[np.int64],
+    values: Array,
+    rng: np.random.Generator,
+    shown: Callable[[Array], Array],
+) -> tuple[float, float]:
+    """The interval of the difference of two means, as they are shown, by resampled stretches."""
+    if not stamps.size:
+        return np.nan, np.nan
+    _, block = np.unique((stamps - stamps[0]) // BLOCK_NS, return_inverse=True)
+    count = int(block.max()) + 1
+    if count < FEWEST_BLOCKS:
+        return np.nan, np.nan
+    sums = np.array([np.bincount(block, weights=row) for row in values])
+    sizes = np.bincount(block)
+    drawn = rng.integers(0, count, size=(DRAWS, count))
+    means = sums[:, drawn].sum(axis=2) / sizes[drawn].sum(axis=1)
+    difference = np.diff(shown(means), axis=0)[0]
+    tail = 50.0 * (1.0 - INTERVAL_SHARE)
+    low, high = np.percentile(difference, (tail, 100.0 - tail))
+    return float(low), float(high)

@@ -1,0 +1,203 @@
+"""Makes a session of somebody else's bag, and files that other programs read of a session."""
+
+import csv
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import BagError, ParameterError
+from anser_ros.sessions.recorded_poses import published_poses
+from anser_ros.stamps import SECOND_NS
+from anser_ros.wire import cdr
+from anser_ros.wire.bag import Salvage
+from anser_ros.wire.bag_writer import SETUP_TYPE, SessionWriter
+from anser_ros.wire.foreign_bag import read_foreign
+from anser_ros.wire.recorded import PoseStream, RecordedFluxes
+from anser_ros.wire.setup import parse_setup
+
+
+@dataclass(frozen=True)
+class ImportedBag:
+    """Holds how many messages each topic got, and how many were left out, by topic and type.
+
+    What is left out has no known definition; ``lost`` says in words what could not be read.
+    """
+
+    messages: dict[str, int]
+    left_out: dict[str, int]
+    lost: str
+
+
+def parse_remaps(entries: Sequence[str]) -> dict[str, str]:
+    """Return new names by old ones from entries ``FROM:=TO``.
+
+    Raises
+    ------
+    ParameterError
+        When an entry is not of that form, a name is not absolute, or one is renamed twice.
+    """
+    names: dict[str, str] = {}
+    for entry in entries:
+        old, _, new = entry.partition(':=')
+        if not old.startswith('/') or not new.startswith('/') or old in names:
+            raise ParameterError(f'a new name must be /FROM:=/TO, each once, got {entry!r}')
+        names[old] = new
+    return names
+
+
+def import_bag(
+    path: str | os.PathLike[str],
+    out: Path,
+    remaps: Mapping[str, str] | None = None,
+    setup_text: str | None = None,
+) -> ImportedBag:
+    """Write the messages of any ROS 2 bag as one MCAP file that every command reads.
+
+    ``remaps`` are new names of topics; a setup document's text is written at the start, in place
+    of any in the bag.
+
+    Raises
+    ------
+    BagError
+        When the bag cannot be read, has no message, or lacks a topic that is to be renamed.
+    SetupError
+        When the text is not a setup document.
+    """
+    if setup_text is not None:
+        parse_setup(setup_text)
+    names, salvage = dict(remaps or {}), Salvage()
+    written: Counter[str] = Counter()
+    left_out: Counter[str] = Counter()
+    types: dict[str, str] = {}
+    seen: set[str] = set()
+    with SessionWriter(out) as writer:
+        for message in read_foreign(path, salvage):
+            if setup_text is not None and not seen:
+                writer.write_setup(setup_text, message.log_time_ns)
+            seen.add(message.topic)
+            topic, type_name = names.get(message.topic, message.topic), message.type_name
+            is_setup = topic.endswith('/setup') and type_name == SETUP_TYPE
+            if is_setup and setup_text is not None:
+                continue
+            if types.setdefault(topic, type_name) != type_name:
+                clash = f'{topic} would have {types[topic]} and {type_name}'
+                raise BagError(f'{os.fspath(path)}: {clash}')
+            if type_name not in cdr.DEFINITIONS and not message.definition:
+                left_out[f'{message.topic} ({type_name})'] += 1
+                continue
+            channel = writer.channel(topic, type_name, message.definition)
+            writer.write(channel, message.log_time_ns, message.data)
+            written[topic] += 1
+        missing = sorted(set(names) - seen)
+        if missing or not written:
+            what = f'no topic {", ".join(missing)}; there are: {", ".join(sorted(seen))}'
+            raise BagError(f'{os.fspath(path)}: {what if missing else "no message can be read"}')
+    return ImportedBag(dict(written), dict(left_out), salvage.lost)
+
+
+CSV, TUM, MAT = 'csv', 'tum', 'mat'
+FORMATS = (CSV, TUM, MAT)
+"""Forms of files; TUM, which `evo` reads, has poses only."""
+POSE_COLUMNS = ('stamp_ns', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
+
+
+@dataclass(frozen=True)
+class ExportedBag:
+    """Holds how many rows each file got, by its name, and in words what could not be read."""
+
+    rows: dict[str, int]
+    lost: str
+
+
+def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBag:
+    """Write a file for each topic of poses and of fluxes.
+
+    Raises
+    ------
+    BagError
+        When the bag cannot be read, or has neither.
+    ParameterError
+        When the form is unknown.
+    """
+    if form not in FORMATS:
+        raise ParameterError(f'format must be among {", ".join(FORMATS)}, got {form!r}')
+    # Nodes that read no bag run where the packages that read bags are not installed.
+    from anser_ros.wire.bag import POSE_TYPE, Salvage, iter_messages, read_fluxes
+
+    salvage = Salvage()
+    topics = sorted({m.topic for m in iter_messages(path, salvage) if m.type_name == POSE_TYPE})
+    written: dict[str, int] = {}
+    for topic, poses in published_poses(path, topics).items():
+        if poses.stamp_ns.size:
+            name = f'{_file_name(topic)}.{"txt" if form == TUM else form}'
+            stream = PoseStream(poses.stamp_ns, poses.position, poses.quaternion)
+            _write_poses(out / name, stream, form)
+            written[name] = int(poses.stamp_ns.size)
+    if form != TUM:
+        for which, fluxes in read_fluxes(path).items():
+            name = f'{which}_flux.{form}'
+            _write_fluxes(out / name, fluxes, form)
+            written[name] = int(fluxes.stamp_ns.size)
+    if not written:
+        raise BagError(f'{os.fspath(path)}: nothing to export as {form}')
+    return ExportedBag(written, salvage.lost)
+
+
+def _file_name(topic: str) -> str:
+    """A topic as the name of a file."""
+    return topic.strip('/').removeprefix('anser/').removesuffix('/pose').replace('/', '_')
+
+
+def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
+    """A table of stamps, positions, m, and quaternions."""
+    numbers = np.column_stack([poses.position, poses.quaternion]).tolist()
+    rows = zip(poses.stamp_ns.tolist(), numbers, strict=True)
+    if form == MAT:
+        parts = (poses.stamp_ns, poses.position, poses.quaternion)
+        _write_mat(path, ('stamp_ns', 'position_m', 'quaternion_xyzw'), parts)
+    elif form == TUM:
+        with path.open('w', encoding='utf-8') as stream:
+            for stamp, row in rows:
+                words = ' '.join(f'{value:.9g}' for value in row)
+                stream.write(f'{stamp // SECOND_NS}.{stamp % SECOND_NS:09d} {words}\n')
+    else:
+        _write_csv(path, POSE_COLUMNS, ([s, *(f'{v:.9g}' for v in row)] for s, row in rows))
+
+
+def _write_fluxes(path: Path, fluxes: RecordedFluxes, form: str) -> None:
+    """A table of stamps, channels, flags and phasors, T."""
+    if form == MAT:
+        parts = (fluxes.stamp_ns, fluxes.channel, fluxes.flags, fluxes.flux)
+        _write_mat(path, ('stamp_ns', 'channel', 'flags', 'flux_t'), parts)
+        return
+    columns = [f'coil{k}_{part}_t' for k in range(fluxes.flux.shape[2]) for part in ('re', 'im')]
+    _write_csv(path, ('stamp_ns', 'channel', 'flags', *columns), _flux_rows(fluxes))
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[list[object]]) -> None:
+    with path.open('w', encoding='utf-8', newline='') as stream:
+        writer = csv.writer(stream)
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _flux_rows(fluxes: RecordedFluxes) -> Iterator[list[object]]:
+    for stamp, flags, frame in zip(
+        fluxes.stamp_ns.tolist(), fluxes.flags.tolist(), fluxes.flux, strict=True
+    ):
+        for channel, flag, values in zip(fluxes.channel.tolist(), flags, frame, strict=True):
+            parts = np.ascontiguousarray(values).view(np.float64).tolist()
+            yield [stamp, channel, flag, *(f'{value:.9g}' for value in parts)]
+
+
+def _write_mat(path: Path, names: Sequence[str], arrays: Sequence[NDArray[Any]]) -> None:
+    from scipy.io import savemat
+
+    content = dict(zip(names, arrays, strict=True))
+    savemat(path, content, do_compression=True, oned_as='column')

@@ -1,0 +1,357 @@
+"""Puts simulated faults of sensors, coils, amplifiers and clocks into a control unit's signals.
+An effect overrides the stage at which it acts. The stages run in the order of the methods: the
+world's fluxes, the coil currents, the voltages of all samples before the converter, the device
+time of the records. Times count from the first drive of the coils, s, except for the device's
+clock. An effect does not know which analysis will look at the result; `draw` draws one and its
+parameters at random, for tests that do not know the answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.errors import ParameterError
+from anser_ros.simulation.world import MetalBody
+from anser_ros.wire.channel_calibration import ChannelCalibration
+from anser_ros.wire.setup import Setup
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+class RawEffect:
+    """Changes nothing at any stage; it is the base of all effects."""
+
+    def setup(self, setup: Setup) -> Setup:
+        """Return the true setup, which the effect may make differ from its document."""
+        return setup
+
+    def flux(self, time_s: float, flux: ComplexArray) -> ComplexArray:
+        """Return the fluxes (S, K), T at nominal current, in the order of the setup's sensors."""
+        return flux
+
+    def current(self, time_s: float, current: ComplexArray) -> ComplexArray:
+        """Return the coil currents (K,), A, for the field and for the current channel alike."""
+        return current
+
+    def volts(self, time_s: Array, volts: Array) -> Array:
+        """Return the voltages (n, S), V, at n sampling instants before noise and converter."""
+        return volts
+
+    def optical_time(self, time_s: float) -> float:
+        """Return the time that the optical tracker's clock stamps with at a true time, s."""
+        return time_s
+
+
+@dataclass(frozen=True)
+class RawChannelCrosstalk(RawEffect):
+    """Makes crosstalk between the sensors of one cluster."""
+
+    columns: tuple[int, ...]  # of the cluster's sensors in the order of the setup
+    # gain from each sensor (column) to each channel (row), with ones on the diagonal
+    matrix: tuple[tuple[float, ...], ...]
+
+    def volts(self, time_s: Array, volts: Array) -> Array:
+        mixed = volts.copy()
+        mixed[:, list(self.columns)] = volts[:, list(self.columns)] @ np.array(self.matrix).T
+        return mixed
+
+
+@dataclass(frozen=True)
+class OneSensor(RawEffect):
+    """Changes the voltages of one sensor, at its column in the order of the setup."""
+
+    column: int
+
+    def volts(self, time_s: Array, volts: Array) -> Array:
+        changed = volts.copy()
+        changed[:, self.column] = self.changed(time_s, volts[:, self.column])
+        return changed
+
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        """Return the sensor's voltages (n,), V."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class CompressingAmplifier(OneSensor):
+    """Saturates one sensor's amplifier: v becomes ``limit * tanh(v / limit)``."""
+
+    limit_v: float
+
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        return np.asarray(self.limit_v * np.tanh(volts / self.limit_v))
+
+
+@dataclass(frozen=True)
+class CrossoverAmplifier(OneSensor):
+    """Distorts one sensor by crossover: v becomes ``v - dead * tanh(v / dead)``.
+
+    The diagnosis has no such effect. The weaker all tones are, the larger is the lost fraction.
+    """
+
+    dead_v: float
+
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        return np.asarray(volts - self.dead_v * np.tanh(volts / self.dead_v))
+
+
+@dataclass(frozen=True)
+class LooseSensor(OneSensor):
+    """Loosens a sensor's contact: periodically its voltage drops to a small remainder."""
+
+    share: float = 0.1  # fraction of the time in which the contact is open
+    rest: float = 0.02  # factor of the voltage at an open contact
+    period_s: float = 0.7  # from one opening to the next, s
+
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        is_open = (time_s / self.period_s) % 1.0 < self.share
+        return np.where(is_open, volts * self.rest, volts)
+
+
+@dataclass(frozen=True)
+class ChannelGain(OneSensor):
+    """Makes the gain of one channel wrong."""
+
+    gain: float
+
+    def changed(self, time_s: Array, volts: Array) -> Array:
+        return volts * self.gain
+
+
+@dataclass(frozen=True)
+class OpticalClock(RawEffect):
+    """Makes the optical tracker's clock early by a constant, and fast."""
+
+    early_s: float = 0.0
+    fast_ppm: float = 0.0
+
+    def optical_time(self, time_s: float) -> float:
+        return time_s * (1.0 + 1e-6 * self.fast_ppm) - self.early_s
+
+
+@dataclass(frozen=True)
+class TiltedSensor(RawEffect):
+    """Tilts a sensor that has come loose: its axis is not the setup document's."""
+
+    column: int
+    axis: tuple[float, float, float]
+
+    def setup(self, setup: Setup) -> Setup:
+        sensors = list(setup.sensors)
+        sensors[self.column] = replace(sensors[self.column], axis=self.axis)
+        return replace(setup, sensors=tuple(sensors))
+
+
+@dataclass(frozen=True)
+class GainRipple(RawEffect):
+    """Makes all gains oscillate, as by a bad supply; the diagnosis has no such effect."""
+
+    depth: float
+    period_s: float
+
+    def volts(self, time_s: Array, volts: Array) -> Array:
+        swing = 1 + self.depth * np.sin(2 * np.pi * time_s / self.period_s)
+        return np.asarray(volts * swing[:, None])
+
+
+@dataclass(frozen=True)
+class CoilWeakens(RawEffect):
+    """Changes a coil's field at constant current, as by a turn that heats up and shorts."""
+
+    coil: int
+    amount: float
+    tau_s: float
+
+    def flux(self, time_s: float, flux: ComplexArray) -> ComplexArray:
+        drifted = flux.copy()
+        drifted[:, self.coil] *= 1 + self.amount * (1 - np.exp(-time_s / self.tau_s))
+        return drifted
+
+
+NONE = 'none'
+RANDOM = 'random'
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Holds a drawn effect with its name and parameters."""
+
+    name: str  # name of the effect
+    # its parameters as plain data, named as in docs/interfaces.md where the effect is there
+    parameters: dict[str, Any]
+    effects: tuple[RawEffect, ...] = ()  # what puts the effect into the signals
+    metal: tuple[MetalBody, ...] = field(default=())  # what puts it into the world
+    # names under which a diagnosis may rightly report the effect; empty where it has no such
+    # effect and only ``unexplained`` is right
+    answers: tuple[str, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """Return the effect as plain data for a file of the truth."""
+        return {
+            'name': self.name, 'parameters': self.parameters, 'answers': list(self.answers)
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Holds the sensors that an effect is put into, with the response of their channels."""
+
+    setup: Setup
+    channels: ChannelCalibration
+
+
+def _tool_columns(setup: Setup) -> list[int]:
+    moving = {sensor.name for sensor in setup.tool_sensors}
+    return [column for column, s in enumerate(setup.sensors) if s.name in moving]
+
+
+def _clusters(setup: Setup) -> list[list[int]]:
+    """Return the columns of tool sensors of which three or more are at the same place."""
+    places: dict[tuple[str, tuple[float, ...]], list[int]] = {}
+    for column in _tool_columns(setup):
+        sensor = setup.sensors[column]
+        places.setdefault((sensor.body, sensor.position_m), []).append(column)
+    return [columns for columns in places.values() if len(columns) >= 3]
+
+
+def _static_metal(unit: Unit, rng: np.random.Generator) -> Drawn:
+    place = np.array([*rng.uniform(-0.08, 0.08, 2), rng.uniform(-0.12, -0.07)])
+    radius = float(rng.uniform(0.03, 0.045))
+    body = MetalBody(np.zeros((1, 3)), radius, 5e6, 200.0, _resting(place))
+    parameters = {'position_m': place.tolist(), 'radius_m': radius}
+    return _known('static_metal', parameters, metal=(body,))
+
+
+def _resting(place: NDArray[np.float64]) -> Callable[[float], Any]:
+    return lambda time_s: (place, np.eye(3))
+
+
+def _known(name: str, parameters: dict[str, Any], *effects: RawEffect, **rest: Any) -> Drawn:
+    """Return an effect that the diagnosis reports under the same name."""
+    return Drawn(name, parameters, effects, answers=(name,), **rest)
+
+
+def _channel_crosstalk(unit: Unit, rng: np.random.Generator) -> Drawn:
+    clusters = _clusters(unit.setup)
+    columns = clusters[rng.integers(len(clusters))] if clusters else _tool_columns(unit.setup)[:2]
+    count = len(columns)
+    matrix = np.eye(count) + rng.uniform(0.01, 0.04, (count, count)) * (1 - np.eye(count))
+    matrix[~np.eye(count, dtype=bool)] *= rng.choice([-1.0, 1.0], count * (count - 1))
+    rows = tuple(tuple(float(v) for v in row) for row in matrix)
+    channels = [unit.setup.sensors[c].channel for c in columns]
+    parameters = {'channels': channels, 'matrix': [list(row) for row in rows]}
+    return _known('channel_crosstalk', parameters, RawChannelCrosstalk(tuple(columns), rows))
+
+
+def _time_offset(unit: Unit, rng: np.random.Generator) -> Drawn:
+    early = float(rng.uniform(0.015, 0.04))
+    return _known('time_offset', {'offset_s': early}, OpticalClock(early_s=early))
+
+
+def _clock_rate(unit: Unit, rng: np.random.Generator) -> Drawn:
+    fast_ppm = float(rng.uniform(2500.0, 6000.0))
+    return _known('clock_rate', {'rate_ppm': -fast_ppm}, OpticalClock(fast_ppm=fast_ppm))
+
+
+def _sensor_axis(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
+    sensor = unit.setup.sensors[column]
+    across = np.cross(sensor.axis, rng.standard_normal(3))
+    tilt_deg = float(rng.uniform(3.0, 8.0))
+    turn = Rotation.from_rotvec(np.radians(tilt_deg) * across / np.linalg.norm(across))
+    x, y, z = (float(v) for v in turn.apply(sensor.axis))
+    parameters = {'channel': sensor.channel, 'tilt_deg': tilt_deg, 'axis': [x, y, z]}
+    return _known('sensor_axis', parameters, TiltedSensor(column, (x, y, z)))
+
+
+def _sensor_gain(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
+    gain = float(1 + rng.choice([-1, 1]) * rng.uniform(0.01, 0.04))
+    parameters = {'channel': unit.setup.sensors[column].channel, 'gain': gain, 'phase_deg': 0.0}
+    return _known('sensor_gain', parameters, ChannelGain(column, gain))
+
+
+def _saturation(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
+    limit_v = float(rng.uniform(2.0, 4.0))
+    channel = unit.setup.sensors[column].channel
+    # The amplifier's limit is a voltage, which grows with the frequency: the mean tone stands for
+    # all of them.
+    volts_per_tesla = unit.channels.areas_m2([channel])[0] * np.mean(unit.setup.frequencies_hz)
+    full_scale_t = float(limit_v / (2 * np.pi * volts_per_tesla))
+    parameters = {'channel': channel, 'full_scale_t': full_scale_t, 'limit_v': limit_v}
+    return _known('saturation', parameters, CompressingAmplifier(column, limit_v))
+
+
+def _coil_drift(unit: Unit, rng: np.random.Generator) -> Drawn:
+    coil = int(rng.integers(len(unit.setup.emitter.coils)))
+    amount = float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.03))
+    tau_s = float(rng.uniform(5.0, 20.0))
+    parameters = {'coil': coil, 'amount': amount, 'tau_s': tau_s}
+    return _known('coil_drift', parameters, CoilWeakens(coil, amount, tau_s))
+
+
+def _loose_contact(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
+    share, period_s = float(rng.uniform(0.04, 0.1)), float(rng.uniform(0.6, 1.2))
+    parameters = {
+        'channels': [unit.setup.sensors[column].channel], 'share': share, 'period_s': period_s
+    }  # fmt: skip
+    effect = LooseSensor(column, share, period_s=period_s)
+    answers = ('loose_contact', 'outliers')
+    return Drawn('loose_contact', parameters, (effect,), answers=answers)
+
+
+def _gain_ripple(unit: Unit, rng: np.random.Generator) -> Drawn:
+    depth, period_s = float(rng.uniform(0.005, 0.02)), float(rng.uniform(1.0, 4.0))
+    parameters = {'depth': depth, 'period_s': period_s}
+    # The diagnosis has no oscillating gain, but one that varies over time.
+    return Drawn(
+        'gain_ripple',
+        parameters,
+        (GainRipple(depth, period_s),),
+        answers=('tool_gain_drift', 'sensor_gain_drift'),
+    )
+
+
+def _crossover(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
+    dead_v = float(rng.uniform(0.01, 0.03))
+    parameters = {'channel': unit.setup.sensors[column].channel, 'dead_v': dead_v}
+    return Drawn('crossover', parameters, (CrossoverAmplifier(column, dead_v),))
+
+
+CATALOGUE: dict[str, Callable[[Unit, np.random.Generator], Drawn]] = {
+    'static_metal': _static_metal,
+    'channel_crosstalk': _channel_crosstalk,
+    'time_offset': _time_offset,
+    'clock_rate': _clock_rate,
+    'sensor_axis': _sensor_axis,
+    'sensor_gain': _sensor_gain,
+    'saturation': _saturation,
+    'coil_drift': _coil_drift,
+    'loose_contact': _loose_contact,
+    'gain_ripple': _gain_ripple,
+    'crossover': _crossover,
+}
+
+
+def draw(name: str, setup: Setup, channels: ChannelCalibration, rng: np.random.Generator) -> Drawn:
+    """Draw the parameters of an effect, and the effect itself when `name` is ``random``.
+
+    Raises `ParameterError` when there is no effect of that name.
+    """
+    if name == NONE:
+        return Drawn(NONE, {})
+    if name == RANDOM:
+        name = str(rng.choice(sorted(CATALOGUE)))
+    if name not in CATALOGUE:
+        raise ParameterError(f'no effect {name!r}; there are: {", ".join(sorted(CATALOGUE))}')
+    return CATALOGUE[name](Unit(setup, channels), rng)

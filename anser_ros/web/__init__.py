@@ -1,1 +1,0 @@
-"""Serves the live view's page in the browser, without ROS: layout, jobs, files, who may look."""
