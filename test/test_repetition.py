@@ -29,7 +29,7 @@ def feed(watch, samples, block=40):
 
 
 class TestRings:
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=30, deadline=None)
     @given(
         length=st.integers(1, 80_000),
         alignment=st.integers(0, 79),

@@ -247,6 +247,7 @@ def test_two_sessions_of_one_board_agree(world):
     assert found.model.provenance['sessions'] == ['one', 'two']
 
 
+@pytest.mark.long
 def test_estimated_sensors_travel_with_the_model(world):
     table = world.measurements.sensors
     gain = np.array([1.01, 0.99, 1.0, 1.02, 0.98, 1.0])

@@ -201,8 +201,7 @@ class Heard:
                 self.lines[status.name] = (status.level[0], status.message, values)
 
     def until(self, condition):
-        """Wait for what takes several searches."""
-        return spin_until(self.node, lambda: condition(self.lines), 130.0)
+        return spin_until(self.node, lambda: condition(self.lines))
 
 
 def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):

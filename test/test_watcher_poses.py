@@ -141,7 +141,7 @@ def test_over_dds_a_late_tracker_is_named_with_no_field_model(ros):
             ros.spin_once(other, timeout_sec=0.0)
             return condition()
 
-        return spin_until(node, done, 100.0)
+        return spin_until(node, done)
 
     try:
         assert spin(lambda: all(s.get_subscription_count() for s in senders.values()))
