@@ -7,8 +7,7 @@ import pytest
 from conftest import SHARED, needs
 
 from anser_ros.apps.lab.cli import measured
-from anser_ros.apps.lab.measured.recipe import ReportRow
-from anser_ros.apps.lab.measured.recipe import Recipe
+from anser_ros.apps.lab.measured.recipe import Recipe, ReportRow
 from anser_ros.cli.main import main as measured_main
 
 

@@ -237,27 +237,13 @@ def check_new_file(path: Path) -> None:
 
 @dataclass(frozen=True)
 class Result:
-    """Holds what a command has found out, and how it says so.
+    """Holds what a command has found out, and how it says so."""
 
-    Attributes
-    ----------
-    document : dict
-        What ``--json`` prints.
-    notes : tuple of str
-        What users have to know of the session or the model, a line each.
-    shown : tuple
-        Tables and texts for the reader of the terminal.
-    written : tuple of Path
-        The files to look at.
-    code : int
-        The exit code.
-    """
-
-    document: dict[str, Any]
-    notes: tuple[str, ...] = ()
-    shown: tuple[Any, ...] = ()
-    written: tuple[Path, ...] = ()
-    code: int = 0
+    document: dict[str, Any]  # what ``--json`` prints
+    notes: tuple[str, ...] = ()  # what users have to know of the session or the model, a line each
+    shown: tuple[Any, ...] = ()  # tables and texts for the reader of the terminal
+    written: tuple[Path, ...] = ()  # the files to look at
+    code: int = 0  # the exit code
 
 
 def say(command: str, result: Result, *, as_json: bool) -> None:

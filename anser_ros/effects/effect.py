@@ -257,34 +257,27 @@ class Effect(BaseEffect[TermT]):
         One clause for the report.
     units : mapping
         Unit of each parameter of the record.
-    parts : tuple of str
-        What the values of each channel are, of an effect that every channel has in its own size.
     plausible : mapping
         Range that a parameter of the record may reasonably have.
     remedy : Remedy
-    family : Family
-    inexact : float
-        Share of its power that its model may miss where it is truly there (`INEXACT`); infinite
-        where its shape is never known.
-    drifts : bool
-        Whether it takes another course in every session, so that a recorded course holds only
-        for the session that it was found on.
-    followed : bool
-        Whether nothing but the reference sensors can follow it live.
-    gradient_error : float
-        Relative error of what it changes at a reference, beyond the survey's, where the field's
-        gradient close to an emitter is known less well than the field.
-    still : Effect or None
-        The effect at rest that this one is in each short stretch of time; where that fits best in
-        each stretch is where this one starts (`along`).
     """
 
+    # what the values of each channel are, of an effect that every channel has in its own size
     parts: ClassVar[tuple[str, ...]] = ()
     family: ClassVar[Family] = Family.STEADY
+    # share of its power that its model may miss where it is truly there (`INEXACT`); infinite
+    # where its shape is never known
     inexact: ClassVar[float] = INEXACT
+    # whether it takes another course in every session, so that a recorded course holds only for
+    # the session that it was found on
     drifts: ClassVar[bool] = False
+    # whether nothing but the reference sensors can follow it live
     followed: ClassVar[bool] = False
+    # relative error of what it changes at a reference, beyond the survey's, where the field's
+    # gradient close to an emitter is known less well than the field
     gradient_error: ClassVar[float] = 0.0
+    # the effect at rest that this one is in each short stretch of time; where that fits best in
+    # each stretch is where this one starts (`along`)
     still: ClassVar['Effect[Any] | None'] = None
 
     # --- search ------------------------------------------------------------------------------

@@ -40,15 +40,9 @@ a curve with several parameters."""
 
 
 class Fluctuation(Effect[FluctuationTerm]):
-    """Lets one constant effect fluctuate; it is the base of all that do so.
+    """Lets one constant effect fluctuate; it is the base of all that do so."""
 
-    Attributes
-    ----------
-    of : Effect
-        The constant effect whose columns a frame may move along.
-    """
-
-    of: ClassVar[Effect[Any]]
+    of: ClassVar[Effect[Any]]  # the constant effect whose columns a frame may move along
     family = Family.FLUCTUATION
     plausible = {'rms': (0.0, 1.0)}
 

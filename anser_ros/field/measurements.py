@@ -14,41 +14,21 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Measurements:
-    """Holds F frames of the S sensors on one body, with a flux for each of K emitters.
+    """Holds F frames of the S sensors on one body, with a flux for each of K emitters."""
 
-    Attributes
-    ----------
-    body : str
-        Name of the body; ``fg`` for reference sensors, whose pose is the identity.
-    sensors : SensorTable
-        The sensors in the order of the second axis of the fluxes.
-    time : ndarray, shape (F,)
-        Time since the session's first stamp on the clock of the fluxes, s.
-    flux : ndarray, shape (F, S, K), complex
-        Flux density along each sensor's axis, T; finite only where ``valid``.
-    valid : ndarray of bool, shape (F, S)
-        False where the value is missing, not finite or flagged.
-    flags : ndarray of int, shape (F, S)
-        Flag bits of the flux messages (saturated 1, stale 2, dropped samples 4).
-    position : ndarray, shape (F, 3)
-        Origin of the body, m, frame fg; NaN where ``has_pose`` is False.
-    rotation : ndarray, shape (F, 3, 3)
-        Rotation matrix from the body's frame to fg.
-    has_pose : ndarray of bool, shape (F,)
-        Whether the other instrument has a pose at the frame's time.
-    track : PoseTrack or None
-        The stream of poses on the same time axis, for effects that shift the clocks.
-    """
-
-    body: str
-    sensors: SensorTable
-    time: Array
+    body: str  # name of the body; ``fg`` for reference sensors, whose pose is the identity
+    sensors: SensorTable  # the sensors in the order of the second axis of the fluxes
+    time: Array  # (F,), time since the session's first stamp on the clock of the fluxes, s
+    # (F, S, K), complex, flux density along each sensor's axis, T; finite only where ``valid``
     flux: ComplexArray
-    valid: NDArray[np.bool_]
+    valid: NDArray[np.bool_]  # (F, S), false where the value is missing, not finite or flagged
+    # (F, S), flag bits of the flux messages (saturated 1, stale 2, dropped samples 4)
     flags: NDArray[np.int64]
-    position: Array
-    rotation: Array
+    position: Array  # (F, 3), origin of the body, m, frame fg; NaN where ``has_pose`` is False
+    rotation: Array  # (F, 3, 3), rotation matrix from the body's frame to fg
+    # (F,), whether the other instrument has a pose at the frame's time
     has_pose: NDArray[np.bool_]
+    # the stream of poses on the same time axis, for effects that shift the clocks
     track: PoseTrack | None = None
 
     @property

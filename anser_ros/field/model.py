@@ -146,63 +146,19 @@ SCHEMA = 'anser_model/1'
 
 @dataclass(frozen=True)
 class EffectRecord:
-    """Records one effect that a model corrects.
+    """Records one effect that a model corrects."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the effect.
-    parameters : mapping
-        Its parameters in SI units unless their names have another unit.
-    uncertainty : mapping
-        Standard deviations of the parameters, under the same keys.
-    evidence : mapping
-        Figures that speak for the effect.
-    """
-
-    name: str
+    name: str  # name of the effect
+    # its parameters in SI units unless their names have another unit
     parameters: Mapping[str, Any]
+    # standard deviations of the parameters, under the same keys
     uncertainty: Mapping[str, Any] = field(default_factory=dict)
-    evidence: Mapping[str, Any] = field(default_factory=dict)
+    evidence: Mapping[str, Any] = field(default_factory=dict)  # figures that speak for the effect
 
 
 @dataclass(frozen=True)
 class FieldModel:
     """Represents the field generator and all that distorts its field by virtual dipoles.
-
-    Attributes
-    ----------
-    positions, directions : ndarray, shape (N, 3)
-        Positions (m) and unit vectors, frame fg. A dipole whose three components are free takes
-        three rows.
-    moments : ndarray, shape (N, K), complex
-        Moments at each emitter's nominal current, A m^2.
-    emitters : tuple of str, length K
-        Names of the emitters.
-    frequencies_hz : tuple of float, length K
-        Their drive frequencies, Hz.
-    flux_error_t : float
-        Standard deviation of the model's own error, T a phasor component, in the volume that it
-        was fitted in (from held-out data, with noise and pose jitter subtracted).
-    modes : ndarray, shape (R, N, K), complex, or None
-        Low-rank factor of the moments' covariance. The variance of the field is the sum of the
-        squares of the R fields of these moments; real and imaginary part of a mode vary together.
-    effects : tuple of EffectRecord
-        Corrections of measured fluxes, sensors or the optical frame that belong to this model.
-        Effects on the field itself are already in the dipoles.
-    provenance : mapping
-        How the model was made, with its held-out error.
-    made_for : Identity or None
-        Board and bodies that it was calibrated on, or its effects were found on; None if not
-        stated.
-    references : ReferenceReadings or None
-        What the references read when it was calibrated.
-    shift_sigma_m : float
-        Standard deviation along each axis, m, of a shift that all places in the field share: what
-        the calibration could not tell between the field and where the tool's sensors are.
-    gaps : ScanGaps or None
-        By how much the field may be off where the scan has gaps, beyond ``flux_error_t``. Only a
-        diagnosis reads it; no pose follows from it.
 
     Raises
     ------
@@ -210,18 +166,33 @@ class FieldModel:
         When the shapes do not fit together or there is no dipole.
     """
 
+    # (N, 3), positions (m) and unit vectors, frame fg. A dipole whose three components are free
+    # takes three rows
     positions: Array
     directions: Array
-    moments: ComplexArray
-    emitters: tuple[str, ...]
-    frequencies_hz: tuple[float, ...]
+    moments: ComplexArray  # (N, K), complex, moments at each emitter's nominal current, A m^2
+    emitters: tuple[str, ...]  # length K, names of the emitters
+    frequencies_hz: tuple[float, ...]  # length K, their drive frequencies, Hz
+    # standard deviation of the model's own error, T a phasor component, in the volume that it was
+    # fitted in (from held-out data, with noise and pose jitter subtracted)
     flux_error_t: float = 0.0
+    # (R, N, K), complex, or None, low-rank factor of the moments' covariance. The variance of the
+    # field is the sum of the squares of the R fields of these moments; real and imaginary part of
+    # a mode vary together
     modes: ComplexArray | None = None
+    # corrections of measured fluxes, sensors or the optical frame that belong to this model.
+    # Effects on the field itself are already in the dipoles
     effects: tuple[EffectRecord, ...] = ()
+    # how the model was made, with its held-out error
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    # board and bodies that it was calibrated on, or its effects were found on; None if not stated
     made_for: Identity | None = None
-    references: ReferenceReadings | None = None
+    references: ReferenceReadings | None = None  # what the references read when it was calibrated
+    # standard deviation along each axis, m, of a shift that all places in the field share: what
+    # the calibration could not tell between the field and where the tool's sensors are
     shift_sigma_m: float = 0.0
+    # by how much the field may be off where the scan has gaps, beyond ``flux_error_t``. Only a
+    # diagnosis reads it; no pose follows from it
     gaps: ScanGaps | None = None
 
     def __post_init__(self) -> None:

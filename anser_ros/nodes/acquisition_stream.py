@@ -36,13 +36,7 @@ are shorter, and a new line settles in less; a pose that is older is of little u
 
 @dataclass(frozen=True)
 class Staleness:
-    """Says why sensors are stale; each array has a place for each of them, shape (S,).
-
-    Attributes
-    ----------
-    age_s : how long before a sensor said the same, s; 0 where what it says is new or constant
-    noiseless : whether it holds too little noise to distinguish new from old
-    """
+    """Says why sensors are stale; each array has a place for each of them, shape (S,)."""
 
     age_s: NDArray[np.float64]
     noiseless: NDArray[np.bool_]
@@ -55,17 +49,7 @@ class Staleness:
 
 @dataclass(frozen=True)
 class FluxFrame:
-    """Holds the fluxes of one window.
-
-    Attributes
-    ----------
-    tool, reference : points of the two topics
-    host_ns : middle of the window in the clock of the arrivals; 0 until it is known
-    window : conversion with noise and currents, sensors in the order of `FluxStream.sensors`
-    flags : flag bits of these sensors
-    staleness : why some of them are stale
-    repeats : whether the whole control unit says nothing new
-    """
+    """Holds the fluxes of one window."""
 
     tool: FluxPoints
     reference: FluxPoints

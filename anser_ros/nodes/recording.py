@@ -200,26 +200,14 @@ GAP_FACTOR = 1.5
 
 @dataclass
 class TopicLog:
-    """Records what arrived of one topic.
+    """Records what arrived of one topic."""
 
-    Attributes
-    ----------
-    n_publishers : int
-        How many nodes publish it.
-    lost : int
-        Messages that the publisher numbered and that never came; known while there is only one.
-    gaps : int
-        Intervals between stamps longer than one and a half of the topic's usual ones.
-    longest_gap_s : float
-    jumps_back : int
-        Stamps that lie before the one that came before them.
-    """
-
-    n_publishers: int = 1
+    n_publishers: int = 1  # how many nodes publish it
+    # messages that the publisher numbered and that never came; known while there is only one
     lost: int = 0
-    gaps: int = 0
+    gaps: int = 0  # intervals between stamps longer than one and a half of the topic's usual ones
     longest_gap_s: float = 0.0
-    jumps_back: int = 0
+    jumps_back: int = 0  # stamps that lie before the one that came before them
     _sequence: int | None = None
     _stamp_ns: int | None = None
     _intervals_s: list[float] = field(default_factory=list)

@@ -186,21 +186,12 @@ SEARCH_HEIGHT_M = 0.02
 
 @dataclass(frozen=True)
 class Excitation:
-    """Gives the driving field, in phase with the current of each emitter.
+    """Gives the driving field, in phase with the current of each emitter."""
 
-    Attributes
-    ----------
-    source : {'board', 'model'}
-        Where it comes from.
-    phase : ndarray, shape (K,), complex
-        Unit phasor of each emitter's field; readings are turned back by it.
-    field : callable
-        From points (P, 3), m, to the field there, (P, K, 3), T.
-    """
-
-    source: str
+    source: str  # where it comes from
+    # (K,), complex, unit phasor of each emitter's field; readings are turned back by it
     phase: ComplexArray
-    field: FieldFunction
+    field: FieldFunction  # from points (P, 3), m, to the field there, (P, K, 3), T
 
 
 def model_field(model: FieldModel, points: Array) -> ComplexArray:

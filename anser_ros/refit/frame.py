@@ -254,15 +254,9 @@ class Pace:
 
 @dataclass
 class NoiseLevel:
-    """Estimates the noise from second differences in time, in which smooth changes cancel.
+    """Estimates the noise from second differences in time, in which smooth changes cancel."""
 
-    Attributes
-    ----------
-    nominal_t : float
-        T; the estimate starts here and stays within a factor 20.
-    """
-
-    nominal_t: float
+    nominal_t: float  # T; the estimate starts here and stays within a factor 20
     _previous: list[ComplexArray] = field(default_factory=list)
     _ratio: float = 1.0
     _known: int = 1
@@ -306,14 +300,9 @@ class Average:
     delay. A drift below the noise is followed too, late by about `longest` frames. A baseline may
     contain no drift at all, so `integrity.clean_references.check_steady` judges a whole window
     in hindsight.
-
-    Attributes
-    ----------
-    longest : int
-        Most frames that are averaged; 1 switches it off.
     """
 
-    longest: int
+    longest: int  # most frames that are averaged; 1 switches it off
     _mean: ComplexArray | None = None
     _frames: int = 0
 

@@ -153,24 +153,14 @@ MOST_AT_ONCE = 4
 
 
 class ReferenceHealth(NamedTuple):
-    """States how one reference coil is in one frame.
-
-    Attributes
-    ----------
-    name : str
-    state : str
-        `OK`, or why it was left out, by the names above.
-    residual_t : float
-        Root mean square of measured minus predicted by all others, T a component; NaN where the
-        coil has no reading.
-    distance : float
-        The same in units of its expected size; about 1 for a healthy coil.
-    """
+    """States how one reference coil is in one frame."""
 
     name: str
-    state: str
+    state: str  # `OK`, or why it was left out, by the names above
+    # root mean square of measured minus predicted by all others, T a component; NaN where the coil
+    # has no reading
     residual_t: float
-    distance: float
+    distance: float  # the same in units of its expected size; about 1 for a healthy coil
 
 
 def judge_references(

@@ -54,36 +54,24 @@ outside has more detail than the box can make."""
 
 @dataclass(frozen=True)
 class Layer:
-    """Holds the dipoles that represent the field of a cloud.
+    """Holds the dipoles that represent the field of a cloud."""
 
-    Attributes
-    ----------
-    name : str
-        The same for the same dipoles.
-    rows : ndarray of int, shape (Q,), or None
-        The calibrated model's own dipoles that take part of the change; they are the layer's first
-        Q. None when all of the layer is added to the model.
-    positions, directions : ndarray, shape (N, 3)
-    inverse : ndarray, shape (N, 3P), or None
-        From field samples (T, point by point) to moments (A m^2); None where the dipoles are the
-        sources themselves, three a source.
-    points : ndarray, shape (P, 3)
-        Where the field is sampled, m.
-    metric : ndarray, shape (N, N)
-        Upper triangle C: ``|C m|`` is what the field of moments m does to poses, an rms over the
-        samples of the field relative to the emitters' own, times the height (an error of the field
-        moves a pose by its size over the field's gradient). Its unit does not matter.
-    middle : ndarray, shape (Q, N)
-        Field components per unit moment at the samples in the middle of the volume.
-    """
-
-    name: str
+    name: str  # the same for the same dipoles
+    # (Q,), or None, the calibrated model's own dipoles that take part of the change; they are the
+    # layer's first Q. None when all of the layer is added to the model
     rows: NDArray[np.int64] | None
+    # (N, 3)
     positions: Array
     directions: Array
+    # (N, 3P), or None, from field samples (T, point by point) to moments (A m^2); None where the
+    # dipoles are the sources themselves, three a source
     inverse: Array | None
-    points: Array
+    points: Array  # (P, 3), where the field is sampled, m
+    # (N, N), upper triangle C: ``|C m|`` is what the field of moments m does to poses, an rms over
+    # the samples of the field relative to the emitters' own, times the height (an error of the
+    # field moves a pose by its size over the field's gradient). Its unit does not matter
     metric: Array
+    # (Q, N), field components per unit moment at the samples in the middle of the volume
     middle: Array
     _projected: dict[bytes, Array] = field(default_factory=dict, repr=False, compare=False)
 

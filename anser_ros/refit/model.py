@@ -321,28 +321,15 @@ WITHHELD = {
 
 @dataclass(frozen=True)
 class Metal:
-    """Describes the sources of the change, as the most likely cloud has them.
+    """Describes the sources of the change, as the most likely cloud has them."""
 
-    Attributes
-    ----------
-    positions : ndarray, shape (M, 3)
-        m, frame fg.
-    polarisability : ndarray, shape (M,), complex
-        A m^2 / T.
-    volumes : ndarray, shape (M,)
-        Volume that each source stands for, m^3.
-    centroid : ndarray, shape (3,)
-        Mean of the space, weighted by the squared magnitude of the polarisability's density: it
-        leans towards the part of the metal that the emitters reach best.
-    standoff_m : float
-        The cloud's distance from the board.
-    """
-
-    positions: Array
-    polarisability: ComplexArray
-    volumes: Array
+    positions: Array  # (M, 3), m, frame fg
+    polarisability: ComplexArray  # (M,), complex, a m^2 / T
+    volumes: Array  # (M,), volume that each source stands for, m^3
+    # (3,), mean of the space, weighted by the squared magnitude of the polarisability's density:
+    # it leans towards the part of the metal that the emitters reach best
     centroid: Array
-    standoff_m: float
+    standoff_m: float  # the cloud's distance from the board
 
 
 def locate_metal(
@@ -370,32 +357,19 @@ class RefitResult:
 
     Attributes
     ----------
-    stamp_ns : int
-    model : FieldModel
-        The active model; the calibrated one itself while nothing has changed.
-    state : str
-        One of `STATES`, and the `reason` why.
     judge, find : callable
         Work out `references` and `metal`.
-    log_odds : float
-        Natural logarithm of the odds that something has changed.
-    weights : mapping of str to float
-        Probability of every cloud, and of ``nothing``.
-    noise_t : float
-        Measured noise of the references' phasor components, T.
-    drift : ndarray, shape (K,), complex
-        Relative change of each emitter's strength; where nothing else changes, zero unless it is
-        significant.
-    reason : str
     """
 
     stamp_ns: int
-    model: FieldModel
-    state: str
+    model: FieldModel  # the active model; the calibrated one itself while nothing has changed
+    state: str  # one of `STATES`, and the `reason` why
     judge: Callable[[], tuple[ReferenceHealth, ...]] = field(repr=False)
-    log_odds: float
-    weights: dict[str, float]
-    noise_t: float
+    log_odds: float  # natural logarithm of the odds that something has changed
+    weights: dict[str, float]  # probability of every cloud, and of ``nothing``
+    noise_t: float  # measured noise of the references' phasor components, T
+    # (K,), complex, relative change of each emitter's strength; where nothing else changes, zero
+    # unless it is significant
     drift: ComplexArray
     reason: str = ''
     find: Callable[[], Metal | None] | None = field(default=None, repr=False)

@@ -36,24 +36,14 @@ STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
 
 @dataclass(frozen=True)
 class FrameEvidence:
-    """Holds the evidence of one frame for H hypotheses, at a noise in units of the nominal one.
+    """Holds the evidence of one frame for H hypotheses, at a noise in units of the nominal one."""
 
-    Attributes
-    ----------
-    projected : ndarray, shape (H, n, 2)
-        Whitened readings in each hypothesis' eigenvectors; real, imaginary.
-    log_evidence : ndarray, shape (H,)
-    curve : ndarray, shape (H, A, 2)
-        Logarithm of the likelihood of each strength, real and imaginary part.
-    strength : ndarray, shape (H, 2, A)
-        Probability of each strength.
-    noise : float
-    """
-
+    # (H, n, 2), whitened readings in each hypothesis' eigenvectors; real, imaginary
     projected: Single
-    log_evidence: Array
+    log_evidence: Array  # (H,)
+    # (H, A, 2), logarithm of the likelihood of each strength, real and imaginary part
     curve: Array
-    strength: Array
+    strength: Array  # (H, 2, A), probability of each strength
     noise: float
 
 

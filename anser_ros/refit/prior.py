@@ -75,23 +75,12 @@ class Response:
     A compact piece responds equally in all directions. A flat piece responds only across its face,
     and pieces that touch drive each other: in recordings, metal below a board responds differently
     along the board's normal, and plates in yet other ways.
-
-    Attributes
-    ----------
-    name : str
-        Empty for the plain one.
-    isotropic : float
-        Of a multiple of the unit tensor.
-    upright : float
-        Of the component along the board's normal (z).
-    tensor : float
-        Of every component of a symmetric tensor, in an orthonormal basis.
     """
 
-    name: str = ''
-    isotropic: float = 1.0
-    upright: float = 0.0
-    tensor: float = 0.0
+    name: str = ''  # empty for the plain one
+    isotropic: float = 1.0  # of a multiple of the unit tensor
+    upright: float = 0.0  # of the component along the board's normal (z)
+    tensor: float = 0.0  # of every component of a symmetric tensor, in an orthonormal basis
 
 
 UPRIGHT = Response('upright', 1.0, 1.0, 0.0)
@@ -104,40 +93,24 @@ BODY = Response('', 1.0, 0.0, 0.5)
 
 @dataclass(frozen=True)
 class CloudPrior:
-    """Holds one hypothesis about the change of the readings.
-
-    Attributes
-    ----------
-    name : str
-    cloud : Cloud
-    layer : Layer
-    response : Response
-        Of its sources.
-    coupling : ndarray, shape (S K, M)
-        Covariance of each reading with each source's mean polarisability (a third of the tensor's
-        trace, A m^2 / T), normalised like ``covariance``.
-    covariance : ndarray, shape (S K, S K)
-        Of the readings, survey errors included, normalised to a mean variance of 1.
-    transfer : ndarray, shape (N K, S K)
-        From weighted readings ``covariance^-1 y`` to moments of the layer, dipole by dipole.
-    draw_readings : ndarray, shape (S K, D)
-        Readings, survey errors included, of draws from the normalised prior.
-    draw_moments : ndarray, shape (N K, D)
-        Moments of the layer of the same draws.
-    scale : float
-        What ``covariance`` was divided by.
-    """
+    """Holds one hypothesis about the change of the readings."""
 
     name: str
     cloud: Cloud
     layer: Layer
-    response: Response
+    response: Response  # of its sources
+    # (S K, M), covariance of each reading with each source's mean polarisability (a third of the
+    # tensor's trace, A m^2 / T), normalised like ``covariance``
     coupling: Array
+    # (S K, S K), of the readings, survey errors included, normalised to a mean variance of 1
     covariance: Array
+    # (N K, S K), from weighted readings ``covariance^-1 y`` to moments of the layer, dipole by
+    # dipole
     transfer: Array
+    # (S K, D), readings, survey errors included, of draws from the normalised prior
     draw_readings: Array
-    draw_moments: Array
-    scale: float
+    draw_moments: Array  # (N K, D), moments of the layer of the same draws
+    scale: float  # what ``covariance`` was divided by
 
 
 class _Sources:
@@ -299,22 +272,13 @@ AT_ONCE = 400
 
 @dataclass(frozen=True)
 class ReducedPrior:
-    """Holds the coordinates of a hypothesis.
+    """Holds the coordinates of a hypothesis."""
 
-    Attributes
-    ----------
-    basis : ndarray, shape (N, K D), single precision
-        Moments of the layer by unit coordinates; metal of strength a has coordinates of variance
-        a, independent of each other.
-    cross : ndarray, shape (D, S K)
-        Covariance of the coordinates with all readings of the references.
-    felt : ndarray, shape (D,)
-        What poses feel of unit coordinates (`Layer.metric`); no two feel alike.
-    """
-
+    # (N, K D), single precision, moments of the layer by unit coordinates; metal of strength a has
+    # coordinates of variance a, independent of each other
     basis: Single
-    cross: Array
-    felt: Array
+    cross: Array  # (D, S K), covariance of the coordinates with all readings of the references
+    felt: Array  # (D,), what poses feel of unit coordinates (`Layer.metric`); no two feel alike
 
 
 def reduced(

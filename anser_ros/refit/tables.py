@@ -77,24 +77,12 @@ def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Sin
 
 @dataclass
 class BodySearch:
-    """Holds the directions of the bodies' readings for the coils in use.
+    """Holds the directions of the bodies' readings for the coils in use."""
 
-    Attributes
-    ----------
-    factors : sequence of ndarray, shape (all readings, c)
-        From `body_factor`.
-    rows : ndarray of int, shape (n,)
-        Readings in use.
-    whitening : ndarray, shape (n, n)
-        Makes noise and drift of the readings white.
-    strengths : ndarray, shape (A,)
-        Variances of a reading that the evidence is summed over.
-    """
-
-    factors: tuple[Single, ...]
-    rows: NDArray[np.int64]
-    whitening: Array
-    strengths: Array
+    factors: tuple[Single, ...]  # (all readings, c), from `body_factor`
+    rows: NDArray[np.int64]  # (n,), readings in use
+    whitening: Array  # (n, n), makes noise and drift of the readings white
+    strengths: Array  # (A,), variances of a reading that the evidence is summed over
     _tables: dict[float, tuple[Single, Array, Array]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

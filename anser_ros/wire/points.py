@@ -37,21 +37,13 @@ _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'
 
 @dataclass(frozen=True)
 class FluxPoints:
-    """Holds the fluxes of one demodulation window with a row for each sensor.
+    """Holds the fluxes of one demodulation window with a row for each sensor."""
 
-    Attributes
-    ----------
-    channel, flags : ndarray, shape (S,)
-        Channel number and flag bits (`SATURATED`, `STALE`, `DROPPED`).
-    flux : ndarray, shape (S, K), complex
-        T, a column per emitter.
-    position, axis : ndarray, shape (S, 3)
-        m and unit vector, frame fg; NaN for sensors that move.
-    """
-
+    # (S,), channel number and flag bits (`SATURATED`, `STALE`, `DROPPED`)
     channel: NDArray[np.int64]
     flags: NDArray[np.int64]
-    flux: ComplexArray
+    flux: ComplexArray  # (S, K), complex, T, a column per emitter
+    # (S, 3), m and unit vector, frame fg; NaN for sensors that move
     position: Array
     axis: Array
 

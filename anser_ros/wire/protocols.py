@@ -177,18 +177,11 @@ class RecordReader(Protocol):
 
 @dataclass(frozen=True)
 class SerialProtocol:
-    """Describes how a kind of control unit speaks.
+    """Describes how a kind of control unit speaks."""
 
-    Attributes
-    ----------
-    make_reader : callable
-        Returns a new `RecordReader`.
-    encode : callable
-        Bytes of a command (`records.Identify`, `SetFrequencies`, `Start`, `Stop`) with a tag that
-        its reply repeats. A command that the unit does not have is no bytes.
-    """
-
-    make_reader: Callable[[], RecordReader]
+    make_reader: Callable[[], RecordReader]  # returns a new `RecordReader`
+    # bytes of a command (`records.Identify`, `SetFrequencies`, `Start`, `Stop`) with a tag that
+    # its reply repeats. A command that the unit does not have is no bytes
     encode: Callable[[Payload, int], bytes]
 
     @property

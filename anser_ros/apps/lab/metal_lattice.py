@@ -66,27 +66,16 @@ class Coils:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Holds the points of a body and their answers.
+    """Holds the points of a body and their answers."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3)
-        m, in the body's own frame.
-    unit : float
-        Unit of the answers, A m^2/T.
-    answers, slopes : ndarray, shape (n,), complex
-        Answer of each point, and its change with the logarithm of the frequency over
-        ``frequency_hz``, both over ``unit``.
-    frequency_hz : float
-    offset : ndarray, shape (n,), complex, or None
-        Small change of the answers, taken in to first order.
-    """
-
-    points: Array
-    unit: float
+    points: Array  # (n, 3), m, in the body's own frame
+    unit: float  # unit of the answers, A m^2/T
+    # (n,), complex, answer of each point, and its change with the logarithm of the frequency over
+    # ``frequency_hz``, both over ``unit``
     answers: ComplexArray
     slopes: ComplexArray
     frequency_hz: float
+    # (n,), complex, or None, small change of the answers, taken in to first order
     offset: ComplexArray | None = None
 
     def __len__(self) -> int:
@@ -260,35 +249,20 @@ EVERY = 8
 
 @dataclass(frozen=True)
 class KnownMetal:
-    """Holds a rigid piece of metal as a recording has shown it.
-
-    Attributes
-    ----------
-    name : str
-    lattice : Lattice
-    directions : ndarray, shape (4n, D)
-        Errors of the lattice's parameters: sums of these with independent normal factors.
-    misfit : float
-        Part of what references read of it, in frames that took no part, that it does not explain.
-    strongest_t : float
-        Largest field that drove one of its points while it was learnt, T.
-    nearest_m : float
-        Least distance of a coil from one of its points then.
-    low, high : ndarray, shape (3,)
-        Corners of the box of its places then, m.
-    turn : ndarray, shape (3,)
-        Its rotation vector in the middle of the recording.
-    """
+    """Holds a rigid piece of metal as a recording has shown it."""
 
     name: str
     lattice: Lattice
+    # (4n, D), errors of the lattice's parameters: sums of these with independent normal factors
     directions: Array
+    # part of what references read of it, in frames that took no part, that it does not explain
     misfit: float
-    strongest_t: float
-    nearest_m: float
+    strongest_t: float  # largest field that drove one of its points while it was learnt, T
+    nearest_m: float  # least distance of a coil from one of its points then
+    # (3,), corners of the box of its places then, m
     low: Array
     high: Array
-    turn: Array
+    turn: Array  # (3,), its rotation vector in the middle of the recording
 
 
 def directions_of(

@@ -63,25 +63,14 @@ RATES = slice(6, 12)
 
 @dataclass(frozen=True)
 class MetalState:
-    """Holds what is known of the metal and of the tools' coils.
+    """Holds what is known of the metal and of the tools' coils."""
 
-    Attributes
-    ----------
-    pose, rates : ndarray, shape (6,)
-        Place (m) and rotation vector; their change, /s.
-    answers : ndarray, shape (D,)
-        Factors of `KnownMetal.directions`.
-    own : ndarray, shape (7 S,)
-        Errors of all tools' coils, as `CoilErrors`.
-    covariance : ndarray
-        Of a step of the pose, rates, answers and own errors, in this order.
-    """
-
+    # (6,), place (m) and rotation vector; their change, /s
     pose: Array
     rates: Array
-    answers: Array
-    own: Array
-    covariance: Array
+    answers: Array  # (D,), factors of `KnownMetal.directions`
+    own: Array  # (7 S,), errors of all tools' coils, as `CoilErrors`
+    covariance: Array  # of a step of the pose, rates, answers and own errors, in this order
 
     def stepped(self, step: Array) -> 'MetalState':
         """Return the state after a step of all that it holds."""

@@ -22,14 +22,7 @@ of a host, less than the time between two words of a node on itself."""
 
 @dataclass(frozen=True)
 class HandedFlux:
-    """Holds the fluxes of a window, as a reader of their message has them.
-
-    Attributes
-    ----------
-    stamp_ns : middle of the window, ns of the ROS clock
-    frame_id : the setup's frame
-    points : a row per sensor, in single precision as messages are
-    """
+    """Holds the fluxes of a window, as a reader of their message has them."""
 
     stamp_ns: int
     frame_id: str

@@ -28,25 +28,14 @@ SCALARS = (bool, int, float, str)
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """States what a parameter's value must satisfy, and what it means.
+    """States what a parameter's value must satisfy, and what it means."""
 
-    Attributes
-    ----------
-    description : str
-        One line for the operator, with the unit.
-    minimum, maximum : float or None
-        Inclusive bounds of a number, or of every number of a list.
-    choices : tuple of str
-        The allowed texts; empty when any will do.
-    live : bool
-        Whether it may change while the node runs.
-    """
-
-    description: str
+    description: str  # one line for the operator, with the unit
+    # inclusive bounds of a number, or of every number of a list
     minimum: float | None = None
     maximum: float | None = None
-    choices: tuple[str, ...] = ()
-    live: bool = False
+    choices: tuple[str, ...] = ()  # the allowed texts; empty when any will do
+    live: bool = False  # whether it may change while the node runs
 
 
 def parameter(

@@ -10,30 +10,17 @@ from anser_ros.calibration.error_map import learn_error_map
 
 @dataclass(frozen=True)
 class BoardRun:
-    """Holds one run's errors in held-out blocks, registered to the others, without and with a map.
-
-    Attributes
-    ----------
-    name : str
-    points : int
-    before_m, after_m : float
-        Root mean square (m) along the board of each block, predicted from the others. The latter
-        may be the larger: a map that helped among the others has then not helped in the block.
-    across_m : float
-        The same across the board, which no map touches.
-    confirmed : bool
-        Whether the blocks show a gain clearly.
-    shape : str
-        The map that all points together choose, in words.
-    """
+    """Holds one run's errors in held-out blocks, registered to the others, without and with a map."""
 
     name: str
     points: int
+    # root mean square (m) along the board of each block, predicted from the others. The latter may
+    # be the larger: a map that helped among the others has then not helped in the block
     before_m: float
     after_m: float
-    across_m: float
-    confirmed: bool
-    shape: str
+    across_m: float  # the same across the board, which no map touches
+    confirmed: bool  # whether the blocks show a gain clearly
+    shape: str  # the map that all points together choose, in words
 
 
 def board_folder() -> Path:

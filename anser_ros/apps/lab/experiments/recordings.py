@@ -83,18 +83,10 @@ NAMES = (
 
 @dataclass(frozen=True)
 class Recordings:
-    """Opens a folder with one bag for each of `NAMES`.
+    """Opens a folder with one bag for each of `NAMES`."""
 
-    Attributes
-    ----------
-    folder : Path
-        The folder.
-    origin : str
-        Who simulated the recordings, for the report.
-    """
-
-    folder: Path
-    origin: str
+    folder: Path  # the folder
+    origin: str  # who simulated the recordings, for the report
 
     def load(self, name: str) -> Session:
         """Return the recording of a name; raises `BagError` when it cannot be read."""

@@ -35,21 +35,12 @@ FROZEN, FREE, SHARED = 'frozen model', 'free dipoles', 'shared polarisability'
 
 @dataclass(frozen=True)
 class AblationRow:
-    """Holds the error of one method with one number of references on one session.
-
-    Attributes
-    ----------
-    session : str
-    method : str
-    references : int
-    rmse_m : float
-        Of all tool coils tracked singly, against the optical pose.
-    """
+    """Holds the error of one method with one number of references on one session."""
 
     session: str
     method: str
     references: int
-    rmse_m: float
+    rmse_m: float  # of all tool coils tracked singly, against the optical pose
 
 
 def spread_out(references: SensorTable, count: int) -> NDArray[np.int64]:

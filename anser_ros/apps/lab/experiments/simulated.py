@@ -48,20 +48,11 @@ METALS = {'aluminium': (35e6, 1.0), 'mu-metal': (1.8e6, 1e4)}
 
 @dataclass(frozen=True)
 class Raster:
-    """Moves a body so that it rests at the points of a lattice, one a second, held by hand.
+    """Moves a body so that it rests at the points of a lattice, one a second, held by hand."""
 
-    Attributes
-    ----------
-    side : int
-        Points along x and along y.
-    span_m : float
-        Edge of the square, m.
-    height_m : float
-        Height of the lattice, m; each point is off by up to 4 mm and turned by up to 20 mrad.
-    """
-
-    side: int
-    span_m: float
+    side: int  # points along x and along y
+    span_m: float  # edge of the square, m
+    # height of the lattice, m; each point is off by up to 4 mm and turned by up to 20 mrad
     height_m: float
 
     def __call__(self, time_s: float) -> Pose:

@@ -143,18 +143,12 @@ def our_model(sessions: Sequence[Session]) -> Calibration:
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Holds one sensor's errors frame by frame, with NaN where it was not tracked.
+    """Holds one sensor's errors frame by frame, with NaN where it was not tracked."""
 
-    Attributes
-    ----------
-    tracked, true : ndarray, shape (F, 3)
-        Tracked and optical position, m, frame fg.
-    distance, angle : ndarray, shape (F,)
-        Position error, m, and orientation error, rad.
-    """
-
+    # (F, 3), tracked and optical position, m, frame fg
     tracked: Array
     true: Array
+    # (F,), position error, m, and orientation error, rad
     distance: Array
     angle: Array
 
@@ -217,32 +211,20 @@ Errors = dict[str, SensorErrors]
 
 @dataclass
 class Results:
-    """Holds the results of all experiments.
+    """Holds the results of all experiments."""
 
-    Attributes
-    ----------
-    origin : str
-        Who simulated the recordings.
-    tracking : dict
-        Errors by experiment, method and sensor.
-    fields : dict
-        The article's field metrics by material, method and set.
-    bounds : dict
-        Cramer-Rao bound of each sensor by experiment, m.
-    models : dict
-        Figures of our model's choice by the recording that it was trained on.
-    corrections : dict
-        The error map of Table V in words, by method and sensor.
-    board_runs : list of BoardRun
-        Error maps of a real tracker's positions; the only measured data here.
-    """
-
-    origin: str
+    origin: str  # who simulated the recordings
+    # errors by experiment, method and sensor
     tracking: dict[str, dict[str, Errors]] = field(default_factory=dict)
+    # the article's field metrics by material, method and set
     fields: dict[str, dict[str, dict[str, dict[str, float]]]] = field(default_factory=dict)
+    # cramer-Rao bound of each sensor by experiment, m
     bounds: dict[str, dict[str, float]] = field(default_factory=dict)
+    # figures of our model's choice by the recording that it was trained on
     models: dict[str, str] = field(default_factory=dict)
+    # the error map of Table V in words, by method and sensor
     corrections: dict[str, dict[str, str]] = field(default_factory=dict)
+    # error maps of a real tracker's positions; the only measured data here
     board_runs: list[BoardRun] = field(default_factory=list)
 
     def document(self) -> dict[str, Any]:

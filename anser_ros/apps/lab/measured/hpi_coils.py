@@ -52,29 +52,18 @@ SPECIAL_MM, SPECIAL_INVERTED = 1.84, 45.0
 
 @dataclass(frozen=True)
 class Epoch:
-    """Holds the file in SI units: S channels, Q points each, T samples, 4 coils.
+    """Holds the file in SI units: S channels, Q points each, T samples, 4 coils."""
 
-    Attributes
-    ----------
-    names : tuple of str, length S
-    is_magnetometer : ndarray of bool, shape (S,)
-    points_m, normals, weights : ndarray, shapes (S, Q, 3), (S, Q, 3), (S, Q)
-    samples : ndarray, shape (S, T)
-    rate_hz : float
-    stored : ndarray, shape (4, S)
-        Amplitudes as stored with the data, signs included.
-    digitised_m, vendor_m : ndarray, shape (4, 3)
-        Places as digitised by hand, and as the vendor's software fits them.
-    """
-
-    names: tuple[str, ...]
-    is_magnetometer: NDArray[np.bool_]
+    names: tuple[str, ...]  # length S
+    is_magnetometer: NDArray[np.bool_]  # (S,)
+    # (S, Q, 3), (S, Q, 3), (S, Q)
     points_m: Array
     normals: Array
     weights: Array
-    samples: Array
+    samples: Array  # (S, T)
     rate_hz: float
-    stored: Array
+    stored: Array  # (4, S), amplitudes as stored with the data, signs included
+    # (4, 3), places as digitised by hand, and as the vendor's software fits them
     digitised_m: Array
     vendor_m: Array
 

@@ -52,31 +52,16 @@ learnt on the first file, the second one tracked."""
 
 @dataclass(frozen=True)
 class Recording:
-    """Holds F poses of a magnet before S three-axis sensors, frame of the optical system.
-
-    Attributes
-    ----------
-    name : str
-    field_t : ndarray, shape (F, S, 3)
-        Flux density in each sensor's own axes, ambient field removed, T.
-    sensor_m : ndarray, shape (F, S, 3)
-        Stated sensor positions, m.
-    sensor_rotation : ndarray, shape (F, S, 3, 3)
-        Stated rotations, sensor to optical frame.
-    magnet_m : ndarray, shape (F, 3)
-        Stated magnet centre, m.
-    magnet_rotation : ndarray, shape (F, 3, 3)
-        Magnet to optical frame; the moment lies along the magnet's +z.
-    stamp_s : ndarray, shape (F,)
-    """
+    """Holds F poses of a magnet before S three-axis sensors, frame of the optical system."""
 
     name: str
-    field_t: Array
-    sensor_m: Array
-    sensor_rotation: Array
-    magnet_m: Array
+    field_t: Array  # (F, S, 3), flux density in each sensor's own axes, ambient field removed, T
+    sensor_m: Array  # (F, S, 3), stated sensor positions, m
+    sensor_rotation: Array  # (F, S, 3, 3), stated rotations, sensor to optical frame
+    magnet_m: Array  # (F, 3), stated magnet centre, m
+    # (F, 3, 3), magnet to optical frame; the moment lies along the magnet's +z
     magnet_rotation: Array
-    stamp_s: Array
+    stamp_s: Array  # (F,)
 
 
 def read_table(path: Path) -> tuple[list[str], Array]:

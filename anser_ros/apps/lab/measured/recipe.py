@@ -80,29 +80,18 @@ class ReportRow:
 
 @dataclass(frozen=True)
 class Recipe:
-    """States what `anser measured` does with a data set.
+    """States what `anser measured` does with a data set."""
 
-    Attributes
-    ----------
-    name : str
-        As `anser measured` calls the data set.
-    write_sessions : callable
-        From the folder of the data and that of the bags to the bags written there.
-    commands : callable
-        From the bags and the folder for results to the command lines, in their order: verb and
-        arguments of `anser`, as anybody would type them.
-    rows : callable
-        From the folder of the data, the bags and the folder for results to the figures, read from
-        what the commands wrote.
-    folder : str
-        Of the data, below ``measured/``; the name, unless another is given.
-    """
-
-    name: str
+    name: str  # as `anser measured` calls the data set
+    # from the folder of the data and that of the bags to the bags written there
     write_sessions: Callable[[Path, Path], list[Path]]
+    # from the bags and the folder for results to the command lines, in their order: verb and
+    # arguments of `anser`, as anybody would type them
     commands: Callable[[list[Path], Path], list[list[str]]]
+    # from the folder of the data, the bags and the folder for results to the figures, read from
+    # what the commands wrote
     rows: Callable[[Path, list[Path], Path], list[ReportRow]]
-    folder: str = ''
+    folder: str = ''  # of the data, below ``measured/``; the name, unless another is given
 
     def data(self, shared: Path) -> Path:
         """Return the folder of the data in the one that contains ``measured/``."""

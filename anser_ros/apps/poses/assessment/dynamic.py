@@ -33,42 +33,27 @@ latency."""
 
 @dataclass(frozen=True)
 class SpeedGroup:
-    """Holds poses of similar speed.
-
-    Attributes
-    ----------
-    low_m_s, high_m_s, mean_m_s : float
-    n : int
-    error_m, error_live_m : IntervalEstimate
-        Root mean square distance, m: with the clocks' offset taken out, and as it is met by who
-        takes a pose for that of its stamp on the reference's clock.
-    latency_s : IntervalEstimate
-        Of the poses against the reference, s, the common offset included.
-    """
+    """Holds poses of similar speed."""
 
     low_m_s: float
     high_m_s: float
     mean_m_s: float
     n: int
+    # root mean square distance, m: with the clocks' offset taken out, and as it is met by who
+    # takes a pose for that of its stamp on the reference's clock
     error_m: IntervalEstimate
     error_live_m: IntervalEstimate
+    # of the poses against the reference, s, the common offset included
     latency_s: IntervalEstimate
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """Holds what a moving tool shows.
-
-    Attributes
-    ----------
-    estimates : dict of str to IntervalEstimate
-    groups : tuple of SpeedGroup
-    speed_m_s, error_m : ndarray, shape (n,)
-        Of every pose.
-    """
+    """Holds what a moving tool shows."""
 
     estimates: dict[str, IntervalEstimate]
     groups: tuple[SpeedGroup, ...]
+    # (n,), of every pose
     speed_m_s: Array
     error_m: Array
 

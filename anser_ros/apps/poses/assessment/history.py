@@ -38,21 +38,12 @@ to be alike do not make limits that the next one must break."""
 
 @dataclass(frozen=True)
 class ControlLimits:
-    """Holds the limits of one figure.
+    """Holds the limits of one figure."""
 
-    Attributes
-    ----------
-    n : int
-        Earlier sessions they are made from.
-    mean, sigma : float
-    note, alert : float
-        Distance from the mean, in the figure's unit, from which on a session is a note, and an
-        alert.
-    """
-
-    n: int
+    n: int  # earlier sessions they are made from
     mean: float
     sigma: float
+    # distance from the mean, in the figure's unit, from which on a session is a note, and an alert
     note: float
     alert: float
 
@@ -67,24 +58,12 @@ def _multiple(count: int, deviations: float, figures: int) -> float:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Judges a figure by those of earlier sessions.
+    """Judges a figure by those of earlier sessions."""
 
-    Attributes
-    ----------
-    state : str
-        One of `STATES`.
-    words : str
-        Why, or that there are no limits yet; empty where it passes by limits.
-    limits : ControlLimits or None
-        None while there are too few sessions.
-    tolerance : float or None
-        What was stated.
-    """
-
-    state: str
-    words: str
-    limits: ControlLimits | None
-    tolerance: float | None
+    state: str  # one of `STATES`
+    words: str  # why, or that there are no limits yet; empty where it passes by limits
+    limits: ControlLimits | None  # none while there are too few sessions
+    tolerance: float | None  # what was stated
 
 
 def limits_of(earlier: Sequence[float], figures: int = 1) -> ControlLimits | None:
@@ -169,23 +148,12 @@ class EarlierFigure:
 
 @dataclass(frozen=True)
 class SessionVerdict:
-    """Holds the verdict on a session.
+    """Holds the verdict on a session."""
 
-    Attributes
-    ----------
-    state : str
-        That of its worst figure.
-    figures : dict of str to Verdict
-        By figure.
-    sessions : int
-        Earlier sessions of the same protocol and body.
-    past : dict of str to tuple of EarlierFigure
-        Watched figures in those sessions, the oldest first.
-    """
-
-    state: str
-    figures: dict[str, Verdict]
-    sessions: int
+    state: str  # that of its worst figure
+    figures: dict[str, Verdict]  # by figure
+    sessions: int  # earlier sessions of the same protocol and body
+    # watched figures in those sessions, the oldest first
     past: dict[str, tuple[EarlierFigure, ...]]
 
 

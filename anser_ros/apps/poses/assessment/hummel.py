@@ -53,26 +53,13 @@ ORDERS = ('rows', 'serpentine')
 
 @dataclass(frozen=True)
 class ErrorGroup:
-    """Holds errors of one kind.
+    """Holds errors of one kind."""
 
-    Attributes
-    ----------
-    unit : str
-        ``mm`` or ``deg``, as MITK has them.
-    descriptions : tuple of str
-    errors : ndarray, shape (n,)
-        Sizes, as MITK's ``distanceError``.
-    signed : ndarray, shape (n,)
-        Measured less true.
-    summary : dict of str to IntervalEstimate
-        Of the sizes.
-    """
-
-    unit: str
+    unit: str  # ``mm`` or ``deg``, as MITK has them
     descriptions: tuple[str, ...]
-    errors: Array
-    signed: Array
-    summary: dict[str, IntervalEstimate]
+    errors: Array  # (n,), sizes, as MITK's ``distanceError``
+    signed: Array  # (n,), measured less true
+    summary: dict[str, IntervalEstimate]  # of the sizes
 
 
 @dataclass(frozen=True)

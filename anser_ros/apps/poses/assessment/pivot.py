@@ -45,53 +45,28 @@ SMALLEST_SIGMA_M = 1e-7  # of a coordinate; simulated poses without noise have n
 
 @dataclass(frozen=True)
 class PivotLimits:
-    """Holds bounds from which on a pivot calibration is refused.
+    """Holds bounds from which on a pivot calibration is refused."""
 
-    Attributes
-    ----------
-    sigma_m : float
-        Largest standard deviation of the tip along any direction, m.
-    rms_m : float
-        Largest root mean square distance of the poses that agree from one point, m.
-    """
-
-    sigma_m: float = 1e-3
+    sigma_m: float = 1e-3  # largest standard deviation of the tip along any direction, m
+    # largest root mean square distance of the poses that agree from one point, m
     rms_m: float = 3e-3
 
 
 @dataclass(frozen=True)
 class PivotFit:
-    """Holds a tip, and how well it is known.
+    """Holds a tip, and how well it is known."""
 
-    Attributes
-    ----------
-    tip : ndarray, shape (3,)
-        m, body's frame.
-    covariance : ndarray, shape (3, 3)
-        Of the tip, m^2, body's frame; errors alike within a stretch of time count once.
-    point : ndarray, shape (3,)
-        What the tip rested on, m, tracker's frame.
-    point_covariance : ndarray, shape (3, 3)
-        m^2, tracker's frame.
-    time, distance : ndarray, shape (n,)
-        Stamps of the poses that took part, s, and how far each puts the tip from the point, m.
-    agrees : ndarray of bool, shape (n,)
-        The poses that agree on the tip.
-    rms_m : float
-        Root mean square distance of those.
-    tilt_deg : ndarray, shape (3,)
-        Root mean square turn of the body's x, y and z direction, degrees.
-    """
-
-    tip: Array
+    tip: Array  # (3,), m, body's frame
+    # (3, 3), of the tip, m^2, body's frame; errors alike within a stretch of time count once
     covariance: Array
-    point: Array
-    point_covariance: Array
+    point: Array  # (3,), what the tip rested on, m, tracker's frame
+    point_covariance: Array  # (3, 3), m^2, tracker's frame
+    # (n,), stamps of the poses that took part, s, and how far each puts the tip from the point, m
     time: Array
     distance: Array
-    agrees: Mask
-    rms_m: float
-    tilt_deg: Array
+    agrees: Mask  # (n,), the poses that agree on the tip
+    rms_m: float  # root mean square distance of those
+    tilt_deg: Array  # (3,), root mean square turn of the body's x, y and z direction, degrees
 
     @property
     def sigma(self) -> Array:

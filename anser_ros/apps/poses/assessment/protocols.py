@@ -39,64 +39,35 @@ STUCK_M = 1e-12
 
 @dataclass(frozen=True)
 class ProtocolOptions:
-    """Holds what a protocol is given besides its recordings.
+    """Holds what a protocol is given besides its recordings."""
 
-    Attributes
-    ----------
-    pause : PauseRule
-        What is a point.
-    grid : tuple of int, or None
-        Rows and columns of a board that is not one of the protocol's.
-    spacing_m, step_deg : float
-        Of the board's holes, and of the ring's.
-    order : str
-        One of `ORDERS`: how a board was gone over.
-    axis : ndarray, shape (3,), or None
-        Direction of a sensor without roll.
-    truth : ndarray, shape (n, 3), or None
-        Places of a phantom's points, m; None: the recording's optical reference.
-    """
-
-    pause: PauseRule = field(default_factory=PauseRule)
+    pause: PauseRule = field(default_factory=PauseRule)  # what is a point
+    # rows and columns of a board that is not one of the protocol's
     grid: tuple[int, int] | None = None
+    # of the board's holes, and of the ring's
     spacing_m: float = SPACING_M
     step_deg: float = RING_STEP_DEG
-    order: str = ORDERS[0]
-    axis: Array | None = None
+    order: str = ORDERS[0]  # one of `ORDERS`: how a board was gone over
+    axis: Array | None = None  # (3,), or None, direction of a sensor without roll
+    # (n, 3), or None, places of a phantom's points, m; None: the recording's optical reference
     truth: Array | None = None
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """Holds what a protocol found.
-
-    Attributes
-    ----------
-    protocol, body : str
-    recordings : tuple of str
-    start_ns : int
-        Stamp at which the first recording begins.
-    estimates : dict of str to IntervalEstimate
-        Figures by name; units are in the names.
-    groups : dict of str to ErrorGroup
-        Errors of a kind, under MITK's names where it has them.
-    points : tuple of StillPoint
-    allan : dict of str to AllanCurve
-    speeds : tuple of SpeedGroup
-    notes : tuple of str
-        What a reader must know of the figures.
-    """
+    """Holds what a protocol found."""
 
     protocol: str
     body: str
     recordings: tuple[str, ...]
-    start_ns: int
-    estimates: dict[str, IntervalEstimate]
+    start_ns: int  # stamp at which the first recording begins
+    estimates: dict[str, IntervalEstimate]  # figures by name; units are in the names
+    # errors of a kind, under MITK's names where it has them
     groups: dict[str, ErrorGroup] = field(default_factory=dict)
     points: tuple[StillPoint, ...] = ()
     allan: dict[str, AllanCurve] = field(default_factory=dict)
     speeds: tuple[SpeedGroup, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what a reader must know of the figures
 
 
 PROTOCOLS = {

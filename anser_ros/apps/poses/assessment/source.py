@@ -30,52 +30,26 @@ TOOL = 'tool'
 
 @dataclass(frozen=True)
 class PoseSource:
-    """States which poses are meant; what is not said is found where there is only one.
+    """States which poses are meant; what is not said is found where there is only one."""
 
-    Attributes
-    ----------
-    topic : str
-        Of the poses in a bag (`geometry_msgs/PoseStamped`).
-    body : str
-        Of a session of fluxes, or of the setup document that a bag of poses has.
-    sensor : str
-        Of a file of poses, or of a bag, that has several.
-    model : str
-        With which a session of fluxes is tracked (a file, or ``nominal``); empty: poses are read.
-    optical : str
-        Topic of the reference, where there are several.
-    tip : ndarray, shape (3,), or None
-        Place on the body, m, whose poses are meant instead of the body's own.
-    """
-
-    topic: str = ''
-    body: str = ''
-    sensor: str = ''
+    topic: str = ''  # of the poses in a bag (`geometry_msgs/PoseStamped`)
+    body: str = ''  # of a session of fluxes, or of the setup document that a bag of poses has
+    sensor: str = ''  # of a file of poses, or of a bag, that has several
+    # with which a session of fluxes is tracked (a file, or ``nominal``); empty: poses are read
     model: str = ''
-    optical: str = ''
+    optical: str = ''  # topic of the reference, where there are several
+    # (3,), or None, place on the body, m, whose poses are meant instead of the body's own
     tip: Array | None = None
 
 
 @dataclass(frozen=True)
 class AssessedPoses:
-    """Holds the poses of one body, and what else is known of them.
+    """Holds the poses of one body, and what else is known of them."""
 
-    Attributes
-    ----------
-    name : str
-        Of the body, sensor or topic.
-    poses : PoseSequence
-        In the tracker's frame.
-    session : PoseSession
-        The same with the reference, where the recording has one.
-    setup : Setup or None
-        The document of a session of fluxes.
-    """
-
-    name: str
-    poses: PoseSequence
-    session: PoseSession
-    setup: Setup | None = None
+    name: str  # of the body, sensor or topic
+    poses: PoseSequence  # in the tracker's frame
+    session: PoseSession  # the same with the reference, where the recording has one
+    setup: Setup | None = None  # the document of a session of fluxes
 
 
 def read_poses(

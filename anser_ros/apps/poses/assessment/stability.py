@@ -34,18 +34,11 @@ ALPHAS = (2, 1, 0, -1, -2)  # exponents of frequency that allantools has interva
 
 @dataclass(frozen=True)
 class AllanCurve:
-    """Holds the overlapping Allan deviation of one coordinate.
+    """Holds the overlapping Allan deviation of one coordinate."""
 
-    Attributes
-    ----------
-    tau_s : ndarray, shape (k,)
-        Averaging times.
-    deviation, low, high : ndarray, shape (k,)
-        m, with its 95 % interval (chi-square with Greenhall's degrees of freedom, for the noise
-        that each averaging time shows).
-    """
-
-    tau_s: Array
+    tau_s: Array  # (k,), averaging times
+    # (k,), m, with its 95 % interval (chi-square with Greenhall's degrees of freedom, for the
+    # noise that each averaging time shows)
     deviation: Array
     low: Array
     high: Array
@@ -53,20 +46,11 @@ class AllanCurve:
 
 @dataclass(frozen=True)
 class Rest:
-    """Holds what a tool at rest shows.
+    """Holds what a tool at rest shows."""
 
-    Attributes
-    ----------
-    estimates : dict of str to IntervalEstimate
-        By their names in ``accuracy.json``.
-    allan : dict of str to AllanCurve
-        By axis.
-    even_share : float
-        Share of the poses that are in the longest evenly spaced stretch, which Allan's is of.
-    """
-
-    estimates: dict[str, IntervalEstimate]
-    allan: dict[str, AllanCurve]
+    estimates: dict[str, IntervalEstimate]  # by their names in ``accuracy.json``
+    allan: dict[str, AllanCurve]  # by axis
+    # share of the poses that are in the longest evenly spaced stretch, which Allan's is of
     even_share: float
 
 

@@ -31,46 +31,26 @@ LONGEST_SILENCE_S = 1.0  # silence that ends a pause: it is not known where the 
 
 @dataclass(frozen=True)
 class PauseRule:
-    """States what counts as a point.
+    """States what counts as a point."""
 
-    Attributes
-    ----------
-    least_s : float
-        Shortest pause.
-    apart_m, apart_rad : float
-        Pauses in a row that are nearer to each other are one point: a tool that was let go of, or
-        touched.
-    """
-
-    least_s: float = 1.0
+    least_s: float = 1.0  # shortest pause
+    # pauses in a row that are nearer to each other are one point: a tool that was let go of, or
+    # touched
     apart_m: float = 5e-3
     apart_rad: float = 0.05
 
 
 @dataclass(frozen=True)
 class StillPoint:
-    """Describes a place where the tool rested.
+    """Describes a place where the tool rested."""
 
-    Attributes
-    ----------
-    begin_s, end_s : float
-        s since the recording's start.
-    position : ndarray, shape (3,)
-        Mean, m, tracker's frame.
-    rotation : ndarray, shape (3, 3)
-        Mean rotation.
-    jitter_m : float
-        Root mean square distance of a pose from the mean.
-    n : int
-        Poses.
-    """
-
+    # s since the recording's start
     begin_s: float
     end_s: float
-    position: Array
-    rotation: Array
-    jitter_m: float
-    n: int
+    position: Array  # (3,), mean, m, tracker's frame
+    rotation: Array  # (3, 3), mean rotation
+    jitter_m: float  # root mean square distance of a pose from the mean
+    n: int  # poses
 
 
 def point_of(poses: PoseSequence) -> StillPoint:
