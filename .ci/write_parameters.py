@@ -12,13 +12,13 @@ from anser_ros.nodes.runtime.node import AnserNode
 TARGET = Path(__file__).resolve().parents[1] / 'config' / 'anser.yaml'
 HEAD = """\
 # Parameters of all nodes: ros2 run anser_ros NODE --ros-args --params-file config/anser.yaml
-# Written by `make parameters` from the tables in anser_ros/nodes; the values are the defaults.
+# Written by `make parameters` from the tables of the nodes; the values are the defaults.
 # A key that its node does not know stops the node with a line that says so.
 """
 
 
 def table_of(name):
-    module = importlib.import_module(f'anser_ros.nodes.{name}')
+    module = importlib.import_module(NODES[name][0])
     for value in vars(module).values():
         if isinstance(value, type) and issubclass(value, AnserNode) and value is not AnserNode:
             return value.PARAMETERS

@@ -43,7 +43,7 @@ def policy(setup_file: str = 'demo_setup.yaml') -> str:
     graph = _graph(setup_file)
     enclaves = {node: _profiles_of(node, graph) for node in NODES}
     for process in COMPOSED:
-        chain = importlib.import_module(f'anser_ros.nodes.{process}').CHAIN
+        chain = importlib.import_module(COMPOSED[process][0]).CHAIN
         enclaves[process] = [name for node in chain for name in enclaves[node.NAME]]
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -139,7 +139,7 @@ def _node(name: str, parameters: Mapping[str, Any]) -> Any:
 
     from anser_ros.nodes.runtime.node import AnserNode
 
-    kinds = vars(importlib.import_module(f'anser_ros.nodes.{name}')).values()
+    kinds = vars(importlib.import_module(ALL_NODES[name][0])).values()
     nodes = [k for k in kinds if isinstance(k, type) and issubclass(k, AnserNode)]
     (kind,) = (k for k in nodes if vars(k).get('NAME') == name)
     values = [Parameter(key, value=value) for key, value in parameters.items()]

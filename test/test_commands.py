@@ -238,7 +238,7 @@ def test_every_command_has_a_page():
 @pytest.mark.parametrize('name', [*NODES, *COMPOSED])
 def test_the_help_of_a_node_has_an_example_that_holds(name, capsys):
     process = importlib.import_module('anser_ros.nodes.runtime.process')
-    module = importlib.import_module(f'anser_ros.nodes.{name}')
+    module = importlib.import_module({**NODES, **COMPOSED}[name][0])
     classes = getattr(module, 'CHAIN', None) or tuple(
         kind for kind in vars(module).values() if getattr(kind, 'NAME', '') == name
     )

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import json
 from pathlib import Path
 
@@ -19,7 +20,8 @@ from anser_ros.wire.setup import parse_setup, topic_of
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
 DOCUMENTS = sorted(CONFIG.glob('*.yaml'))
-NODES_ROOM = CONFIG.parent / 'anser_ros' / 'nodes'
+PACKAGE = CONFIG.parent / 'anser_ros'
+NODE_FILES = [*PACKAGE.glob('nodes/**/*.py'), *PACKAGE.glob('apps/*/nodes/*.py')]
 
 
 def is_parameter_file(document):
@@ -29,7 +31,7 @@ def is_parameter_file(document):
 
 
 def node_class(name):
-    module = importlib.import_module(f'anser_ros.nodes.{name}')
+    module = importlib.import_module(NODES[name][0])
     (found,) = (
         value
         for value in vars(module).values()
@@ -83,7 +85,7 @@ def test_every_parameter_is_read():
     """A parameter that nothing asks for would promise what is not done; the names of
     `anser_ros.settings` are read together, by `stated_by`.
     """
-    trees = [ast.parse(path.read_text()) for path in NODES_ROOM.rglob('*.py')]
+    trees = [ast.parse(path.read_text()) for path in NODE_FILES]
     read = {n.attr for tree in trees for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
     tables = {name: set(node_class(name).PARAMETERS.__dataclass_fields__) for name in NODES}
     unread = {name: names - read - set(VALUES) for name, names in tables.items()}
@@ -121,10 +123,11 @@ def test_views_show_topics_that_exist():
     assert shown and shown <= known
 
 
-def private_names(path):
-    """Return the private methods and attributes that a file's classes give themselves."""
+def private_names(path, name='Node'):
+    """Return the private methods and attributes that a class of a file gives itself."""
     found = set()
-    for node in ast.walk(ast.parse(Path(path).read_text())):
+    classes = [n for n in ast.parse(Path(path).read_text()).body if isinstance(n, ast.ClassDef)]
+    for node in (n for c in classes if c.name.endswith(name) for n in ast.walk(c)):
         if isinstance(node, ast.FunctionDef) and node.args.args[:1]:
             found |= {node.name} if node.args.args[0].arg == 'self' else set()
         elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
@@ -137,5 +140,6 @@ def test_no_node_takes_a_private_name_of_its_bases():
     taken = private_names(rclpy.node.__file__) | private_names(base.__file__)
     assert '_clock' in taken
     for name in NODES:
-        own = private_names(CONFIG.parent / 'anser_ros' / 'nodes' / f'{name}.py')
+        found = node_class(name)
+        own = private_names(inspect.getfile(found), found.__name__)
         assert not own & taken, name

@@ -135,7 +135,7 @@ class TestInterfacesPage:
             assert re.search(rf'`{name}`|anser {name}', text), name
 
     def test_every_service(self):
-        nodes = (REPO / 'anser_ros' / 'nodes').rglob('*.py')
+        nodes = (REPO / 'anser_ros').glob('**/nodes/**/*.py')
         code = ''.join(path.read_text(encoding='utf-8') for path in nodes)
         services = re.findall(r"create_service\(\w+, '([\w/]+)'", code)
         assert services

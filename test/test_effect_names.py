@@ -22,8 +22,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 ALLOWED = {
     'effects/': 'their own room',
     'simulation/': 'faults of a simulated nature, labelled with what a diagnosis should call them',
-    'measured/': 'recipes count the effects that the commands named',
-    'poses/effects/': 'the room of effects of trackers that give poses alone',
+    'apps/lab/measured/': 'recipes count the effects that the commands named',
+    'apps/poses/effects/': 'the room of effects of trackers that give poses alone',
     'calibration/sensor_parameters.py': 'parameters of a fit below the effects, as they are named',
     'calibration/sensor_records.py': 'writes records as `docs/interfaces.md` names them, from '
     'below the effects: a scan finds what is wrong with itself by its own fit',
@@ -36,8 +36,8 @@ GENERAL = {
 }  # fmt: skip
 """Modules in the room of effects that are about no single one; others may import these."""
 MAY_IMPORT = {
-    'diagnosis/screening.py': {'sensor_polarity', 'wiring'},
-    'diagnosis/findings.py': {'excess_noise', 'outliers'},
+    'diagnosis/screening.py': {'wiring'},
+    'diagnosis/findings.py': {'seen'},
     'diagnosis/fit.py': {'metal_remainder'},
     'diagnosis/departure.py': {'departed_metal', 'metal_path'},
 }
@@ -119,7 +119,7 @@ def test_no_module_of_a_single_effect_is_imported_outside_its_room():
     found = {}
     for path in PACKAGE.rglob('*.py'):
         place = path.relative_to(PACKAGE).as_posix()
-        if not place.startswith(('effects/', 'poses/effects/')):
+        if not place.startswith(('effects/', 'apps/poses/effects/')):
             single = set(imports_of_effects(nodes_of(path))) - GENERAL
             found |= {place: single} if single else {}
     assert found == MAY_IMPORT
@@ -127,7 +127,7 @@ def test_no_module_of_a_single_effect_is_imported_outside_its_room():
 
 def test_what_a_site_holds_is_known_to_the_effects_alone():
     """Others ask a term for its channels, seat or label, and an effect on poses for its sensor."""
-    for path in set(FILES) - {PACKAGE / 'poses' / 'effect.py'}:
+    for path in set(FILES) - {PACKAGE / 'apps' / 'poses' / 'effect.py'}:
         nodes = nodes_of(path)
         lines = [n.lineno for n in nodes if isinstance(n, ast.Attribute) and n.attr == 'site']
         assert not lines, f'{path}: {lines}'

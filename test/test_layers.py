@@ -15,11 +15,7 @@ from source_trees import nodes_of, tree_of
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FILES = sorted(PACKAGE.rglob('*.py'))
-CORE = {
-    'physics', 'signals', 'wire', 'frames', 'field', 'metal', 'calibration', 'refit', 'effects',
-    'known_metal', 'tracking', 'diagnosis', 'sessions', 'integrity', 'poses', 'assessment',
-}  # fmt: skip
-# What each layer may import of ours, itself and the errors aside.
+# What each package of the core may import of ours, itself and the modules beside them aside.
 ALLOWED = {
     'physics': set(),
     'signals': set(),
@@ -30,53 +26,47 @@ ALLOWED = {
     'calibration': {'field', 'physics'},
     'integrity': {'frames', 'field', 'physics'},
     'refit': {'integrity', 'frames', 'field', 'metal', 'physics'},
-    'known_metal': {'refit', 'field', 'physics'},
     'effects': {'field', 'metal', 'physics'},
     'tracking': {'integrity', 'frames', 'effects', 'field', 'physics'},
     'diagnosis': {'effects', 'field', 'metal', 'physics'},
     'sessions': {
         'wire', 'frames', 'integrity', 'diagnosis', 'tracking', 'calibration', 'refit', 'effects',
-        'known_metal', 'field', 'metal', 'physics',
+        'field', 'physics',
     },
-    'poses': {'sessions', 'diagnosis', 'calibration', 'effects', 'field', 'physics', 'wire'},
-    'assessment': {'poses', 'sessions', 'tracking', 'field', 'physics', 'wire'},
-    'simulation': {'sessions', 'effects', 'field', 'metal', 'physics', 'signals', 'wire'},
-    'measured': CORE,
-    'experiments': {*CORE, 'simulation', 'measured'},
-    'api': CORE,
+    'simulation': {'sessions', 'metal', 'physics', 'wire'},
+    'api': {'sessions', 'tracking', 'calibration', 'field', 'wire'},
     '__init__.py': {'api', 'sessions', 'wire'},
-    'cli': {*CORE, 'simulation', 'measured', 'experiments'},
-    'web': {*CORE, 'cli'},
-    'nodes': {*CORE, 'simulation', 'web'},
+    'cli': {
+        'simulation', 'sessions', 'diagnosis', 'tracking', 'calibration', 'refit', 'effects',
+        'field', 'physics', 'signals', 'wire',
+    },
+    'nodes': {
+        'simulation', 'sessions', 'tracking', 'refit', 'integrity', 'effects', 'frames', 'field',
+        'physics', 'signals', 'wire',
+    },
 }  # fmt: skip
-# What the rooms inside `nodes` may import of each other; the programs beside them may import all.
-WITHIN_NODES = {
-    'runtime': set(),
-    'streams': {'runtime'},
-    'acquisition_parts': {'runtime', 'streams'},
-    'field_model_parts': {'runtime', 'streams'},
-    'tracker_parts': {'runtime', 'streams'},
-    'bag_parts': {'runtime', 'streams'},
-    'watcher_parts': {'runtime', 'streams'},
-    'output_parts': {'runtime', 'streams'},
-}
+APPS = {path.name for path in (PACKAGE / 'apps').iterdir() if (path / 'extension.py').is_file()}
+# What the packages inside `nodes` may import of it; the programs beside them may import all.
+WITHIN_NODES = {'runtime': set(), 'streams': {'runtime'}}
 # Libraries that only some places may know.
+NODES = ('nodes/', *(f'apps/{app}/nodes/' for app in APPS))
+COMMANDS = ('cli/', *(f'apps/{app}/cli/' for app in APPS))
 ROOMS = {
-    'rclpy': ('nodes/',),
-    'ament_index_python': ('nodes/',),
-    'std_srvs': ('nodes/',),
+    'rclpy': NODES,
+    'ament_index_python': NODES,
+    'std_srvs': NODES,
     'serial': ('wire/port.py', 'wire/port.py'),
     'mcap': ('wire/bag.py', 'wire/bag_writer.py'),
     'mcap_ros2': ('wire/bag.py', 'wire/bag_writer.py'),
     'pyigtl': (),
-    'rich': ('nodes/', 'cli/'),
-    'matplotlib': ('pictures.py', 'experiments/', 'cli/'),
+    'rich': (*NODES, *COMMANDS),
+    'matplotlib': ('pictures.py', 'apps/lab/experiments/', *COMMANDS),
     'dask': ('cli/batch.py',),
     'distributed': ('cli/batch.py',),
     'magpylib': (),
-    'nicegui': ('web/',),
-    'fastapi': ('web/',),
-    'uvicorn': ('web/',),
+    'nicegui': ('apps/dashboard/',),
+    'fastapi': ('apps/dashboard/',),
+    'uvicorn': ('apps/dashboard/',),
 }
 
 
@@ -101,25 +91,47 @@ def is_ros(name):
     return name.endswith('_msgs') or name in ('rclpy', 'std_srvs')
 
 
+def package_of(parts):
+    """Return the package of a path or module, `apps.NAME` for one of an application's."""
+    return f'apps.{parts[1]}' if parts[0] == 'apps' and len(parts) > 1 else parts[0]
+
+
 @by_room(FILES)
 def test_imports_of_ours_point_inwards(paths):
-    modules, faults = {path.stem for path in PACKAGE.glob('*.py')}, []
+    """The core imports no application, and an application no other one."""
+    beside, faults = {path.stem for path in PACKAGE.glob('*.py')}, []
     for path in paths:
-        layer = path.relative_to(PACKAGE).parts[0]
-        if layer.endswith('.py'):  # errors.py knows nothing; __init__.py names what is public
-            allowed, layer = ALLOWED['__init__.py'] if layer == '__init__.py' else set(), ''
+        own = package_of(path.relative_to(PACKAGE).parts)
+        if own.endswith('.py') and own != '__init__.py':
+            allowed = {'apps'} if own == 'extensions.py' else set()
+        elif own.removeprefix('apps.') in APPS:
+            runs_ros = place(path).startswith(NODES)
+            allowed = set(ALLOWED) - (set() if runs_ros else {'nodes'})
+        elif own == 'apps':
+            allowed = set()
         else:
-            assert layer in ALLOWED, f'{layer} is no layer'
-            allowed = ALLOWED[layer]
+            assert own in ALLOWED, f'{own} is no package of the core'
+            allowed = ALLOWED[own]
         for name in imports(path):
-            parts = name.split('.')
-            is_ours = parts[0] == 'anser_ros' and len(parts) > 1 and parts[1] not in modules
-            if is_ours and parts[1] != layer and parts[1] not in allowed:
-                faults.append(f'{place(path)} imports {name}')
+            parts = name.split('.')[1:]
+            if name.startswith('anser_ros.') and parts[0] not in beside:
+                of = package_of(parts)
+                if of != own and of not in allowed:
+                    faults.append(f'{place(path)} imports {name}')
     assert not faults, '\n'.join(faults)
 
 
-def test_parts_of_a_node_import_no_other_node():
+def test_no_package_imports_itself_in_a_circle():
+    """A module is read after what it imports, down to those that import nothing."""
+    names = {p: '.'.join(p.relative_to(PACKAGE.parent).with_suffix('').parts) for p in FILES}
+    modules = set(names.values())
+    below = {name: (set(imports(path)) & modules) - {name} for path, name in names.items()}
+    while free := {name for name, of in below.items() if not of & set(below)}:
+        below = {name: of for name, of in below.items() if name not in free}
+    assert not below, sorted(below)
+
+
+def test_parts_of_nodes_import_no_program():
     nodes = PACKAGE / 'nodes'
     rooms = {path.name for path in nodes.iterdir() if (path / '__init__.py').is_file()}
     assert rooms == set(WITHIN_NODES)
@@ -141,29 +153,19 @@ def test_the_picture_of_the_rooms_has_the_arrows_of_the_table():
     assert set(re.findall(r'<title>(\w+)->(\w+)</title>', picture)) == arrows
 
 
-def test_the_page_has_the_same_table_and_every_file():
-    """What a newcomer reads about the rooms is what is enforced."""
+def test_the_page_has_the_same_table():
+    """What a newcomer reads about the packages is what is enforced."""
     page = (PACKAGE.parent / 'docs' / 'architecture.md').read_text(encoding='utf-8')
     page = page[page.index('## Where code lives') :]
-    core = re.search(r'\*The core\* is (.*?)\.\n', page, re.DOTALL)
-    assert set(re.findall(r'`(\w+)`', core[1])) == CORE
-    told = {}
-    for rooms, may in re.findall(r'^\| (`.*?) \| (.*?) \|', page.split('### Inside')[0], re.M):
-        names = set(re.findall(r'`(\w+)`', may)) | (CORE if 'the core' in may else set())
-        told |= dict.fromkeys(re.findall(r'`(\w+)`', rooms), names)
-    for room, names in told.items():
-        assert names - {room} == ALLOWED[room] - {room}, room
-    assert {*told, '__init__.py'} == set(ALLOWED)
+    said = {
+        name: set(re.findall(r'`(\w+)`', may))
+        for name, may in re.findall(r'^\| `(\w+)` \| (.*?) \|', page, re.M)
+    }
+    assert said == {name: may for name, may in ALLOWED.items() if name != '__init__.py'}
     beside = {path.name for path in PACKAGE.glob('*.py')} - {'__init__.py'}
-    assert set(re.findall(r'`(\w+\.py)`', page.split('### Inside')[0])) >= beside
-    inside = page.split('### Inside')[1]
-    assert {path.stem for path in (PACKAGE / 'nodes').glob('[!_]*.py')} <= set(
-        re.findall(r'`(\w+)`', inside)
-    )
-    for room in WITHIN_NODES:
-        row = re.search(rf'^\| `{room}` .*', inside, re.M)
-        files = {path.stem for path in (PACKAGE / 'nodes' / room).glob('[!_]*.py')}
-        assert set(re.findall(r'`(\w+)`', row[0])) >= files, room
+    assert set(re.findall(r'`(\w+\.py)`', page)) >= beside
+    for app in APPS:
+        assert (PACKAGE / 'apps' / app / 'README.md').is_file() and f'apps/{app}' in page
 
 
 def test_types_are_strict_everywhere():
@@ -178,7 +180,8 @@ def test_types_are_strict_everywhere():
         for name in rule['module']
         if name.startswith('anser_ros')
     }
-    assert excepted == {'anser_ros.nodes.*': {'disallow_untyped_calls'}}
+    assert set(excepted) == {'anser_ros.nodes.*', 'anser_ros.apps.*.nodes.*'}
+    assert all(rule == {'disallow_untyped_calls'} for rule in excepted.values())
 
 
 @by_room(FILES)
@@ -187,7 +190,7 @@ def test_libraries_stay_in_their_rooms(paths):
     for path in paths:
         for name in imports(path):
             library = name.split('.')[0]
-            rooms = ('nodes/',) if is_ros(library) else ROOMS.get(library)
+            rooms = NODES if is_ros(library) else ROOMS.get(library)
             if rooms is not None and not place(path).startswith(rooms):
                 faults.append(f'{place(path)} imports {name}')
     assert not faults, '\n'.join(faults)

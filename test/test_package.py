@@ -74,16 +74,16 @@ def test_every_command_is_an_executable(installed):
 
 
 def test_the_table_lists_every_module_that_is_a_command():
-    def modules(room, mark):
-        files = (REPO / 'anser_ros' / room).rglob('*.py')
+    def modules(pattern, mark):
+        files = (REPO / 'anser_ros').glob(pattern)
         found = {path.relative_to(REPO) for path in files if mark in path.read_text()}
         return {'.'.join(path.with_suffix('').parts) for path in found}
 
     def of(*groups):
         return {module for group in groups for module, _ in group.values()}
 
-    assert of(NODES, COMPOSED) == modules('nodes', "\nif __name__ == '__main__':")
-    assert of(OFFLINE) == modules('.', '\ndef add_arguments(')
+    assert of(NODES, COMPOSED) == modules('**/nodes/*.py', "\nif __name__ == '__main__':")
+    assert of(OFFLINE) == modules('**/*.py', '\ndef add_arguments(')
 
 
 def test_an_installed_node_runs(installed, overlay, ros, tmp_path):

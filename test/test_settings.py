@@ -275,7 +275,9 @@ class TestCommands:
         for entry in entries({key: OTHER[key] for key in used}):
             given += ['--set', entry]
         with pytest.raises(ParameterError, match='kept'):
-            module.run(parser.parse_args(given))
+            args = parser.parse_args(given)
+            args.session = getattr(args, 'session', None) or args.sessions[0]
+            module.work(args, lambda *words: None)
         assert all(read(seen[0].setup.refit, key) == OTHER[key] for key in used)
 
     def test_tracking_starts_from_the_stated_noise(self):

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.cli import missing
+from anser_ros.cli.commands import COMPOSED, NODES
 from anser_ros.cli.output import add_json, add_out, make_new_folder
 from anser_ros.cli.processes import LAST_DOMAIN, VARIABLE, Supervisor, own_domain, tail
 from anser_ros.cli.warm_up import compile_kernels
@@ -354,7 +355,8 @@ def node_command(name: str, /, *words: str, **parameters: object) -> list[str]:
 
     ``NODE__NAME`` is a parameter of one of several nodes in one process.
     """
-    command = [sys.executable, '-P', '-m', f'anser_ros.nodes.{name}', '--ros-args', *words]
+    module, _ = {**NODES, **COMPOSED}[name]
+    command = [sys.executable, '-P', '-m', module, '--ros-args', *words]
     for key, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
         command += ['-p', f'{key.replace("__", ":")}:={text}']

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from anser_ros.cli.commands import COMPOSED, NODES
 from anser_ros.cli.demo import BOARD_SEED
 from anser_ros.cli.processes import Child, Supervisor
 from anser_ros.simulation.control_unit import ControlUnit
@@ -241,7 +242,7 @@ class Run:
 
 
 def _command(name: str, /, **parameters: object) -> list[str]:
-    command = [sys.executable, '-m', f'anser_ros.nodes.{name}', '--ros-args']
+    command = [sys.executable, '-m', {**NODES, **COMPOSED}[name][0], '--ros-args']
     for key, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
         command += ['-p', f'{key.replace("__", ":")}:={text}']

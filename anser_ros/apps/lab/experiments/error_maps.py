@@ -10,7 +10,7 @@ from anser_ros.calibration.error_map import learn_error_map
 
 @dataclass(frozen=True)
 class BoardRun:
-    """Holds one run's errors in held-out blocks, registered to the others, without and with a map."""
+    """Holds one run's errors in held-out blocks, registered to the others, by map or without."""
 
     name: str
     points: int
