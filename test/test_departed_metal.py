@@ -10,8 +10,8 @@ from anser_ros.diagnosis import departure as departing
 from anser_ros.diagnosis.departure import departure
 from anser_ros.diagnosis.prepare import build_problem, train_blocks
 from anser_ros.diagnosis.problem import Spread, evaluate
-from anser_ros.effects.departed_metal import DepartedMetal
 from anser_ros.effects.metal_path import FreePath
+from anser_ros.effects.moving_metal import DepartedMetal
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.metal.body import sphere_polarisability
 

@@ -9,20 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import (
-    ALIKE,
-    FROM_OTHERS,
-    LEAST_MOTION_GAIN,
-    LEAST_OF_EXCESS,
-    LEAST_PATH_GAIN,
-    LIMITS_LEFT,
-    MOST_EFFECTS_AT_REST,
-    NO_RIVAL,
-    NOTHING_LEFT,
-    REST_LEFT,
-    STEADY,
-    as_good,
-)
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.engine import BlockSums, Score, Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Problem, State, evaluate, parts
@@ -160,7 +147,10 @@ def _starts(
     one_place = scorer.held_out - min(held_out for _, _, held_out in places)
     alone = float(gains.max(axis=0).sum())
     excess = scorer.state.sum_of_squares - scorer.state.count
-    if alone < max(LEAST_PATH_GAIN * one_place + LEAST_MOTION_GAIN, LEAST_OF_EXCESS * excess):
+    if alone < max(
+        decisions.LEAST_PATH_GAIN * one_place + decisions.LEAST_MOTION_GAIN,
+        decisions.LEAST_OF_EXCESS * excess,
+    ):
         return []
     course, solution = _course(places, gains)
     time = (blocks + 0.5) * problem.apparatus.duration / (blocks.max() + 1)
@@ -217,7 +207,7 @@ def _estimate(sums: BlockSums) -> Array:
 
 def at_floor(fit: Fit) -> bool:
     """Return whether a fit leaves nothing but noise."""
-    return fit.misfit < NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
+    return fit.misfit < decisions.NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
 
 
 def taken_from_others(fit: Fit) -> float:
@@ -226,7 +216,9 @@ def taken_from_others(fit: Fit) -> float:
 
     For each of its columns, every frame loses the share of one value in the remaining residual.
     """
-    return FROM_OTHERS * fit.newest.effect.freedom(fit.newest) * max(fit.misfit - 1.0, 0.0)
+    return (
+        decisions.FROM_OTHERS * fit.newest.effect.freedom(fit.newest) * max(fit.misfit - 1.0, 0.0)
+    )
 
 
 def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
@@ -237,7 +229,9 @@ def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
     gain, best = max(fitted, key=lambda pair: pair[0])
     newest = best.newest
     steady = [
-        (g, f) for g, f in fitted if g > STEADY * gain and newest.effect.rivals(newest, f.newest)
+        (g, f)
+        for g, f in fitted
+        if g > decisions.STEADY * gain and newest.effect.rivals(newest, f.newest)
     ]
     if steady:
         gain, best = max(steady, key=lambda pair: pair[0])
@@ -246,7 +240,7 @@ def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
         (g, f)
         for g, f in fitted
         if f.newest.complexity < most
-        and gain - g < as_good(most - f.newest.complexity) * max(best.misfit, 1.0)
+        and gain - g < decisions.as_good(most - f.newest.complexity) * max(best.misfit, 1.0)
     ]
     simpler += [
         (g, f)
@@ -279,7 +273,7 @@ def moves_or_rests(
     shaped = settled(fitter, moving.terms)
     resting = [(g, f) for g, f in fitted if f.newest.effect.family is Family.METAL_AT_REST]
     gain, rest = max(resting, key=lambda pair: pair[0], default=(0.0, moving))
-    if gain < NO_RIVAL * explained:
+    if gain < decisions.NO_RIVAL * explained:
         return shaped
     rest = settled(fitter, rest.terms)
     limit = _limit(fitter, shaped, explained)
@@ -291,8 +285,10 @@ def moves_or_rests(
         if term.effect.family.is_metal or term.effect.name in tried:
             continue
         # A linear score is only a promise: the fit may still bring down what is within these.
-        hopeless = score.held_out > LIMITS_LEFT * limit + REST_LEFT * scorer.held_out
-        if hopeless or len(tried) == MOST_EFFECTS_AT_REST:
+        hopeless = (
+            score.held_out > decisions.LIMITS_LEFT * limit + decisions.REST_LEFT * scorer.held_out
+        )
+        if hopeless or len(tried) == decisions.MOST_EFFECTS_AT_REST:
             break
         tried.add(term.effect.name)
         for start in term.effect.started(term, score.solution):
@@ -308,5 +304,5 @@ def moves_or_rests(
 
 def _limit(fitter: Fitter, moving: Fit, explained: float) -> float:
     """Held-out sum of squares up to which metal at rest explains as much."""
-    more = ALIKE * explained + LEAST_MOTION_GAIN * max(moving.misfit, 1.0)
+    more = decisions.ALIKE * explained + decisions.LEAST_MOTION_GAIN * max(moving.misfit, 1.0)
     return moving.held_out() + more

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.choice import course_of
 from anser_ros.diagnosis.decisions import SOMETHING_LEFT
 from anser_ros.diagnosis.engine import Scorer
-from anser_ros.diagnosis.fit import Fit, Fitter, Shaping
+from anser_ros.diagnosis.fit import Fit, Fitter, Known, Shaping, best_modes, unit_of
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Problem, State, evaluate
-from anser_ros.diagnosis.rich_modes import rich_modes
 from anser_ros.diagnosis.screening import without_outliers
-from anser_ros.effects.departed_metal import DepartedMetal, DepartedTerm
 from anser_ros.effects.effect import Richness
 from anser_ros.effects.metal_path import FreePath
+from anser_ros.effects.moving_metal import DepartedMetal, DepartedTerm
 from anser_ros.effects.view import View
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 
@@ -132,25 +131,17 @@ def _best_starts(
 ) -> list[tuple[DepartedTerm, str]]:
     """The start that predicts left-out blocks best with a compact body, and with pieces."""
     state = evaluate(problem, ())
-    found = []
-    for start, kinds in _starts(problem, state, effect, blocks):
-        for kind in kinds:
-
-            def unit(view: View, modes: Array, start: DepartedTerm = start, kind: str = kind):  # type: ignore[no-untyped-def]
-                return start.with_body(kind, modes, np.ones(modes.shape[1])).unit(view)
-
-            none = [np.zeros((*part.white.shape, 0)) for part in state.parts]
-            modes = rich_modes(
-                state, (list(none), np.zeros(0)), unit, body_sizes(kind), blocks,
-                BODY.modes,
-            )  # fmt: skip
-            if modes is not None:
-                found.append((modes[0], start, kind))
+    none: Known = [np.zeros((*part.white.shape, 0)) for part in state.parts], np.zeros(0)
+    starts = [
+        (start, kind) for start, kinds in _starts(problem, state, effect, blocks) for kind in kinds
+    ]
+    compact = [pair for pair in starts if pair[1] == COMPACT]
     best = []
-    for compact in (True, False):
-        group = [one for one in found if (one[2] == COMPACT) == compact]
-        if group:
-            best.append(min(group, key=lambda one: one[0])[1:])
+    for group in (compact, [pair for pair in starts if pair[1] != COMPACT]):
+        tried = ((pair, unit_of(*pair), body_sizes(pair[1])) for pair in group)
+        found = best_modes(state, none, tried, blocks, BODY.modes)
+        if found is not None:
+            best.append(found[0])
     return best
 
 

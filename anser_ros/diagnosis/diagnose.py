@@ -6,16 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.choice import refit_spreads
 from anser_ros.diagnosis.confirm import Confirmation, doubtful
-from anser_ros.diagnosis.decisions import (
-    DEPENDENT,
-    FEWEST_OUTLIERS,
-    LEAST_NOISE_GROWTH,
-    MANY,
-    STRUCTURED,
-    UNSTRUCTURED,
-)
 from anser_ros.diagnosis.findings import (
     Finding,
     corrected_model,
@@ -137,7 +130,7 @@ def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirme
     last = how.fitter(screened.training(FINAL_FRAMES), blocks)
     fit, refused = _settled(how.fitter(search.fit.state.problem, blocks), last, search)
     cleaned = without_outliers(whole, evaluate(whole, fit.terms))
-    if outlying_share(screened.start, cleaned)[0] > FEWEST_OUTLIERS:
+    if outlying_share(screened.start, cleaned)[0] > decisions.FEWEST_OUTLIERS:
         thinned = cleaned.in_blocks(blocks).thinned(FINAL_FRAMES)
         fit = settled(how.fitter(thinned, blocks), fit.terms, FINE)
     return Confirmed(fit, cleaned, refused)
@@ -169,7 +162,7 @@ def _settled(
             break
         # Metal that is doubtful costs much to fit again and is hardly ever more than a stand-in.
         metal = [pair for pair in bad if pair[1].effect.family.is_metal]
-        crowd = [pair for pair in bad if pair[0].alike >= MANY]
+        crowd = [pair for pair in bad if pair[0].alike >= decisions.MANY]
         dropped = metal or crowd or bad[:1]
         refused += [(term, check) for check, term in dropped]
         gone = [term for _, term in dropped]
@@ -188,13 +181,15 @@ def conclude(
     white = whiteness(after)
     expected = expected_rms(after)
     # Residuals that are no noise must not make the floor that they are measured by.
-    grown = noise_t(after) > LEAST_NOISE_GROWTH * cleaned.spread.noise_t
+    grown = noise_t(after) > decisions.LEAST_NOISE_GROWTH * cleaned.spread.noise_t
     scale = min(noise_scale(after), 1.0) if grown and not white.holds else noise_scale(after)
     floor = min(scale * expected, rms(after))
     tests = tuple(structure_tests(after))
     excess = max(rms(after) ** 2 - floor**2, 0.0)
     structured = any(test.significant for test in tests)
-    significant = excess > (STRUCTURED if structured else UNSTRUCTURED) * floor**2
+    significant = (
+        excess > (decisions.STRUCTURED if structured else decisions.UNSTRUCTURED) * floor**2
+    )
     possible = max(rms(before) ** 2 - floor**2, excess)
     findings = [
         fitted_finding(fit, i, unseen, search)
@@ -206,7 +201,7 @@ def conclude(
         findings += noise_findings(whole, after)
     records = [finding.record for finding in findings]
     depends: tuple[str, ...] = ()
-    if excess > DEPENDENT * floor**2:
+    if excess > decisions.DEPENDENT * floor**2:
         named = [t.variable for t in tests if t.significant]
         depends = tuple(dict.fromkeys([*(white.depends_on if grown else ()), *named]))
     return Diagnosis(

@@ -6,12 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import (
-    FEWEST_OUTLIERS,
-    KNOWN_SIGMAS,
-    LEAST_NOISE_GROWTH,
-    MOST_EXCESS_OF_OUTLIERS,
-)
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.fit import Fit
 from anser_ros.diagnosis.problem import Problem, State, evaluate, rms, tool_parts
 from anser_ros.diagnosis.screening import outlying_share
@@ -88,11 +83,11 @@ def outlier_findings(
     share, channels = outlying_share(whole, cleaned)
     # A fluctuation is taken for normal: frames far out along it are its own tails.
     own_tails = any(term.effect.family is Family.FLUCTUATION for term in after.terms)
-    alone = excess < MOST_EXCESS_OF_OUTLIERS and not own_tails
+    alone = excess < decisions.MOST_EXCESS_OF_OUTLIERS and not own_tails
     frames = sum(tool.time.size for tool in whole.tools)
     always = known_share(known)
-    usual = always + KNOWN_SIGMAS * float(np.sqrt(always / max(frames, 1)))
-    if share <= FEWEST_OUTLIERS + usual or not (channels or alone):
+    usual = always + decisions.KNOWN_SIGMAS * float(np.sqrt(always / max(frames, 1)))
+    if share <= decisions.FEWEST_OUTLIERS + usual or not (channels or alone):
         return []
     sigma = float(np.sqrt(share / max(frames, 1)))
     return [plain_finding(outliers_of(share, sigma, channels), rms(after))]
@@ -101,7 +96,7 @@ def outlier_findings(
 def noise_findings(whole: Problem, after: State) -> list[Finding]:
     """Return excess noise, of all channels or of those that have it."""
     factor = noise_t(after) / whole.spread.noise_t
-    if factor <= LEAST_NOISE_GROWTH:
+    if factor <= decisions.LEAST_NOISE_GROWTH:
         return []
     squares: dict[int, Array] = {}
     for part in tool_parts(after):
@@ -109,7 +104,7 @@ def noise_findings(whole: Problem, after: State) -> list[Finding]:
         cells = square.reshape(-1, 2, *part.view.flux.shape[1:])
         for row, channel in enumerate(part.view.sensors.channel.tolist()):
             squares[channel] = cells[:, :, row]
-    noisy = [c for c, values in squares.items() if values.mean() > LEAST_NOISE_GROWTH**2]
+    noisy = [c for c, values in squares.items() if values.mean() > decisions.LEAST_NOISE_GROWTH**2]
     if len(noisy) == len(squares):  # where no others have none, it is that of all
         noisy = []
     count: float = after.count

@@ -1,33 +1,161 @@
-"""Fits all effects on fluxes jointly, metal in as much detail as the data determine. The fit
-itself; couplings that the data determine; a richer body and path for metal that moves; what
-metal at rest leaves; and all of it together (`settled`).
-"""
+"""Fits all effects on fluxes jointly, metal in as much detail as the data determine."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import COARSE_REMAINDER, PER_PARAMETER, SOMETHING_LEFT
-from anser_ros.diagnosis.engine import JointFit, descended, joined
-from anser_ros.diagnosis.problem import Problem, State, evaluate, tools_misfit
-from anser_ros.diagnosis.rich_modes import Known, rich_modes, thinned
-from anser_ros.diagnosis.structure import noise_scale
-from anser_ros.effects.effect import BodyTerm, Family, Resting, Richness, SizedShapes, Term
-from anser_ros.effects.metal_remainder import (
-    REMAINDER,
-    Couplings,
-    IlluminationChange,
-    RemainderPart,
+from anser_ros.diagnosis.decisions import (
+    COARSE_REMAINDER,
+    PER_PARAMETER,
+    SOMETHING_LEFT,
+    TIME_FOLDS,
 )
+from anser_ros.diagnosis.engine import BlockSums, JointFit, block_sums, descended, joined
+from anser_ros.diagnosis.problem import Problem, State, evaluate, parts, tools_misfit
+from anser_ros.diagnosis.structure import noise_scale
+from anser_ros.effects.effect import (
+    BodyTerm,
+    Family,
+    Resting,
+    Richness,
+    SizedShapes,
+    Term,
+    both_phases,
+)
+from anser_ros.effects.metal_remainder import REMAINDER, Couplings, IlluminationChange
 from anser_ros.effects.view import View
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 from anser_ros.metal.scattering import Shapes
 from anser_ros.parallel import in_order
 
 Array = NDArray[np.float64]
+Known = tuple[list[Array | None], Array]
+"""Columns, one array for each part of a state, and their prior sizes."""
+Unit = Callable[[View, Array], NDArray[np.inexact]]
+"""Flux (F, S, K, m) of modes (c, m) of couplings in a view."""
+
+KeyT = TypeVar('KeyT')
+
+MOST_SIZED_MODES = 130
+"""Modes, at most, of which the data are asked how large they are: more would be slower to compare
+than they could ever explain."""
+LEAST_INFORMATION = 0.3
+"""Information in the data, over that in the prior, below which a mode is left out: it would stay
+at about zero and only take time."""
+SCORED_FRAMES = 130
+"""Frames of each part, about, on which sizes of couplings are compared."""
+
+
+def rich_modes(
+    few: State,
+    known: Known,
+    unit: Unit,
+    spreads: Sequence[Array],
+    blocks: NDArray[np.int64],
+    most: int,
+) -> tuple[float, Array] | None:
+    """Return combinations of couplings, of the size that predicts held-out blocks best.
+
+    ``few``: at a fit without these couplings, or with others in their place; some frames do;
+    ``known``: columns of what is fitted with them, and their prior sizes; ``unit``: flux (F, S, K,
+    m) of modes (c, m) in a view; ``spreads`` (c,): prior sizes of the couplings that are tried.
+
+    Returns (c, m) sum of squares of the held-out residuals, and modes of unit prior size; None
+    where no size is better than none at all.
+    """
+    widest = np.max(spreads, axis=0)
+    information = _information(few, unit, widest.size)
+    values, vectors = np.linalg.eigh(information * widest[:, None] * widest)
+    leading = np.argsort(values)[::-1][:MOST_SIZED_MODES]
+    leading = leading[values[leading] > LEAST_INFORMATION]
+    if leading.size == 0:
+        return None
+    vectors = vectors[:, leading]
+    vectors_of = widest[:, None] * vectors
+    group: list[Array | None] = [
+        part.whitener(parts(both_phases(unit(part.view, vectors_of)))) for part in few.parts
+    ]
+    columns, prior = known
+    sums = block_sums(few.parts, joined([columns, group]), blocks)
+    width, count = prior.size, leading.size
+    least, root = sums.columns(np.arange(width)).held_out(prior, TIME_FOLDS), None
+    full_prior = np.concatenate([prior, np.ones(2 * count)])
+    for spread in spreads:
+        turned = vectors * (spread / widest)[:, None]
+        trial = np.linalg.cholesky(turned.T @ turned + 1e-12 * np.eye(count))
+        left = _turned(sums, width, trial).held_out(full_prior, TIME_FOLDS)
+        if left < least:
+            least, root = left, trial
+    if root is None:
+        return None
+    total = sums.normal.sum(axis=0)[width : width + count, width : width + count]
+    information, turn = np.linalg.eigh(root.T @ total @ root)
+    order = np.argsort(information)[::-1][:most]
+    order = order[information[order] > LEAST_INFORMATION]
+    if not order.size:
+        return None
+    return least, vectors_of @ root @ turn[:, order]
+
+
+def best_modes(
+    few: State,
+    known: Known,
+    tried: Iterable[tuple[KeyT, Unit, Sequence[Array]]],
+    blocks: NDArray[np.int64],
+    most: int,
+) -> tuple[KeyT, Array] | None:
+    """Return the key of the shapes that predict held-out blocks best, and their modes.
+
+    ``tried``: key, flux and prior sizes of some shapes; all others as of `rich_modes`. Returns
+    None where none is better than none at all.
+    """
+    best: tuple[float, KeyT, Array] | None = None
+    for key, unit, sizes in tried:
+        found = rich_modes(few, known, unit, sizes, blocks, most)
+        if found is not None and (best is None or found[0] < best[0]):
+            best = found[0], key, found[1]
+    return None if best is None else best[1:]
+
+
+def unit_of(body: BodyTerm, kind: str) -> Unit:
+    """Return the flux of modes of a kind of body on the course of another."""
+    return lambda view, modes: body.with_body(kind, modes, np.ones(modes.shape[1])).unit(view)
+
+
+def _turned(sums: BlockSums, known: int, root: Array) -> BlockSums:
+    """The sums with the columns after the known ones, two groups of them, turned by a matrix."""
+    count = root.shape[0]
+    turn = np.eye(known + 2 * count)
+    for start in (known, known + count):
+        turn[start : start + count, start : start + count] = root
+    return BlockSums(turn.T @ sums.normal @ turn, sums.right @ turn, sums.squares)
+
+
+def thinned(state: State, blocks: NDArray[np.int64]) -> State:
+    """Return the state with only some frames of every part."""
+    few = []
+    for part in state.parts:
+        rows = np.flatnonzero(np.isin(part.blocks, blocks))
+        few.append(part.frames(rows[:: max(1, round(rows.size / SCORED_FRAMES))]))
+    return replace(state, parts=tuple(few))
+
+
+def _information(state: State, unit: Unit, count: int) -> Array:
+    """Of single couplings, (c, c), from half of the frames.
+
+    Only the in-phase half of the columns is used: the other half is the same, rotated in phase.
+    """
+    normal = np.zeros((count, count))
+    for part in state.parts:
+        half = part.frames(np.arange(0, part.view.time.size, 2))
+        flux = unit(half.view, np.eye(count))
+        flat = half.whitener(parts(flux.astype(complex))).reshape(-1, count)
+        normal += 2 * (flat.T @ flat)
+    return normal
 
 
 @dataclass(frozen=True)
@@ -142,22 +270,16 @@ class Shaping:
     def shaped_as(self, fit: Fit, index: int, body: BodyTerm, kinds: Sequence[str]) -> Fit | None:
         """Return the fit with the best of some kinds of bodies; None if no body is better."""
         fitter = self.fitter
-        bare = _with(fit.terms, index, body.with_theta(_without_amounts(body)))
-        few = thinned(evaluate(fitter.problem, bare), fitter.blocks)
+        course = body.theta.copy()
+        course[body.effect.amounts(body)] = 0.0
+        bare = evaluate(fitter.problem, _with(fit.terms, index, body.with_theta(course)))
+        few = thinned(bare, fitter.blocks)
         known = self._known(fit, index, body)
-        best: tuple[float, str, Array] | None = None
-        for kind in kinds:
-
-            def unit(view: View, modes: Array, kind: str = kind) -> NDArray[np.inexact]:
-                return body.with_body(kind, modes, np.ones(modes.shape[1])).unit(view)
-
-            most, sizes = self.richness.modes, body_sizes(kind)
-            found = rich_modes(few, known, unit, sizes, fitter.blocks, most)
-            if found is not None and (best is None or found[0] < best[0]):
-                best = (found[0], kind, found[1])
+        tried = ((kind, unit_of(body, kind), body_sizes(kind)) for kind in kinds)
+        best = best_modes(few, known, tried, fitter.blocks, self.richness.modes)
         if best is None:
             return None
-        rich = body.shaped(best[1], best[2], self.richness)
+        rich = body.shaped(*best, self.richness)
         start = fitter.fit(_with(fit.terms, index, rich.hold()), 1)
         return fitter.fit(_with(start.terms, index, start.terms[index].free()))
 
@@ -177,12 +299,6 @@ class Shaping:
 
 def _body(term: Term) -> BodyTerm | None:
     return term.effect.body(term)
-
-
-def _without_amounts(term: Term) -> Array:
-    theta = term.theta.copy()
-    theta[term.effect.amounts(term)] = 0.0
-    return theta
 
 
 def _with(terms: Sequence[Term], index: int, term: Term) -> tuple[Term, ...]:
@@ -214,7 +330,7 @@ class Remainders:
             own = self._couplings(fit, term, plain, before.near)
             if own is None:
                 return fit
-            start = [t if i != index else term for i, t in enumerate(plain)]
+            start = _with(plain, index, term)
             emitters = self.fitter.problem.apparatus.emitters
             light = REMAINDER.of(term, IlluminationChange([term, own], emitters))
             fit = self.fitter.fit([*start, own, light])
@@ -232,8 +348,7 @@ class Remainders:
         if more is None:
             return fit
         held = term.hold(fit.covariance_of(index))
-        terms = [held if i == index else t for i, t in enumerate(fit.terms)]
-        return self.fitter.fit([*terms, more])
+        return self.fitter.fit([*_with(fit.terms, index, held), more])
 
     def _couplings(
         self, fit: Fit, term: Term, beside: Sequence[Term], shapes: Sequence[SizedShapes]
@@ -241,21 +356,17 @@ class Remainders:
         """The couplings about metal at rest that predict best, given the other terms."""
         fitter, few = self.fitter, thinned(fit.state, self.fitter.blocks)
         centre = _resting(term).centre
-        known = (
-            joined([few.design(t) for t in beside]),
-            np.concatenate([t.effect.prior(t) for t in beside]),
-        )
-        best: tuple[float, RemainderPart] | None = None
-        for kind, sizes in shapes:
+        known = joined([few.design(t) for t in beside]), few.prior(beside)
 
-            def unit(view: View, modes: Array, kind: Shapes = kind) -> NDArray[np.inexact]:
-                return Couplings(kind, centre, modes).unit(view)
+        def unit_of_shapes(kind: Shapes) -> Unit:
+            return lambda view, modes: Couplings(kind, centre, modes).unit(view)
 
-            most = self.richness.modes
-            found = rich_modes(few, known, unit, sizes, fitter.blocks, most)
-            if found is not None and (best is None or found[0] < best[0]):
-                best = (found[0], Couplings(kind, centre, found[1]))
-        return None if best is None else REMAINDER.of(term, best[1])
+        tried = ((kind, unit_of_shapes(kind), sizes) for kind, sizes in shapes)
+        best = best_modes(few, known, tried, fitter.blocks, self.richness.modes)
+        if best is None:
+            return None
+        kind, modes = best
+        return REMAINDER.of(term, Couplings(kind, centre, modes))
 
 
 def _resting(term: Term) -> Resting:

@@ -1,6 +1,4 @@
-"""Sets a session up for diagnosis: whitening, what was measured, what is expected, and its
-size.
-"""
+"""Sets a session up for diagnosis: what was measured, what is expected, and its whitening."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -105,10 +103,9 @@ class Whitener:
 
     def rows(self, frames: NDArray[np.int64]) -> 'Whitener':
         """Return the whitener of some frames, chosen by index."""
-        basis = None if self.basis is None else self.basis[frames]
-        return Whitener(
-            self.weight[frames], basis, None if self.inner is None else self.inner[frames]
-        )
+        if self.basis is None or self.inner is None:
+            return Whitener(self.weight[frames])
+        return Whitener(self.weight[frames], self.basis[frames], self.inner[frames])
 
     def first(self, count: int) -> 'Whitener':
         """Return the whitener with only the first ``count`` directions."""
@@ -190,10 +187,7 @@ class Problem:
 
     def in_blocks(self, wanted: NDArray[np.int64], step: int = 1) -> 'Problem':
         """Return every ``step``-th frame of some blocks, with the bins of those blocks."""
-        keep = []
-        for blocks in self.blocks:
-            rows = np.flatnonzero(np.isin(blocks, wanted))
-            keep.append(rows[::step])
+        keep = [np.flatnonzero(np.isin(blocks, wanted))[::step] for blocks in self.blocks]
         return self.frames(keep, np.flatnonzero(np.isin(self.reference_blocks, wanted)))
 
 
@@ -211,6 +205,13 @@ class Part:
     def count(self) -> int:
         """Return the number of values that have a weight."""
         return int(np.count_nonzero(self.whitener.weight))
+
+    def frames(self, rows: NDArray[np.int64]) -> 'Part':
+        """Return the part of some frames, chosen by index."""
+        return Part(
+            self.view.frames(rows), self.residual[rows], self.whitener.rows(rows),
+            self.white[rows], self.blocks[rows],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -248,7 +249,8 @@ def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
             continue
         view = tool_view(tool, terms, problem.fields)
         residual = parts(np.where(good[..., None], tool.flux - view.flux, 0.0))
-        weight = _repeat(good / np.hypot(problem.spread.flux_t, gaps_t), tool.flux.shape[2])
+        weight = good / np.hypot(problem.spread.flux_t, gaps_t)
+        weight = np.tile(np.repeat(weight, tool.flux.shape[2], axis=1), 2)
         pose = pose_jacobian(view) * problem.spread.accuracy.pose_jitter
         whitener = Whitener.of(weight, _with_free(pose, terms, view), pose.shape[2])
         found.append(Part(view, residual, whitener, whitener(residual), blocks))
@@ -261,12 +263,6 @@ def _with_free(known: Array, terms: Sequence[Term], view: View) -> Array:
     """Directions (F, n, m) that are known, and those that fluctuating effects leave open."""
     found = [term.effect.directions(term, view) for term in terms]
     return np.concatenate([known, *(parts(d) for d in found if d is not None)], axis=2)
-
-
-def _repeat(per_sensor: Array, emitters: int) -> Array:
-    """Weights (F, S) for all parts of a sensor, (F, 2 S K)."""
-    one = np.repeat(per_sensor, emitters, axis=1)
-    return np.concatenate([one, one], axis=1)
 
 
 def _reference_part(problem: Problem, references: References, terms: Sequence[Term]) -> Part:
@@ -290,7 +286,7 @@ def _reference_part(problem: Problem, references: References, terms: Sequence[Te
             gradient += term.effect.gradient_error * shifted * together
     spread = np.sqrt(noise[..., None] ** 2 + survey**2 + gradient**2)
     weight = np.where(good[..., None], 1 / spread, 0.0).reshape(good.shape[0], -1)
-    weight = np.concatenate([weight, weight], axis=1)
+    weight = np.tile(weight, 2)
     free = _with_free(np.zeros((*weight.shape, 0)), terms, view)
     whitener = Whitener.of(weight, free) if free.shape[2] else Whitener(weight)
     return Part(view, residual, whitener, whitener(residual), problem.reference_blocks)

@@ -7,20 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import chdtri
 
-from anser_ros.diagnosis.decisions import (
-    BETTER,
-    DEAD,
-    FRAME_RATIO,
-    JUMP_RATIO,
-    LEAST_CHANNEL_SHARE,
-    OTHERS_CORRELATION,
-    OWN_CORRELATION,
-    PLACE_RATIO,
-    POLARITY_GAIN,
-    RARE,
-    READING_RATIO,
-    WHOLE_FRAME_SHARE,
-)
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.effects.effect import Family, Site, Term
 from anser_ros.effects.wiring import DEAD_CHANNEL, SENSOR_POLARITY, SWAPPED_CHANNELS, SWAPPED_COILS
@@ -49,13 +36,13 @@ def find_outliers(state: State) -> tuple[Mask, ...]:
         frames = np.where(good, readings, 0.0).sum(axis=1) / count
         jumps = np.where(good, _by_reading(size, good.shape[1], emitters), 0.0).sum(axis=1) / count
         values = _values(white, good.shape[1], emitters)
-        of_reading = of_frame = PLACE_RATIO
+        of_reading = of_frame = decisions.PLACE_RATIO
         if tool.track is None or tool.is_followed:
-            of_reading = _ratio(READING_RATIO, values)
-            of_frame = _ratio(FRAME_RATIO, values * good.shape[1])
+            of_reading = _ratio(decisions.READING_RATIO, values)
+            of_frame = _ratio(decisions.FRAME_RATIO, values * good.shape[1])
         bad = _stands_out(readings, of_reading) | _stands_out(frames[:, None], of_frame)
         if not moves:
-            bad |= _stands_out(jumps[:, None], JUMP_RATIO)
+            bad |= _stands_out(jumps[:, None], decisions.JUMP_RATIO)
         masks.append(bad & good)
     return tuple(masks)
 
@@ -74,7 +61,7 @@ def _values(values: Array, sensors: int, emitters: int) -> int:
 
 def _ratio(usual: float, values: int) -> float:
     """Mean square of so many values beyond which it is no noise."""
-    return max(usual, float(chdtri(values, RARE)) / values)
+    return max(usual, float(chdtri(values, decisions.RARE)) / values)
 
 
 def _stands_out(values: Array, ratio: float) -> Mask:
@@ -101,15 +88,17 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
     for tool, old, new in zip(before.tools, before.good, after.good, strict=True):
         lost = old & ~new
         lost_frames += int(lost.any(axis=1).sum())
-        whole += int((lost.sum(axis=1) > WHOLE_FRAME_SHARE * old.sum(axis=1).clip(1)).sum())
+        whole += int(
+            (lost.sum(axis=1) > decisions.WHOLE_FRAME_SHARE * old.sum(axis=1).clip(1)).sum()
+        )
         frames += tool.time.size
         for row, channel in enumerate(tool.sensors.channel.tolist()):
             by_channel[channel] = int(lost[:, row].sum())
     share = lost_frames / max(frames, 1)
-    if whole > WHOLE_FRAME_SHARE * max(lost_frames, 1):
+    if whole > decisions.WHOLE_FRAME_SHARE * max(lost_frames, 1):
         return share, []
     return share, [
-        c for c, n in by_channel.items() if n > LEAST_CHANNEL_SHARE * max(lost_frames, 1)
+        c for c, n in by_channel.items() if n > decisions.LEAST_CHANNEL_SHARE * max(lost_frames, 1)
     ]
 
 
@@ -138,7 +127,9 @@ def wiring_faults(problem: Problem) -> list[Term]:
         gain, alike = _likeness(tool.flux, part.view.flux, usable)
         own = np.diag(alike)
         turned += channels[
-            (np.abs(np.diag(gain) + 1) < POLARITY_GAIN) & (own > OWN_CORRELATION) & ~silent
+            (np.abs(np.diag(gain) + 1) < decisions.POLARITY_GAIN)
+            & (own > decisions.OWN_CORRELATION)
+            & ~silent
         ].tolist()
         order = np.argmax(alike, axis=1)
         moved = _moved(alike, ~silent)
@@ -170,7 +161,7 @@ def _silent(seen: ComplexArray, wanted: ComplexArray, good: Mask) -> Mask:
     """Mask (S,) of sensors with hardly any of the reading that they should have."""
     power = np.where(good[..., None], np.abs(seen) ** 2, 0.0).sum(axis=(0, 2))
     expected = np.where(good[..., None], np.abs(wanted) ** 2, 0.0).sum(axis=(0, 2))
-    return np.asarray((power < DEAD**2 * expected) & (expected > 0))
+    return np.asarray((power < decisions.DEAD**2 * expected) & (expected > 0))
 
 
 def _likeness(seen: ComplexArray, wanted: ComplexArray, good: Mask) -> tuple[ComplexArray, Array]:
@@ -191,8 +182,8 @@ def _moved(alike: Array, is_driven: Mask) -> NDArray[np.int64]:
     moved = rows[
         (order != rows)
         & is_driven
-        & (best > OTHERS_CORRELATION)
-        & (1 - best**2 < BETTER * (1 - own**2))
+        & (best > decisions.OTHERS_CORRELATION)
+        & (1 - best**2 < decisions.BETTER * (1 - own**2))
     ]
     return np.asarray(moved if set(order[moved]) == set(moved) else moved[:0])
 

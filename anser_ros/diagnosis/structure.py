@@ -6,14 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from anser_ros.diagnosis.decisions import (
-    LEAST_CORRELATION,
-    LEAST_DEPENDENCE,
-    NOT_NORMAL,
-    SHARED,
-    SIGNIFICANT,
-    WITH_SIZE,
-)
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.problem import Part, State, tool_parts
 
 Array = NDArray[np.float64]
@@ -38,7 +31,7 @@ class StructureTest:
     @property
     def significant(self) -> bool:
         """Return whether noise hardly does that, and it matters."""
-        return self.probability < SIGNIFICANT and self.share > LEAST_DEPENDENCE
+        return self.probability < decisions.SIGNIFICANT and self.share > decisions.LEAST_DEPENDENCE
 
 
 def structure_tests(state: State) -> list[StructureTest]:
@@ -194,11 +187,11 @@ class Whiteness:
     def depends_on(self) -> tuple[str, ...]:
         """Return what they depend on, in the words of `docs/interfaces.md`."""
         found: list[str] = []
-        if self.memory > LEAST_CORRELATION:
+        if self.memory > decisions.LEAST_CORRELATION:
             found.append('time')
-        if self.shared > SHARED:
+        if self.shared > decisions.SHARED:
             found += ['channel', 'emitter']
-        if self.with_size > WITH_SIZE or abs(self.kurtosis) > NOT_NORMAL:
+        if self.with_size > decisions.WITH_SIZE or abs(self.kurtosis) > decisions.NOT_NORMAL:
             found.append('amplitude')
         return tuple(found)
 

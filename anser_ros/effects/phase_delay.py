@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term
 from anser_ros.effects.view import Apparatus, View
-from anser_ros.field.model import EffectRecord
 
 UNIT = 1e-6
 """theta counts microseconds."""
@@ -20,6 +19,7 @@ class PhaseDelay(Effect[Term]):
     units = {'delay_s': 's'}
     plausible = {'delay_s': (-5e-5, 5e-5)}
     remedy = Remedy.FLUX
+    recorded = {'delay_s': (1, UNIT)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return one candidate, as one delay holds for all channels."""
@@ -36,18 +36,6 @@ class PhaseDelay(Effect[Term]):
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
         """Return the turn of each emitter's phasors on the diagonal."""
         return np.diag(np.exp(-1j * omega * term.theta[0] * UNIT))[None]
-
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the delay and its uncertainty, s."""
-        return EffectRecord(
-            self.name,
-            {'delay_s': UNIT * float(term.theta[0])},
-            {'delay_s': UNIT * float(np.sqrt(covariance[0, 0]))},
-        )
-
-    def term(self, record: EffectRecord) -> Term:
-        """Read the delay, s, from a record."""
-        return Term(self, {}, np.array([float(needed(record, 'delay_s')) / UNIT]))
 
 
 EFFECTS = (PhaseDelay(),)

@@ -1,4 +1,4 @@
-"""A metal object rests near the volume."""
+"""A metal object or a metal sheet rests near the volume."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -15,7 +15,10 @@ from anser_ros.effects.effect import (
     Remedy,
     Resting,
     Term,
+    both_phases,
+    complex_of,
     needed,
+    pairs_of,
     sigmas,
 )
 from anser_ros.effects.view import Apparatus, View
@@ -29,6 +32,9 @@ from anser_ros.metal.body import (
     body_sizes,
     centre_sigma,
     multipoles,
+    sheet_shapes,
+    sheet_sizes,
+    sheet_sources,
 )
 from anser_ros.metal.scattering import UNIT
 from anser_ros.physics.constants import MU_0
@@ -62,20 +68,24 @@ def places(apparatus: Apparatus) -> Array:
         if x in around[0][[0, -1]] or y in around[1][[0, -1]]
     ]
     points = np.array(grid + ring)
-    inside = np.all(
-        (points > apparatus.visited_box[0] - CLOSEST)
-        & (points < apparatus.visited_box[1] + CLOSEST),
-        axis=1,
-    )
-    on_board = np.all(
-        (points > apparatus.board[0] - [0, 0, 0.01])
-        & (points < apparatus.board[1] + [0, 0, 0.04]),
-        axis=1,
-    )
+    inside = _within(points, apparatus.visited_box + [[-CLOSEST], [CLOSEST]])
+    on_board = _within(points, apparatus.board + [[0, 0, -0.01], [0, 0, 0.04]])
     return np.asarray(points[~inside & ~on_board])
 
 
-class StaticMetal(Effect[Term]):
+def _within(points: Array, box: Array) -> NDArray[np.bool_]:
+    return np.asarray(np.all((points > box[0]) & (points < box[1]), axis=1))
+
+
+class MetalAtRest(Effect[Term]):
+    """Is metal of a shape that is never known, which the field model can take in."""
+
+    remedy = Remedy.FIELD
+    family = Family.METAL_AT_REST
+    inexact = np.inf
+
+
+class StaticMetal(MetalAtRest):
     """Theta is the centre (m), then real and imaginary parts of a simple body's modes.
 
     The rest of the body's response belongs to its remainder (`anser_ros.effects.metal_remainder`).
@@ -83,24 +93,14 @@ class StaticMetal(Effect[Term]):
 
     name = 'static_metal'
     summary = 'a metal object stands near the volume'
-    units = {
-        'position_m': 'm',
-        'polarizability': 'm^3 (3x3, [re, im])',
-    }
+    units = {'position_m': 'm', 'polarizability': 'm^3 (3x3, [re, im])'}
     plausible = {'position_m': (-1.0, 1.0)}
-    remedy = Remedy.FIELD
-    family = Family.METAL_AT_REST
-    inexact = np.inf
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a candidate at every place of a grid."""
-        modes = 2 * ball_modes().shape[1]
+        none = np.zeros(2 * ball_modes().shape[1])
         return [
-            Term(
-                self,
-                {'place': tuple(float(v) for v in place)},
-                np.concatenate([place, np.zeros(modes)]),
-            )
+            Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, none]))
             for place in places(apparatus)
         ]
 
@@ -114,8 +114,7 @@ class StaticMetal(Effect[Term]):
         return np.concatenate([np.full(3, place), np.full(term.theta.size - 3, 10.0)])
 
     def _couplings(self, term: Term) -> ComplexArray:
-        parts = term.theta[3:].reshape(2, -1)
-        return np.asarray(ball_modes() @ (parts[0] + 1j * parts[1]))
+        return np.asarray(ball_modes() @ complex_of(term.theta[3:]))
 
     def _seen(self, centre: Array, view: View) -> tuple[Array, ComplexArray]:
         """Amplitudes of the sensors (F, S, M) and of the emitters (K, M) about a centre."""
@@ -135,8 +134,7 @@ class StaticMetal(Effect[Term]):
                 more, less = (self._flux(term, centre + s, view) for s in (step, -step))
                 out[..., i] = (more - less) / (2 * STEP)
         unit = multipoles().mode_flux(*self._seen(centre, view), ball_modes(), view.omega)
-        groups = unit.shape[-1]
-        out[..., 3 : 3 + groups], out[..., 3 + groups :] = unit, 1j * unit
+        out[..., 3:] = both_phases(unit)
         return out
 
     def probe(self, term: Term, view: View) -> ComplexArray | None:
@@ -144,7 +142,7 @@ class StaticMetal(Effect[Term]):
         points = term.theta[:3]
         field = view.illumination.field(points[None])[0] * (UNIT / MU_0)
         unit = view.along(Dipoles.vectors(points[None], field[None]).flux(*view.flat))
-        return np.stack([unit, 1j * unit], axis=-1)
+        return both_phases(unit[..., None])
 
     def started(self, term: Term, solution: Array) -> Sequence[Term]:
         """Start with the isotropic scatterer that the probe found at its place."""
@@ -178,7 +176,7 @@ class StaticMetal(Effect[Term]):
             self.name,
             {
                 'position_m': term.theta[:3].tolist(),
-                'polarizability': np.stack([total.real, total.imag], axis=-1).tolist(),
+                'polarizability': pairs_of(total),
                 'groups': (UNIT * term.theta[3:]).tolist(),
             },
             {'position_m': np.hypot(sigmas(covariance)[:3], centre_sigma(total)).tolist()},
@@ -191,5 +189,122 @@ class StaticMetal(Effect[Term]):
         return Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, alpha]))
 
 
+MESH = 12
+"""Loops along an edge of the sheet's mesh: a loop is then as wide as a twelfth of the edge, less
+than the distance to the sensors for any sheet that is found."""
+DIFFERENCE_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
+"""Steps of the central differences, in theta's units: small compared with the distances and with
+a change of the resistance that shows."""
+TYPICAL_OHM = 3e-5
+"""Surface resistance, ohm, that a plate's fit starts from: about that of a millimetre of
+aluminium. It is only a start, from which the fit moves."""
+
+HEIGHT, RIM, OHM = 0.005, 0.03, 0.1
+"""How well a sheet is known at best, whose true outline, thickness and bend are unknown: its
+height and each rim as shares of its edge, and its resistance."""
+
+
+class ConductivePlate(MetalAtRest):
+    """Theta is height z, edge, centre x and y (m), and the log of the sheet resistance (ohm)."""
+
+    name = 'conductive_plate'
+    summary = 'a metal sheet lies parallel to the board'
+    units = {'z_m': 'm', 'edge_m': 'm', 'centre_m': 'm', 'sheet_ohm': 'ohm'}
+    plausible = {'z_m': (-1.0, 1.0), 'edge_m': (0.02, 2.0), 'sheet_ohm': (1e-7, 1.0)}
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        """Try heights below the board and above the volume, in two sizes."""
+        size = float(np.max(apparatus.board[1, :2] - apparatus.board[0, :2]))
+        middle = apparatus.board.mean(axis=0)
+        below = apparatus.board[0, 2] - size * np.array([0.08, 0.16, 0.26, 0.4, 0.6])
+        above = apparatus.visited_box[1, 2] + size * np.array([0.25, 0.5])
+        return [
+            Term(
+                self, {'z': float(z), 'edge': float(edge)},
+                np.array([z, edge, middle[0], middle[1], np.log(TYPICAL_OHM)]),
+            )
+            for z in (*below, *above)
+            for edge in (0.6 * size, size, 1.8 * size)
+        ]  # fmt: skip
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """Return the edge's index: a sheet without size has no effect."""
+        return np.array([1])
+
+    def prior(self, term: Term) -> Array:
+        """Expect places near the board, resistances over decades; a held sheet stays."""
+        if term.held:
+            return np.full(5, FROZEN)
+        return np.array([0.1, 0.2, 0.1, 0.1, 3.0])
+
+    def bounded(self, term: Term) -> Term:
+        """Keep the edge length and the sheet resistance within what exists."""
+        theta = term.theta.copy()
+        theta[1] = np.clip(theta[1], 0.02, 2.0)
+        theta[4] = np.clip(theta[4], np.log(1e-7), 0.0)
+        return term.with_theta(theta)
+
+    def covers(self, term: Term, candidate: Term) -> bool:
+        """Cover a sheet of any height and size: only one sheet is looked for."""
+        return candidate.effect is self
+
+    def resting(self, term: Term) -> Resting:
+        """Return what the sheet's currents lack, in waves over the sheet."""
+        edge = float(term.theta[1])
+        return Resting(term.theta[[2, 3, 0]], [(sheet_shapes(edge), sheet_sizes(edge))])
+
+    def sources(
+        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
+    ) -> Dipoles | None:
+        """Return the loops of the sheet; none where no amount has been set yet."""
+        z, edge, x, y, log_ohm = term.theta
+        centre, edges = np.array([x, y, z]), np.array([edge, edge])
+        return sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, illumination, omega)
+
+    def _flux(self, theta: Array, view: View) -> ComplexArray:
+        added = self.sources(Term(self, {}, theta), view.dipoles, view.illumination, view.omega)
+        assert added is not None
+        return view.along(added.flux(*view.flat))
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Return the flux's derivatives, taken by central differences with `DIFFERENCE_STEPS`."""
+        if term.held:
+            return view.columns(5)
+        steps, theta = np.diag(DIFFERENCE_STEPS), term.theta
+        differences = [self._flux(theta + s, view) - self._flux(theta - s, view) for s in steps]
+        return np.asarray(np.stack(differences, axis=-1) / (2 * DIFFERENCE_STEPS))
+
+    def probe(self, term: Term, view: View) -> ComplexArray | None:
+        """Return the columns of a sheet of this height and size, of any strength and phase."""
+        return both_phases(self._flux(term.theta, view)[..., None])
+
+    def started(self, term: Term, solution: Array) -> Sequence[Term]:
+        """Return the term of the sheet as it was probed."""
+        return (term,)
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Record height, edge length and centre of the sheet, m, and its resistance, ohm."""
+        z, edge, x, y, log_ohm = (float(v) for v in term.theta)
+        ohm, rim = float(np.exp(log_ohm)), RIM * edge
+        least = [HEIGHT * edge, np.sqrt(2) * rim, rim / np.sqrt(2), rim / np.sqrt(2), OHM]
+        sigma = np.hypot(sigmas(covariance), least)
+        return EffectRecord(
+            self.name,
+            {'z_m': z, 'edge_m': edge, 'centre_m': [x, y], 'sheet_ohm': ohm},
+            {
+                'z_m': float(sigma[0]),
+                'edge_m': float(sigma[1]),
+                'centre_m': sigma[2:4].tolist(),
+                'sheet_ohm': ohm * float(sigma[4]),
+            },
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """Read height, edge length, centre and sheet resistance from a record."""
+        x, y = (float(v) for v in needed(record, 'centre_m'))
+        z, edge, ohm = (float(needed(record, key)) for key in ('z_m', 'edge_m', 'sheet_ohm'))
+        return Term(self, {}, np.array([z, edge, x, y, np.log(ohm)]))
+
+
 STATIC_METAL = StaticMetal()
-EFFECTS = (STATIC_METAL,)
+EFFECTS = STATIC_METAL, ConductivePlate()

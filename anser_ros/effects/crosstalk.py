@@ -1,8 +1,8 @@
-"""Channels leak into each other, inside a cluster or between two of them."""
+"""Channels leak into each other, or one emitter's tone into another's."""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,12 @@ from anser_ros.effects.effect import (
     ComplexArray,
     Effect,
     Remedy,
+    Site,
     Term,
     needed,
+    recorded_site,
     sigmas,
     unit_matrix,
-    whole_numbers,
 )
 from anser_ros.effects.view import Apparatus, View
 from anser_ros.errors import ModelFileError
@@ -88,15 +89,10 @@ class ChannelCrosstalk(Effect[Term]):
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the whole matrix, ones on its diagonal."""
-        size = len(term.site['channels'])
-        sigma = np.zeros((size, size))
-        for value, place in zip(sigmas(covariance), _pairs(size), strict=True):
-            sigma[place] = value
-        return EffectRecord(
-            self.name,
-            {'channels': list(term.site['channels']), 'matrix': self._matrix(term).tolist()},
-            {'matrix': sigma.tolist()},
-        )
+        matrix = self._matrix(term)
+        sigma = self._matrix(term.with_theta(sigmas(covariance))) - np.eye(len(matrix))
+        parameters = {**recorded_site(term), 'matrix': matrix.tolist()}
+        return EffectRecord(self.name, parameters, {'matrix': sigma.tolist()})
 
     def possible(self, record: EffectRecord) -> bool:
         """Return whether the leaks, the matrix less its diagonal of ones, are in their range."""
@@ -106,15 +102,82 @@ class ChannelCrosstalk(Effect[Term]):
 
     def term(self, record: EffectRecord) -> Term:
         """Read the leaks from a record's matrix, whose diagonal is scaled to one."""
-        channels = whole_numbers(record, 'channels')
+        site = self.site_of(record)
+        count = len(site['channels'])
         matrix = np.asarray(needed(record, 'matrix'), dtype=np.float64)
-        if matrix.shape != (len(channels), len(channels)):
+        if matrix.shape != (count, count):
             raise ModelFileError(
-                f'model: channel_crosstalk of {len(channels)} channels has a matrix {matrix.shape}'
+                f'model: channel_crosstalk of {count} channels has a matrix {matrix.shape}'
             )
         matrix = matrix / np.diag(matrix)[:, None]
-        theta = np.array([matrix[place] for place in _pairs(len(channels))])
-        return Term(self, {'channels': channels}, theta)
+        return Term(self, site, np.array([matrix[place] for place in _pairs(count)]))
 
 
-EFFECTS = (ChannelCrosstalk(),)
+class CoilCrosstalk(Effect[Term]):
+    """Theta is the real and imaginary share of a one-way leak, or one real share both ways.
+
+    Readings at the second coil's frequency contain a share of the first one's field.
+    """
+
+    name = 'coil_crosstalk'
+    summary = "one emitter's tone leaks into another's"
+    units = {'coils': '1', 'eps': '1', 'eps_quadrature': '1', 'mutual': '1'}
+    plausible = {'eps': (-0.5, 0.5)}
+    remedy = Remedy.FLUX
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        """Try every ordered pair, and every pair both ways."""
+        coils = range(apparatus.emitters)
+        one_way: list[Site] = [{'coils': p} for p in permutations(coils, 2)]
+        both: list[Site] = [{'coils': p, 'mutual': True} for p in combinations(coils, 2)]
+        return [
+            Term(self, site, np.zeros(1 if 'mutual' in site else 2)) for site in one_way + both
+        ]
+
+    def prior(self, term: Term) -> Array:
+        """Return a prior spread of 0.1: leaks amount to some percent."""
+        return np.full(term.theta.size, 0.1)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Return the source emitter's flux, placed in the other emitter's tone."""
+        source, target = term.site['coils']
+        back = np.linalg.inv(self._matrix(term, view.omega.size))
+        own = np.einsum('ab,fsb->fsa', back, view.linear)
+        out = view.columns(term.theta.size)
+        out[:, :, target, 0] = own[:, :, source]
+        if term.site.get('mutual'):
+            out[:, :, source, 0] = own[:, :, target]
+        else:
+            out[:, :, target, 1] = 1j * own[:, :, source]
+        return out
+
+    def _matrix(self, term: Term, emitters: int) -> ComplexArray:
+        source, target = term.site['coils']
+        matrix = unit_matrix(emitters)
+        if term.site.get('mutual'):
+            matrix[target, source] = matrix[source, target] = term.theta[0]
+        else:
+            matrix[target, source] = complex(*term.theta)
+        return matrix
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        """Return the unit matrix with one entry more, or two."""
+        return self._matrix(term, omega.size)[None]
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Record the source, the target and the share that leaks, with its uncertainty."""
+        keys = ('eps', 'eps_quadrature')[: term.theta.size]
+        parameters = {**recorded_site(term), **dict(zip(keys, term.theta.tolist(), strict=True))}
+        sigma = sigmas(covariance).tolist()
+        return EffectRecord(self.name, parameters, dict(zip(keys, sigma, strict=True)))
+
+    def term(self, record: EffectRecord) -> Term:
+        """Read the source, the target and the share that leaks from a record."""
+        site, eps = self.site_of(record), float(needed(record, 'eps'))
+        if record.parameters.get('mutual'):
+            return Term(self, {**site, 'mutual': True}, np.array([eps]))
+        across = float(record.parameters.get('eps_quadrature', 0.0))
+        return Term(self, site, np.array([eps, across]))
+
+
+EFFECTS = ChannelCrosstalk(), CoilCrosstalk()
