@@ -14,7 +14,7 @@ from anser_ros.diagnosis.engine import BlockSums, Score, Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Problem, State, evaluate, parts
 from anser_ros.diagnosis.structure import noise_scale
-from anser_ros.effects.effect import Effect, Family, Term
+from anser_ros.effects.effect import Family, Term
 from anser_ros.effects.registry import all_effects
 from anser_ros.effects.view import View
 
@@ -25,8 +25,7 @@ SCALES = np.geomspace(1e-3, 1.0, 7)
 """Spreads that are tried first, as multiples of what the constant effect expects; the estimation
 starts at the best of them."""
 EXPECTATION_ROUNDS = 25
-"""Rounds of expectation-maximisation. It starts at the best of seven spreads, so it has less than
-a factor of two to go."""
+"""Rounds of expectation-maximisation, which has less than a factor of two to go."""
 
 
 def _opened(
@@ -103,8 +102,8 @@ def left_over(state: State, term: Term) -> float:
 
 
 STEP_PRICE = 0.05
-"""What a way of one step of the grid between two blocks costs, as a share of the largest gain of a
-place in a block; it grows with the square of the way. Without it a place follows noise."""
+"""Price of a way of one step of the grid between two blocks, over the largest gain of a place; it
+grows with the square of the way. Without it a place follows noise."""
 NO_PRIOR = 1e6
 """Prior spread (1e-4 m^3) of a scatterer's answer in a block: a hundred cubic metres, no bound."""
 
@@ -118,49 +117,30 @@ def moving_starts(
     scorer: Scorer[State],
     blocks: NDArray[np.int64],
 ) -> list[tuple[float, Term]]:
-    """Return expected gain and start values of effects that are another one at a place for each
-    block.
-
-    None if one place for the whole session explains as much.
+    """Return expected gain and start values of effects that are another one (`Effect.still`) at a
+    place for each block; none where one place for the whole session explains as much.
 
     ``scored``: all candidates, from ``scorer``; ``blocks``: the time blocks that take part.
     """
-    found = []
+    found: list[tuple[float, Term]] = []
+    excess = scorer.state.sum_of_squares - scorer.state.count
+    time = (blocks + 0.5) * problem.apparatus.duration / (blocks.max() + 1)
     for effect in all_effects().values():
-        if effect.still is not None:
-            places = [(t, s) for t, s in scored if t.effect is effect.still]
-            found += _starts(effect, places, problem, scorer, blocks)
+        places, gains = _places([(t, s) for t, s in scored if t.effect is effect.still])
+        if not places:
+            continue
+        one_place = scorer.held_out - min(held_out for _, _, held_out in places)
+        alone = float(gains.max(axis=0).sum())
+        moves = decisions.LEAST_PATH_GAIN * one_place + decisions.LEAST_MOTION_GAIN
+        if alone >= max(moves, decisions.LEAST_OF_EXCESS * excess):
+            starts = effect.along(time, *_course(places, gains), problem.apparatus)
+            found += [(alone, start) for start in starts]
     return found
 
 
-def _starts(
-    effect: Effect[Term],
-    scored: Sequence[tuple[Term, Score]],
-    problem: Problem,
-    scorer: Scorer[State],
-    blocks: NDArray[np.int64],
-) -> list[tuple[float, Term]]:
-    """Starts of one effect along the places of the effect that it is at rest."""
-    places, gains = _places(scored)
-    if not places:
-        return []
-    one_place = scorer.held_out - min(held_out for _, _, held_out in places)
-    alone = float(gains.max(axis=0).sum())
-    excess = scorer.state.sum_of_squares - scorer.state.count
-    if alone < max(
-        decisions.LEAST_PATH_GAIN * one_place + decisions.LEAST_MOTION_GAIN,
-        decisions.LEAST_OF_EXCESS * excess,
-    ):
-        return []
-    course, solution = _course(places, gains)
-    time = (blocks + 0.5) * problem.apparatus.duration / (blocks.max() + 1)
-    starts = effect.along(time, course, solution, problem.apparatus)
-    return [(alone, start) for start in starts]
-
-
 def course_of(scored: Sequence[tuple[Term, Score]]) -> tuple[Array, Array] | None:
-    """Return where metal at rest fits best in each block (B, 3), m, frame fg, and the solution of
-    the probe in the block where it explains most; None without such metal.
+    """Return where metal at rest fits best in each block (B, 3), m, frame fg, and the probe's
+    solution in the block where it explains most; None without such metal.
     """
     places, gains = _places(scored)
     return _course(places, gains) if places else None
@@ -181,8 +161,8 @@ def _course(places: Sequence[Place], gains: Array) -> tuple[Array, Array]:
     """The smoothest course, and the solution of the block in which a place explains most."""
     points = np.array([centre for centre, _, _ in places])
     best = int(np.argmax(gains.max(axis=0)))
-    sums = places[int(np.argmax(gains[:, best]))][1]
-    return points[_smoothest(points, gains)], _estimate(sums.part(np.array([best])))
+    sums = places[int(np.argmax(gains[:, best]))][1].part(np.array([best]))
+    return points[_smoothest(points, gains)], sums.solve(np.full(sums.size, NO_PRIOR))[0]
 
 
 def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:
@@ -201,24 +181,17 @@ def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:
     return np.array(way[::-1])
 
 
-def _estimate(sums: BlockSums) -> Array:
-    return sums.solve(np.full(sums.size, NO_PRIOR))[0]
-
-
 def at_floor(fit: Fit) -> bool:
     """Return whether a fit leaves nothing but noise."""
     return fit.misfit < decisions.NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
 
 
 def taken_from_others(fit: Fit) -> float:
-    """Return what a new fluctuation's freedom takes off that is another effect's, unexplained so
-    far.
-
-    For each of its columns, every frame loses the share of one value in the remaining residual.
+    """Return what a new fluctuation's freedom takes off that is another effect's: for each of its
+    columns, every frame loses the share of one value in the remaining residual.
     """
-    return (
-        decisions.FROM_OTHERS * fit.newest.effect.freedom(fit.newest) * max(fit.misfit - 1.0, 0.0)
-    )
+    freedom = fit.newest.effect.freedom(fit.newest)
+    return decisions.FROM_OTHERS * freedom * max(fit.misfit - 1.0, 0.0)
 
 
 def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
@@ -268,7 +241,7 @@ def moves_or_rests(
     effects with their scores, best first, from a scorer; ``explained``: what the metal that moves
     takes off the held-out sum of squares.
 
-    Returns Fit: settled (`anser_ros.diagnosis.fit`).
+    Returns a settled fit (`anser_ros.diagnosis.fit`).
     """
     shaped = settled(fitter, moving.terms)
     resting = [(g, f) for g, f in fitted if f.newest.effect.family is Family.METAL_AT_REST]

@@ -1,9 +1,7 @@
 """Tests whether an effect is the same in all parts of the data, as a real one must be.
 
-A known effect often absorbs part of an unknown one, with parameters that differ from one part of
-the data to the next. So each effect is fitted again in parts of the time and emitter by emitter,
-and the additional power that those fits remove is compared with the power that the effect itself
-removes.
+Each effect is fitted again in parts of the time, emitter by emitter and by sensor. The power that
+those fits remove besides is compared with the power that the effect itself removes.
 """
 
 from collections.abc import Sequence
@@ -67,14 +65,14 @@ def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmati
     left = max(fit.state.sum_of_squares - noise * fit.state.count, 0.0)
     left_tools = left if fit.misfit > decisions.SOMETHING_LEFT * noise else 0.0
     columns = fit.state.design(term)
+    remainder = 0.0
+    if np.isfinite(term.effect.inexact):
+        remainder = _stays(fit.state, columns, noise, max(1.0, decisions.MODEL_ERROR * noise))
     return Confirmation(
         power,
         _varying(fit.state, columns, noise) / max(power, 1e-300),
         power / max(left_tools, 1e-300),
-        0.0
-        if np.isinf(term.effect.inexact)
-        else _stays(fit.state, columns, noise, max(1.0, decisions.MODEL_ERROR * noise))
-        / max(power, 1e-300),
+        remainder / max(power, 1e-300),
         inexact=term.effect.inexact,
         alike=_crowd(fit, term),
         plausible=_plausible(fit, term),
@@ -160,14 +158,10 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
 
 def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmation, Term]]:
     """Return a fit's effects that are not confirmed, the one with the least power first."""
-    checks = [
-        (_checked(problem, fit, term, noise), term) for term in fit.effects if term.theta.size
-    ]
-    checks += [
-        (_checked_open(problem, fit, term, noise), term)
-        for term in fit.terms
-        if term.effect.family is Family.FLUCTUATION
-    ]
+    fitted = [term for term in fit.effects if term.theta.size]
+    free = [term for term in fit.terms if term.effect.family is Family.FLUCTUATION]
+    checks = [(_checked(problem, fit, term, noise), term) for term in fitted]
+    checks += [(_checked_open(problem, fit, term, noise), term) for term in free]
     checks += _unsteady(problem, fit)
     bad = [(check, term) for check, term in checks if not check.holds]
     return sorted(bad, key=lambda pair: pair[0].power)

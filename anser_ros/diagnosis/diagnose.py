@@ -39,8 +39,7 @@ from anser_ros.field.model import FieldModel
 Array = NDArray[np.float64]
 
 SEARCH_FRAMES, FINAL_FRAMES, WIRING_FRAMES = 270, 400, 150
-"""Frames of each tool, about, that the search, the last fit and the look for wiring faults work
-on: time grows with them in proportion, and neighbouring frames say much the same."""
+"""Frames of each tool, about, for the search, the last fit and the look for wiring faults."""
 
 
 @dataclass(frozen=True)
@@ -100,10 +99,11 @@ def diagnose(
     ``problem``: of the whole session (`anser_ros.diagnosis.prepare.build_problem`); ``model``:
     what the problem was built with; ``progress``: called with words on what goes on.
     """
-    how, say = settings or SearchSettings(), progress or (lambda text: None)
+    how = settings or SearchSettings()
     screened = screen(problem)
-    search = search_screened(screened, how, say)
-    say('joint fit')
+    search = search_screened(screened, how, progress)
+    if progress:
+        progress('joint fit')
     confirmed = confirm(screened, search, how)
     return conclude(screened, search, confirmed, model)
 
@@ -119,9 +119,8 @@ def search_screened(
     screened: Screened, how: SearchSettings, progress: Progress | None = None
 ) -> Search:
     """Search for effects on a part of the training blocks' frames."""
-    say = progress or (lambda text: None)
     training = screened.training(SEARCH_FRAMES)
-    return search_effects(training, train_blocks(), list(screened.known), how, say)
+    return search_effects(training, train_blocks(), screened.known, how, progress)
 
 
 def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirmed:
@@ -156,10 +155,7 @@ def _settled(
 ) -> tuple[Fit, tuple[tuple[Term, Confirmation], ...]]:
     """The joint fit, by ``last``, of the effects that are the same in all parts of the data."""
     fit, refused = search.fit, []
-    while True:
-        bad = doubtful(fitter.problem, fit, noise_scale(fit.state) ** 2)
-        if not bad:
-            break
+    while bad := doubtful(fitter.problem, fit, noise_scale(fit.state) ** 2):
         # Metal that is doubtful costs much to fit again and is hardly ever more than a stand-in.
         metal = [pair for pair in bad if pair[1].effect.family.is_metal]
         crowd = [pair for pair in bad if pair[0].alike >= decisions.MANY]
@@ -186,10 +182,8 @@ def conclude(
     floor = min(scale * expected, rms(after))
     tests = tuple(structure_tests(after))
     excess = max(rms(after) ** 2 - floor**2, 0.0)
-    structured = any(test.significant for test in tests)
-    significant = (
-        excess > (decisions.STRUCTURED if structured else decisions.UNSTRUCTURED) * floor**2
-    )
+    named = [test.variable for test in tests if test.significant]
+    significant = excess > (decisions.STRUCTURED if named else decisions.UNSTRUCTURED) * floor**2
     possible = max(rms(before) ** 2 - floor**2, excess)
     findings = [
         fitted_finding(fit, i, unseen, search)
@@ -202,7 +196,6 @@ def conclude(
     records = [finding.record for finding in findings]
     depends: tuple[str, ...] = ()
     if excess > decisions.DEPENDENT * floor**2:
-        named = [t.variable for t in tests if t.significant]
         depends = tuple(dict.fromkeys([*(white.depends_on if grown else ()), *named]))
     return Diagnosis(
         findings=tuple(findings),

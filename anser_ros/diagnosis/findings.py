@@ -37,20 +37,13 @@ def fitted_finding(fit: Fit, index: int, unseen: Problem, search: Search) -> Fin
     rest = [t for t in fit.terms if t is not term and not t.belongs_to(term)]
     without = rms(evaluate(unseen, rest))
     record = term.effect.record(term, fit.covariance_of(index))
-    gain = next(
-        (
-            c.gain
-            for found in search.rounds
-            for c in found
-            if c.fitted_gain is not None and c.term.label == term.label
-        ),
-        None,
-    )
+    tried = (candidate for found in search.rounds for candidate in found)
+    gains = [c.gain for c in tried if c.fitted_gain is not None and c.term.label == term.label]
     evidence = {
         'summary': term.effect.summary,
         'remedy': term.effect.remedy.value,
         'parameters_spent': int(term.theta.size),
-        'held_out_gain': None if gain is None else float(gain),
+        'held_out_gain': float(gains[0]) if gains else None,
         'rivals': [c.term.label for c in search.rivals.get(term.label, [])],
     }
     return Finding(replace(record, evidence={**record.evidence, **evidence}), term, without)
@@ -77,8 +70,7 @@ def outlier_findings(
 
     ``whole`` and ``cleaned``: with and without the frames that stand out; ``after``: the held-out
     part with all effects; ``excess``: power that is not explained, over the floor's; ``known``:
-    the model's. The share of frames that stood out in its own scan is what the optical tracker
-    always does, and no effect of a session.
+    the model's effects. Frames that stood out in its own scan are what the tracker always does.
     """
     share, channels = outlying_share(whole, cleaned)
     # A fluctuation is taken for normal: frames far out along it are its own tails.
@@ -109,8 +101,7 @@ def noise_findings(whole: Problem, after: State) -> list[Finding]:
         noisy = []
     count: float = after.count
     if noisy:
-        total = sum(float(squares[c].sum()) for c in noisy)
-        size = np.sqrt(total / sum(squares[c].size for c in noisy))
+        size = np.sqrt(np.mean(np.concatenate([squares[c].ravel() for c in noisy])))
         factor = float(size) * whole.spread.flux_t / whole.spread.noise_t
         count *= len(noisy) / len(whole.apparatus.tool_channels)
     sigma = factor / np.sqrt(2 * max(count, 1))

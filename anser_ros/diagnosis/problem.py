@@ -21,12 +21,11 @@ REFERENCE_CHANGE = 0.01
 """Relative error of the change that a reference sensor with the default survey errors sees."""
 CHANGE_LENGTH_M = 0.03
 """Way over which what metal does to a reference changes by its own size, m: a third of the
-distance (a dipole's field falls with its cube), for metal some 10 cm away."""
+distance, for metal some 10 cm away."""
 FRAMES_AT_ONCE = 16
-"""Frames that are whitened at once: a megabyte or two, which stay in the cache from one
-product to the next."""
+"""Frames that are whitened at once: a megabyte or two, which stay in the cache."""
 FRAMES_A_THREAD = 8 * FRAMES_AT_ONCE
-"""Frames that one thread whitens, a millisecond's work: a few, and handing over takes longer."""
+"""Frames that one thread whitens, a millisecond's work."""
 
 
 def _survey_share(accuracy: Accuracy) -> float:
@@ -266,13 +265,15 @@ def _with_free(known: Array, terms: Sequence[Term], view: View) -> Array:
 
 
 def _reference_part(problem: Problem, references: References, terms: Sequence[Term]) -> Part:
-    readings = references.readings
-    view = reference_view(readings, references.baseline, terms, problem.fields)
-    good = readings.valid
+    readings, good = references.readings, references.readings.valid
+
+    def predicted(some: Sequence[Term]) -> View:
+        return reference_view(readings, references.baseline, some, problem.fields)
+
+    view = predicted(terms)
     residual = parts(np.where(good[..., None], readings.flux - view.flux, 0.0))
     # A survey error is the same in every bin: shared among B bins it must count B times as much.
-    exact = [term for term in terms if term.effect.remedy is not Remedy.FIELD]
-    unchanged = reference_view(readings, references.baseline, exact, problem.fields)
+    unchanged = predicted([term for term in terms if term.effect.remedy is not Remedy.FIELD])
     change = np.where(good[..., None], readings.flux - unchanged.flux, 0.0)
     size = np.sqrt(np.mean(np.abs(change) ** 2, axis=2, keepdims=True) / 2)
     noise = problem.spread.flux_t / np.sqrt(np.maximum(references.count, 1))
@@ -281,8 +282,7 @@ def _reference_part(problem: Problem, references: References, terms: Sequence[Te
     gradient = np.zeros_like(view.flux.real)
     for term in terms:
         if term.effect.gradient_error:
-            alone = reference_view(readings, references.baseline, [term], problem.fields)
-            shifted = np.abs(alone.flux - references.baseline)
+            shifted = np.abs(predicted([term]).flux - references.baseline)
             gradient += term.effect.gradient_error * shifted * together
     spread = np.sqrt(noise[..., None] ** 2 + survey**2 + gradient**2)
     weight = np.where(good[..., None], 1 / spread, 0.0).reshape(good.shape[0], -1)
@@ -299,8 +299,9 @@ def tool_parts(state: State) -> list[Part]:
 
 def tools_misfit(state: State) -> float:
     """Return the mean square of the tools' whitened residuals."""
-    squares = sum(float(np.sum(part.white**2)) for part in tool_parts(state))
-    return squares / max(sum(part.count for part in tool_parts(state)), 1)
+    tools = tool_parts(state)
+    squares = sum(float(np.sum(part.white**2)) for part in tools)
+    return squares / max(sum(part.count for part in tools), 1)
 
 
 def rms(state: State) -> float:

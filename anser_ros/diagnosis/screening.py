@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 from scipy.special import chdtri
 
 from anser_ros.diagnosis import decisions
-from anser_ros.diagnosis.problem import Problem, State, evaluate
+from anser_ros.diagnosis.problem import Problem, State, evaluate, tool_parts
 from anser_ros.effects.effect import Family, Site, Term
 from anser_ros.effects.wiring import DEAD_CHANNEL, SENSOR_POLARITY, SWAPPED_CHANNELS, SWAPPED_COILS
 
@@ -16,18 +16,15 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WINDOW = 11
-"""Neighbouring frames, this one among them, whose median an outlier stands out from: up to five
-bad ones in a row are seen, and motion changes little over so many."""
+"""Neighbouring frames whose median an outlier stands out from: up to five bad ones in a row."""
 
 
-def find_outliers(state: State) -> tuple[Mask, ...]:
-    """Return masks (F, S) of outlying readings, one per tool; or of whole frames."""
-    masks = []
+def without_outliers(problem: Problem, state: State) -> Problem:
+    """Return the problem without readings and whole frames that stand out in a state of it."""
+    kept = []
     moves = any(term.effect.family is Family.FLUCTUATION for term in state.terms)
-    for part, tool, good in zip(
-        state.parts, state.problem.tools, state.problem.good, strict=False
-    ):
-        emitters = state.problem.fields.omega.size
+    emitters = problem.fields.omega.size
+    for part, tool, good in zip(state.parts, problem.tools, problem.good, strict=False):
         # The residual along the pose's own directions is left in: an optical glitch shows there.
         size = (part.residual * part.whitener.weight) ** 2
         white = part.white**2
@@ -43,8 +40,8 @@ def find_outliers(state: State) -> tuple[Mask, ...]:
         bad = _stands_out(readings, of_reading) | _stands_out(frames[:, None], of_frame)
         if not moves:
             bad |= _stands_out(jumps[:, None], decisions.JUMP_RATIO)
-        masks.append(bad & good)
-    return tuple(masks)
+        kept.append(good & ~bad)
+    return replace(problem, good=tuple(kept))
 
 
 def _by_reading(values: Array, sensors: int, emitters: int) -> Array:
@@ -70,21 +67,13 @@ def _stands_out(values: Array, ratio: float) -> Mask:
     return np.asarray(values > ratio * np.maximum(local, 1.0))
 
 
-def without_outliers(problem: Problem, state: State) -> Problem:
-    """Return the problem with outlying readings left out."""
-    masks = find_outliers(state)
-    good = tuple(g & ~bad for g, bad in zip(problem.good, masks, strict=True))
-    return replace(problem, good=good)
-
-
 def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
     """Return the share of frames that lost a reading, and the channels that lost most of them.
 
     The list is empty if whole frames are outliers.
     """
-    lost_frames, frames = 0, 0
+    lost_frames, frames, whole = 0, 0, 0
     by_channel: dict[int, int] = {}
-    whole = 0
     for tool, old, new in zip(before.tools, before.good, after.good, strict=True):
         lost = old & ~new
         lost_frames += int(lost.any(axis=1).sum())
@@ -92,8 +81,7 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
             (lost.sum(axis=1) > decisions.WHOLE_FRAME_SHARE * old.sum(axis=1).clip(1)).sum()
         )
         frames += tool.time.size
-        for row, channel in enumerate(tool.sensors.channel.tolist()):
-            by_channel[channel] = int(lost[:, row].sum())
+        by_channel |= dict(zip(tool.sensors.channel.tolist(), lost.sum(axis=0), strict=True))
     share = lost_frames / max(frames, 1)
     if whole > decisions.WHOLE_FRAME_SHARE * max(lost_frames, 1):
         return share, []
@@ -119,9 +107,7 @@ def wiring_faults(problem: Problem) -> list[Term]:
     faults: list[Term] = []
     dead: list[int] = []
     turned: list[int] = []
-    for number, part in enumerate(p for p in state.parts if not p.view.is_reference):
-        tool = state.problem.tools[number]
-        usable = state.problem.good[number]
+    for part, tool, usable in zip(tool_parts(state), problem.tools, problem.good, strict=False):
         channels, silent = tool.sensors.channel, _silent(tool.flux, part.view.flux, usable)
         dead += channels[silent].tolist()
         gain, alike = _likeness(tool.flux, part.view.flux, usable)
@@ -193,8 +179,8 @@ def _swapped_coils(state: State) -> Term | None:
     emitters = state.problem.fields.omega.size
     cross = np.zeros((emitters, emitters), dtype=complex)
     power, own = np.zeros(emitters), np.zeros(emitters)
-    tools = [p for p in state.parts if not p.view.is_reference]
-    for part, tool, good in zip(tools, state.problem.tools, state.problem.good, strict=False):
+    problem = state.problem
+    for part, tool, good in zip(tool_parts(state), problem.tools, problem.good, strict=False):
         read = np.where(good[..., None], tool.flux, 0.0)
         wanted = np.where(good[..., None], part.view.flux, 0.0)
         cross += np.einsum('fsb,fsa->ab', wanted.conj(), read)
