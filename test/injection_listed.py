@@ -58,9 +58,7 @@ def cluster_axis(s: Subject, rng: np.random.Generator, size: float) -> Truth:
 @listed(CHANNEL)
 def sensor_polarity(s: Subject, rng: np.random.Generator, size: float) -> Truth:
     rows = sorted(rng.choice(s.sensors, 1 + int(size > 1), replace=False).tolist())
-    flux = s.tool.flux.copy()
-    flux[:, rows] *= -1
-    s.flux(flux)
+    s.channel(rows, -s.tool.flux[:, rows])
     return {'sensor_polarity': {'channels': s.tool.sensors.channel[rows].tolist()}}
 
 
@@ -103,9 +101,7 @@ def channel_crosstalk(s: Subject, rng: np.random.Generator, size: float) -> Trut
     rows = groups[int(rng.integers(len(groups)))]
     leak = size * 0.02 * rng.uniform(-1, 1, (len(rows), len(rows)))
     matrix = np.where(np.eye(len(rows), dtype=bool), 1.0, leak)
-    flux = s.tool.flux.copy()
-    flux[:, rows] = np.einsum('ij,fjk->fik', matrix, flux[:, rows])
-    s.flux(flux)
+    s.channel(rows, np.einsum('ij,fjk->fik', matrix, s.tool.flux[:, rows]))
     channels = s.tool.sensors.channel[rows].tolist()
     return {'channel_crosstalk': {'channels': channels, 'matrix': matrix}}
 

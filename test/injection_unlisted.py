@@ -136,10 +136,9 @@ def cluster_elsewhere(s: Subject, rng: np.random.Generator, size: float) -> Trut
 @unlisted(TABLE, 'sensor_position')
 def warm_body(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """The body is longer than it was surveyed."""
-    flux, longer = s.tool.flux.copy(), size * signed(rng, 0.01, 0.03)
+    longer = size * signed(rng, 0.01, 0.03)
     shift = s.rotation @ s.tool.sensors.position.T * longer
-    flux += s.read(s.centres + shift.transpose(0, 2, 1), s.axes) - s.clean
-    s.flux(flux)
+    s.flux(s.tool.flux + s.read(s.centres + shift.transpose(0, 2, 1), s.axes) - s.clean)
 
 
 @unlisted(READING)
@@ -209,9 +208,7 @@ def even_order(s: Subject, rng: np.random.Generator, size: float) -> Truth | Non
 @unlisted(CHANNEL, 'swapped_channels')
 def channels_swapped(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     pair = rng.choice(s.sensors, 2, replace=False)
-    flux = s.tool.flux.copy()
-    flux[:, pair] = flux[:, pair[::-1]]
-    s.flux(flux)
+    s.channel(pair, s.tool.flux[:, pair[::-1]])
 
 
 @unlisted(EMITTER, 'swapped_coils')
@@ -237,13 +234,8 @@ def optical_scale(s: Subject, rng: np.random.Generator, size: float) -> Truth | 
 @unlisted(TRACK, 'registration_drift', 'optical_jitter')
 def registration_drift(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     track, way = s.tool.track, size * 1e-3 * rng.normal(size=3)
-    s.track(
-        replace(
-            track,
-            position=track.position
-            + way * ((track.time - track.time[0]) / np.ptp(track.time))[:, None],
-        )
-    )
+    share = ((track.time - track.time[0]) / np.ptp(track.time))[:, None]
+    s.track(replace(track, position=track.position + way * share))
 
 
 @unlisted(TRACK, 'registration_drift', 'optical_jitter')
@@ -258,13 +250,9 @@ def optical_knock(s: Subject, rng: np.random.Generator, size: float) -> Truth | 
 def optical_jitter(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     track, more = s.tool.track, 1 + 2 * size
     shake = Rotation.from_rotvec(more * JITTER_RAD * rng.normal(size=(track.time.size, 3)))
-    s.track(
-        PoseTrack(
-            track.time,
-            track.position + more * JITTER_M * rng.normal(size=track.position.shape),
-            (shake * Rotation.from_quat(track.quaternion)).as_quat(),
-        )
-    )
+    shaken = track.position + more * JITTER_M * rng.normal(size=track.position.shape)
+    turned = (shake * Rotation.from_quat(track.quaternion)).as_quat()
+    s.track(PoseTrack(track.time, shaken, turned))
 
 
 @unlisted(TRACK, 'clock_rate')
@@ -299,10 +287,8 @@ def weak_stray_field(s: Subject, rng: np.random.Generator, size: float) -> Truth
 def reference_gain(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     """One reference channel's gain is off; the listed name fits it."""
     row = int(rng.integers(len(s.reference.sensors)))
-    flux = s.reference.flux.copy()
     gain = 1 + size * signed(rng, 0.01, 0.04)
-    flux[:, row] *= gain
-    s.references(flux)
+    s.reference_channel(row, s.reference.flux[:, row] * gain)
     channel = int(s.reference.sensors.channel[row])
     return {'sensor_gain': {'channel': channel, 'gain': gain, 'phase_deg': 0.0}}
 
@@ -310,20 +296,18 @@ def reference_gain(s: Subject, rng: np.random.Generator, size: float) -> Truth |
 @unlisted(CHANNEL, 'reference_changed', 'sensor_gain')
 def reference_moved(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row = int(rng.integers(len(s.reference.sensors)))
-    table, flux = s.reference.sensors, s.reference.flux.copy()
+    table = s.reference.sensors
     place, shift = table.position[row : row + 1], size * 3e-3 * a_direction(rng)
     axis = table.axis[row : row + 1]
     there = s.illumination.flux(place + shift, axis, None)
-    flux[:, row] += there - s.illumination.flux(place, axis, None)
-    s.references(flux)
+    change = there - s.illumination.flux(place, axis, None)
+    s.reference_channel(row, s.reference.flux[:, row] + change)
 
 
 @unlisted(READING, 'dead_channel')
 def reference_dead(s: Subject, rng: np.random.Generator, size: float) -> Truth | None:
     row = int(rng.integers(len(s.reference.sensors)))
-    flux = s.reference.flux.copy()
-    flux[:, row] = NOISE_T * complex_normal(rng, flux[:, row].shape)
-    s.references(flux)
+    s.reference_channel(row, NOISE_T * complex_normal(rng, s.reference.flux[:, row].shape))
 
 
 @unlisted(CHANNEL)

@@ -26,7 +26,7 @@ from anser_ros.physics.constants import MU_0
 @pytest.fixture(scope='module')
 def scenery():
     made = world(frames=60)
-    made.move_track(made.true_track)
+    made.track(made.true_track)
     return made, made.problem()
 
 

@@ -35,9 +35,9 @@ OTHERS_CORRELATION, BETTER = 0.95, 0.1
 the other's may leave, from which a plug is in its socket. A looser pair takes neighbours that read
 alike for exchanged ones; a stricter one misses an exchange if there are other effects."""
 DEAD = 0.02
-"""Share of the expected reading below which a channel hears nothing: a fifth of the leak that
-`channel_crosstalk` expects, so that one that still hears its neighbours is not called dead.
-Smaller, and a dead channel that hears its neighbours is taken for a weak one; larger, and a weak
+"""Share of the expected reading below which a channel receives nothing: a fifth of the leak that
+`channel_crosstalk` expects, so that one that its neighbours leak into is not called dead.
+Smaller, and a dead channel with such a leak is taken for a weak one; larger, and a weak
 one is given up."""
 READING_RATIO, FRAME_RATIO = 6.0, 2.5
 """Mean squares over the neighbours' median from which a reading (16 values with 8 emitters) or a

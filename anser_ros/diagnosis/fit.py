@@ -41,11 +41,9 @@ Unit = Callable[[View, Array], NDArray[np.inexact]]
 KeyT = TypeVar('KeyT')
 
 MOST_SIZED_MODES = 130
-"""Modes, at most, of which the data are asked how large they are: more would be slower to compare
-than they could ever explain."""
+"""Modes, at most, of which the data are asked how large they are."""
 LEAST_INFORMATION = 0.3
-"""Information in the data, over that in the prior, below which a mode is left out: it would stay
-at about zero and only take time."""
+"""Information in the data, over that in the prior, below which a mode is left out."""
 SCORED_FRAMES = 130
 """Frames of each part, about, on which sizes of couplings are compared."""
 
@@ -145,10 +143,7 @@ def thinned(state: State, blocks: NDArray[np.int64]) -> State:
 
 
 def _information(state: State, unit: Unit, count: int) -> Array:
-    """Of single couplings, (c, c), from half of the frames.
-
-    Only the in-phase half of the columns is used: the other half is the same, rotated in phase.
-    """
+    """Of single couplings, (c, c), in phase (quadrature has the same), from half of the frames."""
     normal = np.zeros((count, count))
     for part in state.parts:
         half = part.frames(np.arange(0, part.view.time.size, 2))
@@ -200,15 +195,18 @@ class Fitter:
 
 
 TRIALS = 3
-"""Iterations after which kinds of bodies are compared; the best one is fitted on. All begin at
-places that have been fitted, and each iteration costs as much as the one before."""
+"""Iterations after which kinds of bodies are compared; the best one is fitted on."""
 EVERY_OTHER = 2
 """Every so many frames are used to compare kinds of bodies: it takes half the time."""
+MODE_ROUNDS = 2
+"""Times that modes are made about where the metal then is; the second hardly ever moves it."""
+NEW_MODES_M = 2e-3
+"""A centre that a fit moves farther than this (m) asks for new modes."""
 
 
 @dataclass(frozen=True)
 class Shaping:
-    """Shapes metal that moves in a fit."""
+    """Shapes metal in a fit: body and course where it moves, what it leaves where it rests."""
 
     fitter: Fitter
     richness: Richness  # how many modes and knots it may have
@@ -237,11 +235,7 @@ class Shaping:
         return fit
 
     def _bodied(self, fit: Fit, index: int, first: BodyTerm) -> Fit:
-        """The fit with a richer body.
-
-        A simple body fitted in place of an extended one may have converged to a wrong place, so
-        its start is tried too.
-        """
+        """The fit with a richer body, also from its start: a simple one may have gone astray."""
         if first.richness is not None:
             return self.shaped_as(fit, index, first, [first.kind]) or fit
         half = self.fitter.problem.in_blocks(self.fitter.blocks, EVERY_OTHER)
@@ -296,30 +290,7 @@ class Shaping:
             priors.append(prior)
         return joined(groups), np.concatenate(priors)
 
-
-def _body(term: Term) -> BodyTerm | None:
-    return term.effect.body(term)
-
-
-def _with(terms: Sequence[Term], index: int, term: Term) -> tuple[Term, ...]:
-    return tuple(term if i == index else t for i, t in enumerate(terms))
-
-
-MODE_ROUNDS = 2
-"""Times that modes are made about where the metal then is; the second hardly ever moves it."""
-NEW_MODES_M = 2e-3
-"""A centre that a fit moves farther than this (m) asks for new modes: modes about a centre that is
-off by a tenth of a body's radius stand for it as well."""
-
-
-@dataclass(frozen=True)
-class Remainders:
-    """Adds what metal at rest leaves to a fit."""
-
-    fitter: Fitter
-    richness: Richness  # how many modes it may have
-
-    def added(self, fit: Fit, index: int) -> Fit:
+    def with_remainder(self, fit: Fit, index: int) -> Fit:
         """Return the fit with what one metal at rest leaves; the same fit for any other effect."""
         plain = fit.terms
         if plain[index].effect.resting(plain[index]) is None:
@@ -369,6 +340,14 @@ class Remainders:
         return REMAINDER.of(term, Couplings(kind, centre, modes))
 
 
+def _body(term: Term) -> BodyTerm | None:
+    return term.effect.body(term)
+
+
+def _with(terms: Sequence[Term], index: int, term: Term) -> tuple[Term, ...]:
+    return tuple(term if i == index else t for i, t in enumerate(terms))
+
+
 def _resting(term: Term) -> Resting:
     """Where a term of metal at rest is."""
     found = term.effect.resting(term)
@@ -377,8 +356,7 @@ def _resting(term: Term) -> Resting:
 
 
 COARSE = Richness(50, (17,), COARSE_REMAINDER)
-"""How finely metal is shaped during the search: by what shapes usually leave, about half of the
-modes that the data determine, and a knot in 2.5 s of a session of 40 s."""
+"""How finely metal is shaped during the search: by half of the modes that data determine."""
 FINE = Richness(90, (17, 25), SOMETHING_LEFT)
 """How finely metal is shaped in the last fit, which is made once."""
 
@@ -386,19 +364,18 @@ FINE = Richness(90, (17, 25), SOMETHING_LEFT)
 def settled(fitter: Fitter, terms: Sequence[Term], richness: Richness = COARSE) -> Fit:
     """Return the joint fit of some effects, metal shaped and then held where it is.
 
-    ``terms``: start values; remainders of metal among them are made again; ``richness``: how
-    finely metal is shaped.
+    ``terms``: start values; remainders of metal among them are made again.
     """
     plain = [term.free() for term in terms if term.effect.family is not Family.REMAINDER]
     bodies = [term.effect.body(term) for term in plain]
     # What moves and has its shape already is reshaped below.
     known = any(body is not None and body.richness is not None for body in bodies)
     fit = fitter.fit(plain, 1 if known else None)
-    shaping, remainders = Shaping(fitter, richness), Remainders(fitter, richness)
+    shaping = Shaping(fitter, richness)
     for index in range(len(fit.terms)):
         fit = shaping.shaped(fit, index)
     for index in range(len(fit.terms)):
-        fit = remainders.added(fit, index)
+        fit = shaping.with_remainder(fit, index)
     return _held(fit, fitter)
 
 
@@ -406,8 +383,8 @@ def _held(fit: Fit, fitter: Fitter) -> Fit:
     """The same fit, metal held where it is: what is tried with it is then cheap to fit."""
     if not any(term.effect.family.is_metal for term in fit.terms):
         return fit
-    held = [
-        term.hold(fit.covariance_of(index)) if term.effect.family.is_metal else term
-        for index, term in enumerate(fit.terms)
-    ]
-    return fitter.fit(held, 1)
+    terms = fit.terms
+    for index, term in enumerate(fit.terms):
+        if term.effect.family.is_metal:
+            terms = _with(terms, index, term.hold(fit.covariance_of(index)))
+    return fitter.fit(terms, 1)

@@ -24,8 +24,7 @@ from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 
 MOST_PAIRS = 300
-"""Pairs of channels that are tried at most, those of the lowest numbers: all pairs of 25 channels.
-Each is a linear fit; 48 channels would have a thousand, for a fault that is rare in any one."""
+"""Pairs of channels that are tried at most, those of the lowest numbers: all of 25 channels."""
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:

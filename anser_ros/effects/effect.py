@@ -95,9 +95,7 @@ ComplexArray = NDArray[np.complex128]
 
 LARGEST = 10.0
 """Prior standard deviation of the amplitudes of a simple body's modes, in units of 1e-4 m^3
-(`anser_ros.metal.scattering.UNIT`). A perfectly conducting ball of 25 mm radius has -1, one of
-54 mm -10: the prior holds nothing back that fits beside a tracked volume, and only keeps modes
-that the data do not determine from growing without bound."""
+(`anser_ros.metal.scattering.UNIT`): a perfectly conducting ball of 54 mm radius has -10."""
 
 
 @dataclass(frozen=True)
@@ -199,13 +197,10 @@ SizedShapes = tuple[Shapes, Sequence[Array]]
 """Shapes of a field that metal couples, and the prior sizes of their couplings to try."""
 
 FROZEN = 1e-12
-"""Prior spread of a parameter that a fit must leave where it is, in the parameter's own unit. It
-only has to be negligible compared with any step of a fit; zero would make the prior's weight
-infinite."""
+"""Prior spread of a parameter that a fit must leave where it is, negligible beside any step."""
 INEXACT = 0.01
 """Share of an effect's power that its model may miss where the effect is truly there, unless the
-effect says otherwise. Gains, tilts and shifts are modelled to better than this; what leaves more
-on the values that it changes is another effect's stand-in."""
+effect says otherwise. What leaves more is another effect's stand-in."""
 
 
 class Family(Enum):

@@ -11,9 +11,8 @@ from anser_ros.field.dipoles import Dipoles, size_parameters, spread_along, symm
 from anser_ros.field.model import EffectRecord
 
 GRADIENT_ERROR = 0.07
-"""Relative error of what an emitter's shift changes at a reference close to it, where the field's
-gradient is known less well than the field. Smaller lets references outvote the tools with
-gradients that the model only guesses; larger leaves the shift to the tools alone."""
+"""Relative error of what an emitter's shift changes at a reference close to it. Smaller lets
+references outvote the tools with gradients that the model only guesses."""
 
 
 class CoilMoved(Effect[Term]):

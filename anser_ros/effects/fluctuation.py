@@ -32,9 +32,7 @@ from anser_ros.field.model import EffectRecord
 
 OPEN = 40
 """Parameters that a fluctuation counts for when explanations are compared: more than a constant
-has, whose columns it shares, and less than shaped metal (60), whose freedom is what it replaces.
-Larger lets moving metal explain an emitter that steps; smaller lets a fluctuation take over from
-a curve with several parameters."""
+or a curve has, and less than shaped metal (60), which must not explain an emitter that steps."""
 
 
 class Fluctuation(Effect[FluctuationTerm]):

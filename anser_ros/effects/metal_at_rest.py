@@ -40,14 +40,12 @@ from anser_ros.metal.scattering import UNIT
 from anser_ros.physics.constants import MU_0
 
 STEP = 1e-3
-"""Step (m) of the central differences that give the derivative by the place, small compared with a
-decimetre."""
+"""Step (m) of the central differences that give the derivative by the place."""
 CLOSEST = 0.02
-"""Metal that is searched keeps this distance (m) from where sensors were: a point-like answer is
-no model of a body that is nearer than its own size."""
+"""Distance (m) from where sensors were within which no metal is looked for."""
 SAME_BODY_M = 0.12
 """Distance (m) from active metal within which further metal is taken for the same body: about
-the step of the grid of places. Nearer candidates only stand in for the body's shape."""
+the step of the grid of places."""
 
 
 def places(apparatus: Apparatus) -> Array:
@@ -190,14 +188,11 @@ class StaticMetal(MetalAtRest):
 
 
 MESH = 12
-"""Loops along an edge of the sheet's mesh: a loop is then as wide as a twelfth of the edge, less
-than the distance to the sensors for any sheet that is found."""
+"""Loops along an edge of the sheet's mesh, each less wide than the distance to the sensors."""
 DIFFERENCE_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
-"""Steps of the central differences, in theta's units: small compared with the distances and with
-a change of the resistance that shows."""
+"""Steps of the central differences, in theta's units."""
 TYPICAL_OHM = 3e-5
-"""Surface resistance, ohm, that a plate's fit starts from: about that of a millimetre of
-aluminium. It is only a start, from which the fit moves."""
+"""Surface resistance, ohm, that a plate's fit starts from: of a millimetre of aluminium."""
 
 HEIGHT, RIM, OHM = 0.005, 0.03, 0.1
 """How well a sheet is known at best, whose true outline, thickness and bend are unknown: its

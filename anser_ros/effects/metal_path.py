@@ -10,19 +10,15 @@ from scipy.interpolate import CubicSpline
 Array = NDArray[np.float64]
 
 SHORTEST = 0.2
-"""Shortest time (s) that a straight way may take: a hand is no faster, and a jump has no
-derivative."""
+"""Shortest time (s) that a straight way may take: a hand is no faster."""
 FINE_STEP_S = 0.05
 """Step (s) in which the length of a way is summed up, a quarter of the shortest way."""
 NODES, NODES_PER_KNOT = 41, 6
 """Nodes on a path, in which fields are found; between them they are interpolated."""
 KEPT_SPLINES = 64
-"""Sets of spline weights that are kept, 0.2 MB each: those of a few paths that are fitted side by
-side, for the frames of a few bodies. Fewer, and they are worked out anew in every step."""
+"""Sets of spline weights that are kept, 0.2 MB each, for a few paths fitted side by side."""
 NEGLIGIBLE_WAY = 0.02
-"""Share (0 to 1) of a way that counts as not yet begun, or as over: 2 to 5 mm of a hand's way,
-less than metal that matters is large. Smaller takes ripples of a fitted path at rest for its
-start; larger cuts slow beginnings and ends off."""
+"""Share (0 to 1) of a way that counts as not yet begun, or as over: 2 to 5 mm of a hand's way."""
 
 
 @dataclass(frozen=True)

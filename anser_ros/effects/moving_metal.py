@@ -36,17 +36,13 @@ from anser_ros.metal.scattering import UNIT
 from anser_ros.parallel import in_order
 
 STEP = 1e-3
-"""Step (m) of the central differences that give the derivative by the place. Their relative error
-is about the square of the step over the distance: 1e-4 at a decimetre, far above rounding."""
+"""Step (m) of the central differences by the place: 1e-4 of an error at a decimetre."""
 PATH_SAMPLES = 21
 """Times at which a record says where the metal is: two seconds apart in a session of 40 s."""
 SHAPED = 60
 """Parameters that moving metal counts for at least when explanations are compared: it is shaped
 with dozens of modes once it is taken, and must not win as a simple body against a fluctuation,
-which counts for 40. Larger makes it give way to fluctuations that explain less. It was chosen on
-an emitter that steps and was called metal (`docs/log.md`). On 31 other runs half of it, and
-Schwarz's price of the parameters in its place, let more starts of metal be fitted in 25, of which
-none was taken; twice as much changed nothing."""
+which counts for 40. Chosen on an emitter that steps and was called metal (`docs/log.md`)."""
 SHORT_WAY = 0.02
 """Ends of the course nearer to each other than this (m) don't give a straight path a direction."""
 UPWARDS = np.array([0.0, 0.0, -0.05])
@@ -79,9 +75,8 @@ class MovingTerm(BodyTerm):
         return self.path.centre(self.course, time)
 
     def _seen(self, view: View, shift: Array) -> tuple[Array, ComplexArray]:
-        """Amplitudes of the sensors (F, S, M) and emitters (F, K, M) about the moving centre.
-
-        The emitters' are interpolated between nodes on the way.
+        """Amplitudes about the moving centre: of the sensors (F, S, M), and of the emitters
+        (F, K, M), interpolated between nodes on the way.
         """
         nodes, on_way, at = self.path.nodes(self.course, view.time)
         grid = (on_way + shift)[:, None, :] + self.shapes.offsets

@@ -36,9 +36,7 @@ FLUX, VOLTAGE = 'flux', 'voltage'
 """What the amplifier may see."""
 CURVE = 0.2
 """Share (0 to 1) of a saturation's power that its model may miss: the true curve is none of those
-that are tried, and tones mix into each other's place. Smaller refuses a saturation of another
-curve; larger confirms what only grows with the reading. It was chosen by hand on injected effects
-(`docs/log.md`)."""
+that are tried. It was chosen by hand on injected effects (`docs/log.md`)."""
 
 
 def third_order(flux: ComplexArray) -> ComplexArray:
