@@ -40,6 +40,7 @@ class ChannelCrosstalk(Effect[Term]):
     units = {'channels': '1', 'matrix': '1'}
     plausible = {'matrix': (-0.5, 0.5)}
     remedy = Remedy.FLUX
+    typical = 0.1  # leaks amount to some percent
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Try clusters as a whole, and pairs of channels of different clusters."""
@@ -48,10 +49,6 @@ class ChannelCrosstalk(Effect[Term]):
         pairs = [p for p in combinations(sorted(apparatus.tool_channels), 2) if p not in inside]
         groups += [p for p in pairs if p not in groups][:MOST_PAIRS]
         return [Term(self, {'channels': g}, np.zeros(len(g) * (len(g) - 1))) for g in groups]
-
-    def prior(self, term: Term) -> Array:
-        """Return a prior spread of 0.1: leaks amount to some percent."""
-        return np.full(term.theta.size, 0.1)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return the other channels' fluxes, which leak into each channel."""
@@ -123,6 +120,7 @@ class CoilCrosstalk(Effect[Term]):
     units = {'coils': '1', 'eps': '1', 'eps_quadrature': '1', 'mutual': '1'}
     plausible = {'eps': (-0.5, 0.5)}
     remedy = Remedy.FLUX
+    typical = 0.1  # leaks amount to some percent
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Try every ordered pair, and every pair both ways."""
@@ -132,10 +130,6 @@ class CoilCrosstalk(Effect[Term]):
         return [
             Term(self, site, np.zeros(1 if 'mutual' in site else 2)) for site in one_way + both
         ]
-
-    def prior(self, term: Term) -> Array:
-        """Return a prior spread of 0.1: leaks amount to some percent."""
-        return np.full(term.theta.size, 0.1)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return the source emitter's flux, placed in the other emitter's tone."""

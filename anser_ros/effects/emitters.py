@@ -23,16 +23,13 @@ class CoilMoved(Effect[Term]):
     units = {'coil': '1', 'shift_m': 'm'}
     plausible = {'shift_m': (-0.03, 0.03)}
     remedy = Remedy.FIELD
+    typical = 3e-3  # emitters shift by some millimetres
     gradient_error = GRADIENT_ERROR
     recorded = {'shift_m': (3, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a candidate for every emitter."""
         return [Term(self, {'coil': k}, np.zeros(3)) for k in range(apparatus.emitters)]
-
-    def prior(self, term: Term) -> Array:
-        """Return a prior spread of 3 mm: emitters shift by some millimetres."""
-        return np.full(3, 3e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Move the sensor the other way, which does the same as moving the source."""
@@ -99,6 +96,7 @@ class EmitterSize(Effect[EmitterSizeTerm]):
     }  # fmt: skip
     plausible = {'length_m': (0.0, 1.0), 'diameter_m': (0.0, 1.0)}
     remedy = Remedy.FIELD
+    typical = 100.0  # of magnets and coils of some decimetres
 
     def candidates(self, apparatus: Apparatus) -> Sequence[EmitterSizeTerm]:
         """Return a candidate for each emitter whose dipoles lie on one axis and point along it.
@@ -116,10 +114,6 @@ class EmitterSize(Effect[EmitterSizeTerm]):
                     )
                 )  # fmt: skip
         return found
-
-    def prior(self, term: EmitterSizeTerm) -> Array:
-        """Return a prior spread that allows magnets and coils of some decimetres."""
-        return np.full(1, 100.0)
 
     def columns(self, term: EmitterSizeTerm, view: View) -> ComplexArray:
         """Return the flux that a unit of second moment adds."""

@@ -27,10 +27,7 @@ class ComplexGain(Effect[Term]):
 
     plausible = {'gain': (0.2, 3.0), 'phase_deg': (-60.0, 60.0)}
     remedy = Remedy.FLUX
-
-    def prior(self, term: Term) -> Array:
-        """Expect a gain within some ten percent of one."""
-        return np.full(2, 0.3)
+    typical = 0.3  # gains are within some ten percent of one
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the gain's size and phase."""
@@ -153,6 +150,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
     units = {'coil': '1', 'amount': '1', 'tau_s': 's'}
     plausible = {'amount': (-0.5, 0.5), 'tau_s': (0.5, 1000.0)}
     remedy = Remedy.FLUX
+    typical = (0.1, 1.6)  # some percent, and a time constant within a factor of five
     drifts = True
 
     def candidates(self, apparatus: Apparatus) -> Sequence[CoilDriftTerm]:
@@ -164,10 +162,6 @@ class CoilDrift(Effect[CoilDriftTerm]):
     def amounts(self, term: CoilDriftTerm) -> NDArray[np.int64]:
         """Return the amount's index alone: a drift of nothing has any time constant."""
         return np.array([0])
-
-    def prior(self, term: CoilDriftTerm) -> Array:
-        """Expect amounts of some percent, and time constants known to a factor of five."""
-        return np.array([0.1, 1.6])
 
     def _own(self, term: CoilDriftTerm, view: View) -> ComplexArray:
         coil, (amount, log_tau) = term.site['coil'], term.theta

@@ -27,7 +27,7 @@ class OpticalEffect(Effect[TermT]):
     """Changes the optical track, which all bodies share; references have none."""
 
     remedy = Remedy.OPTICAL
-    spread: ClassVar[Sequence[float]]  # prior standard deviation of each parameter
+    typical: ClassVar[tuple[float, ...]]
 
     def candidates(self, apparatus: Apparatus) -> Sequence[TermT]:
         """Return one candidate, as all bodies are seen by one tracker."""
@@ -35,11 +35,7 @@ class OpticalEffect(Effect[TermT]):
 
     def zero(self, apparatus: Apparatus) -> TermT:
         """Return the term with parameters of zero."""
-        return Term(self, {}, np.zeros(len(self.spread)))  # type: ignore[return-value]
-
-    def prior(self, term: TermT) -> Array:
-        """Return the spreads that the effect declares."""
-        return np.array(self.spread)
+        return Term(self, {}, np.zeros(len(self.typical)))  # type: ignore[return-value]
 
     def columns(self, term: TermT, view: View) -> ComplexArray | None:
         """Return the derivative by a tool's motion, or None for references."""
@@ -69,7 +65,7 @@ class TimeOffset(OpticalEffect[Term]):
     units = {'offset_s': 's'}
     plausible = {'offset_s': (-0.5, 0.5)}
     recorded = {'offset_s': (1, 1.0)}
-    spread = (0.1,)
+    typical = (0.1,)
 
     def slopes(self, term: Term, view: View) -> ComplexArray:
         """Return minus the flux's rate of change."""
@@ -88,7 +84,7 @@ class ClockRate(OpticalEffect[Term]):
     units = {'offset_s': 's', 'rate_ppm': '1e-6'}
     plausible = {'offset_s': (-0.5, 0.5), 'rate_ppm': (-2e4, 2e4)}
     recorded = {'offset_s': (1, 1.0), 'rate_ppm': (1, 1e6)}
-    spread = (0.1, 3e-3)
+    typical = (0.1, 3e-3)
 
     def slopes(self, term: Term, view: View) -> ComplexArray:
         """Return minus the flux's rate of change, constant and growing with time."""
@@ -108,7 +104,7 @@ class Registration(OpticalEffect[Term]):
     units = {'rotation_deg': 'deg', 'translation_m': 'm'}
     plausible = {'rotation_deg': (-10.0, 10.0), 'translation_m': (-0.05, 0.05)}
     recorded = {'rotation_deg': (3, 180.0 / np.pi), 'translation_m': (3, 1.0)}
-    spread = (0.02, 0.02, 0.02, 5e-3, 5e-3, 5e-3)
+    typical = (0.02, 0.02, 0.02, 5e-3, 5e-3, 5e-3)
 
     def slopes(self, term: Term, view: View) -> ComplexArray:
         """Return the derivative by a turn about fg's origin and a shift, which all sensors make
@@ -144,7 +140,7 @@ class OpticalScale(OpticalEffect[Term]):
     summary = "the optical tracker's millimetre is too long or too short"
     units = {'scale': '1', 'shift_m': 'm'}
     plausible = {'scale': (0.9, 1.1), 'shift_m': (-0.1, 0.1)}
-    spread = (0.01, 5e-3, 5e-3, 5e-3)
+    typical = (0.01, 5e-3, 5e-3, 5e-3)
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
         """Return the scale's index alone: a shift is a registration's."""
@@ -191,7 +187,7 @@ class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
     summary = 'the optical tracker moves steadily'
     units = {'translation_m': 'm', 'velocity_m_per_s': 'm/s', 'duration_s': 's'}
     plausible = {'translation_m': (-0.05, 0.05), 'velocity_m_per_s': (-0.01, 0.01)}
-    spread = (5e-3,) * 6
+    typical = (5e-3,) * 6
 
     def zero(self, apparatus: Apparatus) -> RegistrationDriftTerm:
         """Return no drift, over the session's time."""

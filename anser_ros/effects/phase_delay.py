@@ -19,15 +19,12 @@ class PhaseDelay(Effect[Term]):
     units = {'delay_s': 's'}
     plausible = {'delay_s': (-5e-5, 5e-5)}
     remedy = Remedy.FLUX
+    typical = 5.0  # delays are some microseconds
     recorded = {'delay_s': (1, UNIT)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return one candidate, as one delay holds for all channels."""
         return [Term(self, {}, np.zeros(1))]
-
-    def prior(self, term: Term) -> Array:
-        """Return a prior spread of 5 us: delays are some microseconds."""
-        return np.full(1, 5.0)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return minus j omega times the flux, for a microsecond of delay."""

@@ -32,6 +32,7 @@ class Pickup(Effect[Term]):
     units = {'channel': '1', 'phasor_t': 'T (re, im of every emitter)', 'rms_t': 'T'}
     plausible = {'rms_t': (0.0, 1e-6)}
     remedy = Remedy.FLUX
+    typical = 30.0  # phasors are some tens of nanotesla
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a candidate for every channel of a tool."""
@@ -39,10 +40,6 @@ class Pickup(Effect[Term]):
 
     def _at(self, channels: Sequence[int], apparatus: Apparatus) -> list[Term]:
         return [Term(self, {'channel': c}, np.zeros(2 * apparatus.emitters)) for c in channels]
-
-    def prior(self, term: Term) -> Array:
-        """Return a prior spread of 30 nT: phasors are some tens of nanotesla."""
-        return np.full(term.theta.size, 30.0)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return a constant column for either part of every emitter's phasor."""

@@ -81,6 +81,7 @@ class Saturation(Effect[SaturationTerm]):
     }  # fmt: skip
     plausible = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
+    typical = 3.0  # full scales down to the size of the signals
     inexact = CURVE
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SaturationTerm]:
@@ -101,10 +102,6 @@ class Saturation(Effect[SaturationTerm]):
     def covers(self, term: SaturationTerm, candidate: Term) -> bool:
         """Return whether the term is on the candidate's channel, which has one curve only."""
         return candidate.effect is self and candidate.channels == term.channels
-
-    def prior(self, term: SaturationTerm) -> Array:
-        """Expect full scales down to the size of the signals."""
-        return np.full(1, 3.0)
 
     def columns(self, term: SaturationTerm, view: View) -> ComplexArray | None:
         """Return the third-order loss, or differences along the whole curve."""

@@ -42,6 +42,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
     units = {'channel': '1', 'tilt_deg': 'deg', 'axis': '1', 'rotation_deg': 'deg'}
     plausible = {'tilt_deg': (0.0, 30.0)}
     remedy = Remedy.SENSORS
+    typical = 0.1  # tilts are some degrees
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
         """Try every single tool sensor, and every cluster as a whole."""
@@ -58,10 +59,6 @@ class SensorAxis(Effect[SensorAxisTerm]):
             if len(apparatus.tool_channels) > len(cluster) and len(cluster) > 1:
                 terms.append(SensorAxisTerm(self, {'channels': cluster}, np.zeros(3)))
         return terms
-
-    def prior(self, term: SensorAxisTerm) -> Array:
-        """Return a prior spread of 0.1 rad: tilts are some degrees."""
-        return np.full(term.theta.size, 0.1)
 
     def columns(self, term: SensorAxisTerm, view: View) -> ComplexArray | None:
         """Return the derivative by the axis, along the tangents or across the cluster's turn."""
@@ -143,15 +140,12 @@ class PlacedElsewhere(Effect[Term]):
 
     plausible = {'offset_m': (-0.03, 0.03)}
     remedy = Remedy.SENSORS
+    typical = 5e-3  # offsets are some millimetres
     recorded = {'offset_m': (3, 1.0)}
 
     def rows(self, term: Term, sensors: SensorTable) -> NDArray[np.bool_]:
         """Return which sensors (S,) are shifted."""
         raise NotImplementedError
-
-    def prior(self, term: Term) -> Array:
-        """Return a prior spread of 5 mm: offsets are some millimetres."""
-        return np.full(3, 5e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return the derivative by the centres of those sensors, along the body's axes."""
@@ -230,6 +224,7 @@ class SensorSize(Effect[SensorSizeTerm]):
     units = {'length_m': 'm', 'channels': '1'}
     plausible = {'length_m': (0.0, 0.08)}
     remedy = Remedy.SENSORS
+    typical = 10.0  # coils have up to a few centimetres
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorSizeTerm]:
         """Return a candidate for all coils of each body that has sensors."""
@@ -240,10 +235,6 @@ class SensorSize(Effect[SensorSizeTerm]):
                 site: Site = {'body': table.body[0]}
                 found.append(SensorSizeTerm(self, site, np.zeros(1), surveyed=lengths))
         return found
-
-    def prior(self, term: SensorSizeTerm) -> Array:
-        """Return a prior spread that allows coil lengths of a few centimetres."""
-        return np.full(1, 10.0)
 
     def columns(self, term: SensorSizeTerm, view: View) -> ComplexArray | None:
         """Return the difference between the flux of a longer coil and the coil as it is."""

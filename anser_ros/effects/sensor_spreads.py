@@ -111,6 +111,7 @@ class SensorGainSpread(SensorSpread):
     family = Family.STEADY
     units = {'spread': '1', 'channels': '1', 'values': '1'}
     remedy = Remedy.FLUX
+    typical = 0.05  # gains of a kind are within some percent of each other
     parts = ('in phase', 'quadrature')
     faultless = (1.0, 0.0)
 
@@ -132,10 +133,6 @@ class SensorGainSpread(SensorSpread):
                 )
             )  # fmt: skip
         return out
-
-    def prior(self, term: SpreadTerm) -> Array:
-        """Expect gains of a kind of sensor within some percent of each other."""
-        return np.full(term.theta.size, 0.05)
 
     def columns(self, term: SpreadTerm, view: View) -> ComplexArray | None:
         """Return each place's own fluxes, in phase and turned by a quarter."""
