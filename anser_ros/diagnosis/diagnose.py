@@ -1,7 +1,7 @@
 """Runs the whole loop: residual, effect, correction, the error before and after on unseen data."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,12 +57,10 @@ class Diagnosis:
     tests_after: tuple[StructureTest, ...]
     model: FieldModel  # with the effects
     search: Search
-    # Effects that explained something but were not confirmed.
-    refused: tuple[tuple[Term, Confirmation], ...]
+    refused: tuple[tuple[Term, Confirmation], ...]  # explained something, but not confirmed
     before: State  # the held-out part
     after: State
-    # All that was fitted last, also what is no finding.
-    terms: tuple[Term, ...] = field(default_factory=tuple)
+    terms: tuple[Term, ...]  # all that was fitted last, also what is no finding
 
 
 @dataclass(frozen=True)
@@ -84,8 +82,7 @@ class Confirmed:
 
     fit: Fit  # all of them together
     cleaned: Problem  # all frames, without values that stand out with these effects
-    # Effects that explained something but were not confirmed.
-    refused: tuple[tuple[Term, Confirmation], ...]
+    refused: tuple[tuple[Term, Confirmation], ...]  # explained something, but not confirmed
 
 
 def diagnose(
@@ -138,15 +135,13 @@ def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirme
 def _without_dead(problem: Problem, known: Sequence[Term]) -> Problem:
     """The problem without the channels without a signal."""
     dead = [channel for term in known for channel in term.effect.silenced(term)]
-    good = tuple(
-        mask & ~np.isin(tool.sensors.channel, dead)
-        for tool, mask in zip(problem.tools, problem.good, strict=True)
-    )
+    pairs = zip(problem.tools, problem.good, strict=True)
+    good = tuple(mask & ~np.isin(tool.sensors.channel, dead) for tool, mask in pairs)
     references = problem.references
     if references is not None:
-        working = ~np.isin(references.readings.sensors.channel, dead)
-        valid = references.readings.valid & working
-        references = replace(references, readings=replace(references.readings, valid=valid))
+        readings = references.readings
+        valid = readings.valid & ~np.isin(readings.sensors.channel, dead)
+        references = replace(references, readings=replace(readings, valid=valid))
     return replace(problem, good=good, references=references)
 
 

@@ -68,9 +68,8 @@ def _stands_out(values: Array, ratio: float) -> Mask:
 
 
 def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
-    """Return the share of frames that lost a reading, and the channels that lost most of them.
-
-    The list is empty if whole frames are outliers.
+    """Return the share of frames that lost a reading, and the channels that lost most of them;
+    no channels if whole frames are outliers.
     """
     lost_frames, frames, whole = 0, 0, 0
     by_channel: dict[int, int] = {}

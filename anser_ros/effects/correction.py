@@ -33,18 +33,12 @@ LIVE = (Remedy.FLUX, Remedy.SENSORS)
 
 
 def drifts(record: EffectRecord) -> bool:
-    """Return whether a record's course over time is one that another session doesn't repeat.
-
-    Raises `ModelFileError` when no effect has the record's name.
-    """
+    """Return whether no session repeats a course; raises `ModelFileError` on an unknown effect."""
     return effect_named(record.name).drifts
 
 
 def needs_correction(record: EffectRecord) -> bool:
-    """Return whether tracking has to correct an effect, because the dipoles do not include it.
-
-    Raises `ModelFileError` when no effect has the record's name.
-    """
+    """Return whether the dipoles lack an effect; raises `ModelFileError` on an unknown one."""
     return effect_named(record.name).remedy in LIVE
 
 
