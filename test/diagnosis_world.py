@@ -1,20 +1,16 @@
 """A small session in memory: a sheet of dipoles, one tool of two clusters, references, jitter."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from injection_subject import JITTER_M, JITTER_RAD, NOISE_T, Subject
 from scipy.spatial.transform import Rotation
 
-from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Problem, Spread
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
-
-NOISE_T = 60e-12
-JITTER_M, JITTER_RAD = 0.07e-3, 0.4e-3
 
 
 def board(emitters: int = 4) -> FieldModel:
@@ -48,76 +44,31 @@ def reference_sensors(count: int = 12) -> SensorTable:
     place = np.stack([0.16 * np.cos(angle), 0.16 * np.sin(angle), np.full(count, 0.03)], axis=1)
     axes = rng.normal(size=(count, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]
-    return SensorTable(
-        100 + np.arange(count),
-        tuple(f'ref{i}' for i in range(count)),
-        ('fg',) * count,
-        place,
-        axes,
-        np.full(count, 0.008),
-    )
+    names = tuple(f'ref{i}' for i in range(count))
+    lengths = np.full(count, 0.008)
+    return SensorTable(100 + np.arange(count), names, ('fg',) * count, place, axes, lengths)
 
 
 @dataclass
-class World:
+class World(Subject):
     """What a test changes before it builds the problem."""
 
-    model: FieldModel
-    tool: Measurements
-    reference: Measurements
-    baseline: np.ndarray
     true_track: PoseTrack
-
-    @property
-    def dipoles(self) -> Dipoles:
-        """The field."""
-        return Dipoles(self.model.positions, self.model.directions, self.model.moments)
 
     def true_pose(self) -> tuple[np.ndarray, np.ndarray]:
         """Position and rotation without jitter at the flux stamps."""
         position, rotation, _ = self.true_track.at(self.tool.time, 1.0)
         return position, rotation
 
-    def change(self, flux: np.ndarray, reference: np.ndarray | None = None) -> None:
-        """Other readings."""
-        self.tool = replace(self.tool, flux=flux)
-        if reference is not None:
-            self.reference = replace(self.reference, flux=reference)
-
-    def move_track(self, track: PoseTrack) -> None:
-        """Another optical track."""
-        position, rotation, valid = track.at(self.tool.time, 0.25)
-        self.tool = replace(
-            self.tool, track=track, position=position, rotation=rotation, has_pose=valid
-        )
-
-    def problem(self, references: bool = True) -> Problem:
-        """Set up the diagnosis."""
-        spread = Spread(flux_t=float(np.hypot(NOISE_T, self.model.flux_error_t)))
-        return build_problem(
-            (self.tool,),
-            self.reference if references else None,
-            self.baseline if references else None,
-            self.model,
-            self.model,
-            spread,
-        )
-
 
 def _path(time: np.ndarray) -> tuple[np.ndarray, Rotation]:
-    swing = np.stack(
-        [
-            0.09 * np.sin(0.9 * time),
-            0.09 * np.sin(1.27 * time + 0.5),
-            0.15 + 0.03 * np.sin(0.61 * time),
-        ],
-        axis=1,
-    )
-    turn = np.stack(
-        [0.5 * np.sin(0.7 * time), 0.5 * np.sin(0.83 * time + 1.0), 0.8 * np.sin(0.47 * time)],
-        axis=1,
-    )
-    return swing, Rotation.from_rotvec(turn)
+    swing = np.array([0.09, 0.09, 0.03]) * _waves(time, [0.9, 1.27, 0.61], [0.0, 0.5, 0.0])
+    turn = np.array([0.5, 0.5, 0.8]) * _waves(time, [0.7, 0.83, 0.47], [0.0, 1.0, 0.0])
+    return swing + [0.0, 0.0, 0.15], Rotation.from_rotvec(turn)
+
+
+def _waves(time: np.ndarray, rates: list[float], phases: list[float]) -> np.ndarray:
+    return np.sin(np.outer(time, rates) + phases)
 
 
 def world(seed: int = 0, frames: int = 500, emitters: int = 4) -> World:
@@ -136,11 +87,8 @@ def world(seed: int = 0, frames: int = 500, emitters: int = 4) -> World:
     seen, seen_turn = _path(optical)
     true_track = PoseTrack(optical, seen, seen_turn.as_quat())
     jitter = Rotation.from_rotvec(rng.normal(scale=JITTER_RAD, size=(optical.size, 3)))
-    track = PoseTrack(
-        optical,
-        seen + rng.normal(scale=JITTER_M, size=seen.shape),
-        (jitter * seen_turn).as_quat(),
-    )
+    shaken = seen + rng.normal(scale=JITTER_M, size=seen.shape)
+    track = PoseTrack(optical, shaken, (jitter * seen_turn).as_quat())
     at, rotation, valid = track.at(time, 0.25)
     tool = Measurements(
         'tool', sensors, time, flux + _noise(rng, flux.shape), np.ones(flux.shape[:2], bool),
@@ -151,7 +99,7 @@ def world(seed: int = 0, frames: int = 500, emitters: int = 4) -> World:
         np.ones(readings.shape[:2], bool), np.zeros(readings.shape[:2], np.int64),
         np.zeros((frames, 3)), np.broadcast_to(np.eye(3), (frames, 3, 3)), np.ones(frames, bool),
     )  # fmt: skip
-    return World(model, tool, reference, clean, true_track)
+    return World(tool, reference, clean, model, model, dipoles, true_track)
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

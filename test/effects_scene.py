@@ -8,9 +8,7 @@ from anser_ros.effects.effect import Term
 from anser_ros.effects.metal_path import FreePath, StraightPath
 from anser_ros.effects.registry import all_effects
 from anser_ros.field.dipoles import Dipoles
-from anser_ros.metal.body import (
-    lattice,
-)
+from anser_ros.metal.body import lattice
 
 
 def moving(scene) -> Term:

@@ -14,13 +14,9 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.pose_track import PoseTrack
 
 NOISE_T = 60e-12
-
 JITTER_M, JITTER_RAD = 0.07e-3, 0.4e-3
-
 SIZES = {'small': 0.3, 'medium': 1.0, 'large': 3.0}
-
 TRACK, TABLE, FIELD, EMITTER, CHANNEL, OFFSET, READING = range(7)
-
 Truth = dict[str, dict[str, Any]]
 
 
@@ -74,11 +70,17 @@ class Subject:
         """Give the references other readings."""
         self.reference = replace(self.reference, flux=values)
 
-    def channel(self, row: int, values: np.ndarray) -> None:
-        """Give one channel of the tool other readings."""
+    def channel(self, row: int | list[int] | np.ndarray, values: np.ndarray) -> None:
+        """Give one or more channels of the tool other readings."""
         flux = self.tool.flux.copy()
         flux[:, row] = values
         self.flux(flux)
+
+    def reference_channel(self, row: int, values: np.ndarray) -> None:
+        """Give one reference other readings."""
+        flux = self.reference.flux.copy()
+        flux[:, row] = values
+        self.references(flux)
 
     def emitter(self, coil: int, factor: np.ndarray) -> None:
         """Multiply one emitter's phasors by a factor for each frame, shape (F,)."""
@@ -111,33 +113,22 @@ class Subject:
 
 @dataclass(frozen=True)
 class Injection:
-    """One effect that can be put in.
-
-    Attributes
-    ----------
-    name : str
-    put : callable
-        Changes a subject, with a random generator and a relative size; returns the truth.
-    stage : int
-    allowed : tuple of str
-        Names beside the listed ones that describe it rightly.
-    """
+    """One effect that can be put in."""
 
     name: str
+    # Changes a subject, with a random generator and a relative size; returns the truth.
     put: Callable[[Subject, np.random.Generator, float], Truth]
     stage: int
-    allowed: tuple[str, ...] = ()
+    allowed: tuple[str, ...] = ()  # names beside the listed ones that describe it rightly
 
 
 LISTED: dict[str, Injection] = {}
-
 UNLISTED: dict[str, Injection] = {}
 
 
 def listed(stage: int) -> Callable[..., Any]:
     def add(put: Any) -> Any:
-        name = put.__name__
-        LISTED[name] = Injection(name, put, stage)
+        LISTED[put.__name__] = Injection(put.__name__, put, stage)
         return put
 
     return add

@@ -8,10 +8,10 @@ from diagnosis_world import board, world
 
 from anser_ros.diagnosis import departure as departing
 from anser_ros.diagnosis.departure import departure
-from anser_ros.diagnosis.prepare import build_problem, train_blocks
-from anser_ros.diagnosis.problem import Spread, evaluate
-from anser_ros.effects.departed_metal import DepartedMetal
+from anser_ros.diagnosis.prepare import train_blocks
+from anser_ros.diagnosis.problem import evaluate
 from anser_ros.effects.metal_path import FreePath
+from anser_ros.effects.moving_metal import DepartedMetal
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.metal.body import sphere_polarisability
 
@@ -31,7 +31,7 @@ def metal_at(centre, light, omega):
 def scanned():
     """A problem whose model and baseline have the metal at rest, and the metal's field there."""
     made = world(seed=3, frames=500)
-    light = made.dipoles
+    light = made.field
     omega = 2 * np.pi * np.asarray(made.model.frequencies_hz)
     duration = float(made.tool.time[-1])
 
@@ -49,16 +49,12 @@ def scanned():
         reference[i] += sources.flux(fixed.position, fixed.axis, fixed.length)
     resting = metal_at(REST, light, omega)
     learnt = light.joined(resting)
-    model = replace(
-        made.model, positions=learnt.positions, directions=learnt.directions,
-        moments=learnt.moments,
-    )  # fmt: skip
-    baseline = made.baseline + resting.flux(fixed.position, fixed.axis, fixed.length)
-    made.change(flux, reference)
-    problem = build_problem(
-        (made.tool,), made.reference, baseline, model, board(), Spread(flux_t=60e-12)
-    )
-    return problem, resting
+    made.model = replace(made.model, **vars(learnt))
+    made.drawn = board()
+    made.baseline = made.baseline + resting.flux(fixed.position, fixed.axis, fixed.length)
+    made.flux(flux)
+    made.references(reference)
+    return made.problem(), resting
 
 
 def test_metal_at_rest_changes_nothing_and_its_derivatives_are_right(scanned):

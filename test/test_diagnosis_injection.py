@@ -5,20 +5,16 @@ The whole confusion table, on recorded sessions, is a benchmark (`bench/bench_di
 
 import numpy as np
 import pytest
-from diagnosis_world import World, world
-from injection import CATALOGUE, LISTED, SIZES, UNLISTED, Subject
+from diagnosis_world import world
+from injection import CATALOGUE, LISTED, SIZES, UNLISTED
 
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
 from anser_ros.effects.metal_path import StraightPath
 from anser_ros.effects.registry import all_effects
 
 
-def subject(made: World) -> Subject:
-    return Subject(made.tool, made.reference, made.baseline, made.model, made.model, made.dipoles)
-
-
 def found(names: str, seed: int, size: str = 'medium') -> tuple[Diagnosis, dict]:
-    rng, target, truth = np.random.default_rng(seed), subject(world(seed, frames=375)), {}
+    rng, target, truth = np.random.default_rng(seed), world(seed, frames=375), {}
     every = {**LISTED, **UNLISTED}
     for injection in sorted((every[n] for n in names.split('+')), key=lambda i: i.stage):
         truth |= injection.put(target, rng, SIZES[size])
@@ -45,10 +41,7 @@ def test_effects_of_the_table_are_named_and_nothing_else():
 @pytest.mark.long
 @pytest.mark.parametrize(
     ('name', 'called'),
-    [
-        ('coil_steps', 'coil_fluctuation'),
-        ('channels_swapped', 'swapped_channels'),
-    ],
+    [('coil_steps', 'coil_fluctuation'), ('channels_swapped', 'swapped_channels')],
 )
 def test_an_effect_of_no_table_gets_a_name_of_its_own(name, called):
     result, _ = found(name, 4)

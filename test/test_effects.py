@@ -18,15 +18,20 @@ from anser_ros.physics.sensor import SensorTable
 
 
 @pytest.fixture(scope='module')
-def scenery():
+def problem():
     made = world(frames=60)
-    made.move_track(made.true_track)
-    return made, made.problem()
+    made.track(made.true_track)
+    return made.problem()
 
 
-def test_effects_declare_what_the_search_needs(scenery):
+def corrected(problem, *records):
+    frequencies = problem.fields.omega / (2 * np.pi)
+    return Correction.of(records, problem.tools[0].sensors, frequencies)
+
+
+def test_effects_declare_what_the_search_needs(problem):
     """Whoever adds an effect of a family must give what that family is refined with."""
-    apparatus = scenery[1].apparatus
+    apparatus = problem.apparatus
     places = np.repeat(0.05 * np.random.default_rng(1).normal(size=(13, 3)), 3, axis=0)
     array = SensorTable(
         1000 + np.arange(39), tuple(map(str, range(39))), ('array',) * 39, places,
@@ -51,8 +56,8 @@ def test_effects_declare_what_the_search_needs(scenery):
         assert not effect.drifts or effect.remedy is Remedy.FLUX, name
 
 
-def test_a_fluctuation_is_a_rival_of_what_is_steady_on_its_coil(scenery):
-    apparatus, effects = scenery[1].apparatus, all_effects()
+def test_a_fluctuation_is_a_rival_of_what_is_steady_on_its_coil(problem):
+    apparatus, effects = problem.apparatus, all_effects()
     free = effects['coil_fluctuation'].candidates(apparatus)
     steady = {name: effects[name].candidates(apparatus) for name in ('coil_gain', 'coil_drift')}
     for terms in steady.values():
@@ -68,57 +73,42 @@ def test_an_effect_nobody_wrote_is_refused():
         effect_named('gremlin')
 
 
+def agree(term, step, predicted):
+    """Compare a term's columns with central differences of the predicted flux."""
+    columns = term.effect.columns(term, predicted(term))
+    for i, one in enumerate(np.diag(step)):
+        more, less = (predicted(term.with_theta(term.theta + s)).flux for s in (one, -one))
+        wanted = (more - less) / (2 * step[i])
+        if columns is None:
+            assert not np.abs(wanted).max() > 0, f'{term.label} acts elsewhere only'
+            continue
+        error = np.abs(columns[..., i] - wanted).max() / (np.abs(wanted).max() + 1e-30)
+        assert error < 0.05, f'{term.label} parameter {i}: {error:.3g}'
+
+
 @pytest.mark.long
-def test_derivatives_agree_with_differences(scenery):
-    _, problem = scenery
+def test_derivatives_agree_with_differences(problem):
     tool, fields = problem.tools[0], problem.fields
     for start in candidates(problem.apparatus):
         term = in_force(start)
-        view = tool_view(tool, [term], fields)
-        columns = term.effect.columns(term, view)
         step = 1e-4 * np.maximum(np.abs(term.theta), 1e-3)
         if term.effect.name in ('conductive_plate', 'static_metal', 'moving_metal'):
             step = np.full(term.theta.size, 1e-4)
-        for i in range(term.theta.size):
-            sides = []
-            for sign in (1, -1):
-                theta = term.theta.copy()
-                theta[i] += sign * step[i]
-                sides.append(tool_view(tool, [term.with_theta(theta)], fields).flux)
-            wanted = (sides[0] - sides[1]) / (2 * step[i])
-            if columns is None:
-                assert not np.abs(wanted).max() > 0, f'{term.label} acts on references only'
-                continue
-            scale = np.abs(wanted).max() + 1e-30
-            error = np.abs(columns[..., i] - wanted).max() / scale
-            assert error < 0.05, f'{term.label} parameter {i}: {error:.3g}'
+        agree(term, step, lambda term: tool_view(tool, [term], fields))
 
 
-def test_reference_derivatives_agree_with_differences(scenery):
-    _, problem = scenery
-    references = problem.references
+def test_reference_derivatives_agree_with_differences(problem):
+    known, fields = problem.references, problem.fields
     for start in candidates(problem.apparatus):
         term = in_force(start)
-        if term.effect.name in ('coil_moved', 'saturation'):
-            continue
-        view = reference_view(references.readings, references.baseline, [term], problem.fields)
-        columns = term.effect.columns(term, view)
-        for i in range(term.theta.size):
-            theta = term.theta.copy()
-            theta[i] += 1e-5
-            other = reference_view(
-                references.readings, references.baseline, [term.with_theta(theta)], problem.fields
+        if term.effect.name not in ('coil_moved', 'saturation'):
+            step = np.full(term.theta.size, 1e-5)
+            agree(
+                term, step, lambda t: reference_view(known.readings, known.baseline, [t], fields)
             )
-            wanted = (other.flux - view.flux) / 1e-5
-            if columns is None:
-                assert not np.abs(wanted).max() > 0
-                continue
-            scale = np.abs(wanted).max() + 1e-30
-            assert np.abs(columns[..., i] - wanted).max() / scale < 0.05, term.label
 
 
-def test_records_give_the_same_term_back(scenery):
-    _, problem = scenery
+def test_records_give_the_same_term_back(problem):
     for start in candidates(problem.apparatus):
         term = in_force(start)
         record = term.effect.record(term, 1e-6 * np.eye(term.theta.size))
@@ -128,8 +118,7 @@ def test_records_give_the_same_term_back(scenery):
         np.testing.assert_allclose(other, one, rtol=1e-6, atol=1e-15, err_msg=term.label)
 
 
-def test_a_correction_undoes_its_effects(scenery):
-    made, problem = scenery
+def test_a_correction_undoes_its_effects(problem):
     tool = problem.tools[0]
     plain = tool_view(tool, [], problem.fields)
     terms = [
@@ -139,7 +128,7 @@ def test_a_correction_undoes_its_effects(scenery):
     ]
     terms.append(Term(effect_named('sensor_polarity'), {'channels': (1, 4)}))
     records = [t.effect.record(t, 1e-8 * np.eye(t.theta.size)) for t in terms]
-    correction = Correction.of(records, tool.sensors, made.model.frequencies_hz)
+    correction = corrected(problem, *records)
     assert correction.changes_flux
     seen = tool_view(tool, correction.terms, problem.fields).flux
     assert np.abs(seen - plain.flux).max() > 1e-8
@@ -149,23 +138,20 @@ def test_a_correction_undoes_its_effects(scenery):
         np.testing.assert_allclose(back, plain.flux[frame], rtol=1e-5, atol=1e-13)
 
 
-def test_a_correction_keeps_missing_readings_missing(scenery):
-    made, problem = scenery
+def test_a_correction_keeps_missing_readings_missing(problem):
     record = EffectRecord('sensor_gain', {'channel': 0, 'gain': 2.0})
-    correction = Correction.of([record], problem.tools[0].sensors, made.model.frequencies_hz)
+    correction = corrected(problem, record)
     flux = np.ones((2, 4), dtype=complex)
     flux[1] = np.nan
     back = correction.flux(0.0, np.array([0, 1]), flux)
     np.testing.assert_allclose(back[0], 0.5)
     assert np.isnan(back[1]).all()
-    nothing = Correction.of([], problem.tools[0].sensors, made.model.frequencies_hz)
-    assert nothing.flux(0.0, np.array([0, 1]), flux) is flux
+    assert corrected(problem).flux(0.0, np.array([0, 1]), flux) is flux
 
 
-def test_a_drift_is_left_alone_where_nothing_tells_its_course(scenery):
-    made, problem = scenery
+def test_a_drift_is_left_alone_where_nothing_tells_its_course(problem):
     record = EffectRecord('coil_drift', {'coil': 2, 'amount': 0.5, 'tau_s': 1.0})
-    correction = Correction.of([record], problem.tools[0].sensors, made.model.frequencies_hz)
+    correction = corrected(problem, record)
     flux = np.ones((1, 4), dtype=complex)
     np.testing.assert_array_equal(correction.flux(100.0, np.array([0]), flux), flux)
     back = correction.flux(100.0, np.array([0]), flux, recorded=True)
@@ -173,8 +159,7 @@ def test_a_drift_is_left_alone_where_nothing_tells_its_course(scenery):
     assert correction.drifting == ('coil_drift (coil 2)',)
 
 
-def test_sensors_and_track_are_corrected(scenery):
-    made, problem = scenery
+def test_sensors_and_track_are_corrected(problem):
     tool = problem.tools[0]
     records = [
         EffectRecord('lever_arm', {'body': 'tool', 'offset_m': [1e-3, 0.0, 0.0]}),
@@ -184,7 +169,7 @@ def test_sensors_and_track_are_corrected(scenery):
             'registration', {'rotation_deg': [0.0, 0.0, 90.0], 'translation_m': [0.0, 0.0, 0.1]}
         ),
     ]
-    correction = Correction.of(records, tool.sensors, made.model.frequencies_hz)
+    correction = corrected(problem, *records)
     table = correction.sensors()
     np.testing.assert_allclose(table.position[:, 0], 1e-3)
     np.testing.assert_allclose(table.axis[0], [0.0, 1.0, 0.0], atol=1e-12)
@@ -201,17 +186,14 @@ def test_sensors_and_track_are_corrected(scenery):
         ('channel_crosstalk', {'channels': [0, 1], 'matrix': [[1.0]]}, 'has a matrix'),
         (
             'sensor_axis',
-            {'channel': 0, 'axis': [-1.0, 0, 0], 'surveyed_axis': [1.0, 0, 0]},
+            {'channel': 0, 'axis': [-1, 0, 0], 'surveyed_axis': [1, 0, 0]},
             'right angle',
         ),
     ],
 )
-def test_a_broken_record_is_refused(scenery, name, parameters, rule):
-    made, problem = scenery
+def test_a_broken_record_is_refused(problem, name, parameters, rule):
     with pytest.raises(ModelFileError, match=rule):
-        Correction.of(
-            [EffectRecord(name, parameters)], problem.tools[0].sensors, made.model.frequencies_hz
-        )
+        corrected(problem, EffectRecord(name, parameters))
 
 
 def test_compression_keeps_small_signals_and_meets_its_third_order():
@@ -226,8 +208,7 @@ def test_compression_keeps_small_signals_and_meets_its_third_order():
     assert compressed(one, 1.0, 'tanh')[0, 0].real == pytest.approx(wanted, rel=1e-6)
 
 
-def test_the_base_effect_changes_nothing(scenery):
-    _, problem = scenery
+def test_the_base_effect_changes_nothing(problem):
     tool = problem.tools[0]
     term = Term(Effect())
     view = tool_view(tool, [term], problem.fields)

@@ -24,28 +24,35 @@ from anser_ros.physics.constants import MU_0
 
 
 @pytest.fixture(scope='module')
-def scenery():
+def problem():
     made = world(frames=60)
-    made.move_track(made.true_track)
-    return made, made.problem()
+    made.track(made.true_track)
+    return made.problem()
+
+
+@pytest.fixture(scope='module')
+def found(problem):
+    """What is plainly there of each effect, by its name."""
+    return {term.effect.name: in_force(term) for term in candidates(problem.apparatus)}
+
+
+def directions(rng, count):
+    axes = rng.normal(size=(count, 3))
+    return axes / np.linalg.norm(axes, axis=1)[:, None]
 
 
 @pytest.mark.long
 def test_a_large_perfect_sheet_is_a_mirror():
-    source = Dipoles(
-        np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]]), np.array([[1.0 + 0j]])
-    )
-    sheet = sheet_sources(
-        np.array([0.0, 0.0, -0.1]), np.array([0.9, 0.9]), 1e-9, 36, source, np.array([4e4])
-    )
+    source = Dipoles(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.array([[1.0 + 0j]]))
+    centre, edges = np.array([0.0, 0.0, -0.1]), np.array([0.9, 0.9])
+    sheet = sheet_sources(centre, edges, 1e-9, 36, source, np.array([4e4]))
     image = Dipoles(np.array([[0.0, 0.0, -0.2]]), source.directions, -source.moments)
     points = np.array([[0.0, 0.0, 0.1], [0.05, 0.0, 0.12]])
     np.testing.assert_allclose(sheet.field(points)[:, 2], image.field(points)[:, 2], rtol=0.03)
 
 
 @pytest.mark.parametrize('made', [moving, visiting])
-def test_moving_metal_is_where_it_says(scenery, made):
-    _, problem = scenery
+def test_moving_metal_is_where_it_says(problem, made):
     term = made(problem.apparatus)
     view = tool_view(problem.tools[0], [], problem.fields)
     moved = term.effect.moving_flux(term, view)
@@ -73,15 +80,13 @@ def test_paths_keep_to_their_ends_and_times():
 
 
 @pytest.mark.parametrize('kind', [*BODIES])
-def test_a_body_answers_alike_whoever_asks(scenery, kind):
+def test_a_body_answers_alike_whoever_asks(kind):
     """Modes, couplings and plain dipoles give one flux; sensor and emitter may change places."""
     shapes = BODIES[kind]()
     rng = np.random.default_rng(5)
     couplings = rng.normal(size=shapes.size) + 1j * rng.normal(size=shapes.size)
     centre, omega = np.array([0.01, 0.02, -0.1]), 2e4 * np.pi * np.array([0.9, 1.0])
-    places = rng.uniform(-0.1, 0.1, size=(2, 3)) + [0.0, 0.0, 0.25]
-    axes = rng.normal(size=(2, 3))
-    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    places, axes = rng.uniform(-0.1, 0.1, size=(2, 3)) + [0.0, 0.0, 0.25], directions(rng, 2)
     emitters = Dipoles(places, axes, np.eye(2).astype(complex))
     sources = shapes.sources(centre, couplings, emitters, omega)
     plain = sources.flux(places, axes, None)
@@ -101,20 +106,14 @@ def test_a_coupled_body_is_a_sum_of_few_multipoles():
     balls = np.array([(1.3 * x, y, 0.7 * z) for x in line for y in line for z in line[1:]])
     centre = np.array([0.0, 0.0, -0.1])
     rng = np.random.default_rng(6)
-    emitters = Dipoles(
-        np.concatenate([rng.uniform(-0.1, 0.1, size=(6, 2)), np.zeros((6, 1))], axis=1),
-        np.tile([0.0, 0.0, 1.0], (6, 1)),
-        np.eye(6).astype(complex),
-    )
+    below = np.c_[rng.uniform(-0.1, 0.1, size=(6, 2)), np.zeros((6, 1))]
+    emitters = Dipoles(below, np.tile([0.0, 0.0, 1.0], (6, 1)), np.eye(6).astype(complex))
     field = emitters.field(centre + balls).transpose(0, 2, 1)
     alpha = np.full(len(balls), -2 * np.pi * 0.0043**3 / MU_0 * (1 + 0.1j))
     moments = induced_moments(centre + balls, alpha, field)
     sources = Dipoles.vectors(centre + balls, moments.transpose(0, 2, 1))
-    places = np.concatenate(
-        [rng.uniform(-0.12, 0.12, (150, 2)), rng.uniform(0.1, 0.2, (150, 1))], axis=1
-    )
-    axes = rng.normal(size=(150, 3))
-    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    places = np.c_[rng.uniform(-0.12, 0.12, (150, 2)), rng.uniform(0.1, 0.2, (150, 1))]
+    axes = directions(rng, 150)
     wanted = sources.flux(places, axes, None)
     shapes = multipoles()
     ears = shapes.received(centre, places, axes, np.zeros(150))
@@ -128,15 +127,13 @@ def test_a_coupled_body_is_a_sum_of_few_multipoles():
     assert np.linalg.norm(left) < 3e-3 * np.linalg.norm(wanted)
 
 
-def test_the_place_of_metal_is_no_surer_than_its_shape(scenery):
+def test_the_place_of_metal_is_no_surer_than_its_shape(found):
     """Of a ball's strength, however little the data scatter."""
     radius = 0.04
     ball = -2 * np.pi * radius**3 * np.eye(3).astype(complex)
     assert centre_sigma(ball) == pytest.approx(ODD * radius)
-    _, problem = scenery
-    found = {term.effect.name: term for term in candidates(problem.apparatus)}
     for name, keys in (('static_metal', ['position_m']), ('moving_metal', ['start_m', 'path'])):
-        term = in_force(found[name])
+        term = found[name]
         record = term.effect.record(term, np.zeros((term.theta.size, term.theta.size)))
         total = np.array(record.parameters['polarizability']) @ [1.0, 1.0j]
         for key in keys:
@@ -144,12 +141,10 @@ def test_the_place_of_metal_is_no_surer_than_its_shape(scenery):
 
 
 @pytest.mark.parametrize('metal', ['static_metal', 'conductive_plate', 'moving_metal'])
-def test_a_coil_that_moved_lights_metal_from_where_it_is(scenery, metal):
+def test_a_coil_that_moved_lights_metal_from_where_it_is(problem, found, metal):
     """The same as metal in a world that has the coil there from the start."""
-    _, problem = scenery
     tool, fields = problem.tools[0], problem.fields
-    found = {term.effect.name: term for term in candidates(problem.apparatus)}
-    body = in_force(found[metal])
+    body = found[metal]
     coil = found['coil_moved'].with_theta(np.array([0.004, -0.003, 0.002]))
     alone = tool_view(tool, [body], fields).flux
     both = tool_view(tool, [coil, body], fields).flux
@@ -167,10 +162,8 @@ def test_a_coil_that_moved_lights_metal_from_where_it_is(scenery, metal):
     assert np.abs((lit_anew - lit_before)[..., k]).max() > 0.01 * np.abs(lit_before[..., k]).max()
 
 
-def test_leftovers_are_linear_and_belong_to_their_metal(scenery):
-    _, problem = scenery
-    found = next(t for t in candidates(problem.apparatus) if t.effect.name == 'static_metal')
-    parent = in_force(found)
+def test_leftovers_are_linear_and_belong_to_their_metal(problem, found):
+    parent = found['static_metal']
     shapes = multipoles()
     rng = np.random.default_rng(0)
     modes = 0.1 * rng.normal(size=(shapes.size, 4))
@@ -190,19 +183,15 @@ def test_leftovers_are_linear_and_belong_to_their_metal(scenery):
         np.testing.assert_allclose(columns @ term.theta, more, rtol=1e-6, atol=1e-6 * scale)
 
 
-def test_lighting_is_an_emitter_that_sits_higher(scenery):
+def test_lighting_is_an_emitter_that_sits_higher(problem, found):
     """A metal that sees one emitter 0.4 mm higher, told by another illumination."""
-    _, problem = scenery
-    found = next(t for t in candidates(problem.apparatus) if t.effect.name == 'static_metal')
-    parent = in_force(found)
+    parent = found['static_metal']
     view = tool_view(problem.tools[0], [], problem.fields)
     light = view.illumination
     lighting = IlluminationChange([parent], problem.apparatus.emitters)
     column = lighting.columns(view)[..., 3 * problem.apparatus.emitters + 1]
     higher = replace(light, positions=light.positions + [0.0, 0.0, UP_M])
-    both = [
-        parent.effect.sources(parent, i, i, view.omega).flux(*view.flat) for i in (higher, light)
-    ]
-    wanted = view.along(both[0] - both[1])[..., 1]
+    there, here = (parent.effect.sources(parent, i, i, view.omega) for i in (higher, light))
+    wanted = view.along(there.flux(*view.flat) - here.flux(*view.flat))[..., 1]
     np.testing.assert_allclose(column[..., 1], wanted, atol=0.01 * np.abs(wanted).max())
     assert not np.any(column[..., [0, 2]])

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis_world import NOISE_T, world
+from diagnosis_world import world
+from injection_subject import NOISE_T
 from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.screening import clean_start, outlying_share
@@ -18,7 +19,7 @@ def session(rests, change):
     made = world(seed=3)
     flux = made.tool.flux.copy()
     change(flux)
-    made.change(flux)
+    made.flux(flux)
     if rests:
         tool, reference = made.tool, made.reference
         time = 25.0 * tool.time

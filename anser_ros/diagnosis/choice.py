@@ -9,25 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import (
-    ALIKE,
-    FROM_OTHERS,
-    LEAST_MOTION_GAIN,
-    LEAST_OF_EXCESS,
-    LEAST_PATH_GAIN,
-    LIMITS_LEFT,
-    MOST_EFFECTS_AT_REST,
-    NO_RIVAL,
-    NOTHING_LEFT,
-    REST_LEFT,
-    STEADY,
-    as_good,
-)
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.engine import BlockSums, Score, Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Problem, State, evaluate, parts
 from anser_ros.diagnosis.structure import noise_scale
-from anser_ros.effects.effect import Effect, Family, Term
+from anser_ros.effects.effect import Family, Term
 from anser_ros.effects.registry import all_effects
 from anser_ros.effects.view import View
 
@@ -38,8 +25,7 @@ SCALES = np.geomspace(1e-3, 1.0, 7)
 """Spreads that are tried first, as multiples of what the constant effect expects; the estimation
 starts at the best of them."""
 EXPECTATION_ROUNDS = 25
-"""Rounds of expectation-maximisation. It starts at the best of seven spreads, so it has less than
-a factor of two to go."""
+"""Rounds of expectation-maximisation, which has less than a factor of two to go."""
 
 
 def _opened(
@@ -116,8 +102,8 @@ def left_over(state: State, term: Term) -> float:
 
 
 STEP_PRICE = 0.05
-"""What a way of one step of the grid between two blocks costs, as a share of the largest gain of a
-place in a block; it grows with the square of the way. Without it a place follows noise."""
+"""Price of a way of one step of the grid between two blocks, over the largest gain of a place; it
+grows with the square of the way. Without it a place follows noise."""
 NO_PRIOR = 1e6
 """Prior spread (1e-4 m^3) of a scatterer's answer in a block: a hundred cubic metres, no bound."""
 
@@ -131,46 +117,30 @@ def moving_starts(
     scorer: Scorer[State],
     blocks: NDArray[np.int64],
 ) -> list[tuple[float, Term]]:
-    """Return expected gain and start values of effects that are another one at a place for each
-    block.
-
-    None if one place for the whole session explains as much.
+    """Return expected gain and start values of effects that are another one (`Effect.still`) at a
+    place for each block; none where one place for the whole session explains as much.
 
     ``scored``: all candidates, from ``scorer``; ``blocks``: the time blocks that take part.
     """
-    found = []
+    found: list[tuple[float, Term]] = []
+    excess = scorer.state.sum_of_squares - scorer.state.count
+    time = (blocks + 0.5) * problem.apparatus.duration / (blocks.max() + 1)
     for effect in all_effects().values():
-        if effect.still is not None:
-            places = [(t, s) for t, s in scored if t.effect is effect.still]
-            found += _starts(effect, places, problem, scorer, blocks)
+        places, gains = _places([(t, s) for t, s in scored if t.effect is effect.still])
+        if not places:
+            continue
+        one_place = scorer.held_out - min(held_out for _, _, held_out in places)
+        alone = float(gains.max(axis=0).sum())
+        moves = decisions.LEAST_PATH_GAIN * one_place + decisions.LEAST_MOTION_GAIN
+        if alone >= max(moves, decisions.LEAST_OF_EXCESS * excess):
+            starts = effect.along(time, *_course(places, gains), problem.apparatus)
+            found += [(alone, start) for start in starts]
     return found
 
 
-def _starts(
-    effect: Effect[Term],
-    scored: Sequence[tuple[Term, Score]],
-    problem: Problem,
-    scorer: Scorer[State],
-    blocks: NDArray[np.int64],
-) -> list[tuple[float, Term]]:
-    """Starts of one effect along the places of the effect that it is at rest."""
-    places, gains = _places(scored)
-    if not places:
-        return []
-    one_place = scorer.held_out - min(held_out for _, _, held_out in places)
-    alone = float(gains.max(axis=0).sum())
-    excess = scorer.state.sum_of_squares - scorer.state.count
-    if alone < max(LEAST_PATH_GAIN * one_place + LEAST_MOTION_GAIN, LEAST_OF_EXCESS * excess):
-        return []
-    course, solution = _course(places, gains)
-    time = (blocks + 0.5) * problem.apparatus.duration / (blocks.max() + 1)
-    starts = effect.along(time, course, solution, problem.apparatus)
-    return [(alone, start) for start in starts]
-
-
 def course_of(scored: Sequence[tuple[Term, Score]]) -> tuple[Array, Array] | None:
-    """Return where metal at rest fits best in each block (B, 3), m, frame fg, and the solution of
-    the probe in the block where it explains most; None without such metal.
+    """Return where metal at rest fits best in each block (B, 3), m, frame fg, and the probe's
+    solution in the block where it explains most; None without such metal.
     """
     places, gains = _places(scored)
     return _course(places, gains) if places else None
@@ -191,8 +161,8 @@ def _course(places: Sequence[Place], gains: Array) -> tuple[Array, Array]:
     """The smoothest course, and the solution of the block in which a place explains most."""
     points = np.array([centre for centre, _, _ in places])
     best = int(np.argmax(gains.max(axis=0)))
-    sums = places[int(np.argmax(gains[:, best]))][1]
-    return points[_smoothest(points, gains)], _estimate(sums.part(np.array([best])))
+    sums = places[int(np.argmax(gains[:, best]))][1].part(np.array([best]))
+    return points[_smoothest(points, gains)], sums.solve(np.full(sums.size, NO_PRIOR))[0]
 
 
 def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:
@@ -211,22 +181,17 @@ def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:
     return np.array(way[::-1])
 
 
-def _estimate(sums: BlockSums) -> Array:
-    return sums.solve(np.full(sums.size, NO_PRIOR))[0]
-
-
 def at_floor(fit: Fit) -> bool:
     """Return whether a fit leaves nothing but noise."""
-    return fit.misfit < NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
+    return fit.misfit < decisions.NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
 
 
 def taken_from_others(fit: Fit) -> float:
-    """Return what a new fluctuation's freedom takes off that is another effect's, unexplained so
-    far.
-
-    For each of its columns, every frame loses the share of one value in the remaining residual.
+    """Return what a new fluctuation's freedom takes off that is another effect's: for each of its
+    columns, every frame loses the share of one value in the remaining residual.
     """
-    return FROM_OTHERS * fit.newest.effect.freedom(fit.newest) * max(fit.misfit - 1.0, 0.0)
+    freedom = fit.newest.effect.freedom(fit.newest)
+    return decisions.FROM_OTHERS * freedom * max(fit.misfit - 1.0, 0.0)
 
 
 def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
@@ -237,7 +202,9 @@ def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
     gain, best = max(fitted, key=lambda pair: pair[0])
     newest = best.newest
     steady = [
-        (g, f) for g, f in fitted if g > STEADY * gain and newest.effect.rivals(newest, f.newest)
+        (g, f)
+        for g, f in fitted
+        if g > decisions.STEADY * gain and newest.effect.rivals(newest, f.newest)
     ]
     if steady:
         gain, best = max(steady, key=lambda pair: pair[0])
@@ -246,7 +213,7 @@ def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
         (g, f)
         for g, f in fitted
         if f.newest.complexity < most
-        and gain - g < as_good(most - f.newest.complexity) * max(best.misfit, 1.0)
+        and gain - g < decisions.as_good(most - f.newest.complexity) * max(best.misfit, 1.0)
     ]
     simpler += [
         (g, f)
@@ -274,12 +241,12 @@ def moves_or_rests(
     effects with their scores, best first, from a scorer; ``explained``: what the metal that moves
     takes off the held-out sum of squares.
 
-    Returns Fit: settled (`anser_ros.diagnosis.fit`).
+    Returns a settled fit (`anser_ros.diagnosis.fit`).
     """
     shaped = settled(fitter, moving.terms)
     resting = [(g, f) for g, f in fitted if f.newest.effect.family is Family.METAL_AT_REST]
     gain, rest = max(resting, key=lambda pair: pair[0], default=(0.0, moving))
-    if gain < NO_RIVAL * explained:
+    if gain < decisions.NO_RIVAL * explained:
         return shaped
     rest = settled(fitter, rest.terms)
     limit = _limit(fitter, shaped, explained)
@@ -291,8 +258,10 @@ def moves_or_rests(
         if term.effect.family.is_metal or term.effect.name in tried:
             continue
         # A linear score is only a promise: the fit may still bring down what is within these.
-        hopeless = score.held_out > LIMITS_LEFT * limit + REST_LEFT * scorer.held_out
-        if hopeless or len(tried) == MOST_EFFECTS_AT_REST:
+        hopeless = (
+            score.held_out > decisions.LIMITS_LEFT * limit + decisions.REST_LEFT * scorer.held_out
+        )
+        if hopeless or len(tried) == decisions.MOST_EFFECTS_AT_REST:
             break
         tried.add(term.effect.name)
         for start in term.effect.started(term, score.solution):
@@ -308,5 +277,5 @@ def moves_or_rests(
 
 def _limit(fitter: Fitter, moving: Fit, explained: float) -> float:
     """Held-out sum of squares up to which metal at rest explains as much."""
-    more = ALIKE * explained + LEAST_MOTION_GAIN * max(moving.misfit, 1.0)
+    more = decisions.ALIKE * explained + decisions.LEAST_MOTION_GAIN * max(moving.misfit, 1.0)
     return moving.held_out() + more

@@ -1,9 +1,7 @@
 """Tests whether an effect is the same in all parts of the data, as a real one must be.
 
-A known effect often absorbs part of an unknown one, with parameters that differ from one part of
-the data to the next. So each effect is fitted again in parts of the time and emitter by emitter,
-and the additional power that those fits remove is compared with the power that the effect itself
-removes.
+Each effect is fitted again in parts of the time, emitter by emitter and by sensor. The power that
+those fits remove besides is compared with the power that the effect itself removes.
 """
 
 from collections.abc import Sequence
@@ -12,16 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import (
-    CHANGED,
-    LARGEST_VARIATION,
-    LEAST_OF_THE_REST,
-    LEAST_POWER_SIGMAS,
-    MANY,
-    MODEL_ERROR,
-    SOMETHING_LEFT,
-    TIME_PARTS,
-)
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.fit import Fit
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, parts
 from anser_ros.effects.effect import INEXACT, Family, Term
@@ -57,13 +46,13 @@ class Confirmation:
             return 'its parameters are outside their plausible range'
         if not self.helps:
             return 'only the references support it, and the tools contradict it'
-        if self.variation >= LARGEST_VARIATION:
+        if self.variation >= decisions.LARGEST_VARIATION:
             return 'its parameters differ from one part of the data to the next'
         if self.remainder >= self.inexact:
             return 'too much stays unexplained where it acts'
-        if self.alike >= MANY:
+        if self.alike >= decisions.MANY:
             return 'several effects of its kind together imitate a cause that they share'
-        if self.share_of_rest <= LEAST_OF_THE_REST:
+        if self.share_of_rest <= decisions.LEAST_OF_THE_REST:
             return 'much more stays unexplained than it explains'
         return ''
 
@@ -74,15 +63,16 @@ def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmati
     without = evaluate(problem, rest)
     power = without.sum_of_squares - fit.state.sum_of_squares
     left = max(fit.state.sum_of_squares - noise * fit.state.count, 0.0)
-    left_tools = left if fit.misfit > SOMETHING_LEFT * noise else 0.0
+    left_tools = left if fit.misfit > decisions.SOMETHING_LEFT * noise else 0.0
     columns = fit.state.design(term)
+    remainder = 0.0
+    if np.isfinite(term.effect.inexact):
+        remainder = _stays(fit.state, columns, noise, max(1.0, decisions.MODEL_ERROR * noise))
     return Confirmation(
         power,
         _varying(fit.state, columns, noise) / max(power, 1e-300),
         power / max(left_tools, 1e-300),
-        0.0
-        if np.isinf(term.effect.inexact)
-        else _stays(fit.state, columns, noise, max(1.0, MODEL_ERROR * noise)) / max(power, 1e-300),
+        remainder / max(power, 1e-300),
         inexact=term.effect.inexact,
         alike=_crowd(fit, term),
         plausible=_plausible(fit, term),
@@ -135,7 +125,7 @@ def _stays(state: State, columns: Sequence[Array | None], noise: float, expected
         if column is not None:
             size = np.abs(column).sum(axis=2).reshape(shape).sum(axis=(0, 1))
             # The pose's marginalisation spreads a trace of every change over all channels.
-            changed = size > CHANGED * size.max()
+            changed = size > decisions.CHANGED * size.max()
         good = (part.whitener.weight > 0).reshape(shape).sum(axis=(0, 1))
         own.append(left[changed])
         rest.append(left[~changed])
@@ -151,7 +141,7 @@ def _stays(state: State, columns: Sequence[Array | None], noise: float, expected
         stays = max(float(np.median(acted)) - model, 0.0) * acted.size
     else:
         stays = float(acted.sum() - np.median(others) * acted.size)
-    return stays if stays > LEAST_POWER_SIGMAS * spread * np.sqrt(acted.size) else 0.0
+    return stays if stays > decisions.LEAST_POWER_SIGMAS * spread * np.sqrt(acted.size) else 0.0
 
 
 def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:
@@ -168,14 +158,10 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
 
 def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmation, Term]]:
     """Return a fit's effects that are not confirmed, the one with the least power first."""
-    checks = [
-        (_checked(problem, fit, term, noise), term) for term in fit.effects if term.theta.size
-    ]
-    checks += [
-        (_checked_open(problem, fit, term, noise), term)
-        for term in fit.terms
-        if term.effect.family is Family.FLUCTUATION
-    ]
+    fitted = [term for term in fit.effects if term.theta.size]
+    free = [term for term in fit.terms if term.effect.family is Family.FLUCTUATION]
+    checks = [(_checked(problem, fit, term, noise), term) for term in fitted]
+    checks += [(_checked_open(problem, fit, term, noise), term) for term in free]
     checks += _unsteady(problem, fit)
     bad = [(check, term) for check, term in checks if not check.holds]
     return sorted(bad, key=lambda pair: pair[0].power)
@@ -207,7 +193,7 @@ def _varying(state: State, columns: Sequence[Array | None], noise: float) -> flo
     if not used:
         return 0.0
     numbers = np.unique(np.concatenate([part.blocks for part in state.parts]))
-    firsts = [group[0] for group in np.array_split(numbers, TIME_PARTS) if group.size]
+    firsts = [group[0] for group in np.array_split(numbers, decisions.TIME_PARTS) if group.size]
     times = [np.searchsorted(firsts, part.blocks, side='right')[:, None] for part, _ in used]
     cells = [np.indices((2, *p.view.flux.shape[1:])).reshape(3, 1, -1) for p, _ in used]
     kinds = (times, [cell[1] for cell in cells], [cell[2] for cell in cells])

@@ -35,9 +35,9 @@ OTHERS_CORRELATION, BETTER = 0.95, 0.1
 the other's may leave, from which a plug is in its socket. A looser pair takes neighbours that read
 alike for exchanged ones; a stricter one misses an exchange if there are other effects."""
 DEAD = 0.02
-"""Share of the expected reading below which a channel hears nothing: a fifth of the leak that
-`channel_crosstalk` expects, so that one that still hears its neighbours is not called dead.
-Smaller, and a dead channel that hears its neighbours is taken for a weak one; larger, and a weak
+"""Share of the expected reading below which a channel receives nothing: a fifth of the leak that
+`channel_crosstalk` expects, so that one that its neighbours leak into is not called dead.
+Smaller, and a dead channel with such a leak is taken for a weak one; larger, and a weak
 one is given up."""
 READING_RATIO, FRAME_RATIO = 6.0, 2.5
 """Mean squares over the neighbours' median from which a reading (16 values with 8 emitters) or a
@@ -102,16 +102,16 @@ below which the metal may be the model's: what was taken off a scan with metal n
 that is metal's, by 2.3 of its stated sigmas in `dirty/scan_metal`, the only such scan that was
 tried. Larger hides faint metal (2.0: what moves a tool by 0.03 mm); smaller names what is none."""
 MOST_METALS = 2
-"""Pieces of metal in force beside which no further metal is looked for. More let what the shapes
+"""Active pieces of metal beside which no further metal is looked for. More let what the shapes
 of these leave pass for another piece; fewer leave a second piece to be taken for other effects."""
 MOST_DOUBTFUL = 2
-"""With so many effects in force that are not the same in all parts of the data, something else is
+"""With so many active effects that are not the same in all parts of the data, something else is
 the cause, and further effects would only stand in for it: the search ends."""
 CLEAR_GAIN = 5.0
 """An effect whose parameters stand so many times above what it must gain (by their covariance) is
 kept without the fit of all the others without it."""
 DISTINGUISHABLE = 0.05
-"""A candidate of whose power the fluctuations in force leave less than this share (0 to 1) cannot
+"""A candidate of whose power the active fluctuations leave less than this share (0 to 1) cannot
 be distinguished from them. Smaller fits candidates that only noise decides on; larger hides
 effects behind a fluctuation."""
 
@@ -257,11 +257,7 @@ look."""
 
 
 def as_good(spared: int) -> float:
-    """Return the gain, in units of the misfit, that an explanation with fewer parameters may lack.
-
-    Parameters
-    ----------
-    spared : int
-        Parameters that it spares; with none it may lack nothing.
+    """Return the gain, in units of the misfit, that an explanation may lack that spares so many
+    parameters; with none it may lack nothing.
     """
     return AS_GOOD + AS_GOOD_PER_PARAMETER * spared if spared > 0 else 0.0

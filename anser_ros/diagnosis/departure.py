@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.choice import course_of
 from anser_ros.diagnosis.decisions import SOMETHING_LEFT
 from anser_ros.diagnosis.engine import Scorer
-from anser_ros.diagnosis.fit import Fit, Fitter, Shaping
+from anser_ros.diagnosis.fit import Fit, Fitter, Known, Shaping, best_modes, unit_of
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Problem, State, evaluate
-from anser_ros.diagnosis.rich_modes import rich_modes
 from anser_ros.diagnosis.screening import without_outliers
-from anser_ros.effects.departed_metal import DepartedMetal, DepartedTerm
 from anser_ros.effects.effect import Richness
 from anser_ros.effects.metal_path import FreePath
+from anser_ros.effects.moving_metal import DepartedMetal, DepartedTerm
 from anser_ros.effects.view import View
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 
@@ -31,28 +30,21 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 FIRST_KNOTS = 9
-"""Knots of a path at first, three seconds apart in half a minute: fewer cannot follow a way that
-stops for seconds, more are determined by few of the `SOME_FRAMES`."""
+"""Knots of a path at first, three seconds apart in half a minute."""
 FINE_KNOTS = 17
-"""Knots at last. A spline of few pieces cannot rest at its ends, which is what is asked for: with
-nine the metal at rest was half again too strong, with 17 and with 25 right."""
+"""Knots at last: with nine the metal at rest was half again too strong, with 17 and 25 right."""
 PATH_LENGTHS_M = (0.12, 0.24)
-"""Lengths of the ways that are tried, m: a hand's way, and the width of the volume; all between
-lie within a factor of 1.4."""
+"""Lengths of the ways that are tried, m: a hand's way, and the width of the volume."""
 SLOPE = 0.57
-"""Share of a way that goes down, for ways to the side, the sine of 35 deg: metal does not come
-nearer to the tools above the board, and hardly ever goes level."""
+"""Share of a way to the side that goes down, the sine of 35 deg: metal hardly ever goes level."""
 SIDE_DIRECTIONS = 8
-"""Directions to the side in which a way is tried, one in 45 deg. Fewer may start too far from the
-true way for the fit to find it; time grows with their number."""
+"""Directions to the side in which a way is tried, one in 45 deg; time grows with their number."""
 FEW_FRAMES, SOME_FRAMES, MANY_FRAMES = 25, 60, 300
-"""Frames of a tool, about, on which ways are compared, refined, and fitted at last; neighbouring
-frames are alike, and time grows in proportion."""
+"""Frames of a tool, about, on which ways are compared, refined, and fitted at last."""
 BODY = Richness(90, (25,), SOMETHING_LEFT)
 """How finely the body is shaped, and the path divided beyond `FINE_KNOTS` where much is left."""
 DEPARTURE_STEPS = 6
-"""Steps of a fit at most: it ends once it has settled (`engine.SETTLED`); a path that creeps for
-longer is judged by what it predicts."""
+"""Steps of a fit at most; a path that creeps for longer is judged by what it predicts."""
 EXPLAINED = 0.1
 """Share of the power in unseen blocks, beyond the noise's, that may stay. Its root, a third, is
 what is then wrong of the metal's field, as much as `KNOWN` allows."""
@@ -95,18 +87,16 @@ class Departure:
 def departure(problem: Problem, rest_s: float) -> Departure | None:
     """Find metal that moves in a problem whose model and baseline have it at rest.
 
-    ``problem``: of the time in which something moves, with references; ``rest_s``: when it rests,
-    s.
-
-    Returns Departure or None: None without references, or where no body explains anything.
+    ``problem``: of the time in which something moves; ``rest_s``: when the metal rests, s. Returns
+    None without references, or where no body explains anything.
     """
     if problem.references is None:
         return None
     blocks = train_blocks()
     effect = DepartedMetal(rest_s=rest_s)
     few, some = (problem.in_blocks(blocks).thinned(count) for count in (FEW_FRAMES, SOME_FRAMES))
-    best_starts = _best_starts(few, effect, blocks)
-    fits = [_refined(some, start, kind, blocks) for start, kind in best_starts]
+    starts = _best_starts(few, effect, blocks)
+    fits = [_refined(some, start, kind, blocks) for start, kind in starts]
     known = [fit for fit in fits if fit is not None]
     if not known:
         return None
@@ -132,25 +122,17 @@ def _best_starts(
 ) -> list[tuple[DepartedTerm, str]]:
     """The start that predicts left-out blocks best with a compact body, and with pieces."""
     state = evaluate(problem, ())
-    found = []
-    for start, kinds in _starts(problem, state, effect, blocks):
-        for kind in kinds:
-
-            def unit(view: View, modes: Array, start: DepartedTerm = start, kind: str = kind):  # type: ignore[no-untyped-def]
-                return start.with_body(kind, modes, np.ones(modes.shape[1])).unit(view)
-
-            none = [np.zeros((*part.white.shape, 0)) for part in state.parts]
-            modes = rich_modes(
-                state, (list(none), np.zeros(0)), unit, body_sizes(kind), blocks,
-                BODY.modes,
-            )  # fmt: skip
-            if modes is not None:
-                found.append((modes[0], start, kind))
+    none: Known = [np.zeros((*part.white.shape, 0)) for part in state.parts], np.zeros(0)
+    starts = [
+        (start, kind) for start, kinds in _starts(problem, state, effect, blocks) for kind in kinds
+    ]
+    compact = [pair for pair in starts if pair[1] == COMPACT]
     best = []
-    for compact in (True, False):
-        group = [one for one in found if (one[2] == COMPACT) == compact]
-        if group:
-            best.append(min(group, key=lambda one: one[0])[1:])
+    for group in (compact, [pair for pair in starts if pair[1] != COMPACT]):
+        tried = ((pair, unit_of(*pair), body_sizes(pair[1])) for pair in group)
+        found = best_modes(state, none, tried, blocks, BODY.modes)
+        if found is not None:
+            best.append(found[0])
     return best
 
 
@@ -167,9 +149,10 @@ def _starts(
         for term in still.candidates(problem.apparatus)
         if (score := scorer.score(term)) is not None
     ]
-    course, solution = course_of(scored) or (np.zeros((0, 3)), np.zeros(2))
-    if not len(course):
+    found = course_of(scored)
+    if found is None:
         return
+    course, solution = found
     time = (blocks + 0.5) * duration / (blocks.max() + 1)
     path, theta = FreePath.through(knots, time, course)
     yield effect.starting(path, theta, duration, solution), [COMPACT]

@@ -1,21 +1,14 @@
 """Runs the whole loop: residual, effect, correction, the error before and after on unseen data."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.choice import refit_spreads
 from anser_ros.diagnosis.confirm import Confirmation, doubtful
-from anser_ros.diagnosis.decisions import (
-    DEPENDENT,
-    FEWEST_OUTLIERS,
-    LEAST_NOISE_GROWTH,
-    MANY,
-    STRUCTURED,
-    UNSTRUCTURED,
-)
 from anser_ros.diagnosis.findings import (
     Finding,
     corrected_model,
@@ -46,8 +39,7 @@ from anser_ros.field.model import FieldModel
 Array = NDArray[np.float64]
 
 SEARCH_FRAMES, FINAL_FRAMES, WIRING_FRAMES = 270, 400, 150
-"""Frames of each tool, about, that the search, the last fit and the look for wiring faults work
-on: time grows with them in proportion, and neighbouring frames say much the same."""
+"""Frames of each tool, about, for the search, the last fit and the look for wiring faults."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +57,10 @@ class Diagnosis:
     tests_after: tuple[StructureTest, ...]
     model: FieldModel  # with the effects
     search: Search
-    # Effects that explained something but were not confirmed.
-    refused: tuple[tuple[Term, Confirmation], ...]
+    refused: tuple[tuple[Term, Confirmation], ...]  # explained something, but not confirmed
     before: State  # the held-out part
     after: State
-    # All that was fitted last, also what is no finding.
-    terms: tuple[Term, ...] = field(default_factory=tuple)
+    terms: tuple[Term, ...]  # all that was fitted last, also what is no finding
 
 
 @dataclass(frozen=True)
@@ -92,8 +82,7 @@ class Confirmed:
 
     fit: Fit  # all of them together
     cleaned: Problem  # all frames, without values that stand out with these effects
-    # Effects that explained something but were not confirmed.
-    refused: tuple[tuple[Term, Confirmation], ...]
+    refused: tuple[tuple[Term, Confirmation], ...]  # explained something, but not confirmed
 
 
 def diagnose(
@@ -107,10 +96,11 @@ def diagnose(
     ``problem``: of the whole session (`anser_ros.diagnosis.prepare.build_problem`); ``model``:
     what the problem was built with; ``progress``: called with words on what goes on.
     """
-    how, say = settings or SearchSettings(), progress or (lambda text: None)
+    how = settings or SearchSettings()
     screened = screen(problem)
-    search = search_screened(screened, how, say)
-    say('joint fit')
+    search = search_screened(screened, how, progress)
+    if progress:
+        progress('joint fit')
     confirmed = confirm(screened, search, how)
     return conclude(screened, search, confirmed, model)
 
@@ -126,9 +116,8 @@ def search_screened(
     screened: Screened, how: SearchSettings, progress: Progress | None = None
 ) -> Search:
     """Search for effects on a part of the training blocks' frames."""
-    say = progress or (lambda text: None)
     training = screened.training(SEARCH_FRAMES)
-    return search_effects(training, train_blocks(), list(screened.known), how, say)
+    return search_effects(training, train_blocks(), screened.known, how, progress)
 
 
 def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirmed:
@@ -137,7 +126,7 @@ def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirme
     last = how.fitter(screened.training(FINAL_FRAMES), blocks)
     fit, refused = _settled(how.fitter(search.fit.state.problem, blocks), last, search)
     cleaned = without_outliers(whole, evaluate(whole, fit.terms))
-    if outlying_share(screened.start, cleaned)[0] > FEWEST_OUTLIERS:
+    if outlying_share(screened.start, cleaned)[0] > decisions.FEWEST_OUTLIERS:
         thinned = cleaned.in_blocks(blocks).thinned(FINAL_FRAMES)
         fit = settled(how.fitter(thinned, blocks), fit.terms, FINE)
     return Confirmed(fit, cleaned, refused)
@@ -146,15 +135,13 @@ def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirme
 def _without_dead(problem: Problem, known: Sequence[Term]) -> Problem:
     """The problem without the channels without a signal."""
     dead = [channel for term in known for channel in term.effect.silenced(term)]
-    good = tuple(
-        mask & ~np.isin(tool.sensors.channel, dead)
-        for tool, mask in zip(problem.tools, problem.good, strict=True)
-    )
+    pairs = zip(problem.tools, problem.good, strict=True)
+    good = tuple(mask & ~np.isin(tool.sensors.channel, dead) for tool, mask in pairs)
     references = problem.references
     if references is not None:
-        working = ~np.isin(references.readings.sensors.channel, dead)
-        valid = references.readings.valid & working
-        references = replace(references, readings=replace(references.readings, valid=valid))
+        readings = references.readings
+        valid = readings.valid & ~np.isin(readings.sensors.channel, dead)
+        references = replace(references, readings=replace(readings, valid=valid))
     return replace(problem, good=good, references=references)
 
 
@@ -163,13 +150,10 @@ def _settled(
 ) -> tuple[Fit, tuple[tuple[Term, Confirmation], ...]]:
     """The joint fit, by ``last``, of the effects that are the same in all parts of the data."""
     fit, refused = search.fit, []
-    while True:
-        bad = doubtful(fitter.problem, fit, noise_scale(fit.state) ** 2)
-        if not bad:
-            break
+    while bad := doubtful(fitter.problem, fit, noise_scale(fit.state) ** 2):
         # Metal that is doubtful costs much to fit again and is hardly ever more than a stand-in.
         metal = [pair for pair in bad if pair[1].effect.family.is_metal]
-        crowd = [pair for pair in bad if pair[0].alike >= MANY]
+        crowd = [pair for pair in bad if pair[0].alike >= decisions.MANY]
         dropped = metal or crowd or bad[:1]
         refused += [(term, check) for check, term in dropped]
         gone = [term for _, term in dropped]
@@ -188,13 +172,13 @@ def conclude(
     white = whiteness(after)
     expected = expected_rms(after)
     # Residuals that are no noise must not make the floor that they are measured by.
-    grown = noise_t(after) > LEAST_NOISE_GROWTH * cleaned.spread.noise_t
+    grown = noise_t(after) > decisions.LEAST_NOISE_GROWTH * cleaned.spread.noise_t
     scale = min(noise_scale(after), 1.0) if grown and not white.holds else noise_scale(after)
     floor = min(scale * expected, rms(after))
     tests = tuple(structure_tests(after))
     excess = max(rms(after) ** 2 - floor**2, 0.0)
-    structured = any(test.significant for test in tests)
-    significant = excess > (STRUCTURED if structured else UNSTRUCTURED) * floor**2
+    named = [test.variable for test in tests if test.significant]
+    significant = excess > (decisions.STRUCTURED if named else decisions.UNSTRUCTURED) * floor**2
     possible = max(rms(before) ** 2 - floor**2, excess)
     findings = [
         fitted_finding(fit, i, unseen, search)
@@ -206,8 +190,7 @@ def conclude(
         findings += noise_findings(whole, after)
     records = [finding.record for finding in findings]
     depends: tuple[str, ...] = ()
-    if excess > DEPENDENT * floor**2:
-        named = [t.variable for t in tests if t.significant]
+    if excess > decisions.DEPENDENT * floor**2:
         depends = tuple(dict.fromkeys([*(white.depends_on if grown else ()), *named]))
     return Diagnosis(
         findings=tuple(findings),

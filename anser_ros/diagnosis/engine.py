@@ -1,9 +1,7 @@
 """Fits and selects terms of any observation: Gauss-Newton, cross-validation, forward selection.
-Sums of columns over blocks come first, then states and fits, steps, scores of candidates, and
-the selection. Fluxes and poses are fitted and searched by this engine alone. A state says what
-is predicted with some active terms (`JointState`): whitened residuals in parts with blocks of
-time, the whitened columns of a term, and the state with other terms. A term offers its effect's
-prior, bounds, cost and record (`anser_ros.effects.base`).
+
+Sums of columns over blocks come first, then states and fits, steps, scores of candidates, and the
+selection. Fluxes and poses are fitted and searched by this engine alone.
 """
 
 from collections.abc import Sequence
@@ -63,7 +61,8 @@ class BlockSums:
 
     def solve(self, prior: Array) -> tuple[Array, Array]:
         """Estimate and covariance with a Gaussian prior about zero (standard deviations (q,))."""
-        return _solve(self.normal.sum(axis=0), self.right.sum(axis=0), prior)
+        covariance = _covariance(self.normal.sum(axis=0), prior)
+        return covariance @ self.right.sum(axis=0), covariance
 
     def step(self, prior: Array, damping: float) -> Array:
         """Estimate with the diagonal raised by a share ``damping`` of itself (Marquardt)."""
@@ -121,19 +120,13 @@ def _covariance(normal: Array, prior: Array) -> Array:
     return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])
 
 
-def _solve(normal: Array, right: Array, prior: Array) -> tuple[Array, Array]:
-    """Estimate and covariance."""
-    covariance = _covariance(normal, prior)
-    return covariance @ right, covariance
-
-
 def _estimate(normal: Array, right: Array, prior: Array) -> Array:
     """The estimate alone, by Cholesky where that goes."""
     full, scale = _scaled(normal, prior)
     try:
         factor = cho_factor(full + 1e-12 * np.eye(scale.size), check_finite=False)
     except np.linalg.LinAlgError:
-        return _solve(normal, right, prior)[0]
+        return _covariance(normal, prior) @ right
     return np.asarray(scale * cho_solve(factor, scale * right, check_finite=False))
 
 
@@ -218,15 +211,13 @@ def width_of(group: Columns) -> int:
 TermT = TypeVar('TermT', bound=BaseTerm)
 
 ATTEMPTS = 6
-"""Dampings that are tried for a step that lowers the sum of squares; each is ten or a hundred
-times the one before, so the last steps are far too small to help."""
+"""Dampings that are tried for a step, each ten or a hundred times the one before."""
 SETTLED = 1e-5
-"""Share of the sum of squares by which a step must lower it for the fit to go on: one, where 1e5
-readings are fitted to their noise, so that the next step of a fit that converges is by far less
-than a standard deviation. Larger ends fits that still creep; smaller costs steps."""
+"""Share of the sum of squares by which a step must lower it for the fit to go on: of 1e5 readings
+fitted to their noise it is one, so that the next step is far less than a standard deviation."""
 MOST_COLUMNS = 60
-"""Columns that an active term may have to be fitted again with each candidate. A term with more
-is what metal left, and no effect's rival."""
+"""Columns that an active term may have to be fitted again with each candidate: a term with more
+is what metal left, no effect."""
 PartT = TypeVar('PartT', bound=WhitePart)
 
 
@@ -321,19 +312,16 @@ FitT = TypeVar('FitT', bound=JointFit[Any])
 def descended(state: StateT, blocks: Ints, iterations: int) -> tuple[StateT, BlockSums, Array]:
     """Lower a sum of squares by damped Gauss-Newton steps until it has settled.
 
-    ``blocks`` are those of the sums that are kept, ``iterations`` the steps at most. Returns the
-    state, its sums and its prior.
+    Returns the state, its sums over ``blocks`` and its prior; ``iterations``: steps at most.
     """
     sums, prior, damping = state.sums(blocks), state.prior(), 0.0
     for _ in range(iterations if prior.size else 0):
         better, damping = _better(state, sums, prior, damping)
         if better is None:
             break
-        gain = state.sum_of_squares - better.sum_of_squares
-        settled = gain < SETTLED * state.sum_of_squares
-        state = better
+        before, state = state.sum_of_squares, better
         sums, prior = state.sums(blocks), state.prior()
-        if settled:
+        if before - state.sum_of_squares < SETTLED * before:
             break
     return state, sums, prior
 
@@ -379,7 +367,6 @@ class Scorer(Generic[StateT]):
 
     def __init__(self, state: StateT, blocks: Ints) -> None:
         self.state, self.blocks = state, blocks
-        # Terms of very many columns stay as they are: they are what metal left, not effects.
         terms = [t for t in state.terms if t.theta.size <= MOST_COLUMNS]
         empty: Columns = [None] * len(state.parts)
         self._active = joined([state.design(t) for t in terms]) if terms else empty
@@ -388,8 +375,9 @@ class Scorer(Generic[StateT]):
         self.held_out = self.sums.held_out(self.prior, state.folds) + state.penalty
 
     def score(self, term: BaseTerm, prior: Array | None = None) -> Score | None:
-        """Return the worth of a candidate; None when it touches no value, or is at a dipole's own
-        place. Without a prior (q,) its coefficients are free.
+        """Return the worth of a candidate; None where it has no finite effect on any value.
+
+        Without a prior (q,) its coefficients are free.
         """
         probe = self.state.design(term, probe=True)
         width = width_of(probe)

@@ -6,12 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import (
-    FEWEST_OUTLIERS,
-    KNOWN_SIGMAS,
-    LEAST_NOISE_GROWTH,
-    MOST_EXCESS_OF_OUTLIERS,
-)
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.fit import Fit
 from anser_ros.diagnosis.problem import Problem, State, evaluate, rms, tool_parts
 from anser_ros.diagnosis.screening import outlying_share
@@ -42,20 +37,13 @@ def fitted_finding(fit: Fit, index: int, unseen: Problem, search: Search) -> Fin
     rest = [t for t in fit.terms if t is not term and not t.belongs_to(term)]
     without = rms(evaluate(unseen, rest))
     record = term.effect.record(term, fit.covariance_of(index))
-    gain = next(
-        (
-            c.gain
-            for found in search.rounds
-            for c in found
-            if c.fitted_gain is not None and c.term.label == term.label
-        ),
-        None,
-    )
+    tried = (candidate for found in search.rounds for candidate in found)
+    gains = [c.gain for c in tried if c.fitted_gain is not None and c.term.label == term.label]
     evidence = {
         'summary': term.effect.summary,
         'remedy': term.effect.remedy.value,
         'parameters_spent': int(term.theta.size),
-        'held_out_gain': None if gain is None else float(gain),
+        'held_out_gain': float(gains[0]) if gains else None,
         'rivals': [c.term.label for c in search.rivals.get(term.label, [])],
     }
     return Finding(replace(record, evidence={**record.evidence, **evidence}), term, without)
@@ -82,17 +70,16 @@ def outlier_findings(
 
     ``whole`` and ``cleaned``: with and without the frames that stand out; ``after``: the held-out
     part with all effects; ``excess``: power that is not explained, over the floor's; ``known``:
-    the model's. The share of frames that stood out in its own scan is what the optical tracker
-    always does, and no effect of a session.
+    the model's effects. Frames that stood out in its own scan are what the tracker always does.
     """
     share, channels = outlying_share(whole, cleaned)
     # A fluctuation is taken for normal: frames far out along it are its own tails.
     own_tails = any(term.effect.family is Family.FLUCTUATION for term in after.terms)
-    alone = excess < MOST_EXCESS_OF_OUTLIERS and not own_tails
+    alone = excess < decisions.MOST_EXCESS_OF_OUTLIERS and not own_tails
     frames = sum(tool.time.size for tool in whole.tools)
     always = known_share(known)
-    usual = always + KNOWN_SIGMAS * float(np.sqrt(always / max(frames, 1)))
-    if share <= FEWEST_OUTLIERS + usual or not (channels or alone):
+    usual = always + decisions.KNOWN_SIGMAS * float(np.sqrt(always / max(frames, 1)))
+    if share <= decisions.FEWEST_OUTLIERS + usual or not (channels or alone):
         return []
     sigma = float(np.sqrt(share / max(frames, 1)))
     return [plain_finding(outliers_of(share, sigma, channels), rms(after))]
@@ -101,7 +88,7 @@ def outlier_findings(
 def noise_findings(whole: Problem, after: State) -> list[Finding]:
     """Return excess noise, of all channels or of those that have it."""
     factor = noise_t(after) / whole.spread.noise_t
-    if factor <= LEAST_NOISE_GROWTH:
+    if factor <= decisions.LEAST_NOISE_GROWTH:
         return []
     squares: dict[int, Array] = {}
     for part in tool_parts(after):
@@ -109,13 +96,12 @@ def noise_findings(whole: Problem, after: State) -> list[Finding]:
         cells = square.reshape(-1, 2, *part.view.flux.shape[1:])
         for row, channel in enumerate(part.view.sensors.channel.tolist()):
             squares[channel] = cells[:, :, row]
-    noisy = [c for c, values in squares.items() if values.mean() > LEAST_NOISE_GROWTH**2]
+    noisy = [c for c, values in squares.items() if values.mean() > decisions.LEAST_NOISE_GROWTH**2]
     if len(noisy) == len(squares):  # where no others have none, it is that of all
         noisy = []
     count: float = after.count
     if noisy:
-        total = sum(float(squares[c].sum()) for c in noisy)
-        size = np.sqrt(total / sum(squares[c].size for c in noisy))
+        size = np.sqrt(np.mean(np.concatenate([squares[c].ravel() for c in noisy])))
         factor = float(size) * whole.spread.flux_t / whole.spread.noise_t
         count *= len(noisy) / len(whole.apparatus.tool_channels)
     sigma = factor / np.sqrt(2 * max(count, 1))

@@ -1,33 +1,156 @@
-"""Fits all effects on fluxes jointly, metal in as much detail as the data determine. The fit
-itself; couplings that the data determine; a richer body and path for metal that moves; what
-metal at rest leaves; and all of it together (`settled`).
-"""
+"""Fits all effects on fluxes jointly, metal in as much detail as the data determine."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import COARSE_REMAINDER, PER_PARAMETER, SOMETHING_LEFT
-from anser_ros.diagnosis.engine import JointFit, descended, joined
-from anser_ros.diagnosis.problem import Problem, State, evaluate, tools_misfit
-from anser_ros.diagnosis.rich_modes import Known, rich_modes, thinned
-from anser_ros.diagnosis.structure import noise_scale
-from anser_ros.effects.effect import BodyTerm, Family, Resting, Richness, SizedShapes, Term
-from anser_ros.effects.metal_remainder import (
-    REMAINDER,
-    Couplings,
-    IlluminationChange,
-    RemainderPart,
+from anser_ros.diagnosis.decisions import (
+    COARSE_REMAINDER,
+    PER_PARAMETER,
+    SOMETHING_LEFT,
+    TIME_FOLDS,
 )
+from anser_ros.diagnosis.engine import BlockSums, JointFit, block_sums, descended, joined
+from anser_ros.diagnosis.problem import Problem, State, evaluate, parts, tools_misfit
+from anser_ros.diagnosis.structure import noise_scale
+from anser_ros.effects.effect import (
+    BodyTerm,
+    Family,
+    Resting,
+    Richness,
+    SizedShapes,
+    Term,
+    both_phases,
+)
+from anser_ros.effects.metal_remainder import REMAINDER, Couplings, IlluminationChange
 from anser_ros.effects.view import View
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 from anser_ros.metal.scattering import Shapes
 from anser_ros.parallel import in_order
 
 Array = NDArray[np.float64]
+Known = tuple[list[Array | None], Array]
+"""Columns, one array for each part of a state, and their prior sizes."""
+Unit = Callable[[View, Array], NDArray[np.inexact]]
+"""Flux (F, S, K, m) of modes (c, m) of couplings in a view."""
+
+KeyT = TypeVar('KeyT')
+
+MOST_SIZED_MODES = 130
+"""Modes, at most, of which the data are asked how large they are."""
+LEAST_INFORMATION = 0.3
+"""Information in the data, over that in the prior, below which a mode is left out."""
+SCORED_FRAMES = 130
+"""Frames of each part, about, on which sizes of couplings are compared."""
+
+
+def rich_modes(
+    few: State,
+    known: Known,
+    unit: Unit,
+    spreads: Sequence[Array],
+    blocks: NDArray[np.int64],
+    most: int,
+) -> tuple[float, Array] | None:
+    """Return combinations of couplings, of the size that predicts held-out blocks best.
+
+    ``few``: at a fit without these couplings, or with others in their place; some frames do;
+    ``known``: columns of what is fitted with them, and their prior sizes; ``unit``: flux (F, S, K,
+    m) of modes (c, m) in a view; ``spreads`` (c,): prior sizes of the couplings that are tried.
+
+    Returns (c, m) sum of squares of the held-out residuals, and modes of unit prior size; None
+    where no size is better than none at all.
+    """
+    widest = np.max(spreads, axis=0)
+    information = _information(few, unit, widest.size)
+    values, vectors = np.linalg.eigh(information * widest[:, None] * widest)
+    leading = np.argsort(values)[::-1][:MOST_SIZED_MODES]
+    leading = leading[values[leading] > LEAST_INFORMATION]
+    if leading.size == 0:
+        return None
+    vectors = vectors[:, leading]
+    vectors_of = widest[:, None] * vectors
+    group: list[Array | None] = [
+        part.whitener(parts(both_phases(unit(part.view, vectors_of)))) for part in few.parts
+    ]
+    columns, prior = known
+    sums = block_sums(few.parts, joined([columns, group]), blocks)
+    width, count = prior.size, leading.size
+    least, root = sums.columns(np.arange(width)).held_out(prior, TIME_FOLDS), None
+    full_prior = np.concatenate([prior, np.ones(2 * count)])
+    for spread in spreads:
+        turned = vectors * (spread / widest)[:, None]
+        trial = np.linalg.cholesky(turned.T @ turned + 1e-12 * np.eye(count))
+        left = _turned(sums, width, trial).held_out(full_prior, TIME_FOLDS)
+        if left < least:
+            least, root = left, trial
+    if root is None:
+        return None
+    total = sums.normal.sum(axis=0)[width : width + count, width : width + count]
+    information, turn = np.linalg.eigh(root.T @ total @ root)
+    order = np.argsort(information)[::-1][:most]
+    order = order[information[order] > LEAST_INFORMATION]
+    if not order.size:
+        return None
+    return least, vectors_of @ root @ turn[:, order]
+
+
+def best_modes(
+    few: State,
+    known: Known,
+    tried: Iterable[tuple[KeyT, Unit, Sequence[Array]]],
+    blocks: NDArray[np.int64],
+    most: int,
+) -> tuple[KeyT, Array] | None:
+    """Return the key of the shapes that predict held-out blocks best, and their modes.
+
+    ``tried``: key, flux and prior sizes of some shapes; all others as of `rich_modes`. Returns
+    None where none is better than none at all.
+    """
+    best: tuple[float, KeyT, Array] | None = None
+    for key, unit, sizes in tried:
+        found = rich_modes(few, known, unit, sizes, blocks, most)
+        if found is not None and (best is None or found[0] < best[0]):
+            best = found[0], key, found[1]
+    return None if best is None else best[1:]
+
+
+def unit_of(body: BodyTerm, kind: str) -> Unit:
+    """Return the flux of modes of a kind of body on the course of another."""
+    return lambda view, modes: body.with_body(kind, modes, np.ones(modes.shape[1])).unit(view)
+
+
+def _turned(sums: BlockSums, known: int, root: Array) -> BlockSums:
+    """The sums with the columns after the known ones, two groups of them, turned by a matrix."""
+    count = root.shape[0]
+    turn = np.eye(known + 2 * count)
+    for start in (known, known + count):
+        turn[start : start + count, start : start + count] = root
+    return BlockSums(turn.T @ sums.normal @ turn, sums.right @ turn, sums.squares)
+
+
+def thinned(state: State, blocks: NDArray[np.int64]) -> State:
+    """Return the state with only some frames of every part."""
+    few = []
+    for part in state.parts:
+        rows = np.flatnonzero(np.isin(part.blocks, blocks))
+        few.append(part.frames(rows[:: max(1, round(rows.size / SCORED_FRAMES))]))
+    return replace(state, parts=tuple(few))
+
+
+def _information(state: State, unit: Unit, count: int) -> Array:
+    """Of single couplings, (c, c), in phase (quadrature has the same), from half of the frames."""
+    normal = np.zeros((count, count))
+    for part in state.parts:
+        half = part.frames(np.arange(0, part.view.time.size, 2))
+        flux = unit(half.view, np.eye(count))
+        flat = half.whitener(parts(flux.astype(complex))).reshape(-1, count)
+        normal += 2 * (flat.T @ flat)
+    return normal
 
 
 @dataclass(frozen=True)
@@ -72,15 +195,18 @@ class Fitter:
 
 
 TRIALS = 3
-"""Iterations after which kinds of bodies are compared; the best one is fitted on. All begin at
-places that have been fitted, and each iteration costs as much as the one before."""
+"""Iterations after which kinds of bodies are compared; the best one is fitted on."""
 EVERY_OTHER = 2
 """Every so many frames are used to compare kinds of bodies: it takes half the time."""
+MODE_ROUNDS = 2
+"""Times that modes are made about where the metal then is; the second hardly ever moves it."""
+NEW_MODES_M = 2e-3
+"""A centre that a fit moves farther than this (m) asks for new modes."""
 
 
 @dataclass(frozen=True)
 class Shaping:
-    """Shapes metal that moves in a fit."""
+    """Shapes metal in a fit: body and course where it moves, what it leaves where it rests."""
 
     fitter: Fitter
     richness: Richness  # how many modes and knots it may have
@@ -109,11 +235,7 @@ class Shaping:
         return fit
 
     def _bodied(self, fit: Fit, index: int, first: BodyTerm) -> Fit:
-        """The fit with a richer body.
-
-        A simple body fitted in place of an extended one may have converged to a wrong place, so
-        its start is tried too.
-        """
+        """The fit with a richer body, also from its start: a simple one may have gone astray."""
         if first.richness is not None:
             return self.shaped_as(fit, index, first, [first.kind]) or fit
         half = self.fitter.problem.in_blocks(self.fitter.blocks, EVERY_OTHER)
@@ -142,22 +264,16 @@ class Shaping:
     def shaped_as(self, fit: Fit, index: int, body: BodyTerm, kinds: Sequence[str]) -> Fit | None:
         """Return the fit with the best of some kinds of bodies; None if no body is better."""
         fitter = self.fitter
-        bare = _with(fit.terms, index, body.with_theta(_without_amounts(body)))
-        few = thinned(evaluate(fitter.problem, bare), fitter.blocks)
+        course = body.theta.copy()
+        course[body.effect.amounts(body)] = 0.0
+        bare = evaluate(fitter.problem, _with(fit.terms, index, body.with_theta(course)))
+        few = thinned(bare, fitter.blocks)
         known = self._known(fit, index, body)
-        best: tuple[float, str, Array] | None = None
-        for kind in kinds:
-
-            def unit(view: View, modes: Array, kind: str = kind) -> NDArray[np.inexact]:
-                return body.with_body(kind, modes, np.ones(modes.shape[1])).unit(view)
-
-            most, sizes = self.richness.modes, body_sizes(kind)
-            found = rich_modes(few, known, unit, sizes, fitter.blocks, most)
-            if found is not None and (best is None or found[0] < best[0]):
-                best = (found[0], kind, found[1])
+        tried = ((kind, unit_of(body, kind), body_sizes(kind)) for kind in kinds)
+        best = best_modes(few, known, tried, fitter.blocks, self.richness.modes)
         if best is None:
             return None
-        rich = body.shaped(best[1], best[2], self.richness)
+        rich = body.shaped(*best, self.richness)
         start = fitter.fit(_with(fit.terms, index, rich.hold()), 1)
         return fitter.fit(_with(start.terms, index, start.terms[index].free()))
 
@@ -174,36 +290,7 @@ class Shaping:
             priors.append(prior)
         return joined(groups), np.concatenate(priors)
 
-
-def _body(term: Term) -> BodyTerm | None:
-    return term.effect.body(term)
-
-
-def _without_amounts(term: Term) -> Array:
-    theta = term.theta.copy()
-    theta[term.effect.amounts(term)] = 0.0
-    return theta
-
-
-def _with(terms: Sequence[Term], index: int, term: Term) -> tuple[Term, ...]:
-    return tuple(term if i == index else t for i, t in enumerate(terms))
-
-
-MODE_ROUNDS = 2
-"""Times that modes are made about where the metal then is; the second hardly ever moves it."""
-NEW_MODES_M = 2e-3
-"""A centre that a fit moves farther than this (m) asks for new modes: modes about a centre that is
-off by a tenth of a body's radius stand for it as well."""
-
-
-@dataclass(frozen=True)
-class Remainders:
-    """Adds what metal at rest leaves to a fit."""
-
-    fitter: Fitter
-    richness: Richness  # how many modes it may have
-
-    def added(self, fit: Fit, index: int) -> Fit:
+    def with_remainder(self, fit: Fit, index: int) -> Fit:
         """Return the fit with what one metal at rest leaves; the same fit for any other effect."""
         plain = fit.terms
         if plain[index].effect.resting(plain[index]) is None:
@@ -214,7 +301,7 @@ class Remainders:
             own = self._couplings(fit, term, plain, before.near)
             if own is None:
                 return fit
-            start = [t if i != index else term for i, t in enumerate(plain)]
+            start = _with(plain, index, term)
             emitters = self.fitter.problem.apparatus.emitters
             light = REMAINDER.of(term, IlluminationChange([term, own], emitters))
             fit = self.fitter.fit([*start, own, light])
@@ -232,8 +319,7 @@ class Remainders:
         if more is None:
             return fit
         held = term.hold(fit.covariance_of(index))
-        terms = [held if i == index else t for i, t in enumerate(fit.terms)]
-        return self.fitter.fit([*terms, more])
+        return self.fitter.fit([*_with(fit.terms, index, held), more])
 
     def _couplings(
         self, fit: Fit, term: Term, beside: Sequence[Term], shapes: Sequence[SizedShapes]
@@ -241,21 +327,25 @@ class Remainders:
         """The couplings about metal at rest that predict best, given the other terms."""
         fitter, few = self.fitter, thinned(fit.state, self.fitter.blocks)
         centre = _resting(term).centre
-        known = (
-            joined([few.design(t) for t in beside]),
-            np.concatenate([t.effect.prior(t) for t in beside]),
-        )
-        best: tuple[float, RemainderPart] | None = None
-        for kind, sizes in shapes:
+        known = joined([few.design(t) for t in beside]), few.prior(beside)
 
-            def unit(view: View, modes: Array, kind: Shapes = kind) -> NDArray[np.inexact]:
-                return Couplings(kind, centre, modes).unit(view)
+        def unit_of_shapes(kind: Shapes) -> Unit:
+            return lambda view, modes: Couplings(kind, centre, modes).unit(view)
 
-            most = self.richness.modes
-            found = rich_modes(few, known, unit, sizes, fitter.blocks, most)
-            if found is not None and (best is None or found[0] < best[0]):
-                best = (found[0], Couplings(kind, centre, found[1]))
-        return None if best is None else REMAINDER.of(term, best[1])
+        tried = ((kind, unit_of_shapes(kind), sizes) for kind, sizes in shapes)
+        best = best_modes(few, known, tried, fitter.blocks, self.richness.modes)
+        if best is None:
+            return None
+        kind, modes = best
+        return REMAINDER.of(term, Couplings(kind, centre, modes))
+
+
+def _body(term: Term) -> BodyTerm | None:
+    return term.effect.body(term)
+
+
+def _with(terms: Sequence[Term], index: int, term: Term) -> tuple[Term, ...]:
+    return tuple(term if i == index else t for i, t in enumerate(terms))
 
 
 def _resting(term: Term) -> Resting:
@@ -266,8 +356,7 @@ def _resting(term: Term) -> Resting:
 
 
 COARSE = Richness(50, (17,), COARSE_REMAINDER)
-"""How finely metal is shaped during the search: by what shapes usually leave, about half of the
-modes that the data determine, and a knot in 2.5 s of a session of 40 s."""
+"""How finely metal is shaped during the search: by half of the modes that data determine."""
 FINE = Richness(90, (17, 25), SOMETHING_LEFT)
 """How finely metal is shaped in the last fit, which is made once."""
 
@@ -275,19 +364,18 @@ FINE = Richness(90, (17, 25), SOMETHING_LEFT)
 def settled(fitter: Fitter, terms: Sequence[Term], richness: Richness = COARSE) -> Fit:
     """Return the joint fit of some effects, metal shaped and then held where it is.
 
-    ``terms``: start values; remainders of metal among them are made again; ``richness``: how
-    finely metal is shaped.
+    ``terms``: start values; remainders of metal among them are made again.
     """
     plain = [term.free() for term in terms if term.effect.family is not Family.REMAINDER]
     bodies = [term.effect.body(term) for term in plain]
     # What moves and has its shape already is reshaped below.
     known = any(body is not None and body.richness is not None for body in bodies)
     fit = fitter.fit(plain, 1 if known else None)
-    shaping, remainders = Shaping(fitter, richness), Remainders(fitter, richness)
+    shaping = Shaping(fitter, richness)
     for index in range(len(fit.terms)):
         fit = shaping.shaped(fit, index)
     for index in range(len(fit.terms)):
-        fit = remainders.added(fit, index)
+        fit = shaping.with_remainder(fit, index)
     return _held(fit, fitter)
 
 
@@ -295,8 +383,8 @@ def _held(fit: Fit, fitter: Fitter) -> Fit:
     """The same fit, metal held where it is: what is tried with it is then cheap to fit."""
     if not any(term.effect.family.is_metal for term in fit.terms):
         return fit
-    held = [
-        term.hold(fit.covariance_of(index)) if term.effect.family.is_metal else term
-        for index, term in enumerate(fit.terms)
-    ]
-    return fitter.fit(held, 1)
+    terms = fit.terms
+    for index, term in enumerate(fit.terms):
+        if term.effect.family.is_metal:
+            terms = _with(terms, index, term.hold(fit.covariance_of(index)))
+    return fitter.fit(terms, 1)

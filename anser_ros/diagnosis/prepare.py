@@ -1,9 +1,6 @@
-"""Makes a problem of measurements: the emitters' field everywhere, bins of references, time
-blocks.
-"""
+"""Makes a problem of measurements: the emitters' field, bins of references, blocks of time."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,28 +13,17 @@ from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import field_basis, flux_basis
-from anser_ros.physics.sensor import SensorTable
-from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 VOLUME_ERROR = 1e-3
-"""Relative error that the fit allows the model in the volume, a quarter of a reference's
-(`reference_gain`): calibrated models are better than that."""
+"""Relative error that the fit allows the model in the volume, a quarter of a reference's."""
 LEAST_ERROR = 1e-5
-"""Relative error that references are given at least, so that exact ones do not divide by zero."""
+"""Relative error that references have at least, so that exact ones do not divide by zero."""
 DRAWING_ERROR = 0.05
 """Prior spread of the sheet's moments about the drawn ones, as a share of their rms: a coil's
 moment is off by 2 % (`nominal.Tolerances`), and half a millimetre moves a few percent of it."""
-
-
-class CleanReferences(NamedTuple):
-    """Holds reference sensors, their clean readings, (R, K), T, and their relative gain error."""
-
-    sensors: SensorTable
-    flux: ComplexArray
-    gain_error: float = Accuracy.reference_gain
 
 
 def board_box(model: FieldModel) -> Array:
@@ -51,13 +37,14 @@ def fit_illumination(
     model: FieldModel,
     drawn: FieldModel | None,
     points: Array,
-    references: CleanReferences | None,
+    references: References | None,
+    gain_error: float,
 ) -> Dipoles:
     """Return a sheet of dipoles that is good in the volume, at the references and below the board.
 
-    ``model``: trusted at ``points``; ``drawn``: the nominal model of the setup's geometry; None
-    where it has none, and the model itself is all that there is; ``points`` (P, 3): some places in
-    the volume, m.
+    ``model``: trusted at ``points`` (P, 3), m, in the volume; ``drawn``: the nominal model of the
+    setup's geometry, without which the model itself is all that there is; ``gain_error``: relative
+    error of the references' gains.
     """
     if drawn is None:
         return Dipoles(model.positions, model.directions, model.moments)
@@ -65,15 +52,17 @@ def fit_illumination(
     basis = field_basis(points, place, direction).transpose(0, 2, 1).reshape(-1, len(place))
     wanted = Dipoles(model.positions, model.directions, model.moments).field(points)
     wanted = wanted.reshape(-1, wanted.shape[2])
-    start = drawn.moments * _gains(basis @ drawn.moments, wanted)
+    # Complex gain of each emitter that brings the drawn field nearest to the wanted one.
+    near = basis @ drawn.moments
+    power = np.sum(np.abs(near) ** 2, axis=0)
+    gain = np.sum(near.conj() * wanted, axis=0) / np.where(power > 0, power, 1.0)
+    start = drawn.moments * gain
     scale = VOLUME_ERROR * np.sqrt(np.mean(np.abs(wanted) ** 2))
     rows, values = [basis / scale], [(wanted - basis @ start) / scale]
     if references is not None:
-        good = np.isfinite(references.flux).all(axis=1)
-        s = references.sensors.select(np.flatnonzero(good))
+        s, clean = references.readings.sensors, references.baseline
         sheet = flux_basis(s.position, s.axis, s.length, place, direction)
-        clean = references.flux[good]
-        weight = max(references.gain_error, LEAST_ERROR) * np.sqrt(np.mean(np.abs(clean) ** 2))
+        weight = max(gain_error, LEAST_ERROR) * np.sqrt(np.mean(np.abs(clean) ** 2))
         rows.append(sheet / weight)
         values.append((clean - sheet @ start) / weight)
     spread = DRAWING_ERROR * np.sqrt(np.mean(np.abs(start) ** 2))
@@ -81,12 +70,6 @@ def fit_illumination(
     normal = matrix.T @ matrix + np.eye(len(place))
     change = np.linalg.solve(normal, matrix.T @ target) * spread
     return Dipoles(place, direction, start + change)
-
-
-def _gains(drawn: ComplexArray, wanted: ComplexArray) -> ComplexArray:
-    """Complex gain of each emitter that brings the drawn field nearest to the wanted one."""
-    power = np.sum(np.abs(drawn) ** 2, axis=0)
-    return np.asarray(np.sum(drawn.conj() * wanted, axis=0) / np.where(power > 0, power, 1.0))
 
 
 BLOCKS = 25
@@ -148,8 +131,7 @@ def build_problem(
         raise DiagnosisError(
             f'all {count} optical poses are the same: a diagnosis needs a tool that moves'
         )
-    ends = [tool.time for tool in posed]
-    start, end = min(t[0] for t in ends), max(t[-1] for t in ends)
+    start, end = min(tool.time[0] for tool in posed), max(tool.time[-1] for tool in posed)
     edges = np.linspace(start, end + 1e-9, BLOCKS + 1)
     references, reference_blocks = None, np.zeros(0, dtype=np.int64)
     if reference is not None and baseline is not None:
@@ -157,13 +139,9 @@ def build_problem(
     if references is not None:
         reference_blocks = _numbers(references.readings.time, edges)
     centres = np.concatenate([tool.placed()[0].reshape(-1, 3) for tool in posed])
-    clean = None
-    if references is not None:
-        clean = CleanReferences(
-            references.readings.sensors, references.baseline, spread.accuracy.reference_gain
-        )
     some = centres[:: max(1, centres.shape[0] // POINTS)]
-    illumination = fit_illumination(model, drawn, some, clean)
+    gain_error = spread.accuracy.reference_gain
+    illumination = fit_illumination(model, drawn, some, references, gain_error)
     omega = 2 * np.pi * np.asarray(model.frequencies_hz)
     fields = Fields(Dipoles(model.positions, model.directions, model.moments), illumination, omega)
     apparatus = Apparatus(
@@ -176,11 +154,16 @@ def build_problem(
         visited_box=np.stack([centres.min(axis=0), centres.max(axis=0)]),
         board=board_box(drawn or model),
     )
-    blocks = tuple(_numbers(tool.time, edges) for tool in posed)
-    good = tuple(tool.valid.copy() for tool in posed)
-    gaps_t = tuple(_gaps_t(tool, model) for tool in posed)
     return Problem(
-        posed, blocks, references, reference_blocks, fields, apparatus, spread, good, gaps_t
+        tools=posed,
+        blocks=tuple(_numbers(tool.time, edges) for tool in posed),
+        references=references,
+        reference_blocks=reference_blocks,
+        fields=fields,
+        apparatus=apparatus,
+        spread=spread,
+        good=tuple(tool.valid.copy() for tool in posed),
+        gaps_t=tuple(_gaps_t(tool, model) for tool in posed),
     )
 
 
@@ -214,6 +197,8 @@ def _binned(reference: Measurements, baseline: ComplexArray, edges: Array) -> Re
     inside = (readings.time >= fine[0]) & (readings.time < fine[-1])
     readings = readings.frames(np.flatnonzero(inside))
     number = np.searchsorted(fine, readings.time, side='right') - 1
+    if number.size == 0:
+        return None
     flux, count, time = [], [], []
     for bin_number in np.unique(number):
         rows = number == bin_number
@@ -223,10 +208,7 @@ def _binned(reference: Measurements, baseline: ComplexArray, edges: Array) -> Re
         flux.append(total / np.maximum(n, 1)[:, None])
         count.append(n)
         time.append(float(readings.time[rows].mean()))
-    n_bins = len(time)
-    if n_bins == 0:
-        return None
-    counts = np.array(count)
+    counts, n_bins = np.array(count), len(time)
     binned = Measurements(
         body=readings.body, sensors=readings.sensors, time=np.array(time), flux=np.array(flux),
         valid=counts > 0, flags=np.zeros(counts.shape, dtype=np.int64),

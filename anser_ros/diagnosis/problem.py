@@ -1,6 +1,4 @@
-"""Sets a session up for diagnosis: whitening, what was measured, what is expected, and its
-size.
-"""
+"""Sets a session up for diagnosis: what was measured, what is expected, and its whitening."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -23,12 +21,11 @@ REFERENCE_CHANGE = 0.01
 """Relative error of the change that a reference sensor with the default survey errors sees."""
 CHANGE_LENGTH_M = 0.03
 """Way over which what metal does to a reference changes by its own size, m: a third of the
-distance (a dipole's field falls with its cube), for metal some 10 cm away."""
+distance, for metal some 10 cm away."""
 FRAMES_AT_ONCE = 16
-"""Frames that are whitened at once: a megabyte or two, which stay in the cache from one
-product to the next."""
+"""Frames that are whitened at once: a megabyte or two, which stay in the cache."""
 FRAMES_A_THREAD = 8 * FRAMES_AT_ONCE
-"""Frames that one thread whitens, a millisecond's work: a few, and handing over takes longer."""
+"""Frames that one thread whitens, a millisecond's work."""
 
 
 def _survey_share(accuracy: Accuracy) -> float:
@@ -105,10 +102,9 @@ class Whitener:
 
     def rows(self, frames: NDArray[np.int64]) -> 'Whitener':
         """Return the whitener of some frames, chosen by index."""
-        basis = None if self.basis is None else self.basis[frames]
-        return Whitener(
-            self.weight[frames], basis, None if self.inner is None else self.inner[frames]
-        )
+        if self.basis is None or self.inner is None:
+            return Whitener(self.weight[frames])
+        return Whitener(self.weight[frames], self.basis[frames], self.inner[frames])
 
     def first(self, count: int) -> 'Whitener':
         """Return the whitener with only the first ``count`` directions."""
@@ -190,10 +186,7 @@ class Problem:
 
     def in_blocks(self, wanted: NDArray[np.int64], step: int = 1) -> 'Problem':
         """Return every ``step``-th frame of some blocks, with the bins of those blocks."""
-        keep = []
-        for blocks in self.blocks:
-            rows = np.flatnonzero(np.isin(blocks, wanted))
-            keep.append(rows[::step])
+        keep = [np.flatnonzero(np.isin(blocks, wanted))[::step] for blocks in self.blocks]
         return self.frames(keep, np.flatnonzero(np.isin(self.reference_blocks, wanted)))
 
 
@@ -211,6 +204,13 @@ class Part:
     def count(self) -> int:
         """Return the number of values that have a weight."""
         return int(np.count_nonzero(self.whitener.weight))
+
+    def frames(self, rows: NDArray[np.int64]) -> 'Part':
+        """Return the part of some frames, chosen by index."""
+        return Part(
+            self.view.frames(rows), self.residual[rows], self.whitener.rows(rows),
+            self.white[rows], self.blocks[rows],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,8 @@ def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
             continue
         view = tool_view(tool, terms, problem.fields)
         residual = parts(np.where(good[..., None], tool.flux - view.flux, 0.0))
-        weight = _repeat(good / np.hypot(problem.spread.flux_t, gaps_t), tool.flux.shape[2])
+        weight = good / np.hypot(problem.spread.flux_t, gaps_t)
+        weight = np.tile(np.repeat(weight, tool.flux.shape[2], axis=1), 2)
         pose = pose_jacobian(view) * problem.spread.accuracy.pose_jitter
         whitener = Whitener.of(weight, _with_free(pose, terms, view), pose.shape[2])
         found.append(Part(view, residual, whitener, whitener(residual), blocks))
@@ -263,20 +264,16 @@ def _with_free(known: Array, terms: Sequence[Term], view: View) -> Array:
     return np.concatenate([known, *(parts(d) for d in found if d is not None)], axis=2)
 
 
-def _repeat(per_sensor: Array, emitters: int) -> Array:
-    """Weights (F, S) for all parts of a sensor, (F, 2 S K)."""
-    one = np.repeat(per_sensor, emitters, axis=1)
-    return np.concatenate([one, one], axis=1)
-
-
 def _reference_part(problem: Problem, references: References, terms: Sequence[Term]) -> Part:
-    readings = references.readings
-    view = reference_view(readings, references.baseline, terms, problem.fields)
-    good = readings.valid
+    readings, good = references.readings, references.readings.valid
+
+    def predicted(some: Sequence[Term]) -> View:
+        return reference_view(readings, references.baseline, some, problem.fields)
+
+    view = predicted(terms)
     residual = parts(np.where(good[..., None], readings.flux - view.flux, 0.0))
     # A survey error is the same in every bin: shared among B bins it must count B times as much.
-    exact = [term for term in terms if term.effect.remedy is not Remedy.FIELD]
-    unchanged = reference_view(readings, references.baseline, exact, problem.fields)
+    unchanged = predicted([term for term in terms if term.effect.remedy is not Remedy.FIELD])
     change = np.where(good[..., None], readings.flux - unchanged.flux, 0.0)
     size = np.sqrt(np.mean(np.abs(change) ** 2, axis=2, keepdims=True) / 2)
     noise = problem.spread.flux_t / np.sqrt(np.maximum(references.count, 1))
@@ -285,12 +282,11 @@ def _reference_part(problem: Problem, references: References, terms: Sequence[Te
     gradient = np.zeros_like(view.flux.real)
     for term in terms:
         if term.effect.gradient_error:
-            alone = reference_view(readings, references.baseline, [term], problem.fields)
-            shifted = np.abs(alone.flux - references.baseline)
+            shifted = np.abs(predicted([term]).flux - references.baseline)
             gradient += term.effect.gradient_error * shifted * together
     spread = np.sqrt(noise[..., None] ** 2 + survey**2 + gradient**2)
     weight = np.where(good[..., None], 1 / spread, 0.0).reshape(good.shape[0], -1)
-    weight = np.concatenate([weight, weight], axis=1)
+    weight = np.tile(weight, 2)
     free = _with_free(np.zeros((*weight.shape, 0)), terms, view)
     whitener = Whitener.of(weight, free) if free.shape[2] else Whitener(weight)
     return Part(view, residual, whitener, whitener(residual), problem.reference_blocks)
@@ -303,8 +299,9 @@ def tool_parts(state: State) -> list[Part]:
 
 def tools_misfit(state: State) -> float:
     """Return the mean square of the tools' whitened residuals."""
-    squares = sum(float(np.sum(part.white**2)) for part in tool_parts(state))
-    return squares / max(sum(part.count for part in tool_parts(state)), 1)
+    tools = tool_parts(state)
+    squares = sum(float(np.sum(part.white**2)) for part in tools)
+    return squares / max(sum(part.count for part in tools), 1)
 
 
 def rms(state: State) -> float:

@@ -7,21 +7,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import chdtri
 
-from anser_ros.diagnosis.decisions import (
-    BETTER,
-    DEAD,
-    FRAME_RATIO,
-    JUMP_RATIO,
-    LEAST_CHANNEL_SHARE,
-    OTHERS_CORRELATION,
-    OWN_CORRELATION,
-    PLACE_RATIO,
-    POLARITY_GAIN,
-    RARE,
-    READING_RATIO,
-    WHOLE_FRAME_SHARE,
-)
-from anser_ros.diagnosis.problem import Problem, State, evaluate
+from anser_ros.diagnosis import decisions
+from anser_ros.diagnosis.problem import Problem, State, evaluate, tool_parts
 from anser_ros.effects.effect import Family, Site, Term
 from anser_ros.effects.wiring import DEAD_CHANNEL, SENSOR_POLARITY, SWAPPED_CHANNELS, SWAPPED_COILS
 
@@ -29,18 +16,15 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WINDOW = 11
-"""Neighbouring frames, this one among them, whose median an outlier stands out from: up to five
-bad ones in a row are seen, and motion changes little over so many."""
+"""Neighbouring frames whose median an outlier stands out from: up to five bad ones in a row."""
 
 
-def find_outliers(state: State) -> tuple[Mask, ...]:
-    """Return masks (F, S) of outlying readings, one per tool; or of whole frames."""
-    masks = []
+def without_outliers(problem: Problem, state: State) -> Problem:
+    """Return the problem without readings and whole frames that stand out in a state of it."""
+    kept = []
     moves = any(term.effect.family is Family.FLUCTUATION for term in state.terms)
-    for part, tool, good in zip(
-        state.parts, state.problem.tools, state.problem.good, strict=False
-    ):
-        emitters = state.problem.fields.omega.size
+    emitters = problem.fields.omega.size
+    for part, tool, good in zip(state.parts, problem.tools, problem.good, strict=False):
         # The residual along the pose's own directions is left in: an optical glitch shows there.
         size = (part.residual * part.whitener.weight) ** 2
         white = part.white**2
@@ -49,15 +33,15 @@ def find_outliers(state: State) -> tuple[Mask, ...]:
         frames = np.where(good, readings, 0.0).sum(axis=1) / count
         jumps = np.where(good, _by_reading(size, good.shape[1], emitters), 0.0).sum(axis=1) / count
         values = _values(white, good.shape[1], emitters)
-        of_reading = of_frame = PLACE_RATIO
+        of_reading = of_frame = decisions.PLACE_RATIO
         if tool.track is None or tool.is_followed:
-            of_reading = _ratio(READING_RATIO, values)
-            of_frame = _ratio(FRAME_RATIO, values * good.shape[1])
+            of_reading = _ratio(decisions.READING_RATIO, values)
+            of_frame = _ratio(decisions.FRAME_RATIO, values * good.shape[1])
         bad = _stands_out(readings, of_reading) | _stands_out(frames[:, None], of_frame)
         if not moves:
-            bad |= _stands_out(jumps[:, None], JUMP_RATIO)
-        masks.append(bad & good)
-    return tuple(masks)
+            bad |= _stands_out(jumps[:, None], decisions.JUMP_RATIO)
+        kept.append(good & ~bad)
+    return replace(problem, good=tuple(kept))
 
 
 def _by_reading(values: Array, sensors: int, emitters: int) -> Array:
@@ -74,7 +58,7 @@ def _values(values: Array, sensors: int, emitters: int) -> int:
 
 def _ratio(usual: float, values: int) -> float:
     """Mean square of so many values beyond which it is no noise."""
-    return max(usual, float(chdtri(values, RARE)) / values)
+    return max(usual, float(chdtri(values, decisions.RARE)) / values)
 
 
 def _stands_out(values: Array, ratio: float) -> Mask:
@@ -83,33 +67,25 @@ def _stands_out(values: Array, ratio: float) -> Mask:
     return np.asarray(values > ratio * np.maximum(local, 1.0))
 
 
-def without_outliers(problem: Problem, state: State) -> Problem:
-    """Return the problem with outlying readings left out."""
-    masks = find_outliers(state)
-    good = tuple(g & ~bad for g, bad in zip(problem.good, masks, strict=True))
-    return replace(problem, good=good)
-
-
 def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
-    """Return the share of frames that lost a reading, and the channels that lost most of them.
-
-    The list is empty if whole frames are outliers.
+    """Return the share of frames that lost a reading, and the channels that lost most of them;
+    no channels if whole frames are outliers.
     """
-    lost_frames, frames = 0, 0
+    lost_frames, frames, whole = 0, 0, 0
     by_channel: dict[int, int] = {}
-    whole = 0
     for tool, old, new in zip(before.tools, before.good, after.good, strict=True):
         lost = old & ~new
         lost_frames += int(lost.any(axis=1).sum())
-        whole += int((lost.sum(axis=1) > WHOLE_FRAME_SHARE * old.sum(axis=1).clip(1)).sum())
+        whole += int(
+            (lost.sum(axis=1) > decisions.WHOLE_FRAME_SHARE * old.sum(axis=1).clip(1)).sum()
+        )
         frames += tool.time.size
-        for row, channel in enumerate(tool.sensors.channel.tolist()):
-            by_channel[channel] = int(lost[:, row].sum())
+        by_channel |= dict(zip(tool.sensors.channel.tolist(), lost.sum(axis=0), strict=True))
     share = lost_frames / max(frames, 1)
-    if whole > WHOLE_FRAME_SHARE * max(lost_frames, 1):
+    if whole > decisions.WHOLE_FRAME_SHARE * max(lost_frames, 1):
         return share, []
     return share, [
-        c for c, n in by_channel.items() if n > LEAST_CHANNEL_SHARE * max(lost_frames, 1)
+        c for c, n in by_channel.items() if n > decisions.LEAST_CHANNEL_SHARE * max(lost_frames, 1)
     ]
 
 
@@ -130,15 +106,15 @@ def wiring_faults(problem: Problem) -> list[Term]:
     faults: list[Term] = []
     dead: list[int] = []
     turned: list[int] = []
-    for number, part in enumerate(p for p in state.parts if not p.view.is_reference):
-        tool = state.problem.tools[number]
-        usable = state.problem.good[number]
+    for part, tool, usable in zip(tool_parts(state), problem.tools, problem.good, strict=False):
         channels, silent = tool.sensors.channel, _silent(tool.flux, part.view.flux, usable)
         dead += channels[silent].tolist()
         gain, alike = _likeness(tool.flux, part.view.flux, usable)
         own = np.diag(alike)
         turned += channels[
-            (np.abs(np.diag(gain) + 1) < POLARITY_GAIN) & (own > OWN_CORRELATION) & ~silent
+            (np.abs(np.diag(gain) + 1) < decisions.POLARITY_GAIN)
+            & (own > decisions.OWN_CORRELATION)
+            & ~silent
         ].tolist()
         order = np.argmax(alike, axis=1)
         moved = _moved(alike, ~silent)
@@ -170,7 +146,7 @@ def _silent(seen: ComplexArray, wanted: ComplexArray, good: Mask) -> Mask:
     """Mask (S,) of sensors with hardly any of the reading that they should have."""
     power = np.where(good[..., None], np.abs(seen) ** 2, 0.0).sum(axis=(0, 2))
     expected = np.where(good[..., None], np.abs(wanted) ** 2, 0.0).sum(axis=(0, 2))
-    return np.asarray((power < DEAD**2 * expected) & (expected > 0))
+    return np.asarray((power < decisions.DEAD**2 * expected) & (expected > 0))
 
 
 def _likeness(seen: ComplexArray, wanted: ComplexArray, good: Mask) -> tuple[ComplexArray, Array]:
@@ -191,8 +167,8 @@ def _moved(alike: Array, is_driven: Mask) -> NDArray[np.int64]:
     moved = rows[
         (order != rows)
         & is_driven
-        & (best > OTHERS_CORRELATION)
-        & (1 - best**2 < BETTER * (1 - own**2))
+        & (best > decisions.OTHERS_CORRELATION)
+        & (1 - best**2 < decisions.BETTER * (1 - own**2))
     ]
     return np.asarray(moved if set(order[moved]) == set(moved) else moved[:0])
 
@@ -202,8 +178,8 @@ def _swapped_coils(state: State) -> Term | None:
     emitters = state.problem.fields.omega.size
     cross = np.zeros((emitters, emitters), dtype=complex)
     power, own = np.zeros(emitters), np.zeros(emitters)
-    tools = [p for p in state.parts if not p.view.is_reference]
-    for part, tool, good in zip(tools, state.problem.tools, state.problem.good, strict=False):
+    problem = state.problem
+    for part, tool, good in zip(tool_parts(state), problem.tools, problem.good, strict=False):
         read = np.where(good[..., None], tool.flux, 0.0)
         wanted = np.where(good[..., None], part.view.flux, 0.0)
         cross += np.einsum('fsb,fsa->ab', wanted.conj(), read)

@@ -1,12 +1,11 @@
-"""Searches which effects hold: added one by one while they pay on held-out blocks, then thinned
-out.
+"""Searches which effects hold: added one by one while they pay on held-out blocks, then thinned.
 
 Every candidate is first scored by its linear columns (a score test beside the active effects).
 The best ones are fitted in full, and the best of these is taken, or a simpler one that is as good.
-Effects that others have made superfluous are removed. The numbers by which this is decided are in
-`anser_ros.diagnosis.decisions`.
+Effects that others have made superfluous are removed (`anser_ros.diagnosis.decisions`).
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -84,11 +83,7 @@ def search_effects(
     settings: SearchSettings | None = None,
     progress: Progress | None = None,
 ) -> Search:
-    """Find the effects that explain a problem on some blocks of time.
-
-    ``start`` are effects that are known already (polarities, for example); ``progress`` is called
-    with words on what has been found.
-    """
+    """Find the effects that explain a problem on some blocks of time, beside given ones."""
     how = settings or SearchSettings()
     fitter = how.fitter(problem, blocks)
     search = Search(fitter.fit(start))
@@ -146,13 +141,9 @@ class _FluxSelection(ForwardSelection[Fit]):
         search.rivals[term.label] = _rivals(gain, best, fitted)
         if term.effect.family is Family.MOVING_METAL:
             return moves_or_rests(self._fitter, best, fitted, self._scored, gain)
-        search.close[term.label] = [
-            f.newest
-            for g, f in fitted
-            if f is not best
-            and g > decisions.STEADY * gain
-            and f.newest.effect.family is Family.STEADY
-        ]
+        near = [f for g, f in fitted if f is not best and g > decisions.STEADY * gain]
+        steady = [f.newest for f in near if f.newest.effect.family is Family.STEADY]
+        search.close[term.label] = steady
         if any(t.effect.family.is_metal for t in best.terms):
             return settled(self._fitter, best.terms)
         return best
@@ -181,11 +172,7 @@ class _FluxSelection(ForwardSelection[Fit]):
         return None
 
     def _simplified(self, fit: Fit) -> Fit:
-        """Take a simpler effect for an earlier one where, beside the newest, it is as good.
-
-        An effect that was taken while much was unexplained may have been chosen because its
-        parameters absorbed part of another effect.
-        """
+        """Take a simpler effect for an earlier one, which may have absorbed part of the newest."""
         search = self._search
         for term in fit.terms[:-1]:
             if term.effect.family is not Family.STEADY:
@@ -230,18 +217,14 @@ class _FluxSelection(ForwardSelection[Fit]):
         """All candidates that are not active already, best first."""
         candidates = _candidates(self._fitter.problem, scorer.state.terms)
 
-        def score(few: slice) -> list[Score | None]:
-            return [
-                None
-                if left_over(scorer.state, term) < decisions.DISTINGUISHABLE
-                else scorer.score(term)
-                for term in candidates[few]
-            ]
+        def scored(few: slice) -> list[tuple[Term, Score]]:
+            least = decisions.DISTINGUISHABLE
+            left = [term for term in candidates[few] if left_over(scorer.state, term) >= least]
+            pairs = [(term, scorer.score(term)) for term in left]
+            return [(term, score) for term, score in pairs if score is not None]
 
-        parts = in_order(score, slices(len(candidates), CANDIDATES_A_THREAD))
-        pairs = zip(candidates, chain.from_iterable(parts), strict=True)
-        scored = [(term, found) for term, found in pairs if found is not None]
-        return sorted(scored, key=lambda pair: pair[1].held_out)
+        parts = in_order(scored, slices(len(candidates), CANDIDATES_A_THREAD))
+        return sorted(chain.from_iterable(parts), key=lambda pair: pair[1].held_out)
 
 
 def _candidates(problem: Problem, taken: Sequence[Term]) -> list[Term]:
@@ -290,17 +273,11 @@ def _fluctuating(problem: Problem, before: Fit) -> list[tuple[float, Term]]:
     least = max(
         decisions.LEAST_GAIN, decisions.LEAST_OF_EXCESS * excess, decisions.LEAST_OF_NOISE * count
     )
-    found = []
-    for effect in all_effects().values():
-        if effect.family is not Family.FLUCTUATION:
-            continue
-        for term in effect.candidates(problem.apparatus):
-            if is_covered(term, before.terms):
-                continue
-            likeliest = fluctuation_of(before.state, term)
-            if likeliest is not None and likeliest[0] > least:
-                found.append(likeliest)
-    return sorted(found, key=lambda pair: -pair[0])[: decisions.OPEN_FINALISTS]
+    effects = [e for e in all_effects().values() if e.family is Family.FLUCTUATION]
+    terms = [term for effect in effects for term in effect.candidates(problem.apparatus)]
+    found = [fluctuation_of(before.state, t) for t in terms if not is_covered(t, before.terms)]
+    worth = [pair for pair in found if pair is not None and pair[0] > least]
+    return sorted(worth, key=lambda pair: -pair[0])[: decisions.OPEN_FINALISTS]
 
 
 def _finalists(
@@ -308,16 +285,14 @@ def _finalists(
 ) -> list[tuple[float, Term]]:
     """Expected gain and start values of the best candidates, few of each effect."""
     out: list[tuple[float, Term]] = []
-    count: dict[str, int] = {}
+    sites: Counter[str] = Counter()
     for term, score in scored:
         gain = scorer.held_out - score.held_out
-        name = term.effect.name
         if len(out) >= how.finalists or gain < decisions.LEAST_GAIN:
             break
-        if count.get(name, 0) >= decisions.SITES_PER_EFFECT:
-            continue
-        count[name] = count.get(name, 0) + 1
-        out += [(gain, start) for start in term.effect.started(term, score.solution)]
+        if sites[term.effect.name] < decisions.SITES_PER_EFFECT:
+            sites[term.effect.name] += 1
+            out += [(gain, start) for start in term.effect.started(term, score.solution)]
     return out
 
 

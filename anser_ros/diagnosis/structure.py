@@ -6,25 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from anser_ros.diagnosis.decisions import (
-    LEAST_CORRELATION,
-    LEAST_DEPENDENCE,
-    NOT_NORMAL,
-    SHARED,
-    SIGNIFICANT,
-    WITH_SIZE,
-)
+from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.problem import Part, State, tool_parts
 
 Array = NDArray[np.float64]
 
 BINS = 12
-"""Cells into which frames are binned by one variable: tens of frames in each of a session of some
-hundreds."""
+"""Cells into which frames are binned by one variable, tens of frames in each."""
 BINNED = ('time', 'position', 'orientation', 'speed', 'amplitude')  # by which frames are binned
 FEWEST_CELL_VALUES = 4
-"""Values that a cell needs for its mean to be compared: the mean of four is uncertain by half of
-what one value is, and cells of fewer would add more noise than information."""
+"""Values that a cell needs for its mean to be compared: fewer add more noise than information."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +29,7 @@ class StructureTest:
     @property
     def significant(self) -> bool:
         """Return whether noise hardly does that, and it matters."""
-        return self.probability < SIGNIFICANT and self.share > LEAST_DEPENDENCE
+        return self.probability < decisions.SIGNIFICANT and self.share > decisions.LEAST_DEPENDENCE
 
 
 def structure_tests(state: State) -> list[StructureTest]:
@@ -75,11 +66,10 @@ def noise_scale(state: State) -> float:
 
 
 def noise_t(state: State) -> float:
-    """Return the noise of a phasor component, T: the white part, without the pose's own
-    directions.
+    """Return the noise of a phasor component, T: the white part.
 
-    Along those six directions of a frame the residual is as large as the jitter's prior allows,
-    whatever the noise; they are not counted.
+    The six directions of a frame's pose are not counted: the residual along them is as large as
+    the jitter's prior allows, whatever the noise.
     """
     tools = tool_parts(state)
     count = sum(part.count for part in tools)
@@ -108,8 +98,7 @@ def _cells(part: Part, name: str) -> list[NDArray[np.int64]]:
     if name == 'speed':
         x, y, z = view.velocity[:, :3].T
     else:
-        # The turn from the middle frame's orientation, by its components: any orientation that
-        # the tool is near to serves, as the cells are quantiles.
+        # The turn from the middle frame's orientation, by its components.
         turn = view.rotation[len(view.rotation) // 2].T @ view.rotation
         x, y, z = (turn[:, b, a] - turn[:, a, b] for a, b in ((1, 2), (2, 0), (0, 1)))
     return [_quantiles(x, 3) * 9 + _quantiles(y, 3) * 3 + _quantiles(z, 3)]
@@ -132,48 +121,32 @@ def _binned(parts: list[Part], name: str, noise: float) -> StructureTest:
                 use = n >= FEWEST_CELL_VALUES
                 explained += float(np.sum(sums[use] ** 2 / n[use]))
                 cells += int(use.sum())
-    return _verdict(name, explained, cells, total, noise)
+    share = max(explained - cells * noise, 0.0) / max(total, 1e-300)
+    return StructureTest(name, share, float(chdtrc(max(cells, 1), explained / noise)))
 
 
 def _grouped(parts: list[Part], name: str, noise: float) -> StructureTest:
-    squares: dict[int, float] = {}
-    counts: dict[int, int] = {}
+    groups, squares, counts = [], [], []
     for part in parts:
-        sensors, emitters = part.view.flux.shape[1:]
-        shape = (2, sensors, emitters)
-        quadrature, sensor, emitter = (a.ravel() for a in np.indices(shape))
+        quadrature, sensor, emitter = np.indices((2, *part.view.flux.shape[1:])).reshape(3, -1)
         channels = part.view.sensors.channel[sensor]
-        group = {'channel': channels, 'emitter': emitter, 'quadrature': quadrature}[name]
+        groups.append({'channel': channels, 'emitter': emitter, 'quadrature': quadrature}[name])
         good = part.whitener.weight > 0
-        for value in np.unique(group):
-            columns = group == value
-            squares[int(value)] = squares.get(int(value), 0.0) + float(
-                np.sum((part.white[:, columns] * good[:, columns]) ** 2)
-            )
-            counts[int(value)] = counts.get(int(value), 0) + int(good[:, columns].sum())
-    total = sum(squares.values())
-    excess, statistic = 0.0, 0.0
-    for value, square in squares.items():
-        n = max(counts[value], 1)
-        over = square / n / noise - 1.0
-        statistic += over**2 * n / 2
-        excess += max(square - n * noise, 0.0)
-    probability = float(chdtrc(max(len(squares), 1), statistic))
-    return StructureTest(name, excess / max(total, 1e-300), probability)
-
-
-def _verdict(name: str, explained: float, cells: int, total: float, noise: float) -> StructureTest:
-    share = max(explained - cells * noise, 0.0) / max(total, 1e-300)
-    probability = float(chdtrc(max(cells, 1), explained / noise))
-    return StructureTest(name, share, probability)
+        squares.append(np.sum((part.white * good) ** 2, axis=0))
+        counts.append(good.sum(axis=0))
+    _, label = np.unique(np.concatenate(groups), return_inverse=True)
+    square, n = (np.bincount(label, np.concatenate(each)) for each in (squares, counts))
+    n = np.maximum(n, 1)
+    statistic = float(np.sum((square / n / noise - 1.0) ** 2 * n / 2))
+    excess = float(np.sum(np.maximum(square - n * noise, 0.0)))
+    probability = float(chdtrc(n.size, statistic))
+    return StructureTest(name, excess / max(float(square.sum()), 1e-300), probability)
 
 
 LAGS = 12
-"""Frames back to which a memory is looked for: half a second at 25 Hz. Fewer overlook a slow
-course, and each further one is one more chance for noise to pass the bound."""
+"""Frames back to which a memory is looked for: half a second at 25 Hz."""
 OUTLYING = 4.5
-"""Standard deviations beyond which a value is not used here, once in 150,000: outliers are judged
-elsewhere, and one alone would make a kurtosis."""
+"""Standard deviations beyond which a value is not used here: one alone would make a kurtosis."""
 
 
 @dataclass(frozen=True)
@@ -194,18 +167,18 @@ class Whiteness:
     def depends_on(self) -> tuple[str, ...]:
         """Return what they depend on, in the words of `docs/interfaces.md`."""
         found: list[str] = []
-        if self.memory > LEAST_CORRELATION:
+        if self.memory > decisions.LEAST_CORRELATION:
             found.append('time')
-        if self.shared > SHARED:
+        if self.shared > decisions.SHARED:
             found += ['channel', 'emitter']
-        if self.with_size > WITH_SIZE or abs(self.kurtosis) > NOT_NORMAL:
+        if self.with_size > decisions.WITH_SIZE or abs(self.kurtosis) > decisions.NOT_NORMAL:
             found.append('amplitude')
         return tuple(found)
 
 
 def whiteness(state: State) -> Whiteness:
     """Test the tools' whitened residuals, each value over the spread of its own kind."""
-    tools = [p for p in state.parts if not p.view.is_reference and p.white.shape[0] > 2 * LAGS]
+    tools = [part for part in tool_parts(state) if part.white.shape[0] > 2 * LAGS]
     if not tools:
         return Whiteness(0.0, 0.0, 0.0, 0.0)
     values = [_scaled(part) for part in tools]

@@ -35,10 +35,12 @@ class BaseEffect(Generic[AnyTerm]):
     units: ClassVar[Mapping[str, str]] = {}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {}
     remedy: ClassVar[Remedy] = Remedy.NONE
+    # standard deviation of each parameter, or of all, before anything is measured
+    typical: ClassVar[float | tuple[float, ...]] = 1.0
 
     def prior(self, term: AnyTerm) -> Array:
         """Return each parameter's standard deviation before anything is measured, shape (q,)."""
-        return np.ones(term.theta.size)
+        return np.full(term.theta.size, self.typical)
 
     def bounded(self, term: AnyTerm) -> AnyTerm:
         """Return the term with its parameters brought back into their domain."""

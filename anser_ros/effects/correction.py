@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import Effect, Remedy, Term
+from anser_ros.effects.prediction import true_track
 from anser_ros.effects.registry import effect_named
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
@@ -23,34 +24,21 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 DECOMPRESSION_STEPS = 12
-"""Most steps of the fixed point that undoes a compression. Each step
-leaves of the error about the share that the compression takes of a change of the signal, so a few
-steps settle it wherever a channel is of any use; the bound keeps a hopeless one from looping."""
-
+"""Most steps of the fixed point that undoes a compression. Each leaves of the error about the
+share that the compression takes of a change of the signal; the bound keeps a hopeless one from
+looping."""
 
 LIVE = (Remedy.FLUX, Remedy.SENSORS)
 """Remedies of effects that a tracker undoes; those of the field are in the model's dipoles."""
 
 
 def drifts(record: EffectRecord) -> bool:
-    """Return whether a record's course over time is one that another session doesn't repeat.
-
-    Raises
-    ------
-    ModelFileError
-        When no effect has the record's name.
-    """
+    """Return whether no session repeats a course; raises `ModelFileError` on an unknown effect."""
     return effect_named(record.name).drifts
 
 
 def needs_correction(record: EffectRecord) -> bool:
-    """Return whether tracking has to correct an effect, because the dipoles do not include it.
-
-    Raises
-    ------
-    ModelFileError
-        When no effect has the record's name.
-    """
+    """Return whether the dipoles lack an effect; raises `ModelFileError` on an unknown one."""
     return effect_named(record.name).remedy in LIVE
 
 
@@ -81,13 +69,10 @@ class Correction:
         records: Sequence[EffectRecord], sensors: SensorTable, frequencies: Sequence[float]
     ) -> 'Correction':
         """Make the corrections of a model's records; raises `ModelFileError` on an unknown one."""
-        corrected = []
-        for record in records:
-            effect = effect_named(record.name)
-            if effect.remedy in (*LIVE, Remedy.OPTICAL):
-                corrected.append(_term(effect, record))
+        named = [(effect_named(record.name), record) for record in records]
+        undone = [pair for pair in named if pair[0].remedy in (*LIVE, Remedy.OPTICAL)]
         omega = 2 * np.pi * np.asarray(frequencies, dtype=np.float64)
-        return Correction(tuple(corrected), sensors, omega)
+        return Correction(tuple(_term(*pair) for pair in undone), sensors, omega)
 
     def _with(self, remedy: Remedy) -> list[Term]:
         return [term for term in self.terms if term.effect.remedy is remedy]
@@ -119,43 +104,24 @@ class Correction:
 
         Relative, one standard deviation each; None if no effect contains any.
         """
-        every = [term.effect.gain_changes(term, self.surveyed) for term in self.terms]
+        every = (term.effect.gain_changes(term, self.surveyed) for term in self.terms)
         known = [changes for changes in every if changes is not None]
         return np.concatenate(known) if known else None
 
     def optical(self, track: PoseTrack) -> PoseTrack:
         """Return an optical track on the fluxes' clock and in fg."""
-        # As in the forward chain: the order in which the effects are listed.
-        for term in self._with(Remedy.OPTICAL):
-            track = term.effect.optical(term, track)
-        return track
+        return true_track(track, self._with(Remedy.OPTICAL))
 
     def flux(
-        self,
-        time: float,
-        channels: NDArray[np.generic],
-        flux: ComplexArray,
-        *,
+        self, time: float, channels: NDArray[np.generic], flux: ComplexArray, *,
         recorded: bool = False,
-    ) -> ComplexArray:
-        """Return a frame's fluxes as ideal sensors and emitters would have given them.
+    ) -> ComplexArray:  # fmt: skip
+        """Return a frame's fluxes (S, K), T, as ideal sensors and emitters would have given them.
 
-        Parameters
-        ----------
-        time : float
-            s since the start of the session that the model was diagnosed on; only effects that
-            change with time use it, and only where they are ``recorded``.
-        channels : ndarray, shape (S,)
-        flux : ndarray, shape (S, K), complex
-            T. A row with NaN stays NaN.
-        recorded : bool
-            Whether the course that a drift took in the diagnosed session holds, because this is
-            that session. Without it a drift is left as it is: live, the refit follows the
-            strengths of the emitters with the references.
-
-        Returns
-        -------
-        ndarray, shape (S, K), complex
+        ``time``: s since the start of the diagnosed session, for effects that change with time;
+        ``flux`` (S, K), T: a row with NaN stays NaN; ``recorded``: whether this is the diagnosed
+        session, so that the course of a drift holds. Otherwise a drift is left as it is: live, the
+        refit follows the strengths of the emitters with the references.
         """
         terms = self._with(Remedy.FLUX)
         if not terms:
@@ -203,6 +169,3 @@ class Correction:
                 return np.asarray(step)
             x = step
         return np.asarray(x)
-
-
-__all__ = ['Correction', 'drifts']

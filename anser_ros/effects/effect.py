@@ -1,21 +1,21 @@
-"""Defines what every effect looks like: one interface, and one file for each effect. A term is
-one effect at one site, with values of its parameters. The measurement chain that an effect may
-change runs in this order::     optical track -> sensor table -> field -> emitters -> channels
--> offset -> compression An effect overrides the stages at which it acts, and gives the
-derivative of the predicted flux by its own parameters. Its forward stages are also what undoes
-it live (`anser_ros.effects.correction`). It also declares what the search for effects needs to
-know of it (`anser_ros.diagnosis`): its family, its rivals, the cost of its parameters, how it
-is refined, and what errors of a reference sensor's survey add to it. Nothing outside this
-package refers to an effect's name or class, or imports its module, except what
-`test/test_effect_names.py` lists with reasons: the stages of the diagnosis that see an effect
-without the search and so make its term themselves, and code that speaks of effects without
-these classes.
+"""Defines what every effect looks like. A term is one effect at one site, with its parameters.
+
+The measurement chain that an effect may change runs in this order:
+
+    optical track -> sensor table -> field -> emitters -> channels -> offset -> compression
+
+An effect overrides the stages at which it acts, and gives the derivative of the predicted flux by
+its own parameters. Its forward stages are also what undoes it live
+(`anser_ros.effects.correction`). It declares what the search (`anser_ros.diagnosis`) needs to know
+of it: its family, its rivals, the cost of its parameters and how it is refined. Nothing outside
+this package refers to an effect's name or class, or imports its module, except what
+`test/test_effect_names.py` lists with reasons.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, ClassVar, Literal, Self, TypedDict, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypedDict, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,11 +35,7 @@ Array = NDArray[np.float64]
 
 
 class Site(TypedDict, total=False):
-    """States where an effect acts, by the keys that it needs, in the words of records and reports.
-
-    It is a plain mapping, as it is printed, compared and written; the type checker knows each key
-    and the type of its value.
-    """
+    """States where an effect acts, by the keys that records and reports show."""
 
     channel: int
     channels: tuple[int, ...]
@@ -77,7 +73,7 @@ class Term(BaseTerm):
     held: Held | None = None  # None where all parameters are free
 
     def hold(self, covariance: Array | None = None) -> Self:
-        """Return the same term, held; ``covariance`` is kept for its record."""
+        """Return the term, held; ``covariance`` is kept for its record."""
         return replace(self, held=Held(covariance))
 
     def free(self) -> Self:
@@ -99,9 +95,7 @@ ComplexArray = NDArray[np.complex128]
 
 LARGEST = 10.0
 """Prior standard deviation of the amplitudes of a simple body's modes, in units of 1e-4 m^3
-(`anser_ros.metal.scattering.UNIT`). A perfectly conducting ball of 25 mm radius has -1, one of
-54 mm -10: the prior holds nothing back that fits beside a tracked volume, and only keeps modes
-that the data do not determine from growing without bound."""
+(`anser_ros.metal.scattering.UNIT`): a perfectly conducting ball of 54 mm radius has -10."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +143,7 @@ class BodyTerm(Term):
     @property
     def couplings(self) -> ComplexArray:
         """Return the complex couplings of the whole body, shape (c,)."""
-        parts = self.theta[self.placed :].reshape(2, -1)
-        return np.asarray(self.modes @ (parts[0] + 1j * parts[1]))
+        return np.asarray(self.modes @ complex_of(self.theta[self.placed :]))
 
     def unit(self, view: View) -> NDArray[np.inexact]:
         """Return the flux of each mode of unit amplitude in a view, (F, S, K, m), T."""
@@ -162,9 +155,7 @@ class BodyTerm(Term):
         return replace(self, kind=kind, modes=modes, spread=spread, theta=theta)
 
     def shaped(self, kind: str, modes: Array, richness: Richness) -> Self:
-        """Return the same course, a body of modes of unit prior size; a compact one has a ball's
-        too.
-        """
+        """Return the same course, a body of modes of unit prior size, and a ball's if compact."""
         spread = np.ones(modes.shape[1])
         if kind == COMPACT:
             ball = ball_modes()
@@ -206,13 +197,10 @@ SizedShapes = tuple[Shapes, Sequence[Array]]
 """Shapes of a field that metal couples, and the prior sizes of their couplings to try."""
 
 FROZEN = 1e-12
-"""Prior spread of a parameter that a fit must leave where it is, in the parameter's own unit. It
-only has to be negligible compared with any step of a fit; zero would make the prior's weight
-infinite."""
+"""Prior spread of a parameter that a fit must leave where it is, negligible beside any step."""
 INEXACT = 0.01
 """Share of an effect's power that its model may miss where the effect is truly there, unless the
-effect says otherwise. Gains, tilts and shifts are modelled to better than this; what leaves more
-on the values that it changes is another effect's stand-in."""
+effect says otherwise. What leaves more is another effect's stand-in."""
 
 
 class Family(Enum):
@@ -247,21 +235,12 @@ class Resting:
 class Effect(BaseEffect[TermT]):
     """Changes nothing; it is the base of all effects on fluxes.
 
-    What every fit needs of an effect (prior, cost, record) is that of `BaseEffect`.
-
-    Attributes
-    ----------
-    name : str
-        As `docs/interfaces.md` lists it, or a new descriptive one.
-    summary : str
-        One clause for the report.
-    units : mapping
-        Unit of each parameter of the record.
-    plausible : mapping
-        Range that a parameter of the record may reasonably have.
-    remedy : Remedy
+    What every fit needs of an effect (name, prior, cost, record) is that of `BaseEffect`.
     """
 
+    # where the record is the site and theta in other units: how many of theta's values stand under
+    # each key, in their order, and the factor that they are multiplied by
+    recorded: ClassVar[Mapping[str, tuple[int, float]]] = {}
     # what the values of each channel are, of an effect that every channel has in its own size
     parts: ClassVar[tuple[str, ...]] = ()
     family: ClassVar[Family] = Family.STEADY
@@ -308,17 +287,10 @@ class Effect(BaseEffect[TermT]):
     def along(
         self, time: Array, course: Array, solution: Array, apparatus: Apparatus
     ) -> Sequence[TermT]:
-        """Return start values from where ``still`` fits best in each stretch of time.
+        """Return start values from where ``still`` fits best in each of B stretches of time.
 
-        Parameters
-        ----------
-        time : ndarray, shape (B,)
-            Middle of each stretch, s.
-        course : ndarray, shape (B, 3)
-            Best place of ``still`` in each stretch, m, frame fg.
-        solution : ndarray
-            Of the probe of ``still`` in the stretch where it explains most.
-        apparatus : Apparatus
+        ``time`` (B,): middle of each stretch, s; ``course`` (B, 3): best place of ``still`` in
+        each, m, frame fg; ``solution``: of its probe in the stretch where it explains most.
         """
         return ()
 
@@ -352,6 +324,33 @@ class Effect(BaseEffect[TermT]):
         """Return the term of an effect whose spread is found; None for any other effect."""
         return None
 
+    # --- record ------------------------------------------------------------------------------
+    def record(self, term: TermT, covariance: Array) -> EffectRecord:
+        """Return the site, and theta by the keys and units of ``recorded``."""
+        site, sigma = recorded_site(term), sigmas(covariance)
+        return EffectRecord(self.name, {**site, **self._figures(term.theta)}, self._figures(sigma))
+
+    def _figures(self, values: Array) -> dict[str, Any]:
+        out, start = {}, 0
+        for key, (width, factor) in self.recorded.items():
+            part = (factor * values[start : start + width]).tolist()
+            out[key] = part if width > 1 else part[0]
+            start += width
+        return out
+
+    def term(self, record: EffectRecord) -> TermT:
+        """Return the term of a record; raises `ModelFileError` on missing parameters."""
+        parts = [
+            np.asarray(needed(record, key), dtype=np.float64).reshape(width) / factor
+            for key, (width, factor) in self.recorded.items()
+        ]
+        return cast(TermT, Term(self, self.site_of(record), np.concatenate(parts)))
+
+    def site_of(self, record: EffectRecord) -> Site:
+        """Return what a record says of the site; raises `ModelFileError` where it lacks a key."""
+        keys = [key for key in self.units if key in READ_SITE]
+        return cast(Site, {key: READ_SITE[key](needed(record, key)) for key in keys})
+
     # --- forward -----------------------------------------------------------------------------
     @property
     def moving(self) -> bool:
@@ -381,9 +380,7 @@ class Effect(BaseEffect[TermT]):
         return np.zeros_like(view.flux)
 
     def emitter_matrix(self, term: TermT, time: Array, omega: Array) -> ComplexArray | None:
-        """Return the mixing of the emitters' tones, shape (F or 1, K, K): row the tone that is
-        read.
-        """
+        """Return the mixing of the emitters' tones, (F or 1, K, K): row the tone that is read."""
         return None
 
     def channel_matrix(self, term: TermT, channels: NDArray[np.int64]) -> ComplexArray | None:
@@ -415,9 +412,16 @@ def needed(record: EffectRecord, key: str) -> Any:
         raise ModelFileError(f'model: the effect {record.name} lacks {key!r}') from None
 
 
-def whole_numbers(record: EffectRecord, key: str) -> tuple[int, ...]:
-    """Return the channels or coils of a record; raises `ModelFileError` when they are missing."""
-    return tuple(int(number) for number in needed(record, key))
+def whole_numbers(values: Sequence[Any]) -> tuple[int, ...]:
+    """Return the numbers of channels or coils as they are in a record."""
+    return tuple(int(number) for number in values)
+
+
+READ_SITE: Mapping[str, Callable[[Any], Any]] = {
+    'channel': int, 'coil': int, 'body': str,
+    'channels': whole_numbers, 'coils': whole_numbers, 'read_as': whole_numbers,
+}  # fmt: skip
+"""How the keys of a site are read from a record."""
 
 
 def recorded_site(term: Term) -> dict[str, Any]:
@@ -428,6 +432,22 @@ def recorded_site(term: Term) -> dict[str, Any]:
 def sigmas(covariance: Array) -> Array:
     """Return the standard deviations that a covariance matrix holds."""
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
+def complex_of(parts: Array) -> ComplexArray:
+    """Return complex numbers (n,) from their real, then imaginary parts (2 n,)."""
+    real, imaginary = parts.reshape(2, -1)
+    return np.asarray(real + 1j * imaginary)
+
+
+def pairs_of(values: ComplexArray) -> Any:
+    """Return complex numbers as a record has them, as lists of [re, im]."""
+    return np.stack([values.real, values.imag], axis=-1).tolist()
+
+
+def both_phases(unit: NDArray[np.inexact]) -> ComplexArray:
+    """Return columns (..., m) in phase, then in quadrature, (..., 2 m)."""
+    return np.concatenate([unit, 1j * unit], axis=-1)
 
 
 def unit_matrix(size: int) -> ComplexArray:

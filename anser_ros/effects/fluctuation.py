@@ -11,8 +11,8 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from anser_ros.effects.clocks import TimeOffset
 from anser_ros.effects.effect import (
+    READ_SITE,
     Array,
     ComplexArray,
     Effect,
@@ -23,20 +23,16 @@ from anser_ros.effects.effect import (
     Term,
     needed,
     recorded_site,
-    whole_numbers,
 )
 from anser_ros.effects.gains import CoilGain, SensorGain, ToolGain
-from anser_ros.effects.optical_frame import Registration
-from anser_ros.effects.sensor_axis import SensorAxis
-from anser_ros.effects.sensor_position import SensorPosition
+from anser_ros.effects.optical import Registration, TimeOffset
+from anser_ros.effects.sensor_geometry import SensorAxis, SensorPosition
 from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 
 OPEN = 40
 """Parameters that a fluctuation counts for when explanations are compared: more than a constant
-has, whose columns it shares, and less than shaped metal (60), whose freedom is what it replaces.
-Larger lets moving metal explain an emitter that steps; smaller lets a fluctuation take over from
-a curve with several parameters."""
+or a curve has, and less than shaped metal (60), which must not explain an emitter that steps."""
 
 
 class Fluctuation(Effect[FluctuationTerm]):
@@ -97,10 +93,9 @@ class Fluctuation(Effect[FluctuationTerm]):
     def term(self, record: EffectRecord) -> FluctuationTerm:
         """Return where it is; what it does in a frame only the frame can tell."""
         needed(record, 'rms')
-        where = {k: v for k, v in record.parameters.items() if k != 'rms'}
-        if 'channels' in where:
-            where['channels'] = whole_numbers(record, 'channels')
-        return FluctuationTerm(self, cast(Site, where))
+        given = {key: value for key, value in record.parameters.items() if key != 'rms'}
+        site = {key: READ_SITE[key](value) for key, value in given.items()}
+        return FluctuationTerm(self, cast(Site, site))
 
 
 class CoilFluctuation(Fluctuation):

@@ -1,6 +1,7 @@
-"""A complex gain is off: of one channel, of all channels of a tool, or of an emitter."""
+"""A gain is off: of one channel, of a tool's channels, or of an emitter, which may also drift."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,8 @@ from anser_ros.effects.effect import (
     Term,
     needed,
     recorded_site,
+    sigmas,
     unit_matrix,
-    whole_numbers,
 )
 from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
@@ -24,49 +25,26 @@ from anser_ros.field.model import EffectRecord
 class ComplexGain(Effect[Term]):
     """Theta is the real and imaginary part of (gain - 1) of what the site names."""
 
-    plausible = {
-        'gain': (0.2, 3.0),
-        'phase_deg': (-60.0, 60.0),
-    }
+    plausible = {'gain': (0.2, 3.0), 'phase_deg': (-60.0, 60.0)}
     remedy = Remedy.FLUX
-
-    def prior(self, term: Term) -> Array:
-        """Expect a gain within some ten percent of one."""
-        return np.full(2, 0.3)
+    typical = 0.3  # gains are within some ten percent of one
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the gain's size and phase."""
-        figures, sigmas = figures_of(term.theta, covariance)
-        return EffectRecord(self.name, {**recorded_site(term), **figures}, sigmas)
+        figures, deviations = figures_of(term.theta, covariance)
+        return EffectRecord(self.name, {**recorded_site(term), **figures}, deviations)
 
-
-class GainOfChannels(ComplexGain):
-    """Is a complex gain of the channels that a term's site names."""
-
-    def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Return the channels' own flux, in phase and turned by a quarter."""
-        rows = np.isin(view.sensors.channel, term.channels)
-        if not rows.any():
-            return None
-        out = view.columns(2)
-        own = view.linear[:, rows] / (1 + complex(*term.theta))
-        out[:, rows] = np.stack([own, 1j * own], axis=-1)
-        return out
-
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """Return a unit matrix with the gain in the channels' rows."""
-        own = np.isin(channels, term.channels)
-        return np.diag(np.where(own, 1 + complex(*term.theta), 1.0))
+    def term(self, record: EffectRecord) -> Term:
+        """Return the term of a gain and a phase; a record without a phase has none."""
+        phase = np.radians(float(record.parameters.get('phase_deg', 0.0)))
+        gain = float(needed(record, 'gain')) * np.exp(1j * phase)
+        return Term(self, self.site_of(record), np.array([gain.real - 1, gain.imag]))
 
 
 def figures_of(theta: Array, covariance: Array) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return ``gain`` and ``phase_deg`` of a record, and their standard deviations.
 
-    Parameters
-    ----------
-    theta : ndarray, shape (2,)
-        Real and imaginary part of (gain - 1).
-    covariance : ndarray, shape (2, 2)
+    ``theta`` (2,) is the real and imaginary part of (gain - 1).
     """
     gain = 1 + complex(*theta)
     along = np.array([gain.real, gain.imag]) / abs(gain)
@@ -76,13 +54,6 @@ def figures_of(theta: Array, covariance: Array) -> tuple[dict[str, Any], dict[st
         {'gain': abs(gain), 'phase_deg': float(np.degrees(np.angle(gain)))},
         {'gain': float(sigma_gain), 'phase_deg': float(np.degrees(sigma_rad))},
     )
-
-
-def theta_of(record: EffectRecord) -> Array:
-    """Return theta (2,) of a record; one without a phase has none."""
-    phase = np.radians(float(record.parameters.get('phase_deg', 0.0)))
-    gain = float(needed(record, 'gain')) * np.exp(1j * phase)
-    return np.array([gain.real - 1, gain.imag])
 
 
 class CoilGain(ComplexGain):
@@ -109,9 +80,24 @@ class CoilGain(ComplexGain):
         matrix[term.site['coil'], term.site['coil']] = 1 + complex(*term.theta)
         return matrix[None]
 
-    def term(self, record: EffectRecord) -> Term:
-        """Return the term of a gain and a phase."""
-        return Term(self, {'coil': int(needed(record, 'coil'))}, theta_of(record))
+
+class GainOfChannels(ComplexGain):
+    """Is a complex gain of the channels that a term's site names."""
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Return the channels' own flux, in phase and turned by a quarter."""
+        rows = np.isin(view.sensors.channel, term.channels)
+        if not rows.any():
+            return None
+        out = view.columns(2)
+        own = view.linear[:, rows] / (1 + complex(*term.theta))
+        out[:, rows] = np.stack([own, 1j * own], axis=-1)
+        return out
+
+    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+        """Return a unit matrix with the gain in the channels' rows."""
+        own = np.isin(channels, term.channels)
+        return np.diag(np.where(own, 1 + complex(*term.theta), 1.0))
 
 
 class SensorGain(GainOfChannels):
@@ -125,10 +111,6 @@ class SensorGain(GainOfChannels):
         """Return a term for every channel, references too."""
         return [Term(self, {'channel': c}, np.zeros(2)) for c in apparatus.channels]
 
-    def term(self, record: EffectRecord) -> Term:
-        """Return the term of a gain and a phase."""
-        return Term(self, {'channel': int(needed(record, 'channel'))}, theta_of(record))
-
 
 class ToolGain(GainOfChannels):
     """Is the complex gain of all of a tool's channels."""
@@ -139,19 +121,111 @@ class ToolGain(GainOfChannels):
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a candidate for every body with two sensors or more."""
-        return [
-            Term(self, {'channels': tuple(int(c) for c in table.channel)}, np.zeros(2))
-            for table in apparatus.tools
-            if len(table) > 1
-        ]
-
-    def term(self, record: EffectRecord) -> Term:
-        """Return the term of a gain and a phase."""
-        return Term(self, {'channels': whole_numbers(record, 'channels')}, theta_of(record))
+        tools = [tuple(table.channel.tolist()) for table in apparatus.tools if len(table) > 1]
+        return [Term(self, {'channels': channels}, np.zeros(2)) for channels in tools]
 
 
-EFFECTS = (
-    CoilGain(),
-    SensorGain(),
-    ToolGain(),
-)
+PROBED_SHARES = (0.1, 0.5, 2.5)
+"""Time constants of the probe, as shares of the session: from one that has ended early to one that
+is nearly a straight line. Closer ones have nearly parallel columns; fewer miss courses between
+them."""
+
+
+def _shape(time: Array, tau: float) -> Array:
+    return np.asarray(1 - np.exp(-np.maximum(time, 0.0) / tau))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoilDriftTerm(Term):
+    """Holds the drift of one emitter."""
+
+    duration: float = 1.0  # Of the session, s; only the search needs it
+
+
+class CoilDrift(Effect[CoilDriftTerm]):
+    """Multiplies an emitter by 1 + a (1 - exp(-t/tau)); theta is a and log(tau / s)."""
+
+    name = 'coil_drift'
+    summary = "an emitter's strength changes with time"
+    units = {'coil': '1', 'amount': '1', 'tau_s': 's'}
+    plausible = {'amount': (-0.5, 0.5), 'tau_s': (0.5, 1000.0)}
+    remedy = Remedy.FLUX
+    typical = (0.1, 1.6)  # some percent, and a time constant within a factor of five
+    drifts = True
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[CoilDriftTerm]:
+        """Return a candidate for every emitter."""
+        duration = max(apparatus.duration, 1.0)
+        start, coils = np.array([0.0, np.log(0.5 * duration)]), range(apparatus.emitters)
+        return [CoilDriftTerm(self, {'coil': k}, start, duration=duration) for k in coils]
+
+    def amounts(self, term: CoilDriftTerm) -> NDArray[np.int64]:
+        """Return the amount's index alone: a drift of nothing has any time constant."""
+        return np.array([0])
+
+    def _own(self, term: CoilDriftTerm, view: View) -> ComplexArray:
+        coil, (amount, log_tau) = term.site['coil'], term.theta
+        factor = 1 + amount * _shape(view.time, float(np.exp(log_tau)))
+        return np.asarray(view.linear[:, :, coil] / factor[:, None])
+
+    def columns(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
+        """Return the emitter's flux times the derivatives of the curve."""
+        amount, log_tau = term.theta
+        tau = float(np.exp(log_tau))
+        own, late = self._own(term, view), np.maximum(view.time, 0.0) / tau
+        out = view.columns(2)
+        out[:, :, term.site['coil'], 0] = own * _shape(view.time, tau)[:, None]
+        out[:, :, term.site['coil'], 1] = own * (-amount * late * np.exp(-late))[:, None]
+        return out
+
+    def probe(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
+        """Return the flux of drifts with three different time constants."""
+        own = self._own(term, view)
+        out = view.columns(len(PROBED_SHARES))
+        for i, share in enumerate(PROBED_SHARES):
+            curve = _shape(view.time, share * term.duration)
+            out[:, :, term.site['coil'], i] = own * curve[:, None]
+        return out
+
+    def started(self, term: CoilDriftTerm, solution: Array) -> Sequence[CoilDriftTerm]:
+        """Start with the time constant whose curve comes nearest to the probe's sum."""
+        duration = term.duration
+        time = np.linspace(0.0, duration, 60)
+        curves = [_shape(time, share * duration) for share in PROBED_SHARES]
+        wanted = sum(a * c for a, c in zip(solution, curves, strict=True))
+        misfits = []
+        for tau in duration * np.geomspace(0.03, 5.0, 25):
+            curve = _shape(time, float(tau))
+            amount = float(curve @ wanted / (curve @ curve))
+            misfits.append((float(np.sum((wanted - amount * curve) ** 2)), amount, np.log(tau)))
+        return (term.with_theta(np.array(min(misfits)[1:])),)
+
+    def bounded(self, term: CoilDriftTerm) -> CoilDriftTerm:
+        """Keep the time constant between half a second and a quarter of an hour."""
+        amount, log_tau = term.theta
+        return term.with_theta(np.array([amount, np.clip(log_tau, np.log(0.3), np.log(1500.0))]))
+
+    def emitter_matrix(self, term: CoilDriftTerm, time: Array, omega: Array) -> ComplexArray:
+        """Return the emitter's factor at each time, on the diagonal."""
+        amount, log_tau = term.theta
+        matrix = np.repeat(unit_matrix(omega.size)[None], time.size, axis=0)
+        coil = term.site['coil']
+        matrix[:, coil, coil] = 1 + amount * _shape(time, float(np.exp(log_tau)))
+        return matrix
+
+    def record(self, term: CoilDriftTerm, covariance: Array) -> EffectRecord:
+        """Record the emitter, the amount of its drift and the time constant, s."""
+        sigma, tau = sigmas(covariance), float(np.exp(term.theta[1]))
+        return EffectRecord(
+            self.name,
+            {'coil': term.site['coil'], 'amount': float(term.theta[0]), 'tau_s': tau},
+            {'amount': float(sigma[0]), 'tau_s': tau * float(sigma[1])},
+        )
+
+    def term(self, record: EffectRecord) -> CoilDriftTerm:
+        """Read the emitter, the amount of its drift and the time constant, s, from a record."""
+        theta = np.array([float(needed(record, 'amount')), np.log(float(needed(record, 'tau_s')))])
+        return CoilDriftTerm(self, self.site_of(record), theta)
+
+
+EFFECTS = CoilGain(), SensorGain(), ToolGain(), CoilDrift()

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,46 +10,15 @@ from scipy.interpolate import CubicSpline
 Array = NDArray[np.float64]
 
 SHORTEST = 0.2
-"""Shortest time (s) that a straight way may take: a hand is no faster, and a jump has no
-derivative."""
+"""Shortest time (s) that a straight way may take: a hand is no faster."""
 FINE_STEP_S = 0.05
 """Step (s) in which the length of a way is summed up, a quarter of the shortest way."""
 NODES, NODES_PER_KNOT = 41, 6
 """Nodes on a path, in which fields are found; between them they are interpolated."""
 KEPT_SPLINES = 64
-"""Sets of spline weights that are kept, 0.2 MB each: those of a few paths that are fitted side by
-side, for the frames of a few bodies. Fewer, and they are worked out anew in every step."""
+"""Sets of spline weights that are kept, 0.2 MB each, for a few paths fitted side by side."""
 NEGLIGIBLE_WAY = 0.02
-"""Share (0 to 1) of a way that counts as not yet begun, or as over: 2 to 5 mm of a hand's way,
-less than metal that matters is large. Smaller takes ripples of a fitted path at rest for its
-start; larger cuts slow beginnings and ends off."""
-
-
-class MetalPath(Protocol):
-    """Leads along ``count`` parameters, through ``knots`` (s) where it is free."""
-
-    @property
-    def count(self) -> int:
-        """Return the number of the path's parameters."""
-
-    @property
-    def knots(self) -> tuple[float, ...]:
-        """Return the times at which the place is free; none where the path is straight."""
-
-    def centre(self, theta: Array, time: Array) -> Array:
-        """Return the body's centre at each time, shape (F, 3), m."""
-
-    def rates(self, theta: Array, time: Array) -> Array:
-        """Return the derivative of the centre by the parameters, (F, 3, count)."""
-
-    def nodes(self, theta: Array, time: Array) -> tuple[Array, Array, Array]:
-        """Return steps (n,) along the way, the centres there (n, 3), m, and each time's step."""
-
-    def prior(self) -> Array:
-        """Return the prior standard deviation of each parameter, shape (count,)."""
-
-    def bounded(self, theta: Array) -> Array:
-        """Return the parameters brought back into their domain."""
+"""Share (0 to 1) of a way that counts as not yet begun, or as over: 2 to 5 mm of a hand's way."""
 
 
 @dataclass(frozen=True)
@@ -158,20 +126,15 @@ class FreePath:
         return path, np.asarray(course.ravel(), dtype=np.float64)
 
 
+MetalPath = StraightPath | FreePath
+"""Leads along ``count`` parameters, through ``knots`` (s) where it is free."""
+
+
 def spline_weights(nodes: Array, at: Array, ends: str) -> Array:
     """Return what each node's value weighs in a cubic spline's values, shape (F, N); to be read.
 
-    Many splines through the same nodes are wanted at the same places one after the other: the
-    weights are kept for a while.
-
-    Parameters
-    ----------
-    nodes : ndarray, shape (N,)
-        Ascending.
-    at : ndarray, shape (F,)
-        Where values are wanted.
-    ends : str
-        Condition at the ends, as scipy's ``bc_type``.
+    ``nodes`` (N,) ascend, values are wanted ``at`` (F,), ``ends`` is scipy's ``bc_type``. Many
+    splines through the same nodes are wanted at the same places: the weights are kept for a while.
     """
     return _spline_weights(nodes.tobytes(), at.tobytes(), ends)
 

@@ -6,12 +6,20 @@ the corrected field is as good as the data allow while the metal's own parameter
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Family, Remedy, Term
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Family,
+    Remedy,
+    Term,
+    both_phases,
+    complex_of,
+)
 from anser_ros.effects.view import View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord
@@ -22,20 +30,6 @@ GAIN, ASIDE_M, UP_M = 3e-3, 0.2e-3, 0.4e-3
 were so much stronger, or so far away. The far side of the board says least about its height."""
 STEP_M = 0.5e-3
 """Shift (m) of an emitter in the differences that tell what its place does to metal."""
-
-
-class RemainderPart(Protocol):
-    """Holds a linear part of a metal's response, with parameters of unit prior size."""
-
-    @property
-    def count(self) -> int:
-        """Return the number of its real parameters."""
-
-    def columns(self, view: View) -> ComplexArray:
-        """Return the flux of each parameter, (F, S, K, count)."""
-
-    def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
-        """Return the dipoles that stand for the whole leftover."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +54,11 @@ class Couplings:
 
     def columns(self, view: View) -> ComplexArray:
         """Return the flux that a unit of each parameter adds."""
-        unit = self.unit(view)
-        return np.concatenate([unit, 1j * unit], axis=-1)
+        return both_phases(self.unit(view))
 
     def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
         """Return the dipoles that all modes make together."""
-        parts = theta.reshape(2, -1)
-        couplings = self.modes @ (parts[0] + 1j * parts[1])
+        couplings = self.modes @ complex_of(theta)
         return self.shapes.sources(self.centre, couplings, illumination, omega)
 
 
@@ -116,6 +108,10 @@ class IlluminationChange:
         for share, answer in zip(shares, self._answers(illumination, omega), strict=True):
             out = out.joined(replace(answer, moments=answer.moments * share))
         return out
+
+
+RemainderPart = Couplings | IlluminationChange
+"""A linear part of a metal's response, with ``count`` parameters of unit prior size."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,9 +16,12 @@ from anser_ros.effects.effect import (
     Effect,
     Family,
     Remedy,
+    both_phases,
     needed,
+    pairs_of,
     sigmas,
 )
+from anser_ros.effects.metal_at_rest import STATIC_METAL
 from anser_ros.effects.metal_path import (
     FreePath,
     MetalPath,
@@ -26,7 +29,6 @@ from anser_ros.effects.metal_path import (
     moving_times,
     spline_weights,
 )
-from anser_ros.effects.static_metal import STATIC_METAL
 from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 from anser_ros.metal.body import COMPACT, SPACINGS, ball_modes, centre_sigma
@@ -34,17 +36,13 @@ from anser_ros.metal.scattering import UNIT
 from anser_ros.parallel import in_order
 
 STEP = 1e-3
-"""Step (m) of the central differences that give the derivative by the place. Their relative error
-is about the square of the step over the distance: 1e-4 at a decimetre, far above rounding."""
+"""Step (m) of the central differences by the place: 1e-4 of an error at a decimetre."""
 PATH_SAMPLES = 21
 """Times at which a record says where the metal is: two seconds apart in a session of 40 s."""
 SHAPED = 60
 """Parameters that moving metal counts for at least when explanations are compared: it is shaped
 with dozens of modes once it is taken, and must not win as a simple body against a fluctuation,
-which counts for 40. Larger makes it give way to fluctuations that explain less. It was chosen on
-an emitter that steps and was called metal (`docs/log.md`). On 31 other runs half of it, and
-Schwarz's price of the parameters in its place, let more starts of metal be fitted in 25, of which
-none was taken; twice as much changed nothing."""
+which counts for 40. Chosen on an emitter that steps and was called metal (`docs/log.md`)."""
 SHORT_WAY = 0.02
 """Ends of the course nearer to each other than this (m) don't give a straight path a direction."""
 UPWARDS = np.array([0.0, 0.0, -0.05])
@@ -77,9 +75,8 @@ class MovingTerm(BodyTerm):
         return self.path.centre(self.course, time)
 
     def _seen(self, view: View, shift: Array) -> tuple[Array, ComplexArray]:
-        """Amplitudes of the sensors (F, S, M) and emitters (F, K, M) about the moving centre.
-
-        The emitters' are interpolated between nodes on the way.
+        """Amplitudes about the moving centre: of the sensors (F, S, M), and of the emitters
+        (F, K, M), interpolated between nodes on the way.
         """
         nodes, on_way, at = self.path.nodes(self.course, view.time)
         grid = (on_way + shift)[:, None, :] + self.shapes.offsets
@@ -135,9 +132,7 @@ class MovingMetal(Effect[MovingTerm]):
     def along(
         self, time: Array, course: Array, solution: Array, apparatus: Apparatus
     ) -> Sequence[MovingTerm]:
-        """Return a straight and a free path along the best places; ``solution`` is re, im of
-        alpha.
-        """
+        """Return a straight and a free path along the best places."""
         duration, few = apparatus.duration, max(2, len(course) // 8)
         start, end = course[:few].mean(0), course[-few:].mean(0)
         path, knots = FreePath.through(np.linspace(0.0, duration, KNOTS), time, course)
@@ -186,21 +181,16 @@ class MovingMetal(Effect[MovingTerm]):
         course = term.path.bounded(term.course)
         return term.with_theta(np.concatenate([course, term.theta[term.placed :]]))
 
-    def columns(self, term: MovingTerm, view: View) -> ComplexArray | None:
+    def columns(self, term: MovingTerm, view: View) -> ComplexArray:
         """Return derivatives by the path (differences, chained) and by the amplitudes (exact)."""
         unit = term.unit(view)
         out = view.columns(term.theta.size)
-        groups = unit.shape[-1]
-        out[..., term.placed : term.placed + groups] = unit
-        out[..., term.placed + groups :] = 1j * unit
+        out[..., term.placed :] = both_phases(unit)
         if term.held:
             return out
         steps = STEP * np.eye(3)
         moved = in_order(lambda shift: term.flux(view, shift), [*steps, *-steps])
-        by_place = np.stack(
-            [(there - back) / (2 * STEP) for there, back in zip(moved, moved[3:], strict=False)],
-            axis=-1,
-        )
+        by_place = (np.stack(moved[:3], axis=-1) - np.stack(moved[3:], axis=-1)) / (2 * STEP)
         rates = term.path.rates(term.course, view.time)
         out[..., : term.placed] = by_place @ rates[:, None]
         return out
@@ -227,15 +217,12 @@ class MovingMetal(Effect[MovingTerm]):
                 'end_m': at[1].tolist(),
                 't_start_s': start,
                 't_end_s': end,
-                'path': {
-                    'time_s': times.tolist(),
-                    'position_m': term.centres(times).tolist(),
-                },
-                'polarizability': np.stack([total.real, total.imag], axis=-1).tolist(),
+                'path': {'time_s': times.tolist(), 'position_m': term.centres(times).tolist()},
+                'polarizability': pairs_of(total),
                 'knots_s': list(term.path.knots),
                 'course': term.course.tolist(),
                 'body': term.kind,
-                'couplings_m3': np.stack([couplings.real, couplings.imag], axis=-1).tolist(),
+                'couplings_m3': pairs_of(couplings),
             },
             {
                 'start_m': spread[0].tolist(),
@@ -289,6 +276,63 @@ def _time_sigma(
     left = float(time[gone[0]]) if gone.size else knots[-1]
     there = float(time[coming[-1]]) if coming.size else knots[0]
     return float(np.hypot(knot, left - start)), float(np.hypot(knot, end - there))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepartedTerm(MovingTerm):
+    """Holds metal that rested near while a field was learnt, and moves.
+
+    The fitted field and the references' steady readings contain the metal at rest. The residual is
+    its field at its present place, less that at its place of rest, so the motion determines its
+    field at rest.
+    """
+
+    rest_s: float  # When it rests, s since the session's start
+
+    @property
+    def alone(self) -> MovingTerm:
+        """Return the moving metal itself, not relative to where it rests."""
+        return MovingTerm(**{key: v for key, v in vars(self).items() if key != 'rest_s'})
+
+    def resting(self, view: View) -> View:
+        """Return the view as if all of it were recorded while the metal rests."""
+        return replace(view, time=np.full(view.time.shape, self.rest_s))
+
+    def flux(self, view: View, shift: Array) -> ComplexArray:
+        """Return the flux (F, S, K) of the whole body, moved by a shift (m), less that at rest."""
+        return self.alone.flux(view, shift) - self.alone.flux(self.resting(view), shift)
+
+    def unit(self, view: View) -> NDArray[np.inexact]:
+        """Return the flux of each mode of unit amplitude, (F, S, K, m)."""
+        return np.asarray(self.alone.unit(view) - self.alone.unit(self.resting(view)))
+
+    def rest_flux(self, view: View) -> ComplexArray:
+        """Return what the metal at rest adds to a view, (F, S, K), T."""
+        return self.alone.flux(self.resting(view), np.zeros(3))
+
+    def rest_columns(self, view: View) -> ComplexArray:
+        """Return the derivative by the parameters of the flux of metal at rest, (F, S, K, q)."""
+        return MovingMetal().columns(self.alone.free(), self.resting(view))
+
+
+@dataclass(frozen=True)
+class DepartedMetal(MovingMetal):
+    """Takes metal on a free path from its rest and back; a model has none of it to correct."""
+
+    rest_s: float  # When it rests, s since the session's start
+
+    def starting(
+        self, path: MetalPath, course: Array, duration: float, alpha: Array
+    ) -> DepartedTerm:
+        """Return a simple body on a path; arguments as of `MovingMetal.starting`."""
+        plain = super().starting(path, course, duration, alpha)
+        return DepartedTerm(**vars(plain), rest_s=self.rest_s)
+
+    def columns(self, term: MovingTerm, view: View) -> ComplexArray:
+        """Return the derivatives where the metal is, less those where it rests."""
+        assert isinstance(term, DepartedTerm)
+        rest = super().columns(term.alone, term.resting(view))
+        return super().columns(term.alone, view) - rest
 
 
 EFFECTS = (MovingMetal(),)

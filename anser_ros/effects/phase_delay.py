@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term
 from anser_ros.effects.view import Apparatus, View
-from anser_ros.field.model import EffectRecord
 
 UNIT = 1e-6
 """theta counts microseconds."""
@@ -20,14 +19,12 @@ class PhaseDelay(Effect[Term]):
     units = {'delay_s': 's'}
     plausible = {'delay_s': (-5e-5, 5e-5)}
     remedy = Remedy.FLUX
+    typical = 5.0  # delays are some microseconds
+    recorded = {'delay_s': (1, UNIT)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return one candidate, as one delay holds for all channels."""
         return [Term(self, {}, np.zeros(1))]
-
-    def prior(self, term: Term) -> Array:
-        """Return a prior spread of 5 us: delays are some microseconds."""
-        return np.full(1, 5.0)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return minus j omega times the flux, for a microsecond of delay."""
@@ -36,18 +33,6 @@ class PhaseDelay(Effect[Term]):
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
         """Return the turn of each emitter's phasors on the diagonal."""
         return np.diag(np.exp(-1j * omega * term.theta[0] * UNIT))[None]
-
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the delay and its uncertainty, s."""
-        return EffectRecord(
-            self.name,
-            {'delay_s': UNIT * float(term.theta[0])},
-            {'delay_s': UNIT * float(np.sqrt(covariance[0, 0]))},
-        )
-
-    def term(self, record: EffectRecord) -> Term:
-        """Read the delay, s, from a record."""
-        return Term(self, {}, np.array([float(needed(record, 'delay_s')) / UNIT]))
 
 
 EFFECTS = (PhaseDelay(),)

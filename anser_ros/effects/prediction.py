@@ -27,13 +27,7 @@ class Fields:
 
 
 def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View:
-    """Predict a tool's fluxes; frames without a pose get NaN poses and fluxes.
-
-    Raises
-    ------
-    FloatingPointError
-        Never on purpose: a frame without a pose must be left out by the caller.
-    """
+    """Predict a tool's fluxes; the caller leaves out frames without a pose."""
     position, rotation, velocity = _poses(body, terms)
     sensors = body.sensors
     for term in terms:
@@ -70,11 +64,9 @@ def reference_view(
         sensors.position, sensors.axis, sensors.length,
         base.positions, base.directions, base.moments,
     )  # fmt: skip
-    change = (
-        added.flux(sensors.position, sensors.axis, sensors.length)
-        if added.positions.shape[0]
-        else np.zeros_like(flux)
-    )
+    change = np.zeros_like(flux)
+    if added.positions.shape[0]:
+        change = added.flux(sensors.position, sensors.axis, sensors.length)
     shape = (frames, *change.shape)
     eye = np.broadcast_to(np.eye(3), (frames, 3, 3))
     linear = np.broadcast_to(baseline + change, shape)
@@ -146,7 +138,7 @@ def _measured(view: View, terms: Sequence[Term]) -> View:
     for term in terms:
         matrix = term.effect.emitter_matrix(term, view.time, view.omega)
         if matrix is not None:
-            mixed = _frames(matrix, view)
+            mixed = np.broadcast_to(matrix, (view.time.size, *matrix.shape[1:]))
             linear = np.einsum('fab,fsb->fsa', mixed, linear)
             slopes = [np.einsum('fab,fsib->fsia', mixed, slope) for slope in slopes]
     for term in terms:
@@ -164,7 +156,3 @@ def _measured(view: View, terms: Sequence[Term]) -> View:
     return replace(
         view, linear=linear, flux=flux, d_position=d_position, d_axis=d_axis, d_turn=d_turn
     )
-
-
-def _frames(matrix: ComplexArray, view: View) -> ComplexArray:
-    return np.broadcast_to(matrix, (view.time.size, *matrix.shape[1:]))

@@ -1,7 +1,4 @@
-"""Finds all effects by looking: a module in this package that defines `EFFECTS` is one.
-
-To add an effect, add its file; nothing else has to change.
-"""
+"""Finds all effects by looking: those that the modules of this package list as `EFFECTS`."""
 
 import importlib
 import pkgutil

@@ -14,7 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Site, Term, needed
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Site,
+    Term,
+    needed,
+    recorded_site,
+)
 from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 
@@ -27,9 +36,7 @@ FLUX, VOLTAGE = 'flux', 'voltage'
 """What the amplifier may see."""
 CURVE = 0.2
 """Share (0 to 1) of a saturation's power that its model may miss: the true curve is none of those
-that are tried, and tones mix into each other's place. Smaller refuses a saturation of another
-curve; larger confirms what only grows with the reading. It was chosen by hand on injected effects
-(`docs/log.md`)."""
+that are tried. It was chosen by hand on injected effects (`docs/log.md`)."""
 
 
 def third_order(flux: ComplexArray) -> ComplexArray:
@@ -69,22 +76,20 @@ class Saturation(Effect[SaturationTerm]):
     name = 'saturation'
     summary = 'a channel compresses large signals'
     units = {
-        'channel': '1',
-        'full_scale_t': 'T',
-        'shape': 'name of the curve',
-        'sees': 'flux or voltage',
-        'tone_weights': '1',
-    }
+        'channel': '1', 'full_scale_t': 'T', 'shape': 'name of the curve',
+        'sees': 'flux or voltage', 'tone_weights': '1',
+    }  # fmt: skip
     plausible = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
+    typical = 3.0  # full scales down to the size of the signals
     inexact = CURVE
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SaturationTerm]:
         """Try every channel of a tool; references don't see signals of different size."""
-        weights = {
-            FLUX: np.ones(apparatus.emitters),
-            VOLTAGE: apparatus.omega / apparatus.omega.mean(),
-        }
+        weights = {FLUX: np.ones(apparatus.emitters)}
+        voltage = apparatus.omega / apparatus.omega.mean()
+        if not np.allclose(voltage, 1.0):
+            weights[VOLTAGE] = voltage
         return [
             SaturationTerm(
                 self, {'channel': c, 'shape': shape, 'sees': sees}, np.zeros(1), weights=w
@@ -92,18 +97,11 @@ class Saturation(Effect[SaturationTerm]):
             for c in apparatus.tool_channels
             for shape in SHAPES
             for sees, w in weights.items()
-            if sees == FLUX or not np.allclose(w, 1.0)
         ]
 
     def covers(self, term: SaturationTerm, candidate: Term) -> bool:
         """Return whether the term is on the candidate's channel, which has one curve only."""
-        if candidate.effect is not self:
-            return False
-        return bool(candidate.site['channel'] == term.site['channel'])
-
-    def prior(self, term: SaturationTerm) -> Array:
-        """Expect full scales down to the size of the signals."""
-        return np.full(1, 3.0)
+        return candidate.effect is self and candidate.channels == term.channels
 
     def columns(self, term: SaturationTerm, view: View) -> ComplexArray | None:
         """Return the third-order loss, or differences along the whole curve."""
@@ -113,12 +111,12 @@ class Saturation(Effect[SaturationTerm]):
         weights = term.weights
         out, own = view.columns(1), view.linear[:, row] * weights
         if term.theta[0] <= 0:
-            out[:, row, :, 0] = UNIT * third_order(own) / weights
+            slope = UNIT * third_order(own)
         else:
-            step = 0.01 * term.theta[0]
-            more = compressed(own, UNIT * (term.theta[0] + step), term.site['shape'])
-            less = compressed(own, UNIT * (term.theta[0] - step), term.site['shape'])
-            out[:, row, :, 0] = (more - less) / (2 * step) / weights
+            step, shape = 0.01 * term.theta[0], term.site['shape']
+            more = compressed(own, UNIT * (term.theta[0] + step), shape)
+            slope = (more - compressed(own, UNIT * (term.theta[0] - step), shape)) / (2 * step)
+        out[:, row, :, 0] = slope / weights
         return out
 
     def compress(
@@ -128,8 +126,8 @@ class Saturation(Effect[SaturationTerm]):
         out, weights = flux.copy(), term.weights
         for row in np.flatnonzero(channels == term.site['channel']):
             seen = flux[:, row] * weights
-            out[:, row] = compressed(seen, UNIT * float(term.theta[0]), term.site['shape'])
-            out[:, row] /= weights
+            passed = compressed(seen, UNIT * float(term.theta[0]), term.site['shape'])
+            out[:, row] = passed / weights
         return out
 
     def record(self, term: SaturationTerm, covariance: Array) -> EffectRecord:
@@ -138,10 +136,8 @@ class Saturation(Effect[SaturationTerm]):
         full_scale = 1 / np.sqrt(UNIT * value)
         relative = 0.5 * float(np.sqrt(covariance[0, 0])) / value
         parameters = {
-            'channel': term.site['channel'],
+            **recorded_site(term),
             'full_scale_t': float(full_scale),
-            'shape': term.site['shape'],
-            'sees': term.site['sees'],
             'tone_weights': term.weights.tolist(),
         }
         return EffectRecord(self.name, parameters, {'full_scale_t': float(full_scale * relative)})
@@ -150,7 +146,7 @@ class Saturation(Effect[SaturationTerm]):
         """Read the channel's full scale, T, from a record."""
         full_scale = float(needed(record, 'full_scale_t'))
         site: Site = {
-            'channel': int(needed(record, 'channel')),
+            **self.site_of(record),
             'shape': str(record.parameters.get('shape', SHAPES[0])),
             'sees': str(record.parameters.get('sees', FLUX)),
         }

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from anser_ros.effects.effect import Array, Effect, Family, Remedy, Site, Term, needed
+from anser_ros.effects.effect import Array, Effect, Family, Site, Term, needed, recorded_site
 from anser_ros.field.model import EffectRecord
 
 
@@ -11,15 +11,13 @@ from anser_ros.field.model import EffectRecord
 class SeenTerm(Term):
     """States how much of an effect there is, on the channels of its site, or on all."""
 
-    # amount, sigma: What the effect's first parameter is, and its standard deviation
-    amount: float
-    sigma: float = 0.0
+    amount: float  # What the effect's first parameter is
+    sigma: float = 0.0  # Its standard deviation
 
 
 class SeenEffect(Effect[SeenTerm]):
     """Is found in what is left, and corrects nothing; its first parameter says how much."""
 
-    remedy = Remedy.NONE
     family = Family.SEEN
 
     @property
@@ -28,9 +26,7 @@ class SeenEffect(Effect[SeenTerm]):
 
     def record(self, term: SeenTerm, covariance: Array) -> EffectRecord:
         """Record the number, and the channels where not all have the effect."""
-        parameters: dict[str, object] = {self._key: term.amount}
-        if 'channels' in term.site:
-            parameters['channels'] = list(term.site['channels'])
+        parameters = {self._key: term.amount, **recorded_site(term)}
         return EffectRecord(self.name, parameters, {self._key: term.sigma})
 
     def term(self, record: EffectRecord) -> SeenTerm:
@@ -52,9 +48,6 @@ class ExcessNoise(SeenEffect):
     plausible = {'factor': (1.0, 1000.0)}
 
 
-EXCESS_NOISE = ExcessNoise()
-
-
 class Outliers(SeenEffect):
     """Is found as frames that stand out from their neighbours in time (`anser_ros.diagnosis`)."""
 
@@ -71,7 +64,8 @@ class LooseContact(Outliers):
     summary = 'single readings of a channel fail now and then'
 
 
-OUTLIERS, LOOSE_CONTACT = Outliers(), LooseContact()
+EXCESS_NOISE, OUTLIERS, LOOSE_CONTACT = ExcessNoise(), Outliers(), LooseContact()
+EFFECTS = EXCESS_NOISE, OUTLIERS, LOOSE_CONTACT
 
 
 def known_share(records: Sequence[EffectRecord]) -> float:
@@ -86,10 +80,3 @@ def known_share(records: Sequence[EffectRecord]) -> float:
 def outliers_of(fraction: float, sigma: float, channels: Sequence[int]) -> SeenTerm:
     """Return outliers in whole frames, or of some channels, which is what a loose contact does."""
     return (LOOSE_CONTACT if channels else OUTLIERS).seen(fraction, sigma, channels)
-
-
-EFFECTS = (
-    EXCESS_NOISE,
-    OUTLIERS,
-    LOOSE_CONTACT,
-)

@@ -52,7 +52,7 @@ class SpreadTerm(Term):
         """Return the values of listed channels, a row each; zero for one that is no member."""
         out = np.zeros((len(channels), self.values.shape[1]))
         place = {channel: row for row, channel in enumerate(self.members)}
-        for row, channel in enumerate(np.asarray(channels, dtype=np.int64).tolist()):
+        for row, channel in enumerate(channels.tolist()):
             if channel in place:
                 out[row] = self.values[place[channel]]
         return out
@@ -71,14 +71,13 @@ class SensorSpread(Effect[SpreadTerm]):
 
     family = Family.SEEN
     plausible = {'spread': (0.0, 0.3)}
-    width: ClassVar[int] = 0
-    offset_of_values: ClassVar[tuple[float, ...]] = ()
+    # the values of a faultless channel; empty where they are zeros, as many as a record has
+    faultless: ClassVar[tuple[float, ...]] = ()
 
     def record(self, term: SpreadTerm, covariance: Array) -> EffectRecord:
         """Record spread, channels, and each channel's values with their uncertainty."""
-        of_sigma = term.with_theta(sigmas(covariance))
-        sigma = of_sigma.values.tolist()
-        values = (term.values + self._offset(term.values.shape[1])).tolist()
+        sigma = term.with_theta(sigmas(covariance)).values.tolist()
+        values = (term.values + (self.faultless or 0.0)).tolist()
         return EffectRecord(
             self.name,
             {
@@ -88,21 +87,17 @@ class SensorSpread(Effect[SpreadTerm]):
             {'values': sigma},
         )  # fmt: skip
 
-    def _offset(self, width: int) -> Array:
-        """What the values of a faultless channel are."""
-        return np.array(self.offset_of_values or (0.0,) * width)
-
     def term(self, record: EffectRecord) -> SpreadTerm:
         """Read the channels and their values from a record."""
-        channels = tuple(int(channel) for channel in needed(record, 'channels'))
+        channels = self.site_of(record)['channels']
         values = np.asarray(needed(record, 'values'), dtype=np.float64)
-        width = self.width or (values.shape[1] if values.ndim == 2 else 2)
+        width = len(self.faultless) or (values.shape[1] if values.ndim == 2 else 2)
         if values.shape != (len(channels), width) or len(set(channels)) != len(channels):
             raise ModelFileError(
                 f'model: {record.name} needs {width} values for each of its '
                 f'{len(channels)} channels, got {values.shape}'
             )
-        theta = (values - self._offset(width)).ravel()
+        theta = (values - (self.faultless or 0.0)).ravel()
         spread = float(record.parameters.get('spread', 0.0))
         shared = float(record.parameters.get('shared', 0.0))
         return SpreadTerm(self, {}, theta, members=channels, spread=spread, shared=shared)
@@ -116,9 +111,9 @@ class SensorGainSpread(SensorSpread):
     family = Family.STEADY
     units = {'spread': '1', 'channels': '1', 'values': '1'}
     remedy = Remedy.FLUX
-    width = 2
-    parts: ClassVar[tuple[str, ...]] = ('in phase', 'quadrature')
-    offset_of_values = (1.0, 0.0)
+    typical = 0.05  # gains of a kind are within some percent of each other
+    parts = ('in phase', 'quadrature')
+    faultless = (1.0, 0.0)
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SpreadTerm]:
         """Return a term of each body with many sensors; those at one place share a gain."""
@@ -138,10 +133,6 @@ class SensorGainSpread(SensorSpread):
                 )
             )  # fmt: skip
         return out
-
-    def prior(self, term: SpreadTerm) -> Array:
-        """Expect gains of a kind of sensor within some percent of each other."""
-        return np.full(term.theta.size, 0.05)
 
     def columns(self, term: SpreadTerm, view: View) -> ComplexArray | None:
         """Return each place's own fluxes, in phase and turned by a quarter."""
@@ -192,9 +183,8 @@ class SensorAxisSpread(SensorSpread):
     summary = "every sensor's axis is a little off"
     units = {'spread': 'rad', 'channels': '1', 'values': 'rad'}
     remedy = Remedy.SENSORS
-    width = 2
-    parts: ClassVar[tuple[str, ...]] = ('first tangent', 'second tangent')
-    offset_of_values = (0.0, 0.0)
+    parts = ('first tangent', 'second tangent')
+    faultless = (0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
         """Return the table with the sensors' true axes."""
@@ -208,9 +198,8 @@ class SensorPlaceSpread(SensorSpread):
     summary = 'every sensor sits a little off its surveyed place'
     units = {'spread': 'm', 'channels': '1', 'values': 'm'}
     remedy = Remedy.SENSORS
-    width = 3
-    parts: ClassVar[tuple[str, ...]] = ('x', 'y', 'z')
-    offset_of_values = (0.0, 0.0, 0.0)
+    parts = ('x', 'y', 'z')
+    faultless = (0.0, 0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
         """Return the table with the sensors at their true positions, m."""

@@ -2,8 +2,6 @@
 None has a parameter to fit; they are found before the search (`anser_ros.diagnosis.screening`).
 """
 
-from typing import cast
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,11 +11,8 @@ from anser_ros.effects.effect import (
     Effect,
     Family,
     Remedy,
-    Site,
     Term,
-    recorded_site,
     unit_matrix,
-    whole_numbers,
 )
 from anser_ros.field.model import EffectRecord
 
@@ -27,14 +22,9 @@ class Wiring(Effect[Term]):
 
     family = Family.SEEN
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the channels or emitters, and those that they are read as."""
-        return EffectRecord(self.name, recorded_site(term))
-
     def term(self, record: EffectRecord) -> Term:
         """Read the channels or emitters, and those that they are read as, from a record."""
-        site = {key: whole_numbers(record, key) for key in self.units}
-        return Term(self, cast(Site, site))
+        return Term(self, self.site_of(record))
 
 
 class SwappedChannels(Wiring):
@@ -86,9 +76,6 @@ class DeadChannel(Wiring):
         return term.channels
 
 
-SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()
-
-
 class SensorPolarity(Wiring):
     """Turns the channels' signs round, without a parameter."""
 
@@ -103,12 +90,6 @@ class SensorPolarity(Wiring):
         return np.diag(signs).astype(complex)
 
 
+SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()
 SENSOR_POLARITY = SensorPolarity()
-
-
-EFFECTS = (
-    SWAPPED_CHANNELS,
-    SWAPPED_COILS,
-    DEAD_CHANNEL,
-    SENSOR_POLARITY,
-)
+EFFECTS = SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL, SENSOR_POLARITY

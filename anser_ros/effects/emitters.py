@@ -1,4 +1,4 @@
-"""An emitter without a drawing is larger, or flatter, than its model's dipoles are."""
+"""An emitter is elsewhere, or larger or flatter, than the model has it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +9,55 @@ from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, 
 from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.dipoles import Dipoles, size_parameters, spread_along, symmetry_axis
 from anser_ros.field.model import EffectRecord
+
+GRADIENT_ERROR = 0.07
+"""Relative error of what an emitter's shift changes at a reference close to it. Smaller lets
+references outvote the tools with gradients that the model only guesses."""
+
+
+class CoilMoved(Effect[Term]):
+    """Theta is the shift of one emitter, m, frame fg."""
+
+    name = 'coil_moved'
+    summary = 'an emitter is not where the model has it'
+    units = {'coil': '1', 'shift_m': 'm'}
+    plausible = {'shift_m': (-0.03, 0.03)}
+    remedy = Remedy.FIELD
+    typical = 3e-3  # emitters shift by some millimetres
+    gradient_error = GRADIENT_ERROR
+    recorded = {'shift_m': (3, 1.0)}
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        """Return a candidate for every emitter."""
+        return [Term(self, {'coil': k}, np.zeros(3)) for k in range(apparatus.emitters)]
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Move the sensor the other way, which does the same as moving the source."""
+        coil = term.site['coil']
+        out = view.columns(3)
+        out[:, :, coil] = -np.moveaxis(view.d_position[..., coil], 2, -1)
+        return out
+
+    def sources(
+        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
+    ) -> Dipoles | None:
+        """Return the emitter at its new place, less the one at the old."""
+        return self._shifted(term, base)
+
+    def light(self, term: Term, illumination: Dipoles) -> Dipoles:
+        """Shift the emitter in the field that metal sees, too."""
+        return illumination.joined(self._shifted(term, illumination))
+
+    @staticmethod
+    def _shifted(term: Term, base: Dipoles) -> Dipoles:
+        only = np.zeros_like(base.moments)
+        only[:, term.site['coil']] = base.moments[:, term.site['coil']]
+        used = np.flatnonzero(np.abs(only).any(axis=1))
+        place, direction, moment = base.positions[used], base.directions[used], only[used]
+        return Dipoles(place + term.theta, direction, moment).joined(
+            Dipoles(place, direction, -moment)
+        )
+
 
 UNIT = 1e-4
 """theta counts second moments in units of (10 mm)^2."""
@@ -45,11 +94,9 @@ class EmitterSize(Effect[EmitterSizeTerm]):
     units = {
         'coil': '1', 'second_moment_m2': 'm^2', 'length_m': 'm', 'diameter_m': 'm',
     }  # fmt: skip
-    plausible = {
-        'length_m': (0.0, 1.0),
-        'diameter_m': (0.0, 1.0),
-    }
+    plausible = {'length_m': (0.0, 1.0), 'diameter_m': (0.0, 1.0)}
     remedy = Remedy.FIELD
+    typical = 100.0  # of magnets and coils of some decimetres
 
     def candidates(self, apparatus: Apparatus) -> Sequence[EmitterSizeTerm]:
         """Return a candidate for each emitter whose dipoles lie on one axis and point along it.
@@ -67,10 +114,6 @@ class EmitterSize(Effect[EmitterSizeTerm]):
                     )
                 )  # fmt: skip
         return found
-
-    def prior(self, term: EmitterSizeTerm) -> Array:
-        """Return a prior spread that allows magnets and coils of some decimetres."""
-        return np.full(1, 100.0)
 
     def columns(self, term: EmitterSizeTerm, view: View) -> ComplexArray:
         """Return the flux that a unit of second moment adds."""
@@ -103,9 +146,9 @@ class EmitterSize(Effect[EmitterSizeTerm]):
         modelled = float(needed(record, 'model_second_moment_m2'))
         theta = (float(needed(record, 'second_moment_m2')) - modelled) / UNIT
         return EmitterSizeTerm(
-            self, {'coil': int(needed(record, 'coil'))}, np.array([theta]),
+            self, self.site_of(record), np.array([theta]),
             axis=np.asarray(needed(record, 'axis'), dtype=np.float64), modelled_m2=modelled,
         )  # fmt: skip
 
 
-EFFECTS = (EmitterSize(),)
+EFFECTS = CoilMoved(), EmitterSize()

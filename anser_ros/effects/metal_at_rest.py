@@ -1,0 +1,305 @@
+"""A metal object or a metal sheet rests near the volume."""
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import (
+    FROZEN,
+    Array,
+    ComplexArray,
+    Effect,
+    Family,
+    Remedy,
+    Resting,
+    Term,
+    both_phases,
+    complex_of,
+    needed,
+    pairs_of,
+    sigmas,
+)
+from anser_ros.effects.view import Apparatus, View
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord
+from anser_ros.metal.body import (
+    BODIES,
+    COMPACT,
+    SPACINGS,
+    ball_modes,
+    body_sizes,
+    centre_sigma,
+    multipoles,
+    sheet_shapes,
+    sheet_sizes,
+    sheet_sources,
+)
+from anser_ros.metal.scattering import UNIT
+from anser_ros.physics.constants import MU_0
+
+STEP = 1e-3
+"""Step (m) of the central differences that give the derivative by the place."""
+CLOSEST = 0.02
+"""Distance (m) from where sensors were within which no metal is looked for."""
+SAME_BODY_M = 0.12
+"""Distance (m) from active metal within which further metal is taken for the same body: about
+the step of the grid of places."""
+
+
+def places(apparatus: Apparatus) -> Array:
+    """Return where metal is looked for: a grid about the board and the volume, (n, 3), m, fg."""
+    low = np.minimum(apparatus.board[0], apparatus.visited_box[0])
+    high = np.maximum(apparatus.board[1], apparatus.visited_box[1])
+    size = float(np.max(high[:2] - low[:2]))
+    lateral = [np.linspace(low[i] - 0.2 * size, high[i] + 0.2 * size, 7) for i in (0, 1)]
+    around = [np.linspace(low[i] - 0.5 * size, high[i] + 0.5 * size, 5) for i in (0, 1)]
+    below = apparatus.board[0, 2] - size * np.array([0.06, 0.14, 0.24, 0.38, 0.6])
+    above = apparatus.visited_box[1, 2] + size * np.array([0.2, 0.45])
+    beside = np.linspace(apparatus.board[1, 2], apparatus.visited_box[1, 2], 3)
+    grid = [(x, y, z) for z in (*below, *beside, *above) for x, y in product(*lateral)]
+    ring = [
+        (x, y, z)
+        for z in beside
+        for x, y in product(*around)
+        if x in around[0][[0, -1]] or y in around[1][[0, -1]]
+    ]
+    points = np.array(grid + ring)
+    inside = _within(points, apparatus.visited_box + [[-CLOSEST], [CLOSEST]])
+    on_board = _within(points, apparatus.board + [[0, 0, -0.01], [0, 0, 0.04]])
+    return np.asarray(points[~inside & ~on_board])
+
+
+def _within(points: Array, box: Array) -> NDArray[np.bool_]:
+    return np.asarray(np.all((points > box[0]) & (points < box[1]), axis=1))
+
+
+class MetalAtRest(Effect[Term]):
+    """Is metal of a shape that is never known, which the field model can take in."""
+
+    remedy = Remedy.FIELD
+    family = Family.METAL_AT_REST
+    inexact = np.inf
+
+
+class StaticMetal(MetalAtRest):
+    """Theta is the centre (m), then real and imaginary parts of a simple body's modes.
+
+    The rest of the body's response belongs to its remainder (`anser_ros.effects.metal_remainder`).
+    """
+
+    name = 'static_metal'
+    summary = 'a metal object stands near the volume'
+    units = {'position_m': 'm', 'polarizability': 'm^3 (3x3, [re, im])'}
+    plausible = {'position_m': (-1.0, 1.0)}
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        """Return a candidate at every place of a grid."""
+        none = np.zeros(2 * ball_modes().shape[1])
+        return [
+            Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, none]))
+            for place in places(apparatus)
+        ]
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """Return the indices of the modes' amplitudes."""
+        return np.arange(3, term.theta.size)
+
+    def prior(self, term: Term) -> Array:
+        """Expect places within decimetres, a few litres of metal at most; held metal stays."""
+        place = FROZEN if term.held else 0.1
+        return np.concatenate([np.full(3, place), np.full(term.theta.size - 3, 10.0)])
+
+    def _couplings(self, term: Term) -> ComplexArray:
+        return np.asarray(ball_modes() @ complex_of(term.theta[3:]))
+
+    def _seen(self, centre: Array, view: View) -> tuple[Array, ComplexArray]:
+        """Amplitudes of the sensors (F, S, M) and of the emitters (K, M) about a centre."""
+        shapes = multipoles()
+        ears = shapes.received(centre, view.centres, view.axes, view.sensors.length)
+        return ears, shapes.driven(view.illumination.field(centre + shapes.offsets))
+
+    def _flux(self, term: Term, centre: Array, view: View) -> ComplexArray:
+        return multipoles().flux(*self._seen(centre, view), self._couplings(term), view.omega)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Return derivatives by place (differences) and by polarisability (exact)."""
+        centre, alpha = term.theta[:3], term.theta[3:]
+        out = view.columns(term.theta.size)
+        if np.any(alpha) and not term.held:
+            for i, step in enumerate(STEP * np.eye(3)):
+                more, less = (self._flux(term, centre + s, view) for s in (step, -step))
+                out[..., i] = (more - less) / (2 * STEP)
+        unit = multipoles().mode_flux(*self._seen(centre, view), ball_modes(), view.omega)
+        out[..., 3:] = both_phases(unit)
+        return out
+
+    def probe(self, term: Term, view: View) -> ComplexArray | None:
+        """Return both columns, real and imaginary, of an isotropic scatterer."""
+        points = term.theta[:3]
+        field = view.illumination.field(points[None])[0] * (UNIT / MU_0)
+        unit = view.along(Dipoles.vectors(points[None], field[None]).flux(*view.flat))
+        return both_phases(unit[..., None])
+
+    def started(self, term: Term, solution: Array) -> Sequence[Term]:
+        """Start with the isotropic scatterer that the probe found at its place."""
+        alpha = np.zeros((2, ball_modes().shape[1]))
+        alpha[:, 0] = solution
+        return (term.with_theta(np.concatenate([term.theta[:3], alpha.ravel()])),)
+
+    def covers(self, term: Term, candidate: Term) -> bool:
+        """Count nearby candidates as covered: they are the same body."""
+        if candidate.effect is not self:
+            return False
+        return bool(np.linalg.norm(candidate.theta[:3] - term.theta[:3]) < SAME_BODY_M)
+
+    def resting(self, term: Term) -> Resting:
+        """Return a compact body at its place; small pieces of an extended one if much is left."""
+        lattices = [(BODIES[kind](), body_sizes(kind)) for kind in SPACINGS]
+        return Resting(term.theta[:3], [(multipoles(), body_sizes(COMPACT))], lattices)
+
+    def sources(
+        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
+    ) -> Dipoles | None:
+        """Return the dipoles that the emitters induce in the metal, or None without any."""
+        if not np.any(term.theta[3:]):
+            return None
+        return multipoles().sources(term.theta[:3], self._couplings(term), illumination, omega)
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Record the place, m, and the whole polarisability of the metal."""
+        total = multipoles().polarisability(self._couplings(term))
+        return EffectRecord(
+            self.name,
+            {
+                'position_m': term.theta[:3].tolist(),
+                'polarizability': pairs_of(total),
+                'groups': (UNIT * term.theta[3:]).tolist(),
+            },
+            {'position_m': np.hypot(sigmas(covariance)[:3], centre_sigma(total)).tolist()},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """Read the place, m, and the polarisability by groups of modes from a record."""
+        place = np.asarray(needed(record, 'position_m'), dtype=np.float64)
+        alpha = np.asarray(needed(record, 'groups'), dtype=np.float64) / UNIT
+        return Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, alpha]))
+
+
+MESH = 12
+"""Loops along an edge of the sheet's mesh, each less wide than the distance to the sensors."""
+DIFFERENCE_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
+"""Steps of the central differences, in theta's units."""
+TYPICAL_OHM = 3e-5
+"""Surface resistance, ohm, that a plate's fit starts from: of a millimetre of aluminium."""
+
+HEIGHT, RIM, OHM = 0.005, 0.03, 0.1
+"""How well a sheet is known at best, whose true outline, thickness and bend are unknown: its
+height and each rim as shares of its edge, and its resistance."""
+
+
+class ConductivePlate(MetalAtRest):
+    """Theta is height z, edge, centre x and y (m), and the log of the sheet resistance (ohm)."""
+
+    name = 'conductive_plate'
+    summary = 'a metal sheet lies parallel to the board'
+    units = {'z_m': 'm', 'edge_m': 'm', 'centre_m': 'm', 'sheet_ohm': 'ohm'}
+    plausible = {'z_m': (-1.0, 1.0), 'edge_m': (0.02, 2.0), 'sheet_ohm': (1e-7, 1.0)}
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        """Try heights below the board and above the volume, in two sizes."""
+        size = float(np.max(apparatus.board[1, :2] - apparatus.board[0, :2]))
+        middle = apparatus.board.mean(axis=0)
+        below = apparatus.board[0, 2] - size * np.array([0.08, 0.16, 0.26, 0.4, 0.6])
+        above = apparatus.visited_box[1, 2] + size * np.array([0.25, 0.5])
+        return [
+            Term(
+                self, {'z': float(z), 'edge': float(edge)},
+                np.array([z, edge, middle[0], middle[1], np.log(TYPICAL_OHM)]),
+            )
+            for z in (*below, *above)
+            for edge in (0.6 * size, size, 1.8 * size)
+        ]  # fmt: skip
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """Return the edge's index: a sheet without size has no effect."""
+        return np.array([1])
+
+    def prior(self, term: Term) -> Array:
+        """Expect places near the board, resistances over decades; a held sheet stays."""
+        if term.held:
+            return np.full(5, FROZEN)
+        return np.array([0.1, 0.2, 0.1, 0.1, 3.0])
+
+    def bounded(self, term: Term) -> Term:
+        """Keep the edge length and the sheet resistance within what exists."""
+        theta = term.theta.copy()
+        theta[1] = np.clip(theta[1], 0.02, 2.0)
+        theta[4] = np.clip(theta[4], np.log(1e-7), 0.0)
+        return term.with_theta(theta)
+
+    def covers(self, term: Term, candidate: Term) -> bool:
+        """Cover a sheet of any height and size: only one sheet is looked for."""
+        return candidate.effect is self
+
+    def resting(self, term: Term) -> Resting:
+        """Return what the sheet's currents lack, in waves over the sheet."""
+        edge = float(term.theta[1])
+        return Resting(term.theta[[2, 3, 0]], [(sheet_shapes(edge), sheet_sizes(edge))])
+
+    def sources(
+        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
+    ) -> Dipoles | None:
+        """Return the loops of the sheet; none where no amount has been set yet."""
+        z, edge, x, y, log_ohm = term.theta
+        centre, edges = np.array([x, y, z]), np.array([edge, edge])
+        return sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, illumination, omega)
+
+    def _flux(self, theta: Array, view: View) -> ComplexArray:
+        added = self.sources(Term(self, {}, theta), view.dipoles, view.illumination, view.omega)
+        assert added is not None
+        return view.along(added.flux(*view.flat))
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Return the flux's derivatives, taken by central differences with `DIFFERENCE_STEPS`."""
+        if term.held:
+            return view.columns(5)
+        steps, theta = np.diag(DIFFERENCE_STEPS), term.theta
+        differences = [self._flux(theta + s, view) - self._flux(theta - s, view) for s in steps]
+        return np.asarray(np.stack(differences, axis=-1) / (2 * DIFFERENCE_STEPS))
+
+    def probe(self, term: Term, view: View) -> ComplexArray | None:
+        """Return the columns of a sheet of this height and size, of any strength and phase."""
+        return both_phases(self._flux(term.theta, view)[..., None])
+
+    def started(self, term: Term, solution: Array) -> Sequence[Term]:
+        """Return the term of the sheet as it was probed."""
+        return (term,)
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Record height, edge length and centre of the sheet, m, and its resistance, ohm."""
+        z, edge, x, y, log_ohm = (float(v) for v in term.theta)
+        ohm, rim = float(np.exp(log_ohm)), RIM * edge
+        least = [HEIGHT * edge, np.sqrt(2) * rim, rim / np.sqrt(2), rim / np.sqrt(2), OHM]
+        sigma = np.hypot(sigmas(covariance), least)
+        return EffectRecord(
+            self.name,
+            {'z_m': z, 'edge_m': edge, 'centre_m': [x, y], 'sheet_ohm': ohm},
+            {
+                'z_m': float(sigma[0]),
+                'edge_m': float(sigma[1]),
+                'centre_m': sigma[2:4].tolist(),
+                'sheet_ohm': ohm * float(sigma[4]),
+            },
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """Read height, edge length, centre and sheet resistance from a record."""
+        x, y = (float(v) for v in needed(record, 'centre_m'))
+        z, edge, ohm = (float(needed(record, key)) for key in ('z_m', 'edge_m', 'sheet_ohm'))
+        return Term(self, {}, np.array([z, edge, x, y, np.log(ohm)]))
+
+
+STATIC_METAL = StaticMetal()
+EFFECTS = STATIC_METAL, ConductivePlate()

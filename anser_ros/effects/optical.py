@@ -1,0 +1,231 @@
+"""The optical tracker's clock, frame or scale is not the one that is assumed, or drifts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Term,
+    TermT,
+    needed,
+    sigmas,
+)
+from anser_ros.effects.view import Apparatus, View
+from anser_ros.field.model import EffectRecord
+from anser_ros.physics.pose_track import PoseTrack
+
+
+class OpticalEffect(Effect[TermT]):
+    """Changes the optical track, which all bodies share; references have none."""
+
+    remedy = Remedy.OPTICAL
+    typical: ClassVar[tuple[float, ...]]
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[TermT]:
+        """Return one candidate, as all bodies are seen by one tracker."""
+        return [self.zero(apparatus)] if apparatus.tools else []
+
+    def zero(self, apparatus: Apparatus) -> TermT:
+        """Return the term with parameters of zero."""
+        return Term(self, {}, np.zeros(len(self.typical)))  # type: ignore[return-value]
+
+    def columns(self, term: TermT, view: View) -> ComplexArray | None:
+        """Return the derivative by a tool's motion, or None for references."""
+        return None if view.is_reference else self.slopes(term, view)
+
+    def slopes(self, term: TermT, view: View) -> ComplexArray:
+        """Return the derivative of a tool's flux by the parameters, (F, S, K, q)."""
+        raise NotImplementedError
+
+
+def flux_rate(view: View) -> ComplexArray:
+    """Return the time derivative of the flux by the body's motion, (F, S, K), T/s."""
+    lever = view.centres - view.position[:, None, :]
+    moving = view.velocity[:, None, :3] + np.cross(view.velocity[:, None, 3:], lever)
+    turning = np.cross(view.velocity[:, None, 3:], view.axes)
+    return np.asarray(
+        np.einsum('fsik,fsi->fsk', view.d_position, moving)
+        + np.einsum('fsik,fsi->fsk', view.d_axis, turning)
+    )
+
+
+class TimeOffset(OpticalEffect[Term]):
+    """Applies the optical pose stamped t - theta at flux stamp t; theta is in s."""
+
+    name = 'time_offset'
+    summary = 'the optical stamps are early or late'
+    units = {'offset_s': 's'}
+    plausible = {'offset_s': (-0.5, 0.5)}
+    recorded = {'offset_s': (1, 1.0)}
+    typical = (0.1,)
+
+    def slopes(self, term: Term, view: View) -> ComplexArray:
+        """Return minus the flux's rate of change."""
+        return -flux_rate(view)[..., None]
+
+    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        """Return the optical track with its stamps on the fluxes' clock."""
+        return replace(track, time=track.time + term.theta[0])
+
+
+class ClockRate(OpticalEffect[Term]):
+    """Theta is an offset a (s) and a rate b (s a second): optical t' counts as t' + a + b t'."""
+
+    name = 'clock_rate'
+    summary = "one of the two clocks runs slow, so that the stamps' offset grows"
+    units = {'offset_s': 's', 'rate_ppm': '1e-6'}
+    plausible = {'offset_s': (-0.5, 0.5), 'rate_ppm': (-2e4, 2e4)}
+    recorded = {'offset_s': (1, 1.0), 'rate_ppm': (1, 1e6)}
+    typical = (0.1, 3e-3)
+
+    def slopes(self, term: Term, view: View) -> ComplexArray:
+        """Return minus the flux's rate of change, constant and growing with time."""
+        rate = -flux_rate(view)
+        return np.stack([rate, rate * view.time[:, None, None]], axis=-1)
+
+    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        """Return the optical track with its stamps on the fluxes' clock."""
+        return replace(track, time=track.time * (1 + term.theta[1]) + term.theta[0])
+
+
+class Registration(OpticalEffect[Term]):
+    """Theta is a rotation vector r (rad) and a translation t (m): optical = R(r) fg + t."""
+
+    name = 'registration'
+    summary = "the optical frame is not aligned with the field generator's"
+    units = {'rotation_deg': 'deg', 'translation_m': 'm'}
+    plausible = {'rotation_deg': (-10.0, 10.0), 'translation_m': (-0.05, 0.05)}
+    recorded = {'rotation_deg': (3, 180.0 / np.pi), 'translation_m': (3, 1.0)}
+    typical = (0.02, 0.02, 0.02, 5e-3, 5e-3, 5e-3)
+
+    def slopes(self, term: Term, view: View) -> ComplexArray:
+        """Return the derivative by a turn about fg's origin and a shift, which all sensors make
+        the other way round.
+        """
+        back = Rotation.from_rotvec(term.theta[:3]).as_matrix().T
+        turn = np.cross(view.centres[..., :, None], view.d_position, axis=2)
+        turn = turn + np.cross(view.axes[..., :, None], view.d_axis, axis=2)
+        out = view.columns(6)
+        # To first order a further turn w of the optical frame turns the true pose by -R^T w.
+        out[..., :3] = -np.einsum('fsik,ij->fskj', turn, back)
+        out[..., 3:] = -np.einsum('fsik,ij->fskj', view.d_position, back)
+        return out
+
+    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        """Return the optical track as it is in fg."""
+        back = Rotation.from_rotvec(term.theta[:3]).inv()
+        return PoseTrack(
+            track.time,
+            back.apply(track.position - term.theta[3:]),
+            (back * Rotation.from_quat(track.quaternion)).as_quat(),
+        )
+
+
+class OpticalScale(OpticalEffect[Term]):
+    """Theta is the scale less one, and times it the point of fg that stays where it is (m).
+
+    Optical positions are ``p (1 + e) - c``; the scale applies about the tracker's own origin,
+    which may be anywhere, so the shift ``c`` is free.
+    """
+
+    name = 'optical_scale'
+    summary = "the optical tracker's millimetre is too long or too short"
+    units = {'scale': '1', 'shift_m': 'm'}
+    plausible = {'scale': (0.9, 1.1), 'shift_m': (-0.1, 0.1)}
+    typical = (0.01, 5e-3, 5e-3, 5e-3)
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """Return the scale's index alone: a shift is a registration's."""
+        return np.array([0])
+
+    def slopes(self, term: Term, view: View) -> ComplexArray:
+        """Return the flux that changes as all sensors move with scale and shift."""
+        out = view.columns(4)
+        larger = 1 + term.theta[0]
+        out[..., 0] = -np.einsum('fsik,fi->fsk', view.d_position, view.position) / larger
+        out[..., 1:] = np.moveaxis(view.d_position, 2, -1) / larger
+        return out
+
+    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        """Return the optical track with positions at their true scale, m."""
+        return replace(track, position=(track.position + term.theta[1:]) / (1 + term.theta[0]))
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Record the scale and the shift."""
+        sigma = sigmas(covariance)
+        return EffectRecord(
+            self.name,
+            {'scale': 1 + float(term.theta[0]), 'shift_m': term.theta[1:].tolist()},
+            {'scale': float(sigma[0]), 'shift_m': sigma[1:].tolist()},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """Read the scale and the shift, m, from a record."""
+        shift = np.asarray(needed(record, 'shift_m'), dtype=np.float64)
+        return Term(self, {}, np.array([float(needed(record, 'scale')) - 1, *shift]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationDriftTerm(Term):
+    """Holds the drift of the optical tracker."""
+
+    duration: float  # Time over which the growth in theta is made, s
+
+
+class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
+    """Theta is the translation (m) at the session's start, and its growth (m) to the end."""
+
+    name = 'registration_drift'
+    summary = 'the optical tracker moves steadily'
+    units = {'translation_m': 'm', 'velocity_m_per_s': 'm/s', 'duration_s': 's'}
+    plausible = {'translation_m': (-0.05, 0.05), 'velocity_m_per_s': (-0.01, 0.01)}
+    typical = (5e-3,) * 6
+
+    def zero(self, apparatus: Apparatus) -> RegistrationDriftTerm:
+        """Return no drift, over the session's time."""
+        duration = max(apparatus.duration, 1e-3)
+        return RegistrationDriftTerm(self, {}, np.zeros(6), duration=duration)
+
+    def amounts(self, term: RegistrationDriftTerm) -> NDArray[np.int64]:
+        """Return the growth's index alone: a constant shift is a registration's."""
+        return np.arange(3, 6)
+
+    def slopes(self, term: RegistrationDriftTerm, view: View) -> ComplexArray:
+        """Move all sensors the other way, from the start and more and more."""
+        out, back = view.columns(6), -np.moveaxis(view.d_position, 2, -1)
+        share = (view.time / term.duration)[:, None, None, None]
+        out[..., :3], out[..., 3:] = back, back * share
+        return out
+
+    def optical(self, term: RegistrationDriftTerm, track: PoseTrack) -> PoseTrack:
+        """Return the optical track with the drift of its frame taken off, in fg."""
+        share = (track.time / term.duration)[:, None]
+        return replace(track, position=track.position - term.theta[:3] - share * term.theta[3:])
+
+    def record(self, term: RegistrationDriftTerm, covariance: Array) -> EffectRecord:
+        """Record the first translation and the velocity."""
+
+        def figures(values: Array) -> dict[str, list[float]]:
+            velocity = (values[3:] / term.duration).tolist()
+            return {'translation_m': values[:3].tolist(), 'velocity_m_per_s': velocity}
+
+        parameters = {**figures(term.theta), 'duration_s': term.duration}
+        return EffectRecord(self.name, parameters, figures(sigmas(covariance)))
+
+    def term(self, record: EffectRecord) -> RegistrationDriftTerm:
+        """Read the translation, m, and the velocity, m/s, from a record."""
+        duration = float(needed(record, 'duration_s'))
+        start = np.asarray(needed(record, 'translation_m'), dtype=np.float64)
+        way = np.asarray(needed(record, 'velocity_m_per_s'), dtype=np.float64) * duration
+        return RegistrationDriftTerm(self, {}, np.concatenate([start, way]), duration=duration)
+
+
+EFFECTS = (TimeOffset(), ClockRate(), Registration(), OpticalScale(), RegistrationDrift())
