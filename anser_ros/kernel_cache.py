@@ -132,10 +132,7 @@ class KernelCache:
     def locked(self) -> Iterator[None]:
         """Be the only process that compiles; wait for another one that does.
 
-        Raises
-        ------
-        ParameterError
-            When nothing can be written into the cache.
+        Raises `ParameterError` when nothing can be written into the cache.
         """
         try:
             self._lock.parent.mkdir(parents=True, exist_ok=True)

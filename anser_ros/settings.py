@@ -53,12 +53,8 @@ class Accuracy(_Stated):
     The defaults are those of the Anser sessions that this package was developed on: their noise
     and jitter, and the accuracy that their survey of the reference sensors states. If a value is
     too small, ordinary errors look like an effect or like metal; if it is too large, such effects
-    are hidden and poses have too large a sigma.
-
-    Raises
-    ------
-    ParameterError
-        When a value is no number or out of its range.
+    are hidden and poses have too large a sigma. Raises `ParameterError` when a value is no number
+    or out of its range.
     """
 
     # Where the noise is measured (the refit, the tracker's adaptive scale, the calibration), the
@@ -90,10 +86,7 @@ class Accuracy(_Stated):
 class ToolSettings(_Stated):
     """States how well tools are known, and how fast they may be.
 
-    Raises
-    ------
-    ParameterError
-        When a value is no number or out of its range.
+    Raises `ParameterError` when a value is no number or out of its range.
     """
 
     # Too small, and faultless coils contradict their body; too large, and a coil may be wrong by
@@ -116,10 +109,7 @@ class ToolSettings(_Stated):
 class RefitSettings(_Stated):
     """States how the live refit follows; nothing here belongs to a particular board or metal.
 
-    Raises
-    ------
-    ParameterError
-        When a value is no number or out of its range.
+    Raises `ParameterError` when a value is no number or out of its range.
     """
 
     # The current has a gain error of its own. A larger deviation lets a change of one emitter
@@ -171,12 +161,8 @@ VALUES = {name: item for section in SECTIONS.values() for name, item in section.
 def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
     """Return the settings with some values stated by their names, and the default of every other.
 
-    A whole number will do for a float.
-
-    Raises
-    ------
-    ParameterError
-        When a name is unknown, or a value is no number or out of its range.
+    A whole number will do for a float. Raises `ParameterError` when a name is unknown, or a value
+    is no number or out of its range.
     """
     unknown = sorted(set(map(str, stated)) - set(VALUES))
     if unknown:
@@ -202,10 +188,8 @@ def sections_of(stated: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 def parse_entries(entries: list[str]) -> dict[str, float]:
     """Return values from entries ``NAME=VALUE``, as `settings_from` takes them.
 
-    Raises
-    ------
-    ParameterError
-        When an entry is not of that form, a name is unknown or twice there, or a value is bad.
+    Raises `ParameterError` when an entry is not of that form, a name is unknown or twice there, or
+    a value is bad.
     """
     stated: dict[str, float] = {}
     for entry in entries:

@@ -44,12 +44,8 @@ def baseline_of(recording: Session, sensors: SensorTable, model: FieldModel) -> 
 def clean_flux(recording: Session, sensors: SensorTable, model: FieldModel) -> ComplexArray:
     """Return mean readings of a recording without metal in it, as far as it can be checked.
 
-    Arguments, result and further errors are those of `baseline_flux`.
-
-    Raises
-    ------
-    BagError
-        When readings change during the recording, or are not those that the model knows of.
+    Arguments, result and further errors are those of `baseline_flux`. Raises `BagError` when
+    readings change during the recording, or are not those that the model knows of.
     """
     flux = baseline_flux(recording, sensors)
     try:
@@ -127,10 +123,7 @@ def clean_mean(
 ) -> ComplexArray:
     """Return the mean readings (R, K), T, of a window in which there seems to be no metal.
 
-    Raises
-    ------
-    FitError
-        When they change, or are not what the references read without metal.
+    Raises `FitError` when they change, or are not what the references read without metal.
     """
     mean, sigma = window.mean(), check_steady(window.frames)
     if model is not None and sensors is not None:
@@ -143,10 +136,8 @@ def clean_mean(
 def steady_sigma(recording: Session) -> float:
     """Return the noise of a component of a recording's mean readings, T, from its scatter.
 
-    Raises
-    ------
-    FitError
-        When the readings change during the recording by more than an emitter's strength.
+    Raises `FitError` when the readings change during the recording by more than an emitter's
+    strength.
     """
     reference, stated = recording.reference, recording.setup.accuracy.flux_noise_t
     if reference is None:
@@ -175,13 +166,9 @@ def readings_of(recording: Session) -> ReferenceReadings | None:
 def baseline_flux(baseline: Session, sensors: SensorTable) -> ComplexArray:
     """Return the mean reading of each of R reference sensors in a recording without metal.
 
-    (R, K), T, in the order of the sensors; NaN for one without a good reading.
-
-    Raises
-    ------
-    BagError
-        When the recording has no reference fluxes, or lacks one of the sensors, or has it at
-        another place.
+    (R, K), T, in the order of the sensors; NaN for one without a good reading. Raises `BagError`
+    when the recording has no reference fluxes, or lacks one of the sensors, or has it at another
+    place.
     """
     reference = baseline.reference
     if reference is None:

@@ -68,16 +68,9 @@ def diagnose_session(
     """Find what a model lacks on a session with optical poses of at least one tool.
 
     With a baseline, a distortion-free recording of the same board, the references are used.
-    ``progress`` is called with words on what goes on.
-
-    Raises
-    ------
-    DiagnosisError
-        When fewer than 30 frames have fluxes and a pose.
-    ModelFileError
-        When the model's emitters are not the session's.
-    BagError
-        When the baseline's references are not the session's.
+    ``progress`` is called with words on what goes on. Raises `DiagnosisError` when fewer than 30
+    frames have fluxes and a pose; `ModelFileError` when the model's emitters are not the
+    session's; `BagError` when the baseline's references are not the session's.
     """
     say = progress or (lambda text: None)
     prepared = prepare(session, model, baseline)
@@ -94,12 +87,9 @@ def diagnose_session(
 def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Problem:
     """Return the diagnosis problem of a session that was corrected (`correct`).
 
-    Readings and poses may be off by ``spread``, by default that of `spread_of`.
-
-    Raises
-    ------
-    DiagnosisError
-        When the session has no tool fluxes, or fewer than 30 frames have fluxes and a pose.
+    Readings and poses may be off by ``spread``, by default that of `spread_of`. Raises
+    `DiagnosisError` when the session has no tool fluxes, or fewer than 30 frames have fluxes and a
+    pose.
     """
     session, clean = corrected.session, corrected.baseline
     if not session.tools:

@@ -192,10 +192,7 @@ class ComparedShares(Difference):
 def check_same_recording(first: Path, second: Path) -> None:
     """Refuse evaluations of two recordings, of which equal stamps mean nothing.
 
-    Raises
-    ------
-    ParameterError
-        When both state what they are of, and it is not the same.
+    Raises `ParameterError` when both state what they are of, and it is not the same.
     """
     one, two = _recording(first), _recording(second)
     if one and two and one != two:
@@ -219,10 +216,7 @@ def _recording(folder: Path) -> str:
 def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
     """Return errors of position (m) and orientation (rad) by stamp and name, of an evaluation.
 
-    Raises
-    ------
-    ParameterError
-        When the folder has none, or the table is not one of ours.
+    Raises `ParameterError` when the folder has none, or the table is not one of ours.
     """
     _, _, *kinds = ERROR_COLUMNS
     errors = [_read(folder, ERRORS_FILE, ERROR_COLUMNS, itemgetter(kind)) for kind in kinds]
@@ -232,10 +226,7 @@ def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
 def read_states(folder: Path) -> dict[Key, float]:
     """Return whether there is a pose, 1 or 0, by stamp and name of a coil or body.
 
-    Raises
-    ------
-    ParameterError
-        When the folder lacks a table, or one is not ours.
+    Raises `ParameterError` when the folder lacks a table, or one is not ours.
     """
     tables = ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS))
     found: dict[Key, float] = {}
@@ -276,10 +267,7 @@ def compare_shares(
 ) -> dict[str, ComparedShares]:
     """Compare how often two evaluations have a pose; states by stamp and name (`read_states`).
 
-    Raises
-    ------
-    ParameterError
-        When no frame is in both.
+    Raises `ParameterError` when no frame is in both.
     """
     if not first.keys() & second.keys():
         raise ParameterError('the two have no frame in common: are they of the same session?')

@@ -32,10 +32,7 @@ NONE = 'none'
 def parse_references(text: str) -> tuple[int, ...]:
     """Return the channels of a list ``CHANNEL,...``, none for the word ``none``.
 
-    Raises
-    ------
-    ParameterError
-        When an entry is no channel or appears twice.
+    Raises `ParameterError` when an entry is no channel or appears twice.
     """
     if text.strip() == NONE:
         return ()
@@ -51,10 +48,7 @@ def parse_references(text: str) -> tuple[int, ...]:
 def with_references(session: Session, channels: Sequence[int]) -> Session:
     """Return a session that has only the reference sensors on some channels, in its own order.
 
-    Raises
-    ------
-    BagError
-        When it has no reference fluxes, or none on one of the channels.
+    Raises `BagError` when it has no reference fluxes, or none on one of the channels.
     """
     reference = session.reference
     if reference is None:
@@ -131,18 +125,13 @@ class ModelFollower(FrameModels):
     """Refits the model to the reference sensors frame by frame, at the pace of the live node.
 
     The session must have references and a baseline. With ``witnesses``, contradictions of the
-    tools' coils show metal, too.
+    tools' coils show metal, too. Raises `BagError` when the session has no reference fluxes, or
+    there is no baseline or one of too few sensors.
 
     Attributes
     ----------
     summary : RefitSummary
         What the refit did so far.
-
-    Raises
-    ------
-    BagError
-        When the session has no reference fluxes, or there is no baseline or one of too few
-        sensors.
     """
 
     def __init__(self, prepared: PreparedSession, witnesses: bool = False) -> None:

@@ -37,10 +37,8 @@ class ImportedBag:
 def parse_remaps(entries: Sequence[str]) -> dict[str, str]:
     """Return new names by old ones from entries ``FROM:=TO``.
 
-    Raises
-    ------
-    ParameterError
-        When an entry is not of that form, a name is not absolute, or one is renamed twice.
+    Raises `ParameterError` when an entry is not of that form, a name is not absolute, or one is
+    renamed twice.
     """
     names: dict[str, str] = {}
     for entry in entries:
@@ -60,14 +58,8 @@ def import_bag(
     """Write the messages of any ROS 2 bag as one MCAP file that every command reads.
 
     ``remaps`` are new names of topics; a setup document's text is written at the start, in place
-    of any in the bag.
-
-    Raises
-    ------
-    BagError
-        When the bag cannot be read, has no message, or lacks a topic that is to be renamed.
-    SetupError
-        When the text is not a setup document.
+    of any in the bag. Raises `BagError` when the bag cannot be read, has no message, or lacks a
+    topic that is to be renamed; `SetupError` when the text is not a setup document.
     """
     if setup_text is not None:
         parse_setup(setup_text)
@@ -118,12 +110,8 @@ class ExportedBag:
 def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBag:
     """Write a file for each topic of poses and of fluxes.
 
-    Raises
-    ------
-    BagError
-        When the bag cannot be read, or has neither.
-    ParameterError
-        When the form is unknown.
+    Raises `BagError` when the bag cannot be read, or has neither; `ParameterError` when the form
+    is unknown.
     """
     if form not in FORMATS:
         raise ParameterError(f'format must be among {", ".join(FORMATS)}, got {form!r}')

@@ -107,10 +107,7 @@ class KeptTables:
     def write(self, tables: RefitTables) -> None:
         """Keep the tables if they are not, and drop those that were not used for longest.
 
-        Raises
-        ------
-        OSError
-            When the disk is full, or must not be written.
+        Raises `OSError` when the disk is full, or must not be written.
         """
         if not self._path.exists():
             write_arrays(self._path, arrays_of(tables))
@@ -141,10 +138,8 @@ def used_s(path: Path) -> float:
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a file; they share one memory, as reading them one by one is slow.
 
-    Raises
-    ------
-    OSError, ValueError, KeyError, TypeError
-        When it is not there, damaged, or another one's; see `DAMAGED`.
+    Raises `OSError`, `ValueError`, `KeyError`, `TypeError` when it is not there, damaged, or
+    another one's; see `DAMAGED`.
     """
     with path.open('rb') as file:
         head = json.loads(file.readline(LONGEST_HEAD))
@@ -160,10 +155,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write a file that is whole or not there.
 
-    Raises
-    ------
-    OSError
-        When the disk is full, or must not be written.
+    Raises `OSError` when the disk is full, or must not be written.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     rows, parts, begin = {}, [], 0

@@ -126,11 +126,8 @@ OTHER_READINGS = (
 def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Measurements) -> None:
     """Check units and order of a tool's poses, and the unit of its fluxes, against each other.
 
-    Raises
-    ------
-    PlausibilityError
-        When the poses contradict the fluxes as they stand and fit them when read in another way,
-        or the fluxes are larger than the board can make by the factor of a unit.
+    Raises `PlausibilityError` when the poses contradict the fluxes as they stand and fit them when
+    read in another way, or the fluxes are larger than the board can make by the factor of a unit.
     """
     field = nominal.field
     if field is None:
@@ -243,12 +240,8 @@ def plausible_tools(
     """Check a recording's tools, and leave out the poses of an optical tracker that stood still.
 
     ``refused`` is what the reader refused, ``topic: reason``, and how often. What was left out or
-    refused is returned in words; empty when nothing was.
-
-    Raises
-    ------
-    PlausibilityError
-        With the evidence, in one line.
+    refused is returned in words; empty when nothing was. Raises `PlausibilityError` with the
+    evidence, in one line.
     """
     nominal, kept, words = NominalBoard.of(setup), [], []
     for tool in tools:
@@ -265,10 +258,8 @@ def plausible_tools(
 def check_points(tracked: Array, true: Array) -> None:
     """Check the points (M, 3), m, that an error map shall be learnt from; not rows with NaN.
 
-    Raises
-    ------
-    PlausibilityError
-        When their extents fit no tracked volume or not each other, or one of them is a point.
+    Raises `PlausibilityError` when their extents fit no tracked volume or not each other, or one
+    of them is a point.
     """
     good = np.isfinite(tracked).all(axis=1) & np.isfinite(true).all(axis=1)
     if not good.any():
@@ -292,10 +283,8 @@ def check_points(tracked: Array, true: Array) -> None:
 def check_positions(what: str, places: Array) -> None:
     """Check that the positions (n, 3) of a tracker can be in m; ``what`` says whose they are.
 
-    Raises
-    ------
-    PlausibilityError
-        When most of them extend over more than a room, or lie where a unit explains it.
+    Raises `PlausibilityError` when most of them extend over more than a room, or lie where a unit
+    explains it.
     """
     if not len(places):
         return

@@ -63,10 +63,8 @@ class PreparedSession:
     def with_model(self, model: FieldModel) -> 'PreparedSession':
         """Return the same with another model.
 
-        Raises
-        ------
-        ModelFileError
-            When the model's emitters are not the session's, or an effect of it is unknown.
+        Raises `ModelFileError` when the model's emitters are not the session's, or an effect of it
+        is unknown.
         """
         check_fits(model, self.session)
         return replace(
@@ -82,15 +80,10 @@ def prepare(
 ) -> PreparedSession:
     """Check a model against a session, and work out what follows from the two.
 
-    A baseline's readings are not used where the session has no reference fluxes.
-
-    Raises
-    ------
-    ModelFileError
-        When the model's emitters are not the session's or the baseline's, or an effect of it is
-        unknown.
-    BagError
-        When the baseline's references are not the session's, or there is metal in it.
+    A baseline's readings are not used where the session has no reference fluxes. Raises
+    `ModelFileError` when the model's emitters are not the session's or the baseline's, or an
+    effect of it is unknown; `BagError` when the baseline's references are not the session's, or
+    there is metal in it.
     """
     check_fits(model, session)
     clean = None

@@ -69,12 +69,8 @@ def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
 def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
     """Return when each part of a node first warned: log time, ns, by the part's name.
 
-    The statuses of a node's parts are named ``NODE: PART``.
-
-    Raises
-    ------
-    BagError
-        When the recording cannot be read.
+    The statuses of a node's parts are named ``NODE: PART``. Raises `BagError` when the recording
+    cannot be read.
     """
     found: dict[str, int] = {}
     for log_time_ns, status in _statuses(path):

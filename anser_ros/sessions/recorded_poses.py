@@ -56,12 +56,8 @@ def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErro
     """Return errors of all that the tracker of a namespace published, by sensor and body.
 
     The recording has optical poses, and is prepared with the tracker's model, whose corrections of
-    the clock, the optical frame and the sensors are made.
-
-    Raises
-    ------
-    BagError
-        When the recording has no optical poses.
+    the clock, the optical frame and the sensors are made. Raises `BagError` when the recording has
+    no optical poses.
     """
     session = prepared.session
     names = [name for tool in session.tools for name in (*tool.sensors.name, tool.body)]

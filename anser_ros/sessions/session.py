@@ -53,10 +53,7 @@ class Session:
     def with_stated(self, stated: Mapping[str, float]) -> 'Session':
         """Return the session with values stated that go before its setup document's.
 
-        Raises
-        ------
-        ParameterError
-            As `anser_ros.settings.settings_from`.
+        Raises `ParameterError` as `anser_ros.settings.settings_from`.
         """
         return replace(self, setup=self.setup.with_stated(stated))
 
@@ -154,10 +151,7 @@ def shifted(measurements: Measurements, seconds: float) -> Measurements:
 def session_of(bag: Bag) -> Session:
     """Turn a bag into arrays.
 
-    Raises
-    ------
-    BagError
-        When the fluxes' number of emitters is not the setup's.
+    Raises `BagError` when the fluxes' number of emitters is not the setup's.
     """
     streams = [stream for stream in (bag.tool, bag.reference) if stream is not None]
     n_emitters = len(bag.setup.emitter.coils)
@@ -184,14 +178,8 @@ def load_session(path: str | os.PathLike[str]) -> Session:
     """Read a bag as a session that is plausible.
 
     Poses of an optical tracker that stood still while the tool moved are left out; `Session.lost`
-    reports this.
-
-    Raises
-    ------
-    BagError
-        When the bag can't be read.
-    PlausibilityError
-        When units, clocks or the order of quaternions contradict what was recorded.
+    reports this. Raises `BagError` when the bag can't be read; `PlausibilityError` when units,
+    clocks or the order of quaternions contradict what was recorded.
     """
     # Nodes that read no bag run where the packages that read bags are not installed.
     from anser_ros.wire.bag import read_bag
@@ -362,10 +350,7 @@ class SlidingWindow:
     def session(self) -> Session | None:
         """Return what is in the window; None while there are no fluxes.
 
-        Raises
-        ------
-        BagError
-            When the fluxes' number of emitters is not the setup's.
+        Raises `BagError` when the fluxes' number of emitters is not the setup's.
         """
         tool, reference = self._tool.stream(), self._reference.stream()
         if tool is None and reference is None:

@@ -59,10 +59,7 @@ class NumberTable:
     def column(self, reference: Any) -> NDArray[Any]:
         """Return one column, shape (N,), such as ``time``, ``flux[3]`` or ``flux[0, 3]``.
 
-        Raises
-        ------
-        ParameterError
-            When there is no such name, or what it names is no column.
+        Raises `ParameterError` when there is no such name, or what it names is no column.
         """
         match = REFERENCE.match(str(reference))
         if match is None:
@@ -90,10 +87,7 @@ class NumberTable:
 def read_table(path: Path) -> NumberTable:
     """Read a file; MATLAB's before version 7.3 by scipy, later ones, which are HDF5, by h5py.
 
-    Raises
-    ------
-    ParameterError
-        When it is of another kind, or cannot be read.
+    Raises `ParameterError` when it is of another kind, or cannot be read.
     """
     if not path.is_file():
         raise ParameterError(f'{path}: {"is a folder" if path.is_dir() else "no such file"}')
@@ -168,16 +162,9 @@ Array = NDArray[Any]
 def import_tables(document: Path, out: Path) -> dict[str, int]:
     """Write the session that a document describes; how many messages each topic got.
 
-    Files are looked for beside the document.
-
-    Raises
-    ------
-    ParameterError
-        When the document or a table breaks a rule, with the file's name.
-    SetupError
-        When the text is not a setup document.
-    BagError
-        When the file to write is there already.
+    Files are looked for beside the document. Raises `ParameterError` when the document or a table
+    breaks a rule, with the file's name; `SetupError` when the text is not a setup document;
+    `BagError` when the file to write is there already.
     """
     text = read_text(document)
     try:

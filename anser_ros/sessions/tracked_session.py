@@ -71,12 +71,7 @@ def track(
 
     The optical pose is never used: neither as a start value nor to refuse a pose. The noise is
     that of the session's setup. With ``in_phase``, for an `in_phase_model`, only the fluxes'
-    in-phase parts are used.
-
-    Raises
-    ------
-    BagError
-        When the session has no tool fluxes.
+    in-phase parts are used. Raises `BagError` when the session has no tool fluxes.
     """
     if not prepared.session.tools:
         raise BagError(
@@ -248,16 +243,10 @@ def track_session(
     the references as it does live, with witnesses also what the coils of rigid tools contradict;
     ``models`` gives each frame's model in another way, instead of a refit. In phase, only these
     fluxes and moments are used (the article's way). Progress gets the finished share, 0 to 1.
-
-    Raises
-    ------
-    BagError
-        When the session has no tool fluxes, or a refit lacks references or a baseline.
-    ParameterError
-        When such models are to be used beside a refit, or with one phase of the fluxes.
-    ModelFileError
-        When the model's emitters are not the session's, or the session's references locate the
-        board elsewhere. With the gate switched off the latter is not checked.
+    Raises `BagError` when the session has no tool fluxes, or a refit lacks references or a
+    baseline; `ParameterError` when such models are to be used beside a refit, or with one phase of
+    the fluxes; `ModelFileError` when the model's emitters are not the session's, or the session's
+    references locate the board elsewhere. With the gate switched off the latter is not checked.
     """
     if models is not None and (refit or in_phase):
         raise ParameterError(

@@ -88,10 +88,7 @@ class Watch:
     def look(self, session: Session, first_ns: int) -> Sighting:
         """Look at the last seconds; the time of the model's own effects counts from a stamp.
 
-        Raises
-        ------
-        DiagnosisError
-            When there are too few frames to say anything.
+        Raises `DiagnosisError` when there are too few frames to say anything.
         """
         seen = self._corrected(session, (session.start_ns - first_ns) * NANO)
         truth = OPTICAL

@@ -77,10 +77,7 @@ def _import_words(name: str) -> str:
 def bag_file(path: str | os.PathLike[str]) -> str:
     """Return the MCAP file that ``path`` names, the file itself or the one in a bag's folder.
 
-    Raises
-    ------
-    BagError
-        When there is none, or a folder holds several.
+    Raises `BagError` when there is none, or a folder holds several.
     """
     name = os.fspath(path)
     if os.path.isdir(name):
@@ -169,12 +166,8 @@ def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[Ra
 def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[RawMessage]:
     """Yield the messages of a bag, or of its folder, by ascending log time.
 
-    What could not be read is filled into ``salvage``.
-
-    Raises
-    ------
-    BagError
-        When there is no such file, it is no MCAP file, or no message can be read.
+    What could not be read is filled into ``salvage``. Raises `BagError` when there is no such
+    file, it is no MCAP file, or no message can be read.
     """
     name = bag_file(path)
     with open(name, 'rb') as stream:
@@ -307,10 +300,7 @@ def _rename_words(topics: Mapping[str, str]) -> str:
 def read_bag(path: str | os.PathLike[str]) -> Bag:
     """Read a recorded session.
 
-    Raises
-    ------
-    BagError
-        When the file can't be read, has no setup, or has no flux topic at all.
+    Raises `BagError` when the file can't be read, has no setup, or has no flux topic at all.
     """
     salvage, collector = Salvage(), _Collector()
     for raw in iter_messages(path, salvage):

@@ -154,7 +154,7 @@ CHUNK_BYTES = 1024 * 1024
 """Size of a chunk, bytes; smaller ones make larger files, and a larger index in memory."""
 CHUNK_NS = 4_000_000_000
 """Longest time in a chunk while messages are flushed, ns. The index of an hour takes 1.6 MB of
-memory with twelve topics and 4 with forty; of a chunk for each flush it would be ten times that."""
+memory with twelve topics and 4 with forty, ten times that with a chunk for each flush."""
 RESERVE_BYTES = 1024 * 1024
 """Disk space that is reserved at the start, bytes, for the end of a recording on a full disk."""
 LIBRARY = 'anser_ros'
@@ -217,12 +217,7 @@ class BagWriter:
 
     The file must not exist yet; its folder is made. An unbuffered binary stream may be given to be
     written to instead. A block that fails leaves no file, as half of one would be taken for a
-    whole session.
-
-    Raises
-    ------
-    BagError
-        The file exists already, or cannot be made.
+    whole session. Raises `BagError`: the file exists already, or cannot be made.
     """
 
     def __init__(self, path: str | Path, raw: BinaryIO | None = None) -> None:
@@ -374,10 +369,7 @@ FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
 class SessionWriter(BagWriter):
     """Writes a session without ROS: setup, fluxes and poses of one frame, log time = stamp.
 
-    Raises
-    ------
-    BagError
-        The file exists already, or cannot be made.
+    Raises `BagError`: the file exists already, or cannot be made.
     """
 
     def __init__(self, path: str | Path, frame_id: str = 'fg') -> None:

@@ -148,12 +148,8 @@ def cloud_bytes(
 def cloud_head(data: bytes) -> tuple[int, int, int]:
     """Return height, width and number of fields of a serialised ``sensor_msgs/PointCloud2``.
 
-    Nothing after them is read, so that the time does not depend on the size of a message.
-
-    Raises
-    ------
-    LayoutError
-        When the bytes end before.
+    Nothing after them is read, so that the time does not depend on the size of a message. Raises
+    `LayoutError` when the bytes end before.
     """
     order = '<' if data[1:2] == b'\x01' else '>'
     body = memoryview(data)[len(HEADER) :]

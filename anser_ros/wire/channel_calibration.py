@@ -78,10 +78,7 @@ def _response(item: Any, where: str, default: ChannelResponse | None) -> Channel
 def parse_channels(text: str) -> ChannelCalibration:
     """Read and check a channel calibration document.
 
-    Raises
-    ------
-    SetupError
-        With the rule that is broken and where.
+    Raises `SetupError` with the rule that is broken and where.
     """
     try:
         root = read_yaml(text)

@@ -96,11 +96,8 @@ def resolution_s(header: Header, body: bytes) -> float:
 def device_names(named: Mapping[str, str]) -> dict[str, str]:
     """Return the device of each name; one too long for the protocol loses its beginning.
 
-    Raises
-    ------
-    ParameterError
-        When one is empty or not ASCII, or two devices, or a device and the state of another, have
-        the same name.
+    Raises `ParameterError` when one is empty or not ASCII, or two devices, or a device and the
+    state of another, have the same name.
     """
     devices = {name: text[-NAME_BYTES:] for name, text in named.items()}
     owners: dict[str, str] = {}

@@ -141,12 +141,9 @@ def decode_flux(
 ) -> FluxPoints:
     """Read a flux cloud.
 
-    Raises
-    ------
-    LayoutError
-        When a field is missing, doubled, of an unknown type or outside the point, when there are
-        too many points, or not ``width * point_step`` bytes, when a channel appears twice, or when
-        a channel or flag is no integer.
+    Raises `LayoutError` when a field is missing, doubled, of an unknown type or outside the point,
+    when there are too many points, or not ``width * point_step`` bytes, when a channel appears
+    twice, or when a channel or flag is no integer.
     """
     records = _records(fields, point_step, width, data, is_bigendian)
     geometry = _columns(records, ('x', 'y', 'z', 'nx', 'ny', 'nz'))
@@ -270,10 +267,7 @@ def _layout(
 def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, bytes]:
     """Pack a model's uncertainty: fields, point_step and bytes.
 
-    Raises
-    ------
-    LayoutError
-        When there are more modes or dipoles than the layout can count.
+    Raises `LayoutError` when there are more modes or dipoles than the layout can count.
     """
     modes = np.asarray(error.modes, dtype=np.complex128)
     if modes.ndim != 3 or max(modes.shape[:2]) > 0xFFFF:
@@ -302,11 +296,8 @@ def decode_model_error(
 ) -> ModelError:
     """Read the uncertainty of a model with so many dipoles and emitters.
 
-    Raises
-    ------
-    LayoutError
-        When the cloud is not laid out as `encode_model_error` does, names a dipole that the model
-        doesn't have, or holds values that are not finite.
+    Raises `LayoutError` when the cloud is not laid out as `encode_model_error` does, names a
+    dipole that the model doesn't have, or holds values that are not finite.
     """
     has_origin = any(field[0] == 'fingerprint' for field in fields)
     wanted, record = _layout(n_emitters, has_origin)

@@ -203,10 +203,7 @@ class ControlUnitPort:
     def start(self) -> None:
         """Start the reader thread; the port may appear later.
 
-        Raises
-        ------
-        PortError
-            When it was started before.
+        Raises `PortError` when it was started before.
         """
         if self._thread is not None:
             raise PortError(f'the port {self.device} was started before')
@@ -387,12 +384,8 @@ def find_port(
 ) -> str:
     """Find the control unit's port by listening for its hello; nothing is written to any device.
 
-    All serial ports of the computer are tried where no candidates are given.
-
-    Raises
-    ------
-    PortError
-        When no port carries a hello.
+    All serial ports of the computer are tried where no candidates are given. Raises `PortError`
+    when no port carries a hello.
     """
     devices: list[str] = list(candidates or (port.device for port in list_ports.comports()))
     for device in devices:

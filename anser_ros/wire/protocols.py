@@ -193,10 +193,7 @@ class SerialProtocol:
 def records_of(reader: RecordReader, data: bytes) -> list[Record]:
     """Return the records that a reader completes with these bytes.
 
-    Raises
-    ------
-    PortError
-        When the reader fails, or gives a hello that no receiver could use.
+    Raises `PortError` when the reader fails, or gives a hello that no receiver could use.
     """
     try:
         records = reader.feed(data)

@@ -135,10 +135,7 @@ class Setup:
     def with_stated(self, stated: Mapping[str, float]) -> 'Setup':
         """Return the setup with further values stated, which go before the document's own.
 
-        Raises
-        ------
-        ParameterError
-            As `settings_from`.
+        Raises `ParameterError` as `settings_from`.
         """
         together = {**self.stated, **stated}
         settings_from(together)
@@ -147,10 +144,7 @@ class Setup:
     def with_tips(self, tips: Mapping[str, TipSpec]) -> 'Setup':
         """Return the setup with further tips, which go before its own.
 
-        Raises
-        ------
-        SetupError
-            When a tip is of no body, or its topic is that of a sensor.
+        Raises `SetupError` when a tip is of no body, or its topic is that of a sensor.
         """
         topics = [topic_of(name) for name in (*(s.name for s in self.tool_sensors), *self.bodies)]
         refuse_unknown_bodies(tips, {body: topic_of(body) for body in self.bodies}, topics)
@@ -313,12 +307,8 @@ def parse_setup(text: str) -> Setup:
     how the live refit follows. Their keys, with units and defaults, are the fields of
     `anser_ros.settings.Accuracy` and `anser_ros.settings.RefitSettings`; a value that is not
     stated has its default. ``fingerprint`` is for other readers and is computed again. Any other
-    key is kept in ``extra``; one that looks like a misspelling is refused.
-
-    Raises
-    ------
-    SetupError
-        With the rule that is broken and the key where it is.
+    key is kept in ``extra``; one that looks like a misspelling is refused. Raises `SetupError`
+    with the rule that is broken and the key where it is.
     """
     try:
         document = read_yaml(text)

@@ -145,10 +145,7 @@ class TipSpec:
 def parse_tips(item: Any) -> dict[str, TipSpec]:
     """Return the tips of a mapping from bodies to places.
 
-    Raises
-    ------
-    SetupError
-        With the place of what is no tip.
+    Raises `SetupError` with the place of what is no tip.
     """
     tips = {}
     for body, value in read_mapping(item, KEY).items():
@@ -187,10 +184,7 @@ def refuse_unknown_bodies(
 ) -> None:
     """Refuse tips of unknown bodies, or whose topic exists; bodies are given with their topics.
 
-    Raises
-    ------
-    SetupError
-        With the body.
+    Raises `SetupError` with the body.
     """
     taken = set(topics)
     for body in tips:
@@ -212,10 +206,7 @@ def tip_name(body: str) -> str:
 def read_tips(text: str) -> dict[str, TipSpec]:
     """Return the tips of a setup document's text, or of a file of tips alone.
 
-    Raises
-    ------
-    SetupError
-        When it is no YAML, or has no tips.
+    Raises `SetupError` when it is no YAML, or has no tips.
     """
     try:
         root = read_yaml(text)
@@ -237,10 +228,7 @@ def dump_tips(tips: Mapping[str, TipSpec]) -> dict[str, Any]:
 def with_tips(text: str, tips: Mapping[str, TipSpec]) -> str:
     """Return a document's text with these tips beside its own; all else stays letter for letter.
 
-    Raises
-    ------
-    SetupError
-        As `parse_tips`, for the tips that it has.
+    Raises `SetupError` as `parse_tips`, for the tips that it has.
     """
     root = read_mapping(read_yaml(text), 'the document')
     whole = {**(parse_tips(root[KEY]) if KEY in root else {}), **tips}

@@ -22,10 +22,8 @@ from anser_ros.errors import AnserError, BagError, ModelFileError, ParameterErro
 def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterError) -> str:
     """Return the text of a file, without the mark that some editors put at its beginning.
 
-    Raises
-    ------
-    AnserError
-        Of the kind that is asked for, when it cannot be read, or is no text in UTF-8.
+    Raises an `AnserError` of the kind that is asked for when it cannot be read, or is no text in
+    UTF-8.
     """
     try:
         return Path(path).read_text(encoding='utf-8-sig')
@@ -38,10 +36,7 @@ def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterEr
 def read_rows(path: str | os.PathLike[str]) -> tuple[list[str], list[dict[str, str]]]:
     """Return the names in the head of a CSV file, and its rows by these names.
 
-    Raises
-    ------
-    ParameterError
-        When it cannot be read, or is no CSV in UTF-8.
+    Raises `ParameterError` when it cannot be read, or is no CSV in UTF-8.
     """
     reader = csv.DictReader(io.StringIO(read_text(path), newline=''))
     try:
@@ -60,10 +55,8 @@ def numbers_of(
 ) -> NDArray[np.float64]:
     """Return columns of a table's rows as numbers, shape (rows, names).
 
-    Raises
-    ------
-    ParameterError
-        When a column is missing or a cell is no finite number; ``with_gaps`` empty ones are NaN.
+    Raises `ParameterError` when a column is missing or a cell is no finite number; ``with_gaps``
+    empty ones are NaN.
     """
     try:
         values = np.array(
@@ -81,10 +74,7 @@ def numbers_of(
 def read_fiducials(path: Path) -> NDArray[np.float64]:
     """Return the positions (P, 3), m, of a list of fiducials.
 
-    Raises
-    ------
-    BagError
-        When the file has no table of fiducials.
+    Raises `BagError` when the file has no table of fiducials.
     """
     lines = read_text(path).splitlines()
     rows = [line.split(',') for line in lines if line.strip() and not line.startswith('#')]
@@ -115,10 +105,7 @@ lines of aliases of aliases stand for a thousand million."""
 def read_yaml(text: str) -> Any:
     """Return a document as plain data.
 
-    Raises
-    ------
-    yaml.YAMLError
-        When it is no YAML, has a tag of its own, or is beyond a bound.
+    Raises `yaml.YAMLError` when it is no YAML, has a tag of its own, or is beyond a bound.
     """
     if len(text) > MOST_CHARACTERS:
         raise yaml.YAMLError(f'{len(text)} characters are too long, the most is {MOST_CHARACTERS}')
@@ -190,10 +177,7 @@ _PACKAGE = 'anser_ros'
 def config_path(name: str) -> Path:
     """Return the path of a file: `name` itself where it exists, else the one in `config/`.
 
-    Raises
-    ------
-    SetupError
-        When there is neither.
+    Raises `SetupError` when there is neither.
     """
     given = Path(name).expanduser()
     if given.is_file():
@@ -209,9 +193,6 @@ def config_path(name: str) -> Path:
 def read_config(name: str) -> str:
     """Return the text of a file that `config_path` finds.
 
-    Raises
-    ------
-    SetupError
-        When there is none, or it is no text.
+    Raises `SetupError` when there is none, or it is no text.
     """
     return read_text(config_path(name), SetupError)
