@@ -24,7 +24,7 @@ def _value(default: float, meaning: str, low: float, high: float) -> Any:
 
 @dataclass(frozen=True)
 class _Stated:
-    """Refuses a value that is no number or out of its range."""
+    """Raises `ParameterError` when a value is no number or out of its range."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -33,7 +33,6 @@ class _Stated:
 
 
 def _check(item: Any, value: object) -> None:
-    """Raise `ParameterError` when a value is no number or out of its range."""
     whole = item.type is int
     kinds = int if whole else (int, float)
     if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
@@ -53,8 +52,7 @@ class Accuracy(_Stated):
     The defaults are those of the Anser sessions that this package was developed on: their noise
     and jitter, and the accuracy that their survey of the reference sensors states. If a value is
     too small, ordinary errors look like an effect or like metal; if it is too large, such effects
-    are hidden and poses have too large a sigma. Raises `ParameterError` when a value is no number
-    or out of its range.
+    are hidden and poses have too large a sigma.
     """
 
     # Where the noise is measured (the refit, the tracker's adaptive scale, the calibration), the
@@ -84,10 +82,7 @@ class Accuracy(_Stated):
 
 @dataclass(frozen=True)
 class ToolSettings(_Stated):
-    """States how well tools are known, and how fast they may be.
-
-    Raises `ParameterError` when a value is no number or out of its range.
-    """
+    """States how well tools are known, and how fast they may be."""
 
     # Too small, and faultless coils contradict their body; too large, and a coil may be wrong by
     # some times this before its body notices.
@@ -107,10 +102,7 @@ class ToolSettings(_Stated):
 
 @dataclass(frozen=True)
 class RefitSettings(_Stated):
-    """States how the live refit follows; nothing here belongs to a particular board or metal.
-
-    Raises `ParameterError` when a value is no number or out of its range.
-    """
+    """States how the live refit follows; nothing here belongs to a particular board or metal."""
 
     # The current has a gain error of its own. A larger deviation lets a change of one emitter
     # explain more of what metal does.

@@ -6,7 +6,7 @@ stretch together.
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from operator import itemgetter
@@ -22,7 +22,6 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.pose_states import OK
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, metrics
-from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.wire.text_files import read_rows, read_text
 
 SCHEMA = 'anser_evaluation/1'
@@ -72,11 +71,15 @@ def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
     Sensors' poses, or why there is none, are sorted by stamp; those of bodies, and of what else
     was tracked, are one after the other.
     """
+    of_sensors = _pose_rows(evaluation.sensors, POSE_COLUMNS)
     tables = {
-        POSES_FILE: (POSE_COLUMNS, sorted(_sensor_rows(evaluation.sensors), key=itemgetter(0))),
-        BODIES_FILE: (BODY_COLUMNS, _body_rows(evaluation.bodies)),
+        POSES_FILE: (POSE_COLUMNS, sorted(of_sensors, key=itemgetter(0))),
+        BODIES_FILE: (BODY_COLUMNS, _pose_rows(evaluation.bodies, BODY_COLUMNS)),
         ERRORS_FILE: (ERROR_COLUMNS, _error_rows(evaluation)),
-        **{f'{k}.csv': (POSE_COLUMNS, _sensor_rows(g)) for k, g in evaluation.further.items()},
+        **{
+            f'{kind}.csv': (POSE_COLUMNS, _pose_rows(group, POSE_COLUMNS))
+            for kind, group in evaluation.further.items()
+        },
     }
     for name, (columns, rows) in tables.items():
         with (folder / name).open('w', newline='', encoding='utf-8') as stream:
@@ -100,35 +103,18 @@ def _error_rows(evaluation: Evaluation) -> list[list[Any]]:
     ]  # fmt: skip
 
 
-def _sensor_rows(group: Mapping[str, PoseSeries]) -> list[list[Any]]:
-    """Rows of what has a place and an axis."""
-    return [
-        _row(series, pose, [*pose.position, *pose.axis] if pose.state == OK else None, 6)
-        for series in group.values()
-        for pose in series.estimates
-    ]
-
-
-def _body_rows(group: Mapping[str, PoseSeries]) -> list[list[Any]]:
-    rows = []
+def _pose_rows(group: Mapping[str, PoseSeries], columns: Sequence[str]) -> list[list[Any]]:
+    """Rows with an axis, or, in the columns of bodies, a quaternion; empty cells for no pose."""
+    of_body, rows = columns is BODY_COLUMNS, []
     for series in group.values():
         for pose in series.estimates:
-            values = None
-            if pose.state == OK and pose.rotation is not None:
-                values = [*pose.position, *Rotation.from_matrix(pose.rotation).as_quat()]
-            rows.append(_row(series, pose, values, 7))
+            cells = [''] * (len(columns) - 3)
+            if pose.state == OK and not (of_body and pose.rotation is None):
+                turn = Rotation.from_matrix(pose.rotation).as_quat() if of_body else pose.axis
+                values = [*pose.position, *turn, pose.sigma_position_m, pose.residual_t]
+                cells = [f'{float(value):.9g}' for value in values]
+            rows.append([pose.stamp_ns, series.name, *cells, pose.state])
     return rows
-
-
-def _row(
-    series: PoseSeries, pose: PoseEstimate, values: list[float] | None, count: int
-) -> list[Any]:
-    """One pose of so many numbers, its sigma and residual; empty cells where there is none."""
-    cells = [''] * (count + 2)
-    if values is not None:
-        values = [*values, pose.sigma_position_m, pose.residual_t]
-        cells = [f'{float(value):.9g}' for value in values]
-    return [pose.stamp_ns, series.name, *cells, pose.state]
 
 
 Array = NDArray[np.float64]
@@ -259,7 +245,15 @@ def compare_errors(
     A name without a frame in which both have an error has no pairs, only counts of errors that one
     of them has alone.
     """
-    return {name: _compare(first, second, name, rng) for name in _names(first, second)}
+    found = {}
+    for name in _names(first, second):
+        one, two = (sum(other == name for _, other in errors) for errors in (first, second))
+        both, pairs = _paired(first, second, name)
+        low, high = _interval(both, pairs**2, rng, np.sqrt)
+        root = np.sqrt((pairs**2).mean(axis=1)) if both.size else np.full(2, np.nan)
+        alone = one - both.size, two - both.size
+        found[name] = Compared(low, high, both.size, *alone, float(root[0]), float(root[1]))
+    return found
 
 
 def compare_shares(
@@ -291,18 +285,6 @@ def _paired(
     both = sorted(stamp for stamp, other in first if other == name and (stamp, name) in second)
     pairs = [[values[stamp, name] for stamp in both] for values in (first, second)]
     return np.array(both, dtype=np.int64), np.array(pairs).reshape(2, -1)
-
-
-def _compare(
-    first: dict[Key, float], second: dict[Key, float], name: str, rng: np.random.Generator
-) -> Compared:
-    one, two = (sum(other == name for _, other in errors) for errors in (first, second))
-    both, pairs = _paired(first, second, name)
-    low, high = _interval(both, pairs**2, rng, np.sqrt)
-    root = np.sqrt((pairs**2).mean(axis=1)) if both.size else np.full(2, np.nan)
-    return Compared(
-        low, high, both.size, one - both.size, two - both.size, float(root[0]), float(root[1])
-    )
 
 
 def _interval(

@@ -127,11 +127,6 @@ class ModelFollower(FrameModels):
     The session must have references and a baseline. With ``witnesses``, contradictions of the
     tools' coils show metal, too. Raises `BagError` when the session has no reference fluxes, or
     there is no baseline or one of too few sensors.
-
-    Attributes
-    ----------
-    summary : RefitSummary
-        What the refit did so far.
     """
 
     def __init__(self, prepared: PreparedSession, witnesses: bool = False) -> None:

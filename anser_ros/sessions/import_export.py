@@ -15,7 +15,7 @@ from anser_ros.errors import BagError, ParameterError
 from anser_ros.sessions.recorded_poses import published_poses
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire import cdr
-from anser_ros.wire.bag import Salvage
+from anser_ros.wire.bag import POSE_TYPE, Salvage, iter_messages, read_fluxes
 from anser_ros.wire.bag_writer import SETUP_TYPE, SessionWriter
 from anser_ros.wire.foreign_bag import read_foreign
 from anser_ros.wire.recorded import PoseStream, RecordedFluxes
@@ -115,17 +115,14 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBa
     """
     if form not in FORMATS:
         raise ParameterError(f'format must be among {", ".join(FORMATS)}, got {form!r}')
-    # Nodes that read no bag run where the packages that read bags are not installed.
-    from anser_ros.wire.bag import POSE_TYPE, Salvage, iter_messages, read_fluxes
-
     salvage = Salvage()
     topics = sorted({m.topic for m in iter_messages(path, salvage) if m.type_name == POSE_TYPE})
     written: dict[str, int] = {}
     for topic, poses in published_poses(path, topics).items():
         if poses.stamp_ns.size:
-            name = f'{_file_name(topic)}.{"txt" if form == TUM else form}'
-            stream = PoseStream(poses.stamp_ns, poses.position, poses.quaternion)
-            _write_poses(out / name, stream, form)
+            stem = topic.strip('/').removeprefix('anser/').removesuffix('/pose').replace('/', '_')
+            name = f'{stem}.{"txt" if form == TUM else form}'
+            _write_poses(out / name, poses, form)
             written[name] = int(poses.stamp_ns.size)
     if form != TUM:
         for which, fluxes in read_fluxes(path).items():
@@ -137,18 +134,13 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBa
     return ExportedBag(written, salvage.lost)
 
 
-def _file_name(topic: str) -> str:
-    """A topic as the name of a file."""
-    return topic.strip('/').removeprefix('anser/').removesuffix('/pose').replace('/', '_')
-
-
 def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
     """A table of stamps, positions, m, and quaternions."""
     numbers = np.column_stack([poses.position, poses.quaternion]).tolist()
     rows = zip(poses.stamp_ns.tolist(), numbers, strict=True)
     if form == MAT:
-        parts = (poses.stamp_ns, poses.position, poses.quaternion)
-        _write_mat(path, ('stamp_ns', 'position_m', 'quaternion_xyzw'), parts)
+        stamps, places, turns = poses.stamp_ns, poses.position, poses.quaternion
+        _write_mat(path, stamp_ns=stamps, position_m=places, quaternion_xyzw=turns)
     elif form == TUM:
         with path.open('w', encoding='utf-8') as stream:
             for stamp, row in rows:
@@ -161,8 +153,8 @@ def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
 def _write_fluxes(path: Path, fluxes: RecordedFluxes, form: str) -> None:
     """A table of stamps, channels, flags and phasors, T."""
     if form == MAT:
-        parts = (fluxes.stamp_ns, fluxes.channel, fluxes.flags, fluxes.flux)
-        _write_mat(path, ('stamp_ns', 'channel', 'flags', 'flux_t'), parts)
+        flux = {'flags': fluxes.flags, 'flux_t': fluxes.flux}
+        _write_mat(path, stamp_ns=fluxes.stamp_ns, channel=fluxes.channel, **flux)
         return
     columns = [f'coil{k}_{part}_t' for k in range(fluxes.flux.shape[2]) for part in ('re', 'im')]
     _write_csv(path, ('stamp_ns', 'channel', 'flags', *columns), _flux_rows(fluxes))
@@ -184,8 +176,7 @@ def _flux_rows(fluxes: RecordedFluxes) -> Iterator[list[object]]:
             yield [stamp, channel, flag, *(f'{value:.9g}' for value in parts)]
 
 
-def _write_mat(path: Path, names: Sequence[str], arrays: Sequence[NDArray[Any]]) -> None:
+def _write_mat(path: Path, **arrays: NDArray[Any]) -> None:
     from scipy.io import savemat
 
-    content = dict(zip(names, arrays, strict=True))
-    savemat(path, content, do_compression=True, oned_as='column')
+    savemat(path, arrays, do_compression=True, oned_as='column')

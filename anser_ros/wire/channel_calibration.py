@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import SetupError
-from anser_ros.wire.text_files import read_yaml
+from anser_ros.wire.text_files import read_own_yaml
 
 SCHEMA = 'anser_channels/1'
 _KEYS = ('area_m2', 'delay_s')
@@ -80,10 +79,7 @@ def parse_channels(text: str) -> ChannelCalibration:
 
     Raises `SetupError` with the rule that is broken and where.
     """
-    try:
-        root = read_yaml(text)
-    except (yaml.YAMLError, ValueError) as error:
-        raise SetupError(f'channels: not YAML: {" ".join(str(error).split())}') from error
+    root = read_own_yaml(text, 'channels')
     if not isinstance(root, dict) or root.get('schema') != SCHEMA:
         raise SetupError(f'channels: schema must be {SCHEMA!r}')
     default = _response(root.get('default'), 'default', None)

@@ -61,11 +61,7 @@ class FrameReader:
     a good record inside or right behind a damaged one is never lost. Bytes are copied only while a
     record is incomplete; sample blocks are views into the received bytes. Once a hello has stated
     the block size, the reader does not wait for a longer payload, so that a forged length cannot
-    hold back the records behind it.
-
-    Parameters
-    ----------
-    max_payload : longest payload to wait for before a hello, bytes
+    hold back the records behind it; before a hello it waits for ``max_payload`` bytes.
     """
 
     def __init__(self, max_payload: int = MAX_PAYLOAD) -> None:

@@ -34,7 +34,7 @@ from anser_ros.wire.setup_values import (
     refuse_unknown_bodies,
     take,
 )
-from anser_ros.wire.text_files import DUMPER, read_yaml
+from anser_ros.wire.text_files import DUMPER, read_own_yaml
 
 SCHEMA = 'anser_setup/1'
 KEYS = (
@@ -310,11 +310,7 @@ def parse_setup(text: str) -> Setup:
     key is kept in ``extra``; one that looks like a misspelling is refused. Raises `SetupError`
     with the rule that is broken and the key where it is.
     """
-    try:
-        document = read_yaml(text)
-    except (yaml.YAMLError, UnicodeError, ValueError) as error:
-        raise SetupError(f'setup: not YAML: {" ".join(str(error).split())}') from error
-    root = read_mapping(document, 'the document')
+    root = read_mapping(read_own_yaml(text, 'setup'), 'the document')
     if root.get('schema') != SCHEMA:
         raise SetupError(f'setup: schema must be {SCHEMA!r}, got {root.get("schema")!r}')
     if root.get('flux_unit', 'T') != 'T':

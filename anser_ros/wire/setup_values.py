@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import SetupError
-from anser_ros.wire.text_files import read_yaml
+from anser_ros.wire.text_files import read_own_yaml, read_yaml
 
 AXIS_TOLERANCE = 1e-3
 """Largest deviation of an axis' length from one; axes with three written digits pass."""
@@ -208,10 +208,7 @@ def read_tips(text: str) -> dict[str, TipSpec]:
 
     Raises `SetupError` when it is no YAML, or has no tips.
     """
-    try:
-        root = read_yaml(text)
-    except (yaml.YAMLError, UnicodeError, ValueError) as error:
-        raise SetupError(f'tips: not YAML: {" ".join(str(error).split())}') from error
+    root = read_own_yaml(text, 'tips')
     if not isinstance(root, dict) or KEY not in root:
         raise SetupError(f'tips: the document has no key {KEY}')
     return parse_tips(root[KEY])

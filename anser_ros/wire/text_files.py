@@ -113,6 +113,14 @@ def read_yaml(text: str) -> Any:
     return yaml.load(text, Loader=_LOADER)
 
 
+def read_own_yaml(text: str, what: str) -> Any:
+    """Return a document of ours as plain data; raises `SetupError`, which names what it is."""
+    try:
+        return read_yaml(text)
+    except (yaml.YAMLError, ValueError) as error:  # of which UnicodeError is one
+        raise SetupError(f'{what}: not YAML: {" ".join(str(error).split())}') from error
+
+
 def _check(text: str) -> None:
     """Walk through the events of a document, which takes no recursion and builds nothing."""
     sizes: dict[str, int] = {}
