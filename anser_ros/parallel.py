@@ -18,8 +18,7 @@ Piece = TypeVar('Piece')
 Result = TypeVar('Result')
 
 ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
-"""Variables that give BLAS one thread if they are set before numpy is imported. For small matrices
-a second one gains nothing, and waits milliseconds for a busy core."""
+"""Variables that give BLAS one thread, if set before numpy is imported; its matrices are small."""
 _THIS = threading.local()
 
 

@@ -178,11 +178,7 @@ def sections_of(stated: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def parse_entries(entries: list[str]) -> dict[str, float]:
-    """Return values from entries ``NAME=VALUE``, as `settings_from` takes them.
-
-    Raises `ParameterError` when an entry is not of that form, a name is unknown or twice there, or
-    a value is bad.
-    """
+    """Return values from entries ``NAME=VALUE`` for `settings_from`; raises `ParameterError`."""
     stated: dict[str, float] = {}
     for entry in entries:
         name, _, text = entry.partition('=')

@@ -21,8 +21,7 @@ from anser_ros.wire.setup import Setup
 ComplexArray = NDArray[np.complex128]
 
 SAME_PLACE_M = 0.005
-"""Farthest that a reference sensor may be in the baseline from where the session has it, m: a
-fresh survey moves a coil by a millimetre or less."""
+"""Farthest that a sensor may be from where the session has it, m; a survey moves it by 1 mm."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +78,7 @@ def check_clean(
 
 
 def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> BoardPlace | None:
-    """Return what compares the places that a model and references have the board at.
-
-    None for the drawing itself, for a board that cannot be drawn, and for a model with metal.
-    """
+    """Return what compares the board's places by model and references, None without a drawing."""
     board = NominalBoard.of(setup).board
     if board is None or is_nominal(model) or not len(sensors) or not _is_without_metal(model):
         return None
@@ -134,11 +130,7 @@ def clean_mean(
 
 
 def steady_sigma(recording: Session) -> float:
-    """Return the noise of a component of a recording's mean readings, T, from its scatter.
-
-    Raises `FitError` when the readings change during the recording by more than an emitter's
-    strength.
-    """
+    """Return the noise of a component of mean readings, T; raises `FitError` when these change."""
     reference, stated = recording.reference, recording.setup.accuracy.flux_noise_t
     if reference is None:
         return stated

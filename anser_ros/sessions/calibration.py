@@ -154,10 +154,7 @@ def _engine_for(sessions: Sequence[Session], options: Options) -> Engine:
 
 
 def is_estimated_jointly(session: Session) -> bool:
-    """Return whether a session has few poses, or one place, of a body of many sensors.
-
-    Emitters that can be drawn are left to a model of their drawing, whatever the session.
-    """
+    """Return whether a session has few poses of a body of many sensors, and no drawn emitters."""
     options = Options(session.setup.accuracy, is_joint=True)
     return _engine_for([session], options).is_joint
 

@@ -31,9 +31,8 @@ from anser_ros.tracking.estimate import TrackerSettings
 Array = NDArray[np.float64]
 
 ROOM = 2.0
-"""Gate of the held-out part's tracking over the flux residual there. With less, poses that a wrong
-model makes would be refused instead of counted; with much more, wrong minima would be taken for
-poses."""
+"""Gate of the held-out part's tracking over its residual: less would refuse a wrong model's poses
+instead of counting them, much more would take wrong minima for poses."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +48,7 @@ class TrackingErrors:
 
 @dataclass(frozen=True)
 class SessionDiagnosis:
-    """Holds what a model lacks on a session, and how its held-out part is tracked.
-
-    Before is with the model as it was, after with the effects that were found.
-    """
+    """Holds what a model lacks on a session, and tracking errors without and with it."""
 
     diagnosis: Diagnosis
     before: TrackingErrors
@@ -182,8 +178,7 @@ DEPENDENCIES = (
 )  # fmt: skip
 """Variables on which a remainder may depend in words; other tests are for the report only."""
 MODEL_FILE_ONLY = ('groups', 'knots_s', 'course', 'couplings_m3')
-"""Parameters that only a program needs: lists of hundreds of numbers. They are left out here and
-stand in the model file."""
+"""Parameters of hundreds of numbers, which stand in the model file only."""
 
 
 def to_document(result: SessionDiagnosis) -> dict[str, Any]:

@@ -34,11 +34,7 @@ def recording_of(session: Session) -> str:
 
 
 def to_document(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the figures of every sensor and body as plain data.
-
-    Where the model followed the references, the number of frames in each state of the refit, and
-    in how many each reference sensor was left out, are there too.
-    """
+    """Return the figures of every sensor and body, and of a refit, as plain data."""
     document: dict[str, Any] = {'schema': SCHEMA}
     for kind, group in evaluation.groups.items():
         document[kind] = {name: metrics(series) for name, series in group.items()}
@@ -66,11 +62,7 @@ ERROR_COLUMNS = ('stamp_ns', 'name', 'position_error_m', 'orientation_error_rad'
 
 
 def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
-    """Write the tables of poses and of errors into a folder; the files.
-
-    Sensors' poses, or why there is none, are sorted by stamp; those of bodies, and of what else
-    was tracked, are one after the other.
-    """
+    """Write the tables of poses, sensors' by stamp, and of errors into a folder; the files."""
     of_sensors = _pose_rows(evaluation.sensors, POSE_COLUMNS)
     tables = {
         POSES_FILE: (POSE_COLUMNS, sorted(of_sensors, key=itemgetter(0))),
@@ -152,10 +144,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Compared(Difference):
-    """Compares ``n`` pairs of errors, m or rad, of one coil or body, or of all coils.
-
-    ``only_a`` and ``only_b`` are frames that only one of the two has a pose for.
-    """
+    """Compares ``n`` pairs of errors, m or rad, and counts frames that only one of the two has."""
 
     n: int
     only_a: int
@@ -176,10 +165,7 @@ class ComparedShares(Difference):
 
 
 def check_same_recording(first: Path, second: Path) -> None:
-    """Refuse evaluations of two recordings, of which equal stamps mean nothing.
-
-    Raises `ParameterError` when both state what they are of, and it is not the same.
-    """
+    """Raise `ParameterError` when two evaluations state that they are of different recordings."""
     one, two = _recording(first), _recording(second)
     if one and two and one != two:
         raise ParameterError(
@@ -200,20 +186,14 @@ def _recording(folder: Path) -> str:
 
 
 def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
-    """Return errors of position (m) and orientation (rad) by stamp and name, of an evaluation.
-
-    Raises `ParameterError` when the folder has none, or the table is not one of ours.
-    """
+    """Return errors of position (m) and orientation (rad) by stamp and name; `ParameterError`."""
     _, _, *kinds = ERROR_COLUMNS
     errors = [_read(folder, ERRORS_FILE, ERROR_COLUMNS, itemgetter(kind)) for kind in kinds]
     return {'position': errors[0], 'orientation': errors[1]}
 
 
 def read_states(folder: Path) -> dict[Key, float]:
-    """Return whether there is a pose, 1 or 0, by stamp and name of a coil or body.
-
-    Raises `ParameterError` when the folder lacks a table, or one is not ours.
-    """
+    """Return whether there is a pose, 1 or 0, by stamp and name; raises `ParameterError`."""
     tables = ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS))
     found: dict[Key, float] = {}
     for name, columns in tables:
@@ -240,11 +220,7 @@ def _read(
 def compare_errors(
     first: dict[Key, float], second: dict[Key, float], rng: np.random.Generator
 ) -> dict[str, Compared]:
-    """Compare two evaluations by name; errors of one kind by stamp and name.
-
-    A name without a frame in which both have an error has no pairs, only counts of errors that one
-    of them has alone.
-    """
+    """Compare two evaluations by name; errors of one kind by stamp and name."""
     found = {}
     for name in _names(first, second):
         one, two = (sum(other == name for _, other in errors) for errors in (first, second))

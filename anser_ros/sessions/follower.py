@@ -30,10 +30,7 @@ NONE = 'none'
 
 
 def parse_references(text: str) -> tuple[int, ...]:
-    """Return the channels of a list ``CHANNEL,...``, none for the word ``none``.
-
-    Raises `ParameterError` when an entry is no channel or appears twice.
-    """
+    """Return the channels of ``CHANNEL,...`` or ``none``; raises `ParameterError`."""
     if text.strip() == NONE:
         return ()
     entries = [entry.strip() for entry in text.split(',')]

@@ -35,11 +35,7 @@ class ImportedBag:
 
 
 def parse_remaps(entries: Sequence[str]) -> dict[str, str]:
-    """Return new names by old ones from entries ``FROM:=TO``.
-
-    Raises `ParameterError` when an entry is not of that form, a name is not absolute, or one is
-    renamed twice.
-    """
+    """Return new names by old ones from entries ``FROM:=TO``; raises `ParameterError`."""
     names: dict[str, str] = {}
     for entry in entries:
         old, _, new = entry.partition(':=')
@@ -108,11 +104,7 @@ class ExportedBag:
 
 
 def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBag:
-    """Write a file for each topic of poses and of fluxes.
-
-    Raises `BagError` when the bag cannot be read, or has neither; `ParameterError` when the form
-    is unknown.
-    """
+    """Write a file for each topic of poses and of fluxes; raises `BagError` when there is none."""
     if form not in FORMATS:
         raise ParameterError(f'format must be among {", ".join(FORMATS)}, got {form!r}')
     salvage = Salvage()

@@ -50,10 +50,7 @@ class NominalBoard:
 
     @cached_property
     def model(self) -> FieldModel | None:
-        """Return the nominal model, made when it is first asked for, which takes about a second.
-
-        None also if dipoles do not reach the required accuracy.
-        """
+        """Return the nominal model, made at first use; None if dipoles are not accurate enough."""
         try:
             return None if self.board is None else nominal_model(self.board)
         except AnserError:

@@ -30,8 +30,7 @@ FLUX_UNITS: Mapping[str, float] = {
 }  # fmt: skip
 """Units of flux density that stand where teslas belong: how many there are in a tesla."""
 CLOSE = 3.0
-"""Factor within which a ratio is that of a unit. The units are farther apart than its square, but
-for inches and centimetres, of which the nearer one is named."""
+"""Factor within which a ratio is that of a unit; of inches and centimetres the nearer is named."""
 
 
 def unit_words(ratio: float, units: Mapping[str, float]) -> str:
@@ -49,21 +48,17 @@ def unit_words(ratio: float, units: Mapping[str, float]) -> str:
 Array = NDArray[np.float64]
 
 MOST_FRAMES = 40
-"""Frames that are looked at, evenly over the recording: enough for shares, few enough for a
-hundredth of a second."""
+"""Frames that are looked at, evenly over the recording: enough for shares, and quick."""
 FEWEST_READINGS = 12
 """Readings (a coil in a frame) without which nothing is decided: fewer fit by chance."""
 MISFIT = 0.3
-"""Relative misfit of a reading (over all emitters) up to which it fits. A board as drawn, with the
-tolerances of a workshop, metal and a tool's own errors, predicts to a few hundredths; a wrong axis
-misses by one and more."""
+"""Relative misfit of a reading up to which it fits. A board as drawn predicts to a few hundredths;
+a wrong axis misses by one and more."""
 POOR, GOOD = 0.6, 0.8
-"""Shares of readings that fit: below the first the poses as they stand are in doubt, above the
-second another reading of them is right. Half a turn about one axis leaves a third of the readings
-of a triaxial coil right, so between the two nothing is decided."""
+"""Shares of readings that fit: below the first the poses are in doubt, above the second another
+reading is right. Half a turn about an axis leaves a third of a triaxial coil's readings right."""
 TOO_LARGE = 100.0
-"""Factor over the drawn board's fluxes from which on a unit is in doubt; gains and currents of a
-board that is not as drawn stay far below."""
+"""Factor over the drawn board's fluxes from which on a unit is in doubt; gains stay far below."""
 
 
 @dataclass(frozen=True)
@@ -216,16 +211,13 @@ def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurement
 
 
 FAR = 10.0
-"""Distance of the median optical position from the board, in distances of the tracked volume's
-farthest corner, beyond which no tool is held. Optics may see a tool that is carried about the
-room, a few such distances away; a smaller factor would refuse that, a larger one let inches by."""
+"""Distance of optical positions, in the volume's farthest corner's, beyond which no tool is held.
+Carried about the room it may be a few such away; inches are more."""
 FROZEN_S = 1.0
-"""Time, s, for which poses must be the same bit for bit before an optical tracker counts as
-frozen. Cameras that answer more often than they look repeat a pose for a tenth of a second."""
+"""Time, s, of equal poses that counts as frozen; cameras may repeat one for 0.1 s."""
 MOVED = 0.1
-"""Relative change of a tool's fluxes that shows it has moved while its poses stood still: a
-centimetre at a hand's breadth. Noise changes them by a ten-thousandth, metal that comes near a
-tool at rest by a few hundredths."""
+"""Relative change of a tool's fluxes that shows it has moved, a centimetre at a hand's breadth;
+metal that comes near a tool at rest changes them by a few hundredths."""
 MOST_FROZEN = 0.5
 """Share of the time that optical poses may be frozen; what is left of more is no reference."""
 WIDEST_POINTS_M = 10.0

@@ -98,11 +98,7 @@ def overload(path: str | os.PathLike[str]) -> list[str]:
 
 
 def kept_share(session: Session) -> float:
-    """Return the share of frames with tool readings, which is 1 where no window is missing.
-
-    Their expected number follows from the median time between two frames; the tool with the
-    largest share counts.
-    """
+    """Return the share of frames with tool readings, of those that their period lets expect."""
     shares = [0.0]
     for tool in session.tools:
         if tool.time.size > 1:

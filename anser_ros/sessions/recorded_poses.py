@@ -22,10 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LiveErrors:
-    """Holds errors (n,) of the poses of one sensor or body against the optical ones, m and rad.
-
-    The angle is of a coil between the axes, of a body the whole turn.
-    """
+    """Holds errors (n,), m and rad, of a coil's place and axis, or of a body's place and turn."""
 
     position: Array
     orientation: Array

@@ -29,13 +29,11 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MOTION_MARGIN_S = 1.0
-"""Time (s) before and after something is seen to move that is looked at as well: it begins to move
-before it is seen."""
+"""Time (s) before and after a motion that is looked at: it begins before it is seen."""
 FEWEST_STEADY = 10
 """Frames of the references at rest, of which their steady readings are the mean, at least."""
 FIELD_REACH_M = 0.015
-"""Distance (m) of a coil from where the field was learnt, up to which it takes part: frames in
-which metal moves were not learnt from, and farther away the field is predicted less well."""
+"""Distance (m) of a coil from where the field was learnt, up to which that is predicted well."""
 UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 
@@ -58,10 +56,7 @@ def without_resting_metal(
     calibration: Calibration,
     progress: Callable[[str, float], None] | None = None,
 ) -> Scan | None:
-    """Return a scan without metal that rested during it; None where there is none to take off.
-
-    The calibration has the metal in its field.
-    """
+    """Return a scan without metal that rested during it; None where there is none to take off."""
     scan = calibration.scan
     if scan.sensor_fit is None:
         return None

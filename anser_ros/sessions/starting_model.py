@@ -25,10 +25,7 @@ SNAPSHOT = 'snapshot of a refit with metal in force'
 
 
 def load_model(path: str | os.PathLike[str], snapshot: bool = False) -> FieldModel:
-    """Read a model file; a snapshot of a refit, which is no calibration, only if it is wanted.
-
-    Raises `ModelFileError` with the file's name and the rule that it breaks.
-    """
+    """Read a model file, a refit's snapshot only if wanted; raises `ModelFileError`."""
     try:
         model = from_document(read_document(path))
         if is_snapshot(model) and not snapshot:
@@ -73,19 +70,12 @@ NOMINAL = 'nominal'
 
 
 def model_of(name: str) -> FieldModel | None:
-    """Return the model of a file; None for an empty name, and for that of the setup's geometry.
-
-    Raises `ModelFileError` when the file is no model, or a snapshot of a refit.
-    """
+    """Return the model of a file, None for no name or the nominal one; raises `ModelFileError`."""
     return None if name in ('', NOMINAL) else load_model(name)
 
 
 def starting_model(setup: Setup, given: FieldModel | None) -> FieldModel:
-    """Return the model to start from live: the given one, or the geometry's nominal one.
-
-    Raises `ModelFileError` when the given model has other emitters than the setup; `SetupError`
-    when none is given and the setup's geometry makes no nominal model.
-    """
+    """Return the model to start from live, given or nominal; `ModelFileError`, `SetupError`."""
     if given is None:
         return nominal_model(board_of(setup))
     check_emitters(setup, given)
@@ -198,10 +188,7 @@ def _listed(value: object) -> list[object]:
 
 
 def check_fits(model: FieldModel, session: Session) -> None:
-    """Raise `ModelFileError` when the model's emitters are not the session's, or it is of another.
-
-    What else a model may be of: see `check_made_for`.
-    """
+    """Raise `ModelFileError` when a model is not of a session's emitters; see `check_made_for`."""
     names = session.setup.emitter_names
     if model.emitters != names:
         raise ModelFileError(

@@ -29,19 +29,15 @@ Array = NDArray[np.float64]
 
 OPTICAL, RIGID = 'optical poses', 'rigidity of the tools'
 LIGHT_SEARCH = SearchSettings(most_effects=1, finalists=4, iterations=6)
-"""A search that names the strongest effect alone, so that a look takes seconds. What that effect
-leaves is reported, and finding its cause is left to the whole diagnosis."""
+"""A search for the strongest effect alone, in seconds; the rest is left to the whole diagnosis."""
 FREE_POSE_M, FREE_POSE_RAD = 0.02, 0.1
-"""Standard deviations, m and rad per axis, of a pose that the fluxes themselves gave. They are far
-above what such a pose is wrong by, so that it holds nothing against any effect."""
+"""Standard deviations, m and rad per axis, of a pose from the fluxes: it contradicts no effect."""
 EXCESS = 1.25
-"""Mean square of the whitened residuals from which on the model lacks something. Noise alone gives
-1; less of a margin would start searches on noise, more would miss small effects."""
+"""Mean square of whitened residuals from which on the model lacks something; noise gives 1."""
 SAME = 1.3
 """Factor by which the residual that a finding leaves may grow before it is searched for again."""
 LEAST_SPREAD_M, LEAST_TURN_RAD = 0.01, 0.1
-"""Least standard deviation of a tool's places, m, and of its orientations, rad, for a search. A
-tool that stays closer shows that something is wrong, but not what."""
+"""Least spread of a tool's places, m, and orientations, rad, with which a cause can be found."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +82,7 @@ class Watch:
         self.searches = 0
 
     def look(self, session: Session, first_ns: int) -> Sighting:
-        """Look at the last seconds; the time of the model's own effects counts from a stamp.
-
-        Raises `DiagnosisError` when there are too few frames to say anything.
-        """
+        """Look at the last seconds; raises `DiagnosisError` when there are too few frames."""
         seen = self._corrected(session, (session.start_ns - first_ns) * NANO)
         truth = OPTICAL
         if sum(int(tool.has_pose.sum()) for tool in seen.session.tools) < FEWEST_POSED_FRAMES:

@@ -39,8 +39,7 @@ _BROKEN = (
     OverflowError, OSError, zstandard.ZstdError, RuntimeError,
 )  # fmt: skip
 _RECORD_LIMIT = 256 * 2**20
-"""Largest record of a bag that is read, and chunk once it is unpacked, bytes; a larger length
-means a damaged or a hostile file, and memory for it is never asked for."""
+"""Largest record, and unpacked chunk, that is read, bytes: more is damage, or hostile."""
 
 FLUX_TYPE = 'sensor_msgs/msg/PointCloud2'
 POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
@@ -75,10 +74,7 @@ def _import_words(name: str) -> str:
 
 
 def bag_file(path: str | os.PathLike[str]) -> str:
-    """Return the MCAP file that ``path`` names, the file itself or the one in a bag's folder.
-
-    Raises `BagError` when there is none, or a folder holds several.
-    """
+    """Return the MCAP file that ``path`` names, itself or alone in a folder; or `BagError`."""
     name = os.fspath(path)
     if os.path.isdir(name):
         files = sorted(f for f in os.listdir(name) if f.endswith('.mcap'))
@@ -298,10 +294,7 @@ def _rename_words(topics: Mapping[str, str]) -> str:
 
 
 def read_bag(path: str | os.PathLike[str]) -> Bag:
-    """Read a recorded session.
-
-    Raises `BagError` when the file can't be read, has no setup, or has no flux topic at all.
-    """
+    """Read a recorded session; raises `BagError`, also without a setup or without fluxes."""
     salvage, collector = Salvage(), _Collector()
     for raw in iter_messages(path, salvage):
         collector.add(raw)

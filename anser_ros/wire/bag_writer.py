@@ -78,10 +78,7 @@ class BagRecord:
 
 
 def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bool = True) -> None:
-    """Write ``metadata.yaml`` of the folder that holds one MCAP file, in place of an older one.
-
-    The bag may still be written: then it is not ``is_closed``.
-    """
+    """Write ``metadata.yaml`` of a folder with one MCAP file, which may not be closed yet."""
     times = {
         'duration': {'nanoseconds': record.last_ns - record.first_ns},
         'starting_time': {'nanoseconds_since_epoch': record.first_ns},
@@ -111,10 +108,7 @@ def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bo
 
 
 def bag_summary(folder: Path) -> dict[str, Any]:
-    """Return ``duration_s``, ``messages`` and ``closed`` of a bag's ``metadata.yaml``; {} if none.
-
-    A bag that was not closed may hold more than that; its readers do not use this file.
-    """
+    """Return ``duration_s``, ``messages``, ``closed`` of a bag's ``metadata.yaml``; or {}."""
     try:
         document = read_yaml((folder / 'metadata.yaml').read_text('utf-8'))
         info = document['rosbag2_bagfile_information']
@@ -367,10 +361,7 @@ FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
 
 
 class SessionWriter(BagWriter):
-    """Writes a session without ROS: setup, fluxes and poses of one frame, log time = stamp.
-
-    Raises `BagError`: the file exists already, or cannot be made.
-    """
+    """Writes a session without ROS: setup, fluxes and poses of one frame, log time = stamp."""
 
     def __init__(self, path: str | Path, frame_id: str = 'fg') -> None:
         super().__init__(path)
@@ -438,10 +429,7 @@ class SessionWriter(BagWriter):
 
 
 def _points(sensors: Sequence[SensorSpec], flux: NDArray[np.complex128]) -> FluxPoints:
-    """One window's cloud; a sensor lacks its reading where it has none of a driven emitter.
-
-    The place of a sensor that moves is not known to its fluxes.
-    """
+    """One window's cloud; a sensor lacks its reading where it has none of a driven emitter."""
     known, rows = np.isfinite(flux), SensorRows.of(sensors, fixed_only=True)
     lacks = (known != known.any(axis=0)).any(axis=1) | ~known.any()
     return FluxPoints(rows.channel, np.where(lacks, STALE, 0), flux, rows.position, rows.axis)

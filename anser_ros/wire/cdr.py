@@ -146,11 +146,7 @@ def cloud_bytes(
 
 
 def cloud_head(data: bytes) -> tuple[int, int, int]:
-    """Return height, width and number of fields of a serialised ``sensor_msgs/PointCloud2``.
-
-    Nothing after them is read, so that the time does not depend on the size of a message. Raises
-    `LayoutError` when the bytes end before.
-    """
+    """Return height, width and fields of a serialised cloud alone; raises `LayoutError`."""
     order = '<' if data[1:2] == b'\x01' else '>'
     body = memoryview(data)[len(HEADER) :]
     try:

@@ -32,10 +32,7 @@ class ChannelResponse:
 
 @dataclass(frozen=True)
 class ChannelCalibration:
-    """Holds the responses of channels by number, and a default for all others.
-
-    ``current_delay_s`` is the delay of the sum-of-currents channel.
-    """
+    """Holds channels' responses by number, that of all others, and the current's delay."""
 
     default: ChannelResponse
     channels: Mapping[int, ChannelResponse] = field(default_factory=dict)
@@ -75,10 +72,7 @@ def _response(item: Any, where: str, default: ChannelResponse | None) -> Channel
 
 
 def parse_channels(text: str) -> ChannelCalibration:
-    """Read and check a channel calibration document.
-
-    Raises `SetupError` with the rule that is broken and where.
-    """
+    """Read and check a channel calibration; `SetupError` names the rule that is broken."""
     root = read_own_yaml(text, 'channels')
     if not isinstance(root, dict) or root.get('schema') != SCHEMA:
         raise SetupError(f'channels: schema must be {SCHEMA!r}')

@@ -354,10 +354,7 @@ def knows(number: int) -> bool:
 
 
 def encode(payload: Payload, tag: int = 0) -> bytes:
-    """Encode one record, header and CRC included.
-
-    Raises `FrameError` when the payload does not fit one record.
-    """
+    """Encode one record, header and CRC included; raises `FrameError` when it is too long."""
     number = TYPE_OF[type(payload)]
     body = _LAYOUTS[number][1](payload)
     if len(body) > MAX_PAYLOAD:
@@ -374,10 +371,7 @@ def header_check(head: bytes | memoryview) -> int:
 
 
 def decode_payload(number: int, raw: memoryview) -> Payload:
-    """Decode the payload of a record whose CRC was right.
-
-    Raises `FrameError` when its content breaks the layout of its type, or its type is unknown.
-    """
+    """Decode the payload of a record whose CRC was right; raises `FrameError`."""
     if number not in _LAYOUTS:
         raise FrameError(f'unknown record type {number:#04x}')
     try:

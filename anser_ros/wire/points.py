@@ -27,8 +27,7 @@ DROPPED = 4
 """Flag bit of a reading with samples missing inside its window."""
 
 MOST_POINTS = 1 << 16
-"""Most points of a cloud. Channels, and dipoles of a model's uncertainty, are unsigned 16-bit
-numbers, so that more points repeat one; a smaller bound would refuse what the layouts allow."""
+"""Most points of a cloud: channels and dipoles are numbered by 16 bits."""
 UINT16, UINT32, FLOAT32, FLOAT64 = 4, 6, 7, 8
 """Numbers of the data types of sensor_msgs/PointField that are used here."""
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -225,8 +224,7 @@ def encode_field_model(points: DipolePoints) -> tuple[list[PointFieldTuple], int
 
 
 MOST_VALUES = 50_000_000
-"""Largest number of values of the modes that are unpacked, 400 MB; more means a damaged
-message."""
+"""Most values of modes that are unpacked, 400 MB; more means a damaged message."""
 _HEAD = [('mode', '<u2'), ('dipole', '<u2'), ('flux_error', '<f4'), ('follows', '<u4'),
          ('withheld', '<u4')]  # fmt: skip
 
@@ -265,10 +263,7 @@ def _layout(
 
 
 def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, bytes]:
-    """Pack a model's uncertainty: fields, point_step and bytes.
-
-    Raises `LayoutError` when there are more modes or dipoles than the layout can count.
-    """
+    """Pack a model's uncertainty: fields, point_step and bytes; `LayoutError` if too large."""
     modes = np.asarray(error.modes, dtype=np.complex128)
     if modes.ndim != 3 or max(modes.shape[:2]) > 0xFFFF:
         raise LayoutError(f'modes must be (R, N, K) with R, N below 65536, got {modes.shape}')

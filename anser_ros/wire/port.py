@@ -106,11 +106,9 @@ STOP_S = 0.1
 DEFAULT_BAUD = 12_000_000
 """Baud rate of the port; USB devices ignore it."""
 SILENCE_S = 1.5
-"""Time without a byte that counts as a fault, s, unless a setting says another: a unit says hello
-once a second."""
+"""Usual time without a byte that counts as a fault, s: a unit says hello once a second."""
 _COMMANDS = 64
-"""Commands that may wait to be written, and of which the time is remembered; they are answered
-within a second, and asked at most a few times a second."""
+"""Commands that may wait, and whose time is remembered; a few a second are answered within one."""
 _GARBAGE_BYTES = 256
 """Bytes without a record within a second beyond which the line counts as garbled."""
 
@@ -201,10 +199,7 @@ class ControlUnitPort:
         self._tag = 0
 
     def start(self) -> None:
-        """Start the reader thread; the port may appear later.
-
-        Raises `PortError` when it was started before.
-        """
+        """Start the reader thread, once (`PortError`); the port may appear later."""
         if self._thread is not None:
             raise PortError(f'the port {self.device} was started before')
         self._thread = threading.Thread(target=self._run, name='control_unit_port', daemon=True)
@@ -241,10 +236,7 @@ class ControlUnitPort:
             return None
 
     def send(self, command: Payload) -> int:
-        """Queue a command for the reader thread to write; returns its tag.
-
-        It is lost if the port closes first; the sender watches for the reply.
-        """
+        """Queue a command, which is lost if the port closes first; returns its tag."""
         self._tag = self._tag % 0xFFFF + 1
         self._commands.append((self._tag, self._protocol.encode(command, self._tag)))
         return self._tag
@@ -382,11 +374,7 @@ def find_port(
     baud: int = DEFAULT_BAUD,
     listen_s: float = 1.5,
 ) -> str:
-    """Find the control unit's port by listening for its hello; nothing is written to any device.
-
-    All serial ports of the computer are tried where no candidates are given. Raises `PortError`
-    when no port carries a hello.
-    """
+    """Find the port, of the given or of all, that carries a hello, by listening only."""
     devices: list[str] = list(candidates or (port.device for port in list_ports.comports()))
     for device in devices:
         try:

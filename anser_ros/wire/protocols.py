@@ -150,10 +150,7 @@ def _magic_prefix(buffer: bytes, position: int) -> int:
 
 
 class RecordReader(Protocol):
-    """Finds records in received bytes; one instance serves one port for as long as it exists.
-
-    ``last_refusal`` says in words for an operator why the last refused record was refused.
-    """
+    """Finds records in one port's bytes; ``last_refusal`` says why the last was refused."""
 
     last_refusal: str
 
@@ -212,13 +209,11 @@ PROTOCOLS = {'anser': ANSER}
 _REPEAT_NS = 500_000_000
 """Time (0.5 s) after which a command without effect is sent again; an answer takes far less."""
 _DOUBT_NS = 60_000_000_000
-"""Time (1 min) for which the unit is asked again after its hello has changed: by itself it says it
-once a second, and a wrong one has no poses until the next."""
+"""Time (1 min) for which the unit is asked again after its hello has changed."""
 _ASK_NS = 250_000_000
 """Time (0.25 s) from one such question to the next. Each costs a hello of some hundred bytes."""
 _TONE_TOLERANCE_HZ = 1.0
-"""Difference up to which a frequency of the device is that of the setup, Hz; synthesisers
-round."""
+"""Difference up to which a unit's tone is the setup's, Hz; synthesisers round."""
 
 
 class StreamControl:

@@ -43,8 +43,7 @@ KEYS = (
 )  # fmt: skip
 FIELD_GENERATOR = 'fg'
 LOWEST_VOLUME_M = 1e-3
-"""A tracked volume ends at least so far over the board's copper (z = 0), m: nearer than the copper
-is thick, no model of its field holds, and heights are sampled in a geometric series."""
+"""Least height of a tracked volume over the copper (z = 0), m: no model holds nearer."""
 
 
 @dataclass(frozen=True)
@@ -133,19 +132,13 @@ class Setup:
         return self.refit.accuracy
 
     def with_stated(self, stated: Mapping[str, float]) -> 'Setup':
-        """Return the setup with further values stated, which go before the document's own.
-
-        Raises `ParameterError` as `settings_from`.
-        """
+        """Return the setup with values stated before its own; raises `ParameterError`."""
         together = {**self.stated, **stated}
         settings_from(together)
         return replace(self, stated=together)
 
     def with_tips(self, tips: Mapping[str, TipSpec]) -> 'Setup':
-        """Return the setup with further tips, which go before its own.
-
-        Raises `SetupError` when a tip is of no body, or its topic is that of a sensor.
-        """
+        """Return the setup with tips before its own; raises `SetupError` for no body."""
         topics = [topic_of(name) for name in (*(s.name for s in self.tool_sensors), *self.bodies)]
         refuse_unknown_bodies(tips, {body: topic_of(body) for body in self.bodies}, topics)
         return replace(self, tips={**self.tips, **tips})
