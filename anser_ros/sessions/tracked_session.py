@@ -79,12 +79,13 @@ def track(
             f'ends with /tool/flux'
         )
     observers: list[SessionObserver] = [make() for make in extensions.loaded('OBSERVERS')]
-    tracker = _tracker(
-        prepared,
-        settings or TrackerSettings(),
-        observers,
-        follows=isinstance(follower, ModelFollower),
-    )
+    settings = settings or TrackerSettings()
+    settings = replace(settings, volume=settings.volume or prepared.volume)
+    settings = settings_for(prepared.session.setup, settings)
+    # A drift's recorded course is used if nothing follows it.
+    course = prepared.recorded_drift and not isinstance(follower, ModelFollower)
+    settings = replace(settings, recorded_drift=course)
+    tracker = Tracker(prepared.model, prepared.sensors, settings, observers)
     estimates: dict[str, list[PoseEstimate]] = {}
     further: dict[str, dict[str, list[PoseEstimate]]] = {one.KIND: {} for one in observers}
     frames = list(frames_of(prepared.session))
@@ -116,26 +117,6 @@ def track(
         if group
     }
     return TrackedSession(by_name, seconds, summary, others)
-
-
-def _tracker(
-    prepared: PreparedSession,
-    settings: TrackerSettings,
-    observers: Sequence[Observer],
-    *,
-    follows: bool,
-) -> Tracker:
-    """A tracker that knows the session's noise, and a drift's course if nothing else does."""
-    return Tracker(
-        prepared.model,
-        prepared.sensors,
-        replace(
-            settings_for(prepared.session.setup, settings),
-            recorded_drift=prepared.recorded_drift and not follows,
-            volume=settings.volume or prepared.volume,
-        ),
-        observers,
-    )
 
 
 Array = NDArray[np.float64]

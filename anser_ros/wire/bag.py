@@ -102,10 +102,14 @@ def _indexed(stream: io.BufferedReader) -> Iterator[RawMessage] | None:
     ):
         return None  # what is whole is found chunk by chunk
     return (
-        RawMessage(channel.topic, schema.name, message.log_time, message.data, channel, schema)
+        _raw(schema, channel, message)
         for schema, channel, message in reader.iter_messages(log_time_order=True)
         if schema is not None
     )
+
+
+def _raw(schema: Schema, channel: Channel, message: Message) -> RawMessage:
+    return RawMessage(channel.topic, schema.name, message.log_time, message.data, channel, schema)
 
 
 def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator[Any]:
@@ -150,11 +154,7 @@ def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[Ra
             channel = channels[record.channel_id]
             schema = schemas.get(channel.schema_id)
             if schema is not None:
-                messages.append(
-                    RawMessage(
-                        channel.topic, schema.name, record.log_time, record.data, channel, schema
-                    )
-                )
+                messages.append(_raw(schema, channel, record))
     messages.sort(key=lambda message: message.log_time_ns)
     return messages
 
