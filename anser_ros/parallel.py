@@ -1,9 +1,7 @@
-"""Shares independent pieces of work among threads.
+"""Shares independent pieces of work among threads, with results that are the same bit by bit.
 
-Results do not depend on the thread that computes them: the pieces are the same for any number of
-threads, and their results are taken in the pieces' order. So a result is the same, bit by bit, on
-any machine. Threads help if the pieces are compiled code or large arrays, which let other threads
-run meanwhile.
+Pieces are the same for any number of threads, and results are taken in their order. Threads help
+if the pieces are compiled code or large arrays, which let other threads run meanwhile.
 """
 
 import os

@@ -1,9 +1,7 @@
 """Defines what an installation may state about itself: its accuracy, and how the refit follows.
 
-Every value has one name and one default, and both are defined here. The name is the key in the
-setup document's sections ``accuracy`` and ``refit``, the parameter of a node, and the name in
-``--set NAME=VALUE`` of a command. An option or a node's parameter takes precedence over the setup
-document, and the document over the default.
+A value's name is the key in the setup document, the parameter of a node, and the NAME in ``--set
+NAME=VALUE``. Options and parameters go before the document, and that before the default.
 """
 
 import math
@@ -49,10 +47,8 @@ def _check(item: Any, value: object) -> None:
 class Accuracy(_Stated):
     """States how accurate an installation's instruments are: one standard deviation of each error.
 
-    The defaults are those of the Anser sessions that this package was developed on: their noise
-    and jitter, and the accuracy that their survey of the reference sensors states. If a value is
-    too small, ordinary errors look like an effect or like metal; if it is too large, such effects
-    are hidden and poses have too large a sigma.
+    Defaults are those of the Anser sessions of the development. Too small, ordinary errors look
+    like an effect or metal; too large, these are hidden and poses have too large a sigma.
     """
 
     # Where the noise is measured (the refit, the tracker's adaptive scale, the calibration), the

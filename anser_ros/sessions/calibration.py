@@ -1,6 +1,4 @@
-"""Calibrates recorded sessions of one board by the first engine that accepts them; the last
-one, which accepts any, fits a scan.
-"""
+"""Calibrates recorded sessions of one board by the first engine that accepts them."""
 
 import functools
 import itertools

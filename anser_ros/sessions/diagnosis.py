@@ -1,8 +1,7 @@
 """Diagnoses a recorded session, and tracks its held-out part without and with what was found.
-The stages are `prepare`, `correct`, `problem_of`, `anser_ros.diagnosis.diagnose.diagnose`
-(which screens, searches, confirms and concludes), `held_out_part` and `track_held_out`; each
-can be called alone, and `diagnose_session` runs all of them. `diagnosis_document` is the
-document of it.
+
+Each stage can be called alone: `prepare`, `correct`, `problem_of`, `diagnosis.diagnose`,
+`held_out_part`, `track_held_out`; `diagnose_session` runs all of them.
 """
 
 from collections.abc import Callable
@@ -132,8 +131,7 @@ def track_held_out(
 ) -> tuple[TrackingErrors, TrackingErrors]:
     """Track the held-out part with the model as it was, and with the effects that were found.
 
-    The second time the model follows the references if only these can determine an effect live:
-    metal that moves, and an emitter whose strength has no course of its own.
+    Then the model follows the references if only these can determine an effect live.
     """
     floor = max(found.flux_rms_floor_t, 1e-30)
     after = unseen.with_model(found.model)

@@ -1,6 +1,4 @@
-"""Lets the field model follow a recorded session's reference sensors, as it does live, by all
-of them or by chosen ones.
-"""
+"""Lets the model follow a recorded session's references, all or chosen ones, as it does live."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,4 @@
-"""Keeps the tables of refits on disk, which take seconds to compute.
-
-They hold as long as model, setup and code are the same.
-"""
+"""Keeps tables of refits, seconds of work, on disk while model, setup and code are the same."""
 
 import json
 import os

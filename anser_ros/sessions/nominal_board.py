@@ -1,6 +1,4 @@
-"""Makes the nominal board of a setup, the emitters as it draws them, and finds the tracked
-volume.
-"""
+"""Makes a setup's nominal board, the emitters as drawn, and finds the tracked volume."""
 
 from dataclasses import dataclass
 from functools import cached_property

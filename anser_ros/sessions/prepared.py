@@ -1,8 +1,4 @@
-"""Prepares a session: everything about it is worked out once and then only read. All that
-evaluates or diagnoses a session starts with `prepare` and hands its result on: the board, the
-noise, the baseline and the corrections are the same wherever they are needed, and the model has
-been checked against the session. `settings_for` takes what a setup says about tracking.
-"""
+"""Works out once what follows from a session and a model, after checking that they fit."""
 
 from dataclasses import dataclass, replace
 

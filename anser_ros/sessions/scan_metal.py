@@ -1,9 +1,8 @@
 """Removes the field of metal from a scan that moved in it, and rested near before and after.
 
-Frames in which it moves are left out of a calibration, but a field that is fitted to the others
-contains the resting metal. Its motion determines its field at rest
-(`anser_ros.diagnosis.departure`), which is subtracted from the scan's fluxes; then the field is
-fitted again.
+Frames in which it moves are left out of a calibration, but the field of the others contains the
+resting metal. Its motion determines that part (`diagnosis.departure`), which is subtracted from
+the fluxes before the field is fitted again.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,6 +1,4 @@
-"""Holds a recorded session as arrays, yields its frames, and keeps the last seconds of a live
-one.
-"""
+"""Holds a recorded session as arrays, its frames, and the last seconds of a live one."""
 
 import os
 from collections import deque

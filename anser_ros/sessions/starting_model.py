@@ -1,6 +1,4 @@
-"""Reads, writes and chooses the field model that a command starts from, and checks what it is
-of.
-"""
+"""Reads, writes and chooses the model that a command starts from, and checks what it is of."""
 
 import os
 from collections.abc import Sequence

@@ -1,7 +1,4 @@
-"""Evaluates a recorded session: tracks its poses as the live nodes would, and compares them.
-The stages are `prepare`, `track` and `compare`; each can be called alone, and `track_session`
-runs all of them. `evaluation_files` writes their results.
-"""
+"""Evaluates a recorded session: `prepare`, `track` as the live nodes would, and `compare`."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -158,9 +155,8 @@ def pose_series(
 def metrics(series: PoseSeries) -> dict[str, Any]:
     """Return the figures of one sensor or body as the evaluation document has them.
 
-    These are the number of compared poses, the share of frames with a pose, and the RMSE, mean
-    error, 50th and 95th percentile (equation 7 of the article) of position and orientation; None
-    where nothing could be compared.
+    RMSE, mean, 50th and 95th percentile (equation 7 of the article) of position and orientation
+    are None where nothing could be compared.
     """
     result: dict[str, Any] = {
         'n': int(np.isfinite(series.position_error).sum()),

@@ -1,8 +1,4 @@
-"""Diagnoses the last seconds lightly: whether the model lacks anything, and what.
-
-A check costs little while the residual is as expected, and while the last findings still explain
-it; only a change starts a search.
-"""
+"""Diagnoses the last seconds lightly: only a change of the residual starts a search."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -70,9 +66,8 @@ class Sighting:
 class Watch:
     """Looks at one window after the other, and remembers what it found.
 
-    It is made of any session of the setup, an empty one too, with the model whose effects are
-    corrected already; without a baseline the references are not used. ``searches`` counts how
-    often something new was searched for.
+    It is made of any session of the setup, also an empty one, with the model whose effects are
+    corrected; ``searches`` counts how often something new was searched for.
     """
 
     def __init__(self, prepared: PreparedSession) -> None:

@@ -1,7 +1,7 @@
-"""Encodes and decodes the records of the control unit's serial protocol, version 1. First what
-control unit and host exchange (hellos, samples, states, commands), then their bytes. The
-protocol is written down in `docs/cu_protocol.md`; the two must agree. Everything is little
-endian. `frame_reader` finds records in a stream; this module knows what is inside one.
+"""Encodes and decodes the records of the control unit's serial protocol, version 1.
+
+It is written down in `docs/cu_protocol.md`; the two must agree. Everything is little endian.
+`protocols` finds records in a stream; this module knows what is inside one.
 """
 
 from __future__ import annotations

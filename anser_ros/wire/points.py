@@ -1,8 +1,7 @@
 """Lays out the bytes of three point clouds, flux, field model and its uncertainty, without ROS.
-Fields are read by name and offset, never by position, so a cloud with other fields in between,
-or in another order, is read right. A field is the tuple ``(name, offset, datatype, count)``
-with the datatype codes of ``sensor_msgs/PointField``. The uncertainty (`ModelError`) has one
-layout only.
+
+Fields, tuples ``(name, offset, datatype, count)`` as in ``sensor_msgs/PointField``, are read by
+name and offset, so others may lie between them; the uncertainty has one layout only.
 """
 
 from collections.abc import Iterable, Sequence

@@ -69,10 +69,8 @@ def cause_of(error: BaseException) -> str:
 def receiver_of(port: serial.SerialBase) -> Callable[[], bytes]:
     """Return a function that waits for bytes and takes all there are; empty when time is over.
 
-    pyserial's own read costs several system calls and an extra byte for every wake-up, which at a
-    thousand blocks a second is most of the work. With a file descriptor, two calls are enough. A
-    terminal hands out four kilobytes at a time; all that is there is taken before any of it is
-    looked at, so that nothing waits for the work on what came before it.
+    pyserial's own read costs several system calls and an extra byte for every wake-up. A terminal
+    hands out 4 kB at a time; all of it is taken before any is looked at.
     """
     try:
         descriptor = port.fileno()
@@ -157,11 +155,9 @@ class Batch:
 class ControlUnitPort:
     """Reads the control unit in a separate thread.
 
-    The device is a path or any pyserial URL; ``baud`` is without meaning on USB. No byte for
-    ``silence_s`` is a fault, as a hello comes once a second. So many blocks of samples may wait
-    for the receiver, and the pause between attempts to open is doubled up to the longest. The
-    receiver is woken for ``blocks_wanted`` blocks, which it may change by `want`: one that needs
-    twenty for a window is spared nineteen changes of threads.
+    The device is a path or a pyserial URL. No byte for ``silence_s`` is a fault. So many blocks
+    may wait for the receiver, which is woken for ``blocks_wanted`` of them; the pause between
+    attempts to open is doubled up to the longest.
     """
 
     def __init__(

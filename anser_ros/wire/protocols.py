@@ -1,8 +1,7 @@
 """Finds records in a byte stream, lists the protocols that do so, and chooses the next command.
-A protocol turns bytes into records and commands into bytes. The rest of the package knows a
-control unit only by its records (`frames.Hello`, `SampleBlock`, `DeviceStatus`, `Reply`):
-another unit's reader translates the received bytes into them. Everything above the port stays
-the same.
+
+The rest of the package knows a control unit only by its records (`frames.Hello`, `SampleBlock`,
+`DeviceStatus`, `Reply`), so another unit needs a reader only.
 """
 
 from __future__ import annotations

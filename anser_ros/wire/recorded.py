@@ -1,7 +1,4 @@
-"""Holds a recorded session as arrays, names topics of poses, and judges quaternions from
-outside. Reading a session from a file is the business of `wire.bag`, without which this can be
-imported.
-"""
+"""Holds a recorded session as arrays, names topics of poses, and judges quaternions."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field

@@ -1,8 +1,7 @@
 """Reads the setup document (`anser_setup/1`): which coils drive, which sense, and where they are.
 
-The YAML text is contained in every bag and published on the latched topic ``setup``. Sensor
-positions and axes are given in the frame of the sensor's body; the body ``fg`` is the field
-generator itself.
+It is in every bag and on the latched topic ``setup``. Sensors lie in the frame of their body; the
+body ``fg`` is the field generator itself.
 """
 
 from collections.abc import Mapping, Sequence
