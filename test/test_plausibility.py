@@ -54,8 +54,7 @@ def with_track(tool, time=None, position=None, quaternion=None):
         old.position if position is None else position,
         old.quaternion if quaternion is None else quaternion,
     )
-    place, turn, has_pose = track.at(tool.time)
-    return replace(tool, track=track, position=place, rotation=turn, has_pose=has_pose)
+    return tool.with_track(track)
 
 
 def says(session, tool, *words, refused=None):

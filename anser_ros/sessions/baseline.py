@@ -35,11 +35,6 @@ class Baseline:
     flux: ComplexArray
 
 
-def baseline_of(recording: Session, sensors: SensorTable, model: FieldModel) -> Baseline:
-    """Return clean readings of reference sensors; raises as `clean_flux`."""
-    return Baseline(recording.path, clean_flux(recording, sensors, model))
-
-
 def clean_flux(recording: Session, sensors: SensorTable, model: FieldModel) -> ComplexArray:
     """Return mean readings of a recording without metal in it, as far as it can be checked.
 

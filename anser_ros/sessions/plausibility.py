@@ -7,7 +7,7 @@ check refuses on evidence only, and names it; what the data cannot decide passes
 import itertools
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -345,9 +345,7 @@ def _thawed(path: str, tool: Measurements) -> tuple[Measurements, list[str]]:
     if lasted_s > MOST_FROZEN * whole_s:
         raise PlausibilityError(f'{path}: {evidence}: was the optical tracker frozen?')
     live = PoseTrack(track.time[~frozen], track.position[~frozen], track.quaternion[~frozen])
-    position, rotation, has_pose = live.at(tool.time)
-    thawed = replace(tool, track=live, position=position, rotation=rotation, has_pose=has_pose)
-    return thawed, [f'{evidence}; these poses are left out']
+    return tool.with_track(live), [f'{evidence}; these poses are left out']
 
 
 def _still_runs(track: PoseTrack) -> list[tuple[int, int]]:

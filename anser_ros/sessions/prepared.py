@@ -9,7 +9,7 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.sessions.baseline import Baseline, baseline_of
+from anser_ros.sessions.baseline import Baseline, clean_flux
 from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.sessions.session import Session, measured_noise, stamp_sigma, tracking_noise
 from anser_ros.sessions.starting_model import check_fits, is_recorded
@@ -86,7 +86,8 @@ def prepare(
     if baseline is not None:
         check_fits(model, baseline)
         if session.reference is not None:
-            clean = baseline_of(baseline, session.reference.sensors, model)
+            flux = clean_flux(baseline, session.reference.sensors, model)
+            clean = Baseline(baseline.path, flux)
     return PreparedSession(
         session,
         model,
@@ -133,8 +134,4 @@ def _corrected(prepared: PreparedSession, measurements: Measurements) -> Measure
 def with_truth(measurements: Measurements, correction: Correction) -> Measurements:
     """Return measurements whose sensors and optical poses are as a model's corrections say."""
     out = replace(measurements, sensors=correction.sensors(measurements.sensors))
-    if measurements.track is None:
-        return out
-    track = correction.optical(measurements.track)
-    position, rotation, has_pose = track.at(measurements.time)
-    return replace(out, track=track, position=position, rotation=rotation, has_pose=has_pose)
+    return out if out.track is None else out.with_track(correction.optical(out.track))
