@@ -147,11 +147,7 @@ VALUES = {name: item for section in SECTIONS.values() for name, item in section.
 
 
 def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
-    """Return the settings with some values stated by their names, and the default of every other.
-
-    A whole number will do for a float. Raises `ParameterError` when a name is unknown, or a value
-    is no number or out of its range.
-    """
+    """Return the settings with some values stated by name; raises `ParameterError`."""
     unknown = sorted(set(map(str, stated)) - set(VALUES))
     if unknown:
         raise ParameterError(

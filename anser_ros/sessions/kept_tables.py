@@ -98,7 +98,7 @@ class KeptTables:
             return None
 
     def write(self, tables: RefitTables) -> None:
-        """Keep the tables, if they are not, and drop those not used for longest; or `OSError`."""
+        """Keep the tables, and drop those that were not used for longest; raises `OSError`."""
         if not self._path.exists():
             write_arrays(self._path, arrays_of(tables))
         files = sorted(self._folder.glob(f'{TABLES}*'), key=used_s, reverse=True)

@@ -39,11 +39,7 @@ UNCERTAINTY_FRAMES = 60
 
 @dataclass(frozen=True)
 class RestingMetal:
-    """Holds what metal at rest did to the fluxes of a session's tools, (F, S, K) each, T.
-
-    Sigma is that of a phasor component, root mean square; the record says where it rested and
-    came.
-    """
+    """Holds what metal at rest did to tools' fluxes, (F, S, K) each, T, its error and places."""
 
     flux: tuple[NDArray[np.complex128], ...]
     sigma_t: float

@@ -23,7 +23,7 @@ from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
 MOST_NOISE_T = 1e-3
 """Noise, T, from which on a setup's statement is a mistake: emitters make microtesla at most."""
 MOST_STAMP_SIGMA_S = 0.1
-"""Error of the stamps, s, from which on a statement is a mistake: a hand moves by 1 cm in it."""
+"""Error of the stamps, s, from which on a statement is a mistake; a hand moves 1 cm in it."""
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def model_of(name: str) -> FieldModel | None:
 
 
 def starting_model(setup: Setup, given: FieldModel | None) -> FieldModel:
-    """Return the model to start from live, given or nominal; `ModelFileError`, `SetupError`."""
+    """Return the given or nominal model to start from; raises `ModelFileError`, `SetupError`."""
     if given is None:
         return nominal_model(board_of(setup))
     check_emitters(setup, given)

@@ -57,7 +57,7 @@ class NumberTable:
         return self.arrays[name]
 
     def column(self, reference: Any) -> NDArray[Any]:
-        """Return a column (N,): ``time``, ``flux[3]``, ``flux[0, 3]``; or `ParameterError`."""
+        """Return a column (N,): ``time``, ``flux[0, 3]``; raises `ParameterError` for no such."""
         match = REFERENCE.match(str(reference))
         if match is None:
             raise ParameterError(f'{self.path}: {reference!r} is not a column, such as x or x[3]')

@@ -74,7 +74,7 @@ def _import_words(name: str) -> str:
 
 
 def bag_file(path: str | os.PathLike[str]) -> str:
-    """Return the MCAP file that ``path`` names, itself or alone in a folder; or `BagError`."""
+    """Return the MCAP file that ``path`` names, itself or alone in a folder; raises `BagError`."""
     name = os.fspath(path)
     if os.path.isdir(name):
         files = sorted(f for f in os.listdir(name) if f.endswith('.mcap'))

@@ -46,11 +46,7 @@ def numbers_of(
     *,
     with_gaps: bool = False,
 ) -> NDArray[np.float64]:
-    """Return columns of a table's rows as numbers, shape (rows, names).
-
-    Raises `ParameterError` when a column is missing or a cell is no finite number; ``with_gaps``
-    empty ones are NaN.
-    """
+    """Return columns (rows, names) as finite numbers, gaps as NaN if allowed; `ParameterError`."""
     try:
         values = np.array(
             [[float((row[n] or 'nan') if with_gaps else row[n]) for n in names] for row in rows]
