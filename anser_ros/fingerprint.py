@@ -8,19 +8,14 @@ from typing import Any
 import numpy as np
 
 DIGITS = 8
-"""Hexadecimal digits of a fingerprint. It has to fit a uint32 on the wire, and two contents that
-differ have the same one by chance once in four thousand million."""
+"""Hexadecimal digits of a fingerprint: it has to fit a uint32 on the wire."""
 MANTISSA_BITS = 40
-"""Bits to which numbers are rounded, one part in 10^12: no text or sum changes them by more, and
-nobody can set or measure a length or a moment so well."""
+"""Bits to which numbers are rounded, one part in 10^12: no text or sum changes them by more."""
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Holds fingerprints of a setup: of its emitters, and of the sensors on each body by name.
-
-    The references are those on the body ``fg``.
-    """
+    """Holds fingerprints of a setup's emitters, and of the sensors on each body, ``fg`` too."""
 
     board: str
     bodies: Mapping[str, str] = field(default_factory=dict)

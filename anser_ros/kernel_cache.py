@@ -95,15 +95,7 @@ def _state() -> tuple[str, int]:
 class KernelCache:
     """Keeps the mark, the lock and the progress of one state of the kernels' sources.
 
-    Parameters
-    ----------
-    folder : Path, optional
-        Where these are kept; by default beside the kernels.
-
-    Attributes
-    ----------
-    total : int
-        How many kernels the package has.
+    They are in a folder, by default beside the kernels, of which there are ``total``.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -132,10 +124,7 @@ class KernelCache:
     def locked(self) -> Iterator[None]:
         """Be the only process that compiles; wait for another one that does.
 
-        Raises
-        ------
-        ParameterError
-            When nothing can be written into the cache.
+        Raises `ParameterError` when nothing can be written into the cache.
         """
         try:
             self._lock.parent.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,7 @@
-"""Shares independent pieces of work among threads.
+"""Shares independent pieces of work among threads, with results that are the same bit by bit.
 
-Results do not depend on the thread that computes them: the pieces are the same for any number of
-threads, and their results are taken in the pieces' order. So a result is the same, bit by bit, on
-any machine. Threads help if the pieces are compiled code or large arrays, which let other threads
-run meanwhile.
+Pieces are the same for any number of threads, and results are taken in their order. Threads help
+if the pieces are compiled code or large arrays, which let other threads run meanwhile.
 """
 
 import os
@@ -18,8 +16,7 @@ Piece = TypeVar('Piece')
 Result = TypeVar('Result')
 
 ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
-"""Variables that give BLAS one thread if they are set before numpy is imported. For small matrices
-a second one gains nothing, and waits milliseconds for a busy core."""
+"""Variables that give BLAS one thread, if set before numpy is imported; its matrices are small."""
 _THIS = threading.local()
 
 

@@ -20,8 +20,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 DOTS_PER_INCH = 110
 """Resolution of the figures, a compromise between legible text and the size of the files."""
 WIDE = 4.0
-"""Largest over smallest value from which an axis is logarithmic: on a shorter one, labels at 1, 2
-and 5 are too few."""
+"""Largest over smallest value from which an axis is logarithmic: else it has too few labels."""
 
 
 def save(figure: Figure, path: Path | io.BytesIO) -> None:

@@ -1,8 +1,7 @@
 """Names every state of a pose: why a frame has one, or why it is withheld.
 
-This is the only list of states. A package that withholds poses takes the name from here and says
-the reason in its own words: `frames` for readings, `tracking` for solves, `integrity` for poses
-that contradict other readings, and the server of the field model for all poses together.
+This is the only list of states; the packages that withhold poses say the reasons in their own
+words.
 """
 
 from typing import NamedTuple

@@ -1,9 +1,7 @@
 """Defines what an installation may state about itself: its accuracy, and how the refit follows.
 
-Every value has one name and one default, and both are defined here. The name is the key in the
-setup document's sections ``accuracy`` and ``refit``, the parameter of a node, and the name in
-``--set NAME=VALUE`` of a command. An option or a node's parameter takes precedence over the setup
-document, and the document over the default.
+A value's name is the key in the setup document, the parameter of a node, and the NAME in ``--set
+NAME=VALUE``. Options and parameters go before the document, and that before the default.
 """
 
 import math
@@ -24,7 +22,7 @@ def _value(default: float, meaning: str, low: float, high: float) -> Any:
 
 @dataclass(frozen=True)
 class _Stated:
-    """Refuses a value that is no number or out of its range."""
+    """Raises `ParameterError` when a value is no number or out of its range."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -33,7 +31,6 @@ class _Stated:
 
 
 def _check(item: Any, value: object) -> None:
-    """Raise `ParameterError` when a value is no number or out of its range."""
     whole = item.type is int
     kinds = int if whole else (int, float)
     if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
@@ -50,15 +47,8 @@ def _check(item: Any, value: object) -> None:
 class Accuracy(_Stated):
     """States how accurate an installation's instruments are: one standard deviation of each error.
 
-    The defaults are those of the Anser sessions that this package was developed on: their noise
-    and jitter, and the accuracy that their survey of the reference sensors states. If a value is
-    too small, ordinary errors look like an effect or like metal; if it is too large, such effects
-    are hidden and poses have too large a sigma.
-
-    Raises
-    ------
-    ParameterError
-        When a value is no number or out of its range.
+    Defaults are those of the Anser sessions of the development. Too small, ordinary errors look
+    like an effect or metal; too large, these are hidden and poses have too large a sigma.
     """
 
     # Where the noise is measured (the refit, the tracker's adaptive scale, the calibration), the
@@ -88,13 +78,7 @@ class Accuracy(_Stated):
 
 @dataclass(frozen=True)
 class ToolSettings(_Stated):
-    """States how well tools are known, and how fast they may be.
-
-    Raises
-    ------
-    ParameterError
-        When a value is no number or out of its range.
-    """
+    """States how well tools are known, and how fast they may be."""
 
     # Too small, and faultless coils contradict their body; too large, and a coil may be wrong by
     # some times this before its body notices.
@@ -114,13 +98,7 @@ class ToolSettings(_Stated):
 
 @dataclass(frozen=True)
 class RefitSettings(_Stated):
-    """States how the live refit follows; nothing here belongs to a particular board or metal.
-
-    Raises
-    ------
-    ParameterError
-        When a value is no number or out of its range.
-    """
+    """States how the live refit follows; nothing here belongs to a particular board or metal."""
 
     # The current has a gain error of its own. A larger deviation lets a change of one emitter
     # explain more of what metal does.
@@ -169,15 +147,7 @@ VALUES = {name: item for section in SECTIONS.values() for name, item in section.
 
 
 def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
-    """Return the settings with some values stated by their names, and the default of every other.
-
-    A whole number will do for a float.
-
-    Raises
-    ------
-    ParameterError
-        When a name is unknown, or a value is no number or out of its range.
-    """
+    """Return the settings with some values stated by name; raises `ParameterError`."""
     unknown = sorted(set(map(str, stated)) - set(VALUES))
     if unknown:
         raise ParameterError(
@@ -200,13 +170,7 @@ def sections_of(stated: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def parse_entries(entries: list[str]) -> dict[str, float]:
-    """Return values from entries ``NAME=VALUE``, as `settings_from` takes them.
-
-    Raises
-    ------
-    ParameterError
-        When an entry is not of that form, a name is unknown or twice there, or a value is bad.
-    """
+    """Return values from entries ``NAME=VALUE`` for `settings_from`; raises `ParameterError`."""
     stated: dict[str, float] = {}
     for entry in entries:
         name, _, text = entry.partition('=')

@@ -10,14 +10,11 @@ SECOND_NS = 1_000_000_000
 """Nanoseconds in a second."""
 
 JUMP_NS = SECOND_NS
-"""A stamp further than this from the last one, ns, is not late or lost but a jump: backwards a
-replay that begins again or a clock that was set, forwards a clock that was set or a silence. It is
-as old as a good pose may be to start the tracker's next one from. Smaller, and every short pause
-is called a jump; larger, and a clock that was set passes unnoticed."""
+"""A stamp further than this from the last one, ns, is not late or lost but a jump: a replay begins
+again, a clock was set, or a silence. It is as old as a good pose may be to start the next from."""
 
 LIVE_WITHIN_S = 60.0
-"""A stamp further than this from the host's clock, s, is a recording's. Larger than any clock's
-error between two hosts that work together, smaller than the age of any recording."""
+"""A stamp further than this from the host's clock, s, is a recording's; hosts agree far better."""
 
 
 class Order(Enum):
@@ -34,10 +31,7 @@ class Order(Enum):
 
 
 def order_of(stamp_ns: int, last_ns: int, jump_ns: int = JUMP_NS) -> Order:
-    """Return how a stamp follows the last one, ns; ``jump_ns`` is the longest pause.
-
-    A first stamp, after ``last_ns`` 0, is the next one.
-    """
+    """Return how a stamp follows the last one (0: none), ns; ``jump_ns`` is the longest pause."""
     if last_ns == 0 or last_ns < stamp_ns <= last_ns + jump_ns:
         return Order.NEXT
     if stamp_ns > last_ns:

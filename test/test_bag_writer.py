@@ -204,18 +204,42 @@ def test_metadata_is_what_rosbag2_reads(tmp_path):
     assert only['topic_metadata']['type_description_hash'] == 'RIHS01_00'
 
 
-def test_the_index_of_a_recording_is_whole(tmp_path):
-    path, chunks, topics = tmp_path / 'long.mcap', 40, 40
-    with BagWriter(path) as bag:
-        channels = [bag.add_topic(f'/t{k}', 'std_msgs/msg/String', '') for k in range(topics)]
-        for k in range(chunks):
-            for channel in channels:
-                bag.write(channel, STAMP_NS + k, cdr.string_bytes(str(k)))
-            bag.flush()
-    with open(path, 'rb') as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        summary = reader.get_summary()
-        assert len(summary.chunk_indexes) == chunks == summary.statistics.chunk_count
-        assert all(set(c.message_index_offsets) == set(channels) for c in summary.chunk_indexes)
-        found = [message.data for _, _, message in reader.iter_messages(['/t7'])]
-        assert found == [cdr.string_bytes(str(k)) for k in range(chunks)]
+class TestIndex:
+    TOPICS, FLUSHES, PERIOD_NS = 40, 64, 250_000_000
+
+    def record(self, path):
+        """Write a quarter of a minute, and return the file's bytes after every flush."""
+        states = []
+        with BagWriter(path) as bag:
+            for k in range(self.FLUSHES):
+                if k in (0, 3):  # half of the topics appear later
+                    half = range(k and self.TOPICS // 2, self.TOPICS // (1 if k else 2))
+                    for n in half:
+                        bag.add_topic(f'/t{n}', 'std_msgs/msg/String', '')
+                for channel in bag.record.topics:
+                    time_ns = STAMP_NS + k * self.PERIOD_NS
+                    bag.write(channel, time_ns, cdr.string_bytes(str(k)))
+                bag.flush()
+                states.append((bag.record.messages, path.read_bytes()))
+        return states
+
+    def test_is_whole_and_of_few_chunks(self, tmp_path):
+        path = tmp_path / 'long.mcap'
+        self.record(path)
+        with open(path, 'rb') as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            summary = reader.get_summary()
+            chunks = summary.chunk_indexes
+            assert len(chunks) == summary.statistics.chunk_count <= 6
+            assert set(chunks[-1].message_index_offsets) == set(range(1, self.TOPICS + 1))
+            found = [message.data for _, _, message in reader.iter_messages(['/t7'])]
+            assert found == [cdr.string_bytes(str(k)) for k in range(self.FLUSHES)]
+
+    def test_every_flush_leaves_a_file_with_all_messages(self, tmp_path):
+        for count, data in self.record(tmp_path / 'long.mcap'):
+            messages = set()
+            with pytest.raises(EndOfFile):
+                for record in StreamReader(io.BytesIO(data), validate_crcs=True).records:
+                    if type(record).__name__ == 'Message':
+                        messages.add((record.channel_id, record.log_time))
+            assert len(messages) == count

@@ -15,8 +15,7 @@ from anser_ros.cli import calibrate as command
 from anser_ros.cli.main import main
 from anser_ros.errors import FitError
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.calibration import calibrate_sessions
-from anser_ros.sessions.calibration_engine import generator_of
+from anser_ros.sessions.calibration import calibrate_sessions, generator_of
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model

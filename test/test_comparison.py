@@ -68,12 +68,9 @@ def test_few_stretches_give_no_interval_and_other_sessions_are_refused():
 
 
 def test_a_side_without_a_pose_is_told_and_not_refused(tmp_path, capsys):
-    some, folders = errors(1.0), []
-    for name, state in (('one', OK), ('none', 'residual')):
-        (tmp_path / name).mkdir()
-        folders.append(str(tmp_path / name))
-        evaluation = evaluation_of(some, state)
-        write_tables(tmp_path / name, evaluation)
+    some = errors(1.0)
+    states = {'one': OK, 'none': 'residual'}
+    folders = [written(tmp_path / name, some, state) for name, state in states.items()]
     found = compare_errors(some, {}, np.random.default_rng(1))['a']
     assert (found.n, found.only_a, found.only_b) == (0, FRAMES, 0)
     assert found.verdict == 'neither'
@@ -116,16 +113,20 @@ def evaluation_of(found, state=OK):
     return Evaluation({'a': PoseSeries('a', estimates, sizes, 2 * sizes)}, {}, 1e-3)
 
 
+def written(folder, found, state=OK):
+    """Write the tables of an evaluation, and return their folder."""
+    folder.mkdir()
+    write_tables(folder, evaluation_of(found, state))
+    return str(folder)
+
+
 def test_the_command(tmp_path, capsys):
-    for name, scale in (('one', 2.0), ('two', 1.0)):
-        (tmp_path / name).mkdir()
-        evaluation = evaluation_of(errors(scale))
-        write_tables(tmp_path / name, evaluation)
+    scales = {'one': 2.0, 'two': 1.0}
+    folders = [written(tmp_path / name, errors(scale)) for name, scale in scales.items()]
     read = read_errors(tmp_path / 'one')
     assert len(read['position']) == FRAMES - 1
     key = next(iter(read['position']))
     assert read['position'][key] == pytest.approx(errors(2.0)[key], rel=1e-8)
-    folders = [str(tmp_path / 'one'), str(tmp_path / 'two')]
     assert main(['compare', *folders, '--out', str(tmp_path / 'out'), '--json']) == 0
     document = json.loads(capsys.readouterr().out)
     assert document == json.loads((tmp_path / 'out' / 'comparison.json').read_text())

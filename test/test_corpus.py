@@ -60,14 +60,14 @@ def harmless(use, name=''):
         assert len(str(error)) < 2000, 'a message that repeats its input without end'
 
 
-def read_serial(data):
+def read_serial(data, folder):
     reader = FrameReader()
     for start in range(0, len(data), 50):
         reader.feed(data[start : start + 50])
     assert len(reader._pending) <= len(data)
 
 
-def read_setup(data):
+def read_setup(data, folder):
     parse_setup(data.decode('utf-8', 'replace'))
 
 
@@ -95,11 +95,8 @@ def read_names(path):
 
 
 READERS = {
-    'serial': lambda data, folder: read_serial(data),
-    'setups': lambda data, folder: read_setup(data),
-    'models': read_model,
-    'bags': read_session,
-}
+    'serial': read_serial, 'setups': read_setup, 'models': read_model, 'bags': read_session
+}  # fmt: skip
 
 
 @pytest.mark.parametrize('kind', READERS)
@@ -157,12 +154,10 @@ def test_whatever_a_client_says_to_openigtlink():
 
 
 def test_an_effect_that_is_none_is_named():
-    for parameters, words in (
-        (
-            {'coil': 'coil3', 'gain': 1.0, 'phase_deg': 0.0},
-            'effect coil_gain: its parameters are malformed',
-        ),
-        ({'coil': 0, 'gain': float('nan'), 'phase_deg': 0.0}, 'effect coil_gain'),
+    for coil, gain, words in (
+        ('coil3', 1.0, 'effect coil_gain: its parameters are malformed'),
+        (0, float('nan'), 'effect coil_gain'),
     ):
+        record = EffectRecord('coil_gain', {'coil': coil, 'gain': gain, 'phase_deg': 0.0})
         with pytest.raises(ModelFileError, match=words):
-            Correction.of((EffectRecord('coil_gain', parameters),), SENSORS, (1e3, 2e3))
+            Correction.of((record,), SENSORS, (1e3, 2e3))

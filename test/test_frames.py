@@ -36,16 +36,9 @@ TONES = tuple(6000.0 + 170 * k for k in range(8))
 
 
 def hello(**changes: object) -> Hello:
-    channels = tuple(Channel(n, ChannelKind.SENSE, 5.0) for n in range(4))
-    base = Hello(
-        'anser cu 7',
-        40e3,
-        1e6,
-        40,
-        (*channels, Channel(48, ChannelKind.CURRENT, 4.0)),
-        TONES,
-        (0.25,) * 8,
-    )
+    sensors = [Channel(n, ChannelKind.SENSE, 5.0) for n in range(4)]
+    channels = (*sensors, Channel(48, ChannelKind.CURRENT, 4.0))
+    base = Hello('anser cu 7', 40e3, 1e6, 40, channels, TONES, (0.25,) * 8)
     return replace(base, **changes)
 
 
@@ -55,16 +48,8 @@ def block(sequence: int = 3, n: int = 40, columns: int = 5) -> SampleBlock:
 
 
 STATUS = DeviceStatus(DeviceState.STREAMING, StatusFlag(0), 1_000_000, 0, 0, 25.0)
-PAYLOADS = [
-    hello(),
-    block(),
-    STATUS,
-    Reply(0x84, ReplyCode.BAD_ARGUMENT, 'eight tones, not seven'),
-    Identify(),
-    Start(),
-    Stop(),
-    SetFrequencies(TONES),
-]
+REPLY = Reply(0x84, ReplyCode.BAD_ARGUMENT, 'eight tones, not seven')
+PAYLOADS = [hello(), block(), STATUS, REPLY, Identify(), Start(), Stop(), SetFrequencies(TONES)]
 
 
 def same(a: object, b: object) -> bool:
@@ -112,8 +97,8 @@ def test_every_damaged_byte_costs_at_most_its_own_record():
         assert [r.payload.sequence for r in found] == [0, 2]
 
 
-def corrupt_inputs(folder: Path) -> dict[str, tuple[Path, set[str]]]:
-    """Write a corpus of broken streams; each ends with one good record."""
+def corrupt_inputs() -> dict[str, tuple[bytes, set[str]]]:
+    """Return broken streams by name, with the counters that they raise."""
     good = encode(block())
     rng = np.random.default_rng(5)
     noise = bytes(rng.integers(0, 256, 5000, dtype=np.uint8))
@@ -124,7 +109,7 @@ def corrupt_inputs(folder: Path) -> dict[str, tuple[Path, set[str]]]:
     body = bytes(other_version) + good[12:-4]
     version2 = body + struct.pack('<I', zlib.crc32(body))
     short_hello = _forge(0x01, encode(hello())[12:40])
-    cases = {
+    return {
         'noise_in_front': (noise, {'skipped_bytes'}),
         'magic_only': (frames.MAGIC * 50, {'bad_header'}),
         'cut_record': (good[:37], {'bad_crc', 'skipped_bytes'}),
@@ -140,12 +125,6 @@ def corrupt_inputs(folder: Path) -> dict[str, tuple[Path, set[str]]]:
         'tone_cut': (_forge(0x84, b'1234567'), {'bad_payload'}),
         'ascii_device': (b'$GPGGA,123519,4807.038,N*47\r\n' * 40, {'skipped_bytes'}),
     }
-    files = {}
-    for name, (raw, counters) in cases.items():
-        path = folder / f'{name}.bin'
-        path.write_bytes(raw + good)
-        files[name] = (path, counters)
-    return files
 
 
 def _forge(number: int, body: bytes) -> bytes:
@@ -154,10 +133,10 @@ def _forge(number: int, body: bytes) -> bytes:
     return raw + struct.pack('<I', zlib.crc32(raw))
 
 
-def test_corrupt_inputs_are_named_and_the_good_record_behind_is_found(tmp_path):
-    for name, (path, expected) in corrupt_inputs(tmp_path).items():
+def test_corrupt_inputs_are_named_and_the_good_record_behind_is_found():
+    for name, (raw, expected) in corrupt_inputs().items():
         reader = FrameReader()
-        found = reader.feed(path.read_bytes())
+        found = reader.feed(raw + encode(block()))
         assert len(found) == 1 and same(found[0].payload, block()), name
         counted = {key for key, value in reader.fault_counters().items() if value}
         assert expected <= counted, (name, counted)

@@ -36,6 +36,11 @@ def moving():
     return load_session(ROOT / 'bags' / 'moving.mcap')
 
 
+@pytest.fixture(scope='module')
+def tool(moving):
+    return moving.tools[0]
+
+
 def checked(session, tool, refused=None):
     tools, left_out = plausible_tools('bag', session.setup, (tool,), refused or {})
     return tools[0], left_out
@@ -49,8 +54,7 @@ def with_track(tool, time=None, position=None, quaternion=None):
         old.position if position is None else position,
         old.quaternion if quaternion is None else quaternion,
     )
-    place, turn, has_pose = track.at(tool.time)
-    return replace(tool, track=track, position=place, rotation=turn, has_pose=has_pose)
+    return tool.with_track(track)
 
 
 def says(session, tool, *words, refused=None):
@@ -61,24 +65,21 @@ def says(session, tool, *words, refused=None):
     assert '\n' not in text
 
 
-def test_what_is_right_passes_unchanged(moving):
-    (tool,) = moving.tools
+def test_what_is_right_passes_unchanged(moving, tool):
     same, left_out = checked(moving, tool)
     assert same is tool and left_out == '' and moving.lost == ''
 
 
 @pytest.mark.parametrize('unit', LENGTH_UNITS)
-def test_positions_in_another_unit(moving, unit):
-    (tool,) = moving.tools
+def test_positions_in_another_unit(moving, tool, unit):
     wrong = with_track(tool, position=LENGTH_UNITS[unit] * tool.track.position)
     says(moving, wrong, f'positions in {unit}', 'span')
     also = with_track(wrong, quaternion=tool.track.quaternion[:, [3, 0, 1, 2]])
     says(moving, also, f'positions in {unit} and quaternions with w first')
 
 
-def test_positions_far_away_need_no_drawing(moving):
+def test_positions_far_away_need_no_drawing(moving, tool):
     """A board that can't be drawn explains no flux; its tracked volume still bounds the poses."""
-    (tool,) = moving.tools
     emitter = replace(moving.setup.emitter, kind='somebody_elses')
     undrawn = replace(moving, setup=replace(moving.setup, emitter=emitter))
     assert NominalBoard.of(undrawn.setup).field is None
@@ -87,16 +88,14 @@ def test_positions_far_away_need_no_drawing(moving):
     says(undrawn, far, 'span', 'millimetres?')
 
 
-def test_quaternions_in_another_order(moving):
-    (tool,) = moving.tools
+def test_quaternions_in_another_order(moving, tool):
     first = with_track(tool, quaternion=tool.track.quaternion[:, [3, 0, 1, 2]])
     says(moving, first, 'quaternions with w first', '100 %')
     inverse = with_track(tool, quaternion=tool.track.quaternion * [-1, -1, -1, 1])
     says(moving, inverse, 'rotations from fg to the body')
 
 
-def test_axes_that_are_exchanged_or_reversed(moving):
-    (tool,) = moving.tools
+def test_axes_that_are_exchanged_or_reversed(moving, tool):
     place, turned = tool.track.position, Rotation.from_quat(tool.track.quaternion)
     says(moving, with_track(tool, position=place[:, [1, 0, 2]]), 'positions with the axes y, x, z')
     mirror = np.diag([1.0, 1.0, -1.0])
@@ -110,9 +109,8 @@ def test_axes_that_are_exchanged_or_reversed(moving):
     says(moving, other, 'poses in a frame of the axes z, x, y')
 
 
-def test_what_cannot_be_decided_is_not_said(moving):
+def test_what_cannot_be_decided_is_not_said(moving, tool):
     """An optical frame that is not the board's explains nothing in any order."""
-    (tool,) = moving.tools
     turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     elsewhere = with_track(tool, position=tool.track.position @ turn.T + 0.3)
     assert checked(moving, elsewhere)[1] == ''
@@ -122,8 +120,7 @@ def test_what_cannot_be_decided_is_not_said(moving):
 
 
 @pytest.mark.parametrize('unit', FLUX_UNITS)
-def test_fluxes_in_another_unit(moving, unit):
-    (tool,) = moving.tools
+def test_fluxes_in_another_unit(moving, tool, unit):
     larger = replace(tool, flux=FLUX_UNITS[unit] * tool.flux)
     says(moving, larger, f'{unit}?', 'drawn board')
     blind = replace(larger, track=None, has_pose=np.zeros_like(tool.has_pose))
@@ -133,15 +130,13 @@ def test_fluxes_in_another_unit(moving, unit):
         says(moving, blind, '?', 'drawn board')
 
 
-def test_clocks_that_do_not_overlap(moving):
-    (tool,) = moving.tools
+def test_clocks_that_do_not_overlap(moving, tool):
     says(moving, with_track(tool, time=tool.track.time + 3600.0), 'after the last flux', 'clocks')
     says(moving, with_track(tool, time=tool.track.time - 3600.0), 'before the first flux')
 
 
-def test_a_frozen_optical_tracker(moving):
+def test_a_frozen_optical_tracker(moving, tool):
     """It repeats its last pose; such poses are left out, and most of them are too many."""
-    (tool,) = moving.tools
     track = tool.track
     size = track.time.size
 
@@ -163,16 +158,14 @@ def test_a_frozen_optical_tracker(moving):
     assert checked(moving, rest)[1] == ''
 
 
-def test_quaternions_that_are_none(moving):
-    (tool,) = moving.tools
+def test_quaternions_that_are_none(moving, tool):
     reason = f'/optical/{tool.body}/pose: a quaternion not of unit length'
     none = replace(tool, track=None, has_pose=np.zeros_like(tool.has_pose))
     says(moving, none, 'all 7 optical poses', 'unit length', refused={reason: 7})
     assert '7 optical poses' in checked(moving, tool, {reason: 7})[1]
 
 
-def test_a_diagnosis_of_one_pose_ends_at_once(moving):
-    (tool,) = moving.tools
+def test_a_diagnosis_of_one_pose_ends_at_once(moving, tool):
     track = tool.track
     rest = with_track(
         tool,

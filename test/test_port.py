@@ -5,6 +5,7 @@ import os
 import threading
 import time
 import tty
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,15 +29,8 @@ from anser_ros.wire.port import ControlUnitPort, PortState, find_port
 from anser_ros.wire.protocols import FrameReader, StreamControl
 
 TONES = (6000.0, 6170.0)
-HELLO = Hello(
-    'test unit',
-    40e3,
-    1e6,
-    40,
-    (Channel(0, ChannelKind.SENSE, 5.0), Channel(1, ChannelKind.CURRENT, 1.0)),
-    TONES,
-    (0.25, 0.25),
-)
+CHANNELS = (Channel(0, ChannelKind.SENSE, 5.0), Channel(1, ChannelKind.CURRENT, 1.0))
+HELLO = Hello('test unit', 40e3, 1e6, 40, CHANNELS, TONES, (0.25, 0.25))
 
 
 def block(sequence: int) -> bytes:
@@ -94,17 +88,25 @@ def wire(tmp_path):
         cable.unplug()
 
 
+@contextlib.contextmanager
+def started(device, **options):
+    """A port while its reader runs."""
+    reader = ControlUnitPort(str(device), **options)
+    reader.start()
+    try:
+        yield reader
+    finally:
+        reader.stop()
+
+
 @pytest.fixture
 def port(wire, request):
     """A port that is open; it finds no silence within a test, unless one says after how long."""
     silence_s = getattr(request, 'param', 600.0)
-    reader = ControlUnitPort(
-        str(wire.link), silence_s=silence_s, pause_s=0.02, longest_pause_s=0.1
-    )
-    reader.start()
-    assert wait(lambda: reader.state is PortState.WAITING)
-    yield reader
-    reader.stop()
+    options = {'silence_s': silence_s, 'pause_s': 0.02, 'longest_pause_s': 0.1}
+    with started(wire.link, **options) as reader:
+        assert wait(lambda: reader.state is PortState.WAITING)
+        yield reader
     assert reader.state is PortState.CLOSED
 
 
@@ -117,6 +119,13 @@ def receive(port, count: int) -> list:
 
     wait(lambda: len(payloads) >= count, take)
     return payloads
+
+
+def write_singly(wire, port, count: int):
+    """Write blocks, each after the one before was read."""
+    for sequence in range(count):
+        wire.write(block(sequence))
+        assert wait(lambda n=sequence: port.fault_counters()['records'] == n + 1)
 
 
 def test_records_arrive_in_order(wire, port):
@@ -157,24 +166,16 @@ def test_a_unit_that_takes_no_command_is_not_called_unplugged(wire, port):
     ],
 )
 def test_why_a_port_does_not_open_is_one_short_line(device, why):
-    port = ControlUnitPort(device)
-    port.start()
-    try:
+    with started(device) as port:
         assert wait(lambda: port.counters.open_failures > 0)
         assert port.reason == f'cannot open {device}: {why}'
-    finally:
-        port.stop()
 
 
 def test_a_port_in_use_says_so(wire, port):
-    other = ControlUnitPort(port.device)
     assert wait(lambda: port.counters.opens == 1)
-    other.start()
-    try:
+    with started(port.device) as other:
         assert wait(lambda: other.counters.open_failures > 0)
         assert other.reason == f'cannot open {port.device}: another program uses it'
-    finally:
-        other.stop()
 
 
 def test_unplugged_cable_is_counted_and_the_port_comes_back(wire, port):
@@ -230,27 +231,19 @@ def test_silence_is_counted_and_ends_with_the_next_record(wire, port):
 
 
 def test_slow_receiver_loses_blocks_but_no_hello_and_stops_nobody(wire):
-    port = ControlUnitPort(str(wire.link), queue_blocks=3)
-    port.start()
-    assert wait(lambda: port.state is PortState.WAITING)
-    try:
-        for sequence in range(30):
-            wire.write(block(sequence))
-            assert wait(lambda n=sequence: port.fault_counters()['records'] == n + 1)
+    with started(wire.link, queue_blocks=3) as port:
+        assert wait(lambda: port.state is PortState.WAITING)
+        write_singly(wire, port, 30)
         wire.write(encode(HELLO))
         assert wait(lambda: port.fault_counters()['records'] == 31)
         assert port.counters.overrun_blocks >= 26
         batches = iter(lambda: port.get(0.05), None)
         assert HELLO in [record.payload for batch in batches for record in batch.records]
-    finally:
-        port.stop()
 
 
 def test_receiver_is_woken_for_as_many_blocks_as_it_wants(wire, port):
     port.blocks_wanted = 5
-    for sequence in range(12):
-        wire.write(block(sequence))
-        assert wait(lambda n=sequence: port.fault_counters()['records'] == n + 1)
+    write_singly(wire, port, 12)
     assert len(receive(port, 12)) == 12, 'a pause hands over what there is'
     wire.write(block(12) + encode(HELLO))
     assert len(receive(port, 2)) == 2, 'a hello waits for nothing'
@@ -300,7 +293,7 @@ def test_control_asks_for_hello_then_tones_then_samples():
     control.take(Record(HELLO), now)
     assert not control.tones_agree
     assert control.due(now) == SetFrequencies((6000.0, 6200.0))
-    right = Hello(**{**HELLO.__dict__, 'frequencies_hz': (6000.0, 6199.99)})
+    right = replace(HELLO, frequencies_hz=(6000.0, 6199.99))
     control.take(Record(right), now)
     assert control.tones_agree
     assert control.due(now) == Start()
@@ -332,7 +325,7 @@ def test_control_that_may_not_set_tones_says_what_differs():
 
 def test_control_asks_again_after_a_hello_that_contradicts_a_good_one():
     control = StreamControl(HELLO.frequencies_hz)
-    other = Hello(**{**HELLO.__dict__, 'channels': HELLO.channels[::-1]})
+    other = replace(HELLO, channels=HELLO.channels[::-1])
     control.take(Record(HELLO), 0)
     control.take(Record(Reply(0x82, ReplyCode.OK)), 0)
 

@@ -14,7 +14,7 @@ from anser_ros.diagnosis.prepare import test_blocks as held_out_blocks
 from anser_ros.diagnosis.search import SearchSettings
 from anser_ros.errors import BagError, DiagnosisError, ModelFileError
 from anser_ros.field.model import EffectRecord, plain
-from anser_ros.sessions.baseline import baseline_of
+from anser_ros.sessions.baseline import Baseline, clean_flux
 from anser_ros.sessions.diagnosis import (
     SessionDiagnosis,
     held_out_part,
@@ -189,7 +189,7 @@ class TestFollow:
         assert prepare(blind, model, factory).baseline is None
         with pytest.raises(BagError, match='needs reference fluxes'):
             ModelFollower(prepare(blind, model, factory))
-        few = baseline_of(factory, metal.reference.sensors, model)
+        few = Baseline(factory.path, clean_flux(factory, metal.reference.sensors, model))
         few.flux[3:] = np.nan
         with pytest.raises(BagError, match=f'{factory.path}.*a baseline of 3'):
             ModelFollower(replace(prepare(metal, model), baseline=few))

@@ -60,6 +60,11 @@ class Measurements:
             has_pose=self.has_pose[rows],
         )
 
+    def with_track(self, track: PoseTrack) -> 'Measurements':
+        """Return the measurements with the poses that another track has at their times."""
+        position, rotation, has_pose = track.at(self.time)
+        return replace(self, track=track, position=position, rotation=rotation, has_pose=has_pose)
+
     def sensors_only(self, rows: NDArray[np.generic]) -> 'Measurements':
         """Return the measurements of the sensors given by index or mask."""
         return replace(

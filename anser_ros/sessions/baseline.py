@@ -21,8 +21,7 @@ from anser_ros.wire.setup import Setup
 ComplexArray = NDArray[np.complex128]
 
 SAME_PLACE_M = 0.005
-"""Farthest that a reference sensor may be in the baseline from where the session has it, m: a
-fresh survey moves a coil by a millimetre or less."""
+"""Farthest that a sensor may be from where the session has it, m; a survey moves it by 1 mm."""
 
 
 @dataclass(frozen=True)
@@ -36,20 +35,11 @@ class Baseline:
     flux: ComplexArray
 
 
-def baseline_of(recording: Session, sensors: SensorTable, model: FieldModel) -> Baseline:
-    """Return clean readings of reference sensors; raises as `clean_flux`."""
-    return Baseline(recording.path, clean_flux(recording, sensors, model))
-
-
 def clean_flux(recording: Session, sensors: SensorTable, model: FieldModel) -> ComplexArray:
     """Return mean readings of a recording without metal in it, as far as it can be checked.
 
-    Arguments, result and further errors are those of `baseline_flux`.
-
-    Raises
-    ------
-    BagError
-        When readings change during the recording, or are not those that the model knows of.
+    Arguments, result and further errors are those of `baseline_flux`. Raises `BagError` when
+    readings change during the recording, or are not those that the model knows of.
     """
     flux = baseline_flux(recording, sensors)
     try:
@@ -83,10 +73,7 @@ def check_clean(
 
 
 def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> BoardPlace | None:
-    """Return what compares the places that a model and references have the board at.
-
-    None for the drawing itself, for a board that cannot be drawn, and for a model with metal.
-    """
+    """Return what compares the board's places by model and references, None without a drawing."""
     board = NominalBoard.of(setup).board
     if board is None or is_nominal(model) or not len(sensors) or not _is_without_metal(model):
         return None
@@ -127,10 +114,7 @@ def clean_mean(
 ) -> ComplexArray:
     """Return the mean readings (R, K), T, of a window in which there seems to be no metal.
 
-    Raises
-    ------
-    FitError
-        When they change, or are not what the references read without metal.
+    Raises `FitError` when they change, or are not what the references read without metal.
     """
     mean, sigma = window.mean(), check_steady(window.frames)
     if model is not None and sensors is not None:
@@ -141,13 +125,7 @@ def clean_mean(
 
 
 def steady_sigma(recording: Session) -> float:
-    """Return the noise of a component of a recording's mean readings, T, from its scatter.
-
-    Raises
-    ------
-    FitError
-        When the readings change during the recording by more than an emitter's strength.
-    """
+    """Return the noise of a component of mean readings, T; raises `FitError` when these change."""
     reference, stated = recording.reference, recording.setup.accuracy.flux_noise_t
     if reference is None:
         return stated
@@ -175,13 +153,9 @@ def readings_of(recording: Session) -> ReferenceReadings | None:
 def baseline_flux(baseline: Session, sensors: SensorTable) -> ComplexArray:
     """Return the mean reading of each of R reference sensors in a recording without metal.
 
-    (R, K), T, in the order of the sensors; NaN for one without a good reading.
-
-    Raises
-    ------
-    BagError
-        When the recording has no reference fluxes, or lacks one of the sensors, or has it at
-        another place.
+    (R, K), T, in the order of the sensors; NaN for one without a good reading. Raises `BagError`
+    when the recording has no reference fluxes, or lacks one of the sensors, or has it at another
+    place.
     """
     reference = baseline.reference
     if reference is None:

@@ -1,8 +1,7 @@
 """Diagnoses a recorded session, and tracks its held-out part without and with what was found.
-The stages are `prepare`, `correct`, `problem_of`, `anser_ros.diagnosis.diagnose.diagnose`
-(which screens, searches, confirms and concludes), `held_out_part` and `track_held_out`; each
-can be called alone, and `diagnose_session` runs all of them. `diagnosis_document` is the
-document of it.
+
+Each stage can be called alone: `prepare`, `correct`, `problem_of`, `diagnosis.diagnose`,
+`held_out_part`, `track_held_out`; `diagnose_session` runs all of them.
 """
 
 from collections.abc import Callable
@@ -31,9 +30,8 @@ from anser_ros.tracking.estimate import TrackerSettings
 Array = NDArray[np.float64]
 
 ROOM = 2.0
-"""Gate of the held-out part's tracking over the flux residual there. With less, poses that a wrong
-model makes would be refused instead of counted; with much more, wrong minima would be taken for
-poses."""
+"""Gate of the held-out part's tracking over its residual: less would refuse a wrong model's poses
+instead of counting them, much more would take wrong minima for poses."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +47,7 @@ class TrackingErrors:
 
 @dataclass(frozen=True)
 class SessionDiagnosis:
-    """Holds what a model lacks on a session, and how its held-out part is tracked.
-
-    Before is with the model as it was, after with the effects that were found.
-    """
+    """Holds what a model lacks on a session, and tracking errors without and with it."""
 
     diagnosis: Diagnosis
     before: TrackingErrors
@@ -68,16 +63,9 @@ def diagnose_session(
     """Find what a model lacks on a session with optical poses of at least one tool.
 
     With a baseline, a distortion-free recording of the same board, the references are used.
-    ``progress`` is called with words on what goes on.
-
-    Raises
-    ------
-    DiagnosisError
-        When fewer than 30 frames have fluxes and a pose.
-    ModelFileError
-        When the model's emitters are not the session's.
-    BagError
-        When the baseline's references are not the session's.
+    ``progress`` is called with words on what goes on. Raises `DiagnosisError` when fewer than 30
+    frames have fluxes and a pose; `ModelFileError` when the model's emitters are not the
+    session's; `BagError` when the baseline's references are not the session's.
     """
     say = progress or (lambda text: None)
     prepared = prepare(session, model, baseline)
@@ -94,12 +82,9 @@ def diagnose_session(
 def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Problem:
     """Return the diagnosis problem of a session that was corrected (`correct`).
 
-    Readings and poses may be off by ``spread``, by default that of `spread_of`.
-
-    Raises
-    ------
-    DiagnosisError
-        When the session has no tool fluxes, or fewer than 30 frames have fluxes and a pose.
+    Readings and poses may be off by ``spread``, by default that of `spread_of`. Raises
+    `DiagnosisError` when the session has no tool fluxes, or fewer than 30 frames have fluxes and a
+    pose.
     """
     session, clean = corrected.session, corrected.baseline
     if not session.tools:
@@ -146,8 +131,7 @@ def track_held_out(
 ) -> tuple[TrackingErrors, TrackingErrors]:
     """Track the held-out part with the model as it was, and with the effects that were found.
 
-    The second time the model follows the references if only these can determine an effect live:
-    metal that moves, and an emitter whose strength has no course of its own.
+    Then the model follows the references if only these can determine an effect live.
     """
     floor = max(found.flux_rms_floor_t, 1e-30)
     after = unseen.with_model(found.model)
@@ -192,8 +176,7 @@ DEPENDENCIES = (
 )  # fmt: skip
 """Variables on which a remainder may depend in words; other tests are for the report only."""
 MODEL_FILE_ONLY = ('groups', 'knots_s', 'course', 'couplings_m3')
-"""Parameters that only a program needs: lists of hundreds of numbers. They are left out here and
-stand in the model file."""
+"""Parameters of hundreds of numbers, which stand in the model file only."""
 
 
 def to_document(result: SessionDiagnosis) -> dict[str, Any]:

@@ -6,7 +6,7 @@ stretch together.
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from operator import itemgetter
@@ -22,7 +22,6 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.pose_states import OK
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, metrics
-from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.wire.text_files import read_rows, read_text
 
 SCHEMA = 'anser_evaluation/1'
@@ -35,11 +34,7 @@ def recording_of(session: Session) -> str:
 
 
 def to_document(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the figures of every sensor and body as plain data.
-
-    Where the model followed the references, the number of frames in each state of the refit, and
-    in how many each reference sensor was left out, are there too.
-    """
+    """Return the figures of every sensor and body, and of a refit, as plain data."""
     document: dict[str, Any] = {'schema': SCHEMA}
     for kind, group in evaluation.groups.items():
         document[kind] = {name: metrics(series) for name, series in group.items()}
@@ -67,16 +62,16 @@ ERROR_COLUMNS = ('stamp_ns', 'name', 'position_error_m', 'orientation_error_rad'
 
 
 def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
-    """Write the tables of poses and of errors into a folder; the files.
-
-    Sensors' poses, or why there is none, are sorted by stamp; those of bodies, and of what else
-    was tracked, are one after the other.
-    """
+    """Write the tables of poses, sensors' by stamp, and of errors into a folder; the files."""
+    of_sensors = _pose_rows(evaluation.sensors, POSE_COLUMNS)
     tables = {
-        POSES_FILE: (POSE_COLUMNS, sorted(_sensor_rows(evaluation.sensors), key=itemgetter(0))),
-        BODIES_FILE: (BODY_COLUMNS, _body_rows(evaluation.bodies)),
+        POSES_FILE: (POSE_COLUMNS, sorted(of_sensors, key=itemgetter(0))),
+        BODIES_FILE: (BODY_COLUMNS, _pose_rows(evaluation.bodies, BODY_COLUMNS)),
         ERRORS_FILE: (ERROR_COLUMNS, _error_rows(evaluation)),
-        **{f'{k}.csv': (POSE_COLUMNS, _sensor_rows(g)) for k, g in evaluation.further.items()},
+        **{
+            f'{kind}.csv': (POSE_COLUMNS, _pose_rows(group, POSE_COLUMNS))
+            for kind, group in evaluation.further.items()
+        },
     }
     for name, (columns, rows) in tables.items():
         with (folder / name).open('w', newline='', encoding='utf-8') as stream:
@@ -100,35 +95,18 @@ def _error_rows(evaluation: Evaluation) -> list[list[Any]]:
     ]  # fmt: skip
 
 
-def _sensor_rows(group: Mapping[str, PoseSeries]) -> list[list[Any]]:
-    """Rows of what has a place and an axis."""
-    return [
-        _row(series, pose, [*pose.position, *pose.axis] if pose.state == OK else None, 6)
-        for series in group.values()
-        for pose in series.estimates
-    ]
-
-
-def _body_rows(group: Mapping[str, PoseSeries]) -> list[list[Any]]:
-    rows = []
+def _pose_rows(group: Mapping[str, PoseSeries], columns: Sequence[str]) -> list[list[Any]]:
+    """Rows with an axis, or, in the columns of bodies, a quaternion; empty cells for no pose."""
+    of_body, rows = columns is BODY_COLUMNS, []
     for series in group.values():
         for pose in series.estimates:
-            values = None
-            if pose.state == OK and pose.rotation is not None:
-                values = [*pose.position, *Rotation.from_matrix(pose.rotation).as_quat()]
-            rows.append(_row(series, pose, values, 7))
+            cells = [''] * (len(columns) - 3)
+            if pose.state == OK and not (of_body and pose.rotation is None):
+                turn = Rotation.from_matrix(pose.rotation).as_quat() if of_body else pose.axis
+                values = [*pose.position, *turn, pose.sigma_position_m, pose.residual_t]
+                cells = [f'{float(value):.9g}' for value in values]
+            rows.append([pose.stamp_ns, series.name, *cells, pose.state])
     return rows
-
-
-def _row(
-    series: PoseSeries, pose: PoseEstimate, values: list[float] | None, count: int
-) -> list[Any]:
-    """One pose of so many numbers, its sigma and residual; empty cells where there is none."""
-    cells = [''] * (count + 2)
-    if values is not None:
-        values = [*values, pose.sigma_position_m, pose.residual_t]
-        cells = [f'{float(value):.9g}' for value in values]
-    return [pose.stamp_ns, series.name, *cells, pose.state]
 
 
 Array = NDArray[np.float64]
@@ -166,10 +144,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Compared(Difference):
-    """Compares ``n`` pairs of errors, m or rad, of one coil or body, or of all coils.
-
-    ``only_a`` and ``only_b`` are frames that only one of the two has a pose for.
-    """
+    """Compares ``n`` pairs of errors, m or rad, and counts frames that only one of the two has."""
 
     n: int
     only_a: int
@@ -190,13 +165,7 @@ class ComparedShares(Difference):
 
 
 def check_same_recording(first: Path, second: Path) -> None:
-    """Refuse evaluations of two recordings, of which equal stamps mean nothing.
-
-    Raises
-    ------
-    ParameterError
-        When both state what they are of, and it is not the same.
-    """
+    """Raise `ParameterError` when two evaluations state that they are of different recordings."""
     one, two = _recording(first), _recording(second)
     if one and two and one != two:
         raise ParameterError(
@@ -217,26 +186,14 @@ def _recording(folder: Path) -> str:
 
 
 def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
-    """Return errors of position (m) and orientation (rad) by stamp and name, of an evaluation.
-
-    Raises
-    ------
-    ParameterError
-        When the folder has none, or the table is not one of ours.
-    """
+    """Return errors of position (m) and orientation (rad) by stamp and name; `ParameterError`."""
     _, _, *kinds = ERROR_COLUMNS
     errors = [_read(folder, ERRORS_FILE, ERROR_COLUMNS, itemgetter(kind)) for kind in kinds]
     return {'position': errors[0], 'orientation': errors[1]}
 
 
 def read_states(folder: Path) -> dict[Key, float]:
-    """Return whether there is a pose, 1 or 0, by stamp and name of a coil or body.
-
-    Raises
-    ------
-    ParameterError
-        When the folder lacks a table, or one is not ours.
-    """
+    """Return whether there is a pose, 1 or 0, by stamp and name; raises `ParameterError`."""
     tables = ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS))
     found: dict[Key, float] = {}
     for name, columns in tables:
@@ -263,12 +220,16 @@ def _read(
 def compare_errors(
     first: dict[Key, float], second: dict[Key, float], rng: np.random.Generator
 ) -> dict[str, Compared]:
-    """Compare two evaluations by name; errors of one kind by stamp and name.
-
-    A name without a frame in which both have an error has no pairs, only counts of errors that one
-    of them has alone.
-    """
-    return {name: _compare(first, second, name, rng) for name in _names(first, second)}
+    """Compare two evaluations by name; errors of one kind by stamp and name."""
+    found = {}
+    for name in _names(first, second):
+        one, two = (sum(other == name for _, other in errors) for errors in (first, second))
+        both, pairs = _paired(first, second, name)
+        low, high = _interval(both, pairs**2, rng, np.sqrt)
+        root = np.sqrt((pairs**2).mean(axis=1)) if both.size else np.full(2, np.nan)
+        alone = one - both.size, two - both.size
+        found[name] = Compared(low, high, both.size, *alone, float(root[0]), float(root[1]))
+    return found
 
 
 def compare_shares(
@@ -276,10 +237,7 @@ def compare_shares(
 ) -> dict[str, ComparedShares]:
     """Compare how often two evaluations have a pose; states by stamp and name (`read_states`).
 
-    Raises
-    ------
-    ParameterError
-        When no frame is in both.
+    Raises `ParameterError` when no frame is in both.
     """
     if not first.keys() & second.keys():
         raise ParameterError('the two have no frame in common: are they of the same session?')
@@ -303,18 +261,6 @@ def _paired(
     both = sorted(stamp for stamp, other in first if other == name and (stamp, name) in second)
     pairs = [[values[stamp, name] for stamp in both] for values in (first, second)]
     return np.array(both, dtype=np.int64), np.array(pairs).reshape(2, -1)
-
-
-def _compare(
-    first: dict[Key, float], second: dict[Key, float], name: str, rng: np.random.Generator
-) -> Compared:
-    one, two = (sum(other == name for _, other in errors) for errors in (first, second))
-    both, pairs = _paired(first, second, name)
-    low, high = _interval(both, pairs**2, rng, np.sqrt)
-    root = np.sqrt((pairs**2).mean(axis=1)) if both.size else np.full(2, np.nan)
-    return Compared(
-        low, high, both.size, one - both.size, two - both.size, float(root[0]), float(root[1])
-    )
 
 
 def _interval(

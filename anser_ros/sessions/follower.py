@@ -1,6 +1,4 @@
-"""Lets the field model follow a recorded session's reference sensors, as it does live, by all
-of them or by chosen ones.
-"""
+"""Lets the model follow a recorded session's references, all or chosen ones, as it does live."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -30,13 +28,7 @@ NONE = 'none'
 
 
 def parse_references(text: str) -> tuple[int, ...]:
-    """Return the channels of a list ``CHANNEL,...``, none for the word ``none``.
-
-    Raises
-    ------
-    ParameterError
-        When an entry is no channel or appears twice.
-    """
+    """Return the channels of ``CHANNEL,...`` or ``none``; raises `ParameterError`."""
     if text.strip() == NONE:
         return ()
     entries = [entry.strip() for entry in text.split(',')]
@@ -51,10 +43,7 @@ def parse_references(text: str) -> tuple[int, ...]:
 def with_references(session: Session, channels: Sequence[int]) -> Session:
     """Return a session that has only the reference sensors on some channels, in its own order.
 
-    Raises
-    ------
-    BagError
-        When it has no reference fluxes, or none on one of the channels.
+    Raises `BagError` when it has no reference fluxes, or none on one of the channels.
     """
     reference = session.reference
     if reference is None:
@@ -131,18 +120,8 @@ class ModelFollower(FrameModels):
     """Refits the model to the reference sensors frame by frame, at the pace of the live node.
 
     The session must have references and a baseline. With ``witnesses``, contradictions of the
-    tools' coils show metal, too.
-
-    Attributes
-    ----------
-    summary : RefitSummary
-        What the refit did so far.
-
-    Raises
-    ------
-    BagError
-        When the session has no reference fluxes, or there is no baseline or one of too few
-        sensors.
+    tools' coils show metal, too. Raises `BagError` when the session has no reference fluxes, or
+    there is no baseline or one of too few sensors.
     """
 
     def __init__(self, prepared: PreparedSession, witnesses: bool = False) -> None:

@@ -15,7 +15,7 @@ from anser_ros.errors import BagError, ParameterError
 from anser_ros.sessions.recorded_poses import published_poses
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire import cdr
-from anser_ros.wire.bag import Salvage
+from anser_ros.wire.bag import POSE_TYPE, Salvage, iter_messages, read_fluxes
 from anser_ros.wire.bag_writer import SETUP_TYPE, SessionWriter
 from anser_ros.wire.foreign_bag import read_foreign
 from anser_ros.wire.recorded import PoseStream, RecordedFluxes
@@ -35,13 +35,7 @@ class ImportedBag:
 
 
 def parse_remaps(entries: Sequence[str]) -> dict[str, str]:
-    """Return new names by old ones from entries ``FROM:=TO``.
-
-    Raises
-    ------
-    ParameterError
-        When an entry is not of that form, a name is not absolute, or one is renamed twice.
-    """
+    """Return new names by old ones from entries ``FROM:=TO``; raises `ParameterError`."""
     names: dict[str, str] = {}
     for entry in entries:
         old, _, new = entry.partition(':=')
@@ -60,14 +54,8 @@ def import_bag(
     """Write the messages of any ROS 2 bag as one MCAP file that every command reads.
 
     ``remaps`` are new names of topics; a setup document's text is written at the start, in place
-    of any in the bag.
-
-    Raises
-    ------
-    BagError
-        When the bag cannot be read, has no message, or lacks a topic that is to be renamed.
-    SetupError
-        When the text is not a setup document.
+    of any in the bag. Raises `BagError` when the bag cannot be read, has no message, or lacks a
+    topic that is to be renamed; `SetupError` when the text is not a setup document.
     """
     if setup_text is not None:
         parse_setup(setup_text)
@@ -116,28 +104,17 @@ class ExportedBag:
 
 
 def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBag:
-    """Write a file for each topic of poses and of fluxes.
-
-    Raises
-    ------
-    BagError
-        When the bag cannot be read, or has neither.
-    ParameterError
-        When the form is unknown.
-    """
+    """Write a file for each topic of poses and of fluxes; raises `BagError` when there is none."""
     if form not in FORMATS:
         raise ParameterError(f'format must be among {", ".join(FORMATS)}, got {form!r}')
-    # Nodes that read no bag run where the packages that read bags are not installed.
-    from anser_ros.wire.bag import POSE_TYPE, Salvage, iter_messages, read_fluxes
-
     salvage = Salvage()
     topics = sorted({m.topic for m in iter_messages(path, salvage) if m.type_name == POSE_TYPE})
     written: dict[str, int] = {}
     for topic, poses in published_poses(path, topics).items():
         if poses.stamp_ns.size:
-            name = f'{_file_name(topic)}.{"txt" if form == TUM else form}'
-            stream = PoseStream(poses.stamp_ns, poses.position, poses.quaternion)
-            _write_poses(out / name, stream, form)
+            stem = topic.strip('/').removeprefix('anser/').removesuffix('/pose').replace('/', '_')
+            name = f'{stem}.{"txt" if form == TUM else form}'
+            _write_poses(out / name, poses, form)
             written[name] = int(poses.stamp_ns.size)
     if form != TUM:
         for which, fluxes in read_fluxes(path).items():
@@ -149,18 +126,13 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBa
     return ExportedBag(written, salvage.lost)
 
 
-def _file_name(topic: str) -> str:
-    """A topic as the name of a file."""
-    return topic.strip('/').removeprefix('anser/').removesuffix('/pose').replace('/', '_')
-
-
 def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
     """A table of stamps, positions, m, and quaternions."""
     numbers = np.column_stack([poses.position, poses.quaternion]).tolist()
     rows = zip(poses.stamp_ns.tolist(), numbers, strict=True)
     if form == MAT:
-        parts = (poses.stamp_ns, poses.position, poses.quaternion)
-        _write_mat(path, ('stamp_ns', 'position_m', 'quaternion_xyzw'), parts)
+        stamps, places, turns = poses.stamp_ns, poses.position, poses.quaternion
+        _write_mat(path, stamp_ns=stamps, position_m=places, quaternion_xyzw=turns)
     elif form == TUM:
         with path.open('w', encoding='utf-8') as stream:
             for stamp, row in rows:
@@ -173,8 +145,8 @@ def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
 def _write_fluxes(path: Path, fluxes: RecordedFluxes, form: str) -> None:
     """A table of stamps, channels, flags and phasors, T."""
     if form == MAT:
-        parts = (fluxes.stamp_ns, fluxes.channel, fluxes.flags, fluxes.flux)
-        _write_mat(path, ('stamp_ns', 'channel', 'flags', 'flux_t'), parts)
+        flux = {'flags': fluxes.flags, 'flux_t': fluxes.flux}
+        _write_mat(path, stamp_ns=fluxes.stamp_ns, channel=fluxes.channel, **flux)
         return
     columns = [f'coil{k}_{part}_t' for k in range(fluxes.flux.shape[2]) for part in ('re', 'im')]
     _write_csv(path, ('stamp_ns', 'channel', 'flags', *columns), _flux_rows(fluxes))
@@ -196,8 +168,7 @@ def _flux_rows(fluxes: RecordedFluxes) -> Iterator[list[object]]:
             yield [stamp, channel, flag, *(f'{value:.9g}' for value in parts)]
 
 
-def _write_mat(path: Path, names: Sequence[str], arrays: Sequence[NDArray[Any]]) -> None:
+def _write_mat(path: Path, **arrays: NDArray[Any]) -> None:
     from scipy.io import savemat
 
-    content = dict(zip(names, arrays, strict=True))
-    savemat(path, content, do_compression=True, oned_as='column')
+    savemat(path, arrays, do_compression=True, oned_as='column')

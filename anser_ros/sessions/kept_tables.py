@@ -1,7 +1,4 @@
-"""Keeps the tables of refits on disk, which take seconds to compute.
-
-They hold as long as model, setup and code are the same.
-"""
+"""Keeps tables of refits, seconds of work, on disk while model, setup and code are the same."""
 
 import json
 import os
@@ -45,11 +42,7 @@ def kept_folder(is_wanted: bool = True) -> Path | None:
 
 
 class ReadAhead:
-    """Reads the tables of a model that were used last, before references and setup are known.
-
-    Fresh memory of their size may take a third of a second, in which the graph is discovered.
-    Without a folder or a model nothing is read.
-    """
+    """Reads a model's last used tables, for 0.3 s, before references and setup are known."""
 
     def __init__(self, folder: Path | None, model: FieldModel | None) -> None:
         self._path: Path | None = None
@@ -105,13 +98,7 @@ class KeptTables:
             return None
 
     def write(self, tables: RefitTables) -> None:
-        """Keep the tables if they are not, and drop those that were not used for longest.
-
-        Raises
-        ------
-        OSError
-            When the disk is full, or must not be written.
-        """
+        """Keep the tables, and drop those that were not used for longest; raises `OSError`."""
         if not self._path.exists():
             write_arrays(self._path, arrays_of(tables))
         files = sorted(self._folder.glob(f'{TABLES}*'), key=used_s, reverse=True)
@@ -139,13 +126,7 @@ def used_s(path: Path) -> float:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file; they share one memory, as reading them one by one is slow.
-
-    Raises
-    ------
-    OSError, ValueError, KeyError, TypeError
-        When it is not there, damaged, or another one's; see `DAMAGED`.
-    """
+    """Return the arrays of a file, which share one memory; raises what `DAMAGED` lists."""
     with path.open('rb') as file:
         head = json.loads(file.readline(LONGEST_HEAD))
         data = np.fromfile(file, dtype=np.uint8)
@@ -158,13 +139,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a file that is whole or not there.
-
-    Raises
-    ------
-    OSError
-        When the disk is full, or must not be written.
-    """
+    """Write a file that is whole or not there; raises `OSError`."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     rows, parts, begin = {}, [], 0
     for name, array in arrays.items():

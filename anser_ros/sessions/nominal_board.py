@@ -1,6 +1,4 @@
-"""Makes the nominal board of a setup, the emitters as it draws them, and finds the tracked
-volume.
-"""
+"""Makes a setup's nominal board, the emitters as drawn, and finds the tracked volume."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -50,10 +48,7 @@ class NominalBoard:
 
     @cached_property
     def model(self) -> FieldModel | None:
-        """Return the nominal model, made when it is first asked for, which takes about a second.
-
-        None also if dipoles do not reach the required accuracy.
-        """
+        """Return the nominal model, made at first use; None if dipoles are not accurate enough."""
         try:
             return None if self.board is None else nominal_model(self.board)
         except AnserError:

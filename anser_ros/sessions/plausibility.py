@@ -7,7 +7,7 @@ check refuses on evidence only, and names it; what the data cannot decide passes
 import itertools
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -30,8 +30,7 @@ FLUX_UNITS: Mapping[str, float] = {
 }  # fmt: skip
 """Units of flux density that stand where teslas belong: how many there are in a tesla."""
 CLOSE = 3.0
-"""Factor within which a ratio is that of a unit. The units are farther apart than its square, but
-for inches and centimetres, of which the nearer one is named."""
+"""Factor within which a ratio is that of a unit; of inches and centimetres the nearer is named."""
 
 
 def unit_words(ratio: float, units: Mapping[str, float]) -> str:
@@ -49,21 +48,17 @@ def unit_words(ratio: float, units: Mapping[str, float]) -> str:
 Array = NDArray[np.float64]
 
 MOST_FRAMES = 40
-"""Frames that are looked at, evenly over the recording: enough for shares, few enough for a
-hundredth of a second."""
+"""Frames that are looked at, evenly over the recording: enough for shares, and quick."""
 FEWEST_READINGS = 12
 """Readings (a coil in a frame) without which nothing is decided: fewer fit by chance."""
 MISFIT = 0.3
-"""Relative misfit of a reading (over all emitters) up to which it fits. A board as drawn, with the
-tolerances of a workshop, metal and a tool's own errors, predicts to a few hundredths; a wrong axis
-misses by one and more."""
+"""Relative misfit of a reading up to which it fits. A board as drawn predicts to a few hundredths;
+a wrong axis misses by one and more."""
 POOR, GOOD = 0.6, 0.8
-"""Shares of readings that fit: below the first the poses as they stand are in doubt, above the
-second another reading of them is right. Half a turn about one axis leaves a third of the readings
-of a triaxial coil right, so between the two nothing is decided."""
+"""Shares of readings that fit: below the first the poses are in doubt, above the second another
+reading is right. Half a turn about an axis leaves a third of a triaxial coil's readings right."""
 TOO_LARGE = 100.0
-"""Factor over the drawn board's fluxes from which on a unit is in doubt; gains and currents of a
-board that is not as drawn stay far below."""
+"""Factor over the drawn board's fluxes from which on a unit is in doubt; gains stay far below."""
 
 
 @dataclass(frozen=True)
@@ -126,11 +121,8 @@ OTHER_READINGS = (
 def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Measurements) -> None:
     """Check units and order of a tool's poses, and the unit of its fluxes, against each other.
 
-    Raises
-    ------
-    PlausibilityError
-        When the poses contradict the fluxes as they stand and fit them when read in another way,
-        or the fluxes are larger than the board can make by the factor of a unit.
+    Raises `PlausibilityError` when the poses contradict the fluxes as they stand and fit them when
+    read in another way, or the fluxes are larger than the board can make by the factor of a unit.
     """
     field = nominal.field
     if field is None:
@@ -219,16 +211,13 @@ def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurement
 
 
 FAR = 10.0
-"""Distance of the median optical position from the board, in distances of the tracked volume's
-farthest corner, beyond which no tool is held. Optics may see a tool that is carried about the
-room, a few such distances away; a smaller factor would refuse that, a larger one let inches by."""
+"""Distance of optical positions, in the volume's farthest corner's, beyond which no tool is held.
+Carried about the room it may be a few such away; inches are more."""
 FROZEN_S = 1.0
-"""Time, s, for which poses must be the same bit for bit before an optical tracker counts as
-frozen. Cameras that answer more often than they look repeat a pose for a tenth of a second."""
+"""Time, s, of equal poses that counts as frozen; cameras may repeat one for 0.1 s."""
 MOVED = 0.1
-"""Relative change of a tool's fluxes that shows it has moved while its poses stood still: a
-centimetre at a hand's breadth. Noise changes them by a ten-thousandth, metal that comes near a
-tool at rest by a few hundredths."""
+"""Relative change of a tool's fluxes that shows it has moved, a centimetre at a hand's breadth;
+metal that comes near a tool at rest changes them by a few hundredths."""
 MOST_FROZEN = 0.5
 """Share of the time that optical poses may be frozen; what is left of more is no reference."""
 WIDEST_POINTS_M = 10.0
@@ -243,12 +232,8 @@ def plausible_tools(
     """Check a recording's tools, and leave out the poses of an optical tracker that stood still.
 
     ``refused`` is what the reader refused, ``topic: reason``, and how often. What was left out or
-    refused is returned in words; empty when nothing was.
-
-    Raises
-    ------
-    PlausibilityError
-        With the evidence, in one line.
+    refused is returned in words; empty when nothing was. Raises `PlausibilityError` with the
+    evidence, in one line.
     """
     nominal, kept, words = NominalBoard.of(setup), [], []
     for tool in tools:
@@ -265,10 +250,8 @@ def plausible_tools(
 def check_points(tracked: Array, true: Array) -> None:
     """Check the points (M, 3), m, that an error map shall be learnt from; not rows with NaN.
 
-    Raises
-    ------
-    PlausibilityError
-        When their extents fit no tracked volume or not each other, or one of them is a point.
+    Raises `PlausibilityError` when their extents fit no tracked volume or not each other, or one
+    of them is a point.
     """
     good = np.isfinite(tracked).all(axis=1) & np.isfinite(true).all(axis=1)
     if not good.any():
@@ -292,10 +275,8 @@ def check_points(tracked: Array, true: Array) -> None:
 def check_positions(what: str, places: Array) -> None:
     """Check that the positions (n, 3) of a tracker can be in m; ``what`` says whose they are.
 
-    Raises
-    ------
-    PlausibilityError
-        When most of them extend over more than a room, or lie where a unit explains it.
+    Raises `PlausibilityError` when most of them extend over more than a room, or lie where a unit
+    explains it.
     """
     if not len(places):
         return
@@ -364,9 +345,7 @@ def _thawed(path: str, tool: Measurements) -> tuple[Measurements, list[str]]:
     if lasted_s > MOST_FROZEN * whole_s:
         raise PlausibilityError(f'{path}: {evidence}: was the optical tracker frozen?')
     live = PoseTrack(track.time[~frozen], track.position[~frozen], track.quaternion[~frozen])
-    position, rotation, has_pose = live.at(tool.time)
-    thawed = replace(tool, track=live, position=position, rotation=rotation, has_pose=has_pose)
-    return thawed, [f'{evidence}; these poses are left out']
+    return tool.with_track(live), [f'{evidence}; these poses are left out']
 
 
 def _still_runs(track: PoseTrack) -> list[tuple[int, int]]:

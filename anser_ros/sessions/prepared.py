@@ -1,8 +1,4 @@
-"""Prepares a session: everything about it is worked out once and then only read. All that
-evaluates or diagnoses a session starts with `prepare` and hands its result on: the board, the
-noise, the baseline and the corrections are the same wherever they are needed, and the model has
-been checked against the session. `settings_for` takes what a setup says about tracking.
-"""
+"""Works out once what follows from a session and a model, after checking that they fit."""
 
 from dataclasses import dataclass, replace
 
@@ -13,7 +9,7 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.sessions.baseline import Baseline, baseline_of
+from anser_ros.sessions.baseline import Baseline, clean_flux
 from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.sessions.session import Session, measured_noise, stamp_sigma, tracking_noise
 from anser_ros.sessions.starting_model import check_fits, is_recorded
@@ -63,10 +59,8 @@ class PreparedSession:
     def with_model(self, model: FieldModel) -> 'PreparedSession':
         """Return the same with another model.
 
-        Raises
-        ------
-        ModelFileError
-            When the model's emitters are not the session's, or an effect of it is unknown.
+        Raises `ModelFileError` when the model's emitters are not the session's, or an effect of it
+        is unknown.
         """
         check_fits(model, self.session)
         return replace(
@@ -82,22 +76,18 @@ def prepare(
 ) -> PreparedSession:
     """Check a model against a session, and work out what follows from the two.
 
-    A baseline's readings are not used where the session has no reference fluxes.
-
-    Raises
-    ------
-    ModelFileError
-        When the model's emitters are not the session's or the baseline's, or an effect of it is
-        unknown.
-    BagError
-        When the baseline's references are not the session's, or there is metal in it.
+    A baseline's readings are not used where the session has no reference fluxes. Raises
+    `ModelFileError` when the model's emitters are not the session's or the baseline's, or an
+    effect of it is unknown; `BagError` when the baseline's references are not the session's, or
+    there is metal in it.
     """
     check_fits(model, session)
     clean = None
     if baseline is not None:
         check_fits(model, baseline)
         if session.reference is not None:
-            clean = baseline_of(baseline, session.reference.sensors, model)
+            flux = clean_flux(baseline, session.reference.sensors, model)
+            clean = Baseline(baseline.path, flux)
     return PreparedSession(
         session,
         model,
@@ -144,8 +134,4 @@ def _corrected(prepared: PreparedSession, measurements: Measurements) -> Measure
 def with_truth(measurements: Measurements, correction: Correction) -> Measurements:
     """Return measurements whose sensors and optical poses are as a model's corrections say."""
     out = replace(measurements, sensors=correction.sensors(measurements.sensors))
-    if measurements.track is None:
-        return out
-    track = correction.optical(measurements.track)
-    position, rotation, has_pose = track.at(measurements.time)
-    return replace(out, track=track, position=position, rotation=rotation, has_pose=has_pose)
+    return out if out.track is None else out.with_track(correction.optical(out.track))

@@ -69,12 +69,8 @@ def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
 def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
     """Return when each part of a node first warned: log time, ns, by the part's name.
 
-    The statuses of a node's parts are named ``NODE: PART``.
-
-    Raises
-    ------
-    BagError
-        When the recording cannot be read.
+    The statuses of a node's parts are named ``NODE: PART``. Raises `BagError` when the recording
+    cannot be read.
     """
     found: dict[str, int] = {}
     for log_time_ns, status in _statuses(path):
@@ -102,11 +98,7 @@ def overload(path: str | os.PathLike[str]) -> list[str]:
 
 
 def kept_share(session: Session) -> float:
-    """Return the share of frames with tool readings, which is 1 where no window is missing.
-
-    Their expected number follows from the median time between two frames; the tool with the
-    largest share counts.
-    """
+    """Return the share of frames with tool readings, of those that their period lets expect."""
     shares = [0.0]
     for tool in session.tools:
         if tool.time.size > 1:

@@ -22,10 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LiveErrors:
-    """Holds errors (n,) of the poses of one sensor or body against the optical ones, m and rad.
-
-    The angle is of a coil between the axes, of a body the whole turn.
-    """
+    """Holds errors (n,), m and rad, of a coil's place and axis, or of a body's place and turn."""
 
     position: Array
     orientation: Array
@@ -56,12 +53,8 @@ def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErro
     """Return errors of all that the tracker of a namespace published, by sensor and body.
 
     The recording has optical poses, and is prepared with the tracker's model, whose corrections of
-    the clock, the optical frame and the sensors are made.
-
-    Raises
-    ------
-    BagError
-        When the recording has no optical poses.
+    the clock, the optical frame and the sensors are made. Raises `BagError` when the recording has
+    no optical poses.
     """
     session = prepared.session
     names = [name for tool in session.tools for name in (*tool.sensors.name, tool.body)]

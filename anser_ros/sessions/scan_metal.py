@@ -1,9 +1,8 @@
 """Removes the field of metal from a scan that moved in it, and rested near before and after.
 
-Frames in which it moves are left out of a calibration, but a field that is fitted to the others
-contains the resting metal. Its motion determines its field at rest
-(`anser_ros.diagnosis.departure`), which is subtracted from the scan's fluxes; then the field is
-fitted again.
+Frames in which it moves are left out of a calibration, but the field of the others contains the
+resting metal. Its motion determines that part (`diagnosis.departure`), which is subtracted from
+the fluxes before the field is fitted again.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,24 +28,18 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MOTION_MARGIN_S = 1.0
-"""Time (s) before and after something is seen to move that is looked at as well: it begins to move
-before it is seen."""
+"""Time (s) before and after a motion that is looked at: it begins before it is seen."""
 FEWEST_STEADY = 10
 """Frames of the references at rest, of which their steady readings are the mean, at least."""
 FIELD_REACH_M = 0.015
-"""Distance (m) of a coil from where the field was learnt, up to which it takes part: frames in
-which metal moves were not learnt from, and farther away the field is predicted less well."""
+"""Distance (m) of a coil from where the field was learnt, up to which that is predicted well."""
 UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 
 
 @dataclass(frozen=True)
 class RestingMetal:
-    """Holds what metal at rest did to the fluxes of a session's tools, (F, S, K) each, T.
-
-    Sigma is that of a phasor component, root mean square; the record says where it rested and
-    came.
-    """
+    """Holds what metal at rest did to tools' fluxes, (F, S, K) each, T, its error and places."""
 
     flux: tuple[NDArray[np.complex128], ...]
     sigma_t: float
@@ -58,10 +51,7 @@ def without_resting_metal(
     calibration: Calibration,
     progress: Callable[[str, float], None] | None = None,
 ) -> Scan | None:
-    """Return a scan without metal that rested during it; None where there is none to take off.
-
-    The calibration has the metal in its field.
-    """
+    """Return a scan without metal that rested during it; None where there is none to take off."""
     scan = calibration.scan
     if scan.sensor_fit is None:
         return None

@@ -1,6 +1,4 @@
-"""Holds a recorded session as arrays, yields its frames, and keeps the last seconds of a live
-one.
-"""
+"""Holds a recorded session as arrays, its frames, and the last seconds of a live one."""
 
 import os
 from collections import deque
@@ -23,11 +21,9 @@ from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes, unit_quater
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
 
 MOST_NOISE_T = 1e-3
-"""Noise, T, from which on a setup's statement is taken for a mistake and not used. The emitters
-make microtesla at most, so that nothing could be tracked in so much noise."""
+"""Noise, T, from which on a setup's statement is a mistake: emitters make microtesla at most."""
 MOST_STAMP_SIGMA_S = 0.1
-"""Error of the stamps, s, from which on a setup's statement is taken for a mistake and not used: a
-hand at 0.1 m/s would be a centimetre off. Smaller, a slow recorder could not say what it is."""
+"""Error of the stamps, s, from which on a statement is a mistake; a hand moves 1 cm in it."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +47,7 @@ class Session:
         return sensor_table(()).joined(*(tool.sensors for tool in self.tools))
 
     def with_stated(self, stated: Mapping[str, float]) -> 'Session':
-        """Return the session with values stated that go before its setup document's.
-
-        Raises
-        ------
-        ParameterError
-            As `anser_ros.settings.settings_from`.
-        """
+        """Return the session with values stated before its setup's; raises `ParameterError`."""
         return replace(self, setup=self.setup.with_stated(stated))
 
 
@@ -83,10 +73,7 @@ def _measured(setup: Setup, name: str) -> float:
 
 
 def measured_noise(setup: Setup) -> float:
-    """Return the noise of the fluxes' components that the acquisition measured with the setup, T.
-
-    It is 0 if the setup contains none, and if ``flux_noise_t`` is stated, which takes precedence.
-    """
+    """Return the noise of flux components that was measured, T; 0 if none, or if one is stated."""
     measured = _measured(setup, 'flux_noise_t')
     return measured if 0.0 < measured < MOST_NOISE_T else 0.0
 
@@ -97,10 +84,7 @@ def tracking_noise(setup: Setup) -> float:
 
 
 def stamp_sigma(setup: Setup) -> float:
-    """Return the error of the fluxes' stamps, s: what is stated, or else was measured.
-
-    If the setup has neither, it is the default of `anser_ros.settings.Accuracy`.
-    """
+    """Return the error of the fluxes' stamps, s: stated, or else measured, or else the default."""
     measured = _measured(setup, 'stamp_sigma_s')
     return measured if 0.0 <= measured <= MOST_STAMP_SIGMA_S else setup.accuracy.stamp_sigma_s
 
@@ -152,13 +136,7 @@ def shifted(measurements: Measurements, seconds: float) -> Measurements:
 
 
 def session_of(bag: Bag) -> Session:
-    """Turn a bag into arrays.
-
-    Raises
-    ------
-    BagError
-        When the fluxes' number of emitters is not the setup's.
-    """
+    """Turn a bag into arrays; raises `BagError` when it has other emitters than its setup."""
     streams = [stream for stream in (bag.tool, bag.reference) if stream is not None]
     n_emitters = len(bag.setup.emitter.coils)
     for stream in streams:
@@ -184,14 +162,8 @@ def load_session(path: str | os.PathLike[str]) -> Session:
     """Read a bag as a session that is plausible.
 
     Poses of an optical tracker that stood still while the tool moved are left out; `Session.lost`
-    reports this.
-
-    Raises
-    ------
-    BagError
-        When the bag can't be read.
-    PlausibilityError
-        When units, clocks or the order of quaternions contradict what was recorded.
+    reports this. Raises `BagError` when the bag can't be read; `PlausibilityError` when units,
+    clocks or the order of quaternions contradict what was recorded.
     """
     # Nodes that read no bag run where the packages that read bags are not installed.
     from anser_ros.wire.bag import read_bag
@@ -360,13 +332,7 @@ class SlidingWindow:
         return max(spans, default=0) * NANO
 
     def session(self) -> Session | None:
-        """Return what is in the window; None while there are no fluxes.
-
-        Raises
-        ------
-        BagError
-            When the fluxes' number of emitters is not the setup's.
-        """
+        """Return what is in the window, None without fluxes; raises `BagError` as `session_of`."""
         tool, reference = self._tool.stream(), self._reference.stream()
         if tool is None and reference is None:
             return None

@@ -1,6 +1,4 @@
-"""Reads, writes and chooses the field model that a command starts from, and checks what it is
-of.
-"""
+"""Reads, writes and chooses the model that a command starts from, and checks what it is of."""
 
 import os
 from collections.abc import Sequence
@@ -25,13 +23,7 @@ SNAPSHOT = 'snapshot of a refit with metal in force'
 
 
 def load_model(path: str | os.PathLike[str], snapshot: bool = False) -> FieldModel:
-    """Read a model file; a snapshot of a refit, which is no calibration, only if it is wanted.
-
-    Raises
-    ------
-    ModelFileError
-        With the file's name and the rule that it breaks.
-    """
+    """Read a model file, a refit's snapshot only if wanted; raises `ModelFileError`."""
     try:
         model = from_document(read_document(path))
         if is_snapshot(model) and not snapshot:
@@ -76,26 +68,12 @@ NOMINAL = 'nominal'
 
 
 def model_of(name: str) -> FieldModel | None:
-    """Return the model of a file; None for an empty name, and for that of the setup's geometry.
-
-    Raises
-    ------
-    ModelFileError
-        When the file is no model, or a snapshot of a refit.
-    """
+    """Return the model of a file, None for no name or the nominal one; raises `ModelFileError`."""
     return None if name in ('', NOMINAL) else load_model(name)
 
 
 def starting_model(setup: Setup, given: FieldModel | None) -> FieldModel:
-    """Return the model to start from live: the given one, or the geometry's nominal one.
-
-    Raises
-    ------
-    ModelFileError
-        When the given model has other emitters than the setup.
-    SetupError
-        When none is given and the setup's geometry makes no nominal model.
-    """
+    """Return the given or nominal model to start from; raises `ModelFileError`, `SetupError`."""
     if given is None:
         return nominal_model(board_of(setup))
     check_emitters(setup, given)
@@ -118,15 +96,10 @@ def model_for(
     """Return the model that ``name`` stands for: a file's path, or ``nominal``.
 
     ``snapshot`` is whether a snapshot of a refit, which is no calibration, is accepted, and
-    ``resurveyed`` names bodies whose sensors are the same, surveyed again.
-
-    Raises
-    ------
-    ModelFileError
-        When the file is no model or a snapshot that is not wanted, or its emitters are not the
-        session's.
-    SetupError
-        When the nominal model is asked for and the setup's geometry makes none.
+    ``resurveyed`` names bodies whose sensors are the same, surveyed again. Raises `ModelFileError`
+    when the file is no model or a snapshot that is not wanted, or its emitters are not the
+    session's; `SetupError` when the nominal model is asked for and the setup's geometry makes
+    none.
     """
     if name == NOMINAL:
         return nominal_model(board_of(session.setup))
@@ -151,12 +124,9 @@ def with_new_survey(model: FieldModel, setup: Setup, bodies: Sequence[str]) -> F
     """Return the model for bodies whose sensors are the same, but surveyed again.
 
     The model's corrections of channels, such as their gains, still hold. Places and axes of
-    sensors are now those of the new survey: effects that corrected the old one are removed.
-
-    Raises
-    ------
-    ModelFileError
-        When the setup has no such body, or the model does not state what it was made for.
+    sensors are now those of the new survey: effects that corrected the old one are removed. Raises
+    `ModelFileError` when the setup has no such body, or the model does not state what it was made
+    for.
     """
     made, kept = model.made_for, model.effects
     for body in bodies:
@@ -216,10 +186,7 @@ def _listed(value: object) -> list[object]:
 
 
 def check_fits(model: FieldModel, session: Session) -> None:
-    """Raise `ModelFileError` when the model's emitters are not the session's, or it is of another.
-
-    What else a model may be of: see `check_made_for`.
-    """
+    """Raise `ModelFileError` when a model is not of a session's emitters; see `check_made_for`."""
     names = session.setup.emitter_names
     if model.emitters != names:
         raise ModelFileError(

@@ -57,13 +57,7 @@ class NumberTable:
         return self.arrays[name]
 
     def column(self, reference: Any) -> NDArray[Any]:
-        """Return one column, shape (N,), such as ``time``, ``flux[3]`` or ``flux[0, 3]``.
-
-        Raises
-        ------
-        ParameterError
-            When there is no such name, or what it names is no column.
-        """
+        """Return a column (N,): ``time``, ``flux[0, 3]``; raises `ParameterError` for no such."""
         match = REFERENCE.match(str(reference))
         if match is None:
             raise ParameterError(f'{self.path}: {reference!r} is not a column, such as x or x[3]')
@@ -88,13 +82,7 @@ class NumberTable:
 
 
 def read_table(path: Path) -> NumberTable:
-    """Read a file; MATLAB's before version 7.3 by scipy, later ones, which are HDF5, by h5py.
-
-    Raises
-    ------
-    ParameterError
-        When it is of another kind, or cannot be read.
-    """
+    """Read a file, MATLAB's of version 7.3 (HDF5) by h5py; raises `ParameterError`."""
     if not path.is_file():
         raise ParameterError(f'{path}: {"is a folder" if path.is_dir() else "no such file"}')
     try:
@@ -166,18 +154,9 @@ Array = NDArray[Any]
 
 
 def import_tables(document: Path, out: Path) -> dict[str, int]:
-    """Write the session that a document describes; how many messages each topic got.
+    """Write the session that a document, beside its files, describes; return messages by topic.
 
-    Files are looked for beside the document.
-
-    Raises
-    ------
-    ParameterError
-        When the document or a table breaks a rule, with the file's name.
-    SetupError
-        When the text is not a setup document.
-    BagError
-        When the file to write is there already.
+    Raises `ParameterError`, `SetupError`, `BagError` with the file's name.
     """
     text = read_text(document)
     try:

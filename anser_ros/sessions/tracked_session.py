@@ -1,7 +1,4 @@
-"""Evaluates a recorded session: tracks its poses as the live nodes would, and compares them.
-The stages are `prepare`, `track` and `compare`; each can be called alone, and `track_session`
-runs all of them. `evaluation_files` writes their results.
-"""
+"""Evaluates a recorded session: `prepare`, `track` as the live nodes would, and `compare`."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -71,12 +68,7 @@ def track(
 
     The optical pose is never used: neither as a start value nor to refuse a pose. The noise is
     that of the session's setup. With ``in_phase``, for an `in_phase_model`, only the fluxes'
-    in-phase parts are used.
-
-    Raises
-    ------
-    BagError
-        When the session has no tool fluxes.
+    in-phase parts are used. Raises `BagError` when the session has no tool fluxes.
     """
     if not prepared.session.tools:
         raise BagError(
@@ -84,12 +76,13 @@ def track(
             f'ends with /tool/flux'
         )
     observers: list[SessionObserver] = [make() for make in extensions.loaded('OBSERVERS')]
-    tracker = _tracker(
-        prepared,
-        settings or TrackerSettings(),
-        observers,
-        follows=isinstance(follower, ModelFollower),
-    )
+    settings = settings or TrackerSettings()
+    settings = replace(settings, volume=settings.volume or prepared.volume)
+    settings = settings_for(prepared.session.setup, settings)
+    # A drift's recorded course is used if nothing follows it.
+    course = prepared.recorded_drift and not isinstance(follower, ModelFollower)
+    settings = replace(settings, recorded_drift=course)
+    tracker = Tracker(prepared.model, prepared.sensors, settings, observers)
     estimates: dict[str, list[PoseEstimate]] = {}
     further: dict[str, dict[str, list[PoseEstimate]]] = {one.KIND: {} for one in observers}
     frames = list(frames_of(prepared.session))
@@ -121,26 +114,6 @@ def track(
         if group
     }
     return TrackedSession(by_name, seconds, summary, others)
-
-
-def _tracker(
-    prepared: PreparedSession,
-    settings: TrackerSettings,
-    observers: Sequence[Observer],
-    *,
-    follows: bool,
-) -> Tracker:
-    """A tracker that knows the session's noise, and a drift's course if nothing else does."""
-    return Tracker(
-        prepared.model,
-        prepared.sensors,
-        replace(
-            settings_for(prepared.session.setup, settings),
-            recorded_drift=prepared.recorded_drift and not follows,
-            volume=settings.volume or prepared.volume,
-        ),
-        observers,
-    )
 
 
 Array = NDArray[np.float64]
@@ -182,9 +155,8 @@ def pose_series(
 def metrics(series: PoseSeries) -> dict[str, Any]:
     """Return the figures of one sensor or body as the evaluation document has them.
 
-    These are the number of compared poses, the share of frames with a pose, and the RMSE, mean
-    error, 50th and 95th percentile (equation 7 of the article) of position and orientation; None
-    where nothing could be compared.
+    RMSE, mean, 50th and 95th percentile (equation 7 of the article) of position and orientation
+    are None where nothing could be compared.
     """
     result: dict[str, Any] = {
         'n': int(np.isfinite(series.position_error).sum()),
@@ -248,16 +220,10 @@ def track_session(
     the references as it does live, with witnesses also what the coils of rigid tools contradict;
     ``models`` gives each frame's model in another way, instead of a refit. In phase, only these
     fluxes and moments are used (the article's way). Progress gets the finished share, 0 to 1.
-
-    Raises
-    ------
-    BagError
-        When the session has no tool fluxes, or a refit lacks references or a baseline.
-    ParameterError
-        When such models are to be used beside a refit, or with one phase of the fluxes.
-    ModelFileError
-        When the model's emitters are not the session's, or the session's references locate the
-        board elsewhere. With the gate switched off the latter is not checked.
+    Raises `BagError` when the session has no tool fluxes, or a refit lacks references or a
+    baseline; `ParameterError` when such models are to be used beside a refit, or with one phase of
+    the fluxes; `ModelFileError` when the model's emitters are not the session's, or the session's
+    references locate the board elsewhere. With the gate switched off the latter is not checked.
     """
     if models is not None and (refit or in_phase):
         raise ParameterError(

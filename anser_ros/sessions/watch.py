@@ -1,8 +1,4 @@
-"""Diagnoses the last seconds lightly: whether the model lacks anything, and what.
-
-A check costs little while the residual is as expected, and while the last findings still explain
-it; only a change starts a search.
-"""
+"""Diagnoses the last seconds lightly: only a change of the residual starts a search."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -29,19 +25,15 @@ Array = NDArray[np.float64]
 
 OPTICAL, RIGID = 'optical poses', 'rigidity of the tools'
 LIGHT_SEARCH = SearchSettings(most_effects=1, finalists=4, iterations=6)
-"""A search that names the strongest effect alone, so that a look takes seconds. What that effect
-leaves is reported, and finding its cause is left to the whole diagnosis."""
+"""A search for the strongest effect alone, in seconds; the rest is left to the whole diagnosis."""
 FREE_POSE_M, FREE_POSE_RAD = 0.02, 0.1
-"""Standard deviations, m and rad per axis, of a pose that the fluxes themselves gave. They are far
-above what such a pose is wrong by, so that it holds nothing against any effect."""
+"""Standard deviations, m and rad per axis, of a pose from the fluxes: it contradicts no effect."""
 EXCESS = 1.25
-"""Mean square of the whitened residuals from which on the model lacks something. Noise alone gives
-1; less of a margin would start searches on noise, more would miss small effects."""
+"""Mean square of whitened residuals from which on the model lacks something; noise gives 1."""
 SAME = 1.3
 """Factor by which the residual that a finding leaves may grow before it is searched for again."""
 LEAST_SPREAD_M, LEAST_TURN_RAD = 0.01, 0.1
-"""Least standard deviation of a tool's places, m, and of its orientations, rad, for a search. A
-tool that stays closer shows that something is wrong, but not what."""
+"""Least spread of a tool's places, m, and orientations, rad, with which a cause can be found."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +66,8 @@ class Sighting:
 class Watch:
     """Looks at one window after the other, and remembers what it found.
 
-    It is made of any session of the setup, an empty one too, with the model whose effects are
-    corrected already; without a baseline the references are not used. ``searches`` counts how
-    often something new was searched for.
+    It is made of any session of the setup, also an empty one, with the model whose effects are
+    corrected; ``searches`` counts how often something new was searched for.
     """
 
     def __init__(self, prepared: PreparedSession) -> None:
@@ -86,13 +77,7 @@ class Watch:
         self.searches = 0
 
     def look(self, session: Session, first_ns: int) -> Sighting:
-        """Look at the last seconds; the time of the model's own effects counts from a stamp.
-
-        Raises
-        ------
-        DiagnosisError
-            When there are too few frames to say anything.
-        """
+        """Look at the last seconds; raises `DiagnosisError` when there are too few frames."""
         seen = self._corrected(session, (session.start_ns - first_ns) * NANO)
         truth = OPTICAL
         if sum(int(tool.has_pose.sum()) for tool in seen.session.tools) < FEWEST_POSED_FRAMES:

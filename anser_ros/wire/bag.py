@@ -39,8 +39,7 @@ _BROKEN = (
     OverflowError, OSError, zstandard.ZstdError, RuntimeError,
 )  # fmt: skip
 _RECORD_LIMIT = 256 * 2**20
-"""Largest record of a bag that is read, and chunk once it is unpacked, bytes; a larger length
-means a damaged or a hostile file, and memory for it is never asked for."""
+"""Largest record, and unpacked chunk, that is read, bytes: more is damage, or hostile."""
 
 FLUX_TYPE = 'sensor_msgs/msg/PointCloud2'
 POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
@@ -75,13 +74,7 @@ def _import_words(name: str) -> str:
 
 
 def bag_file(path: str | os.PathLike[str]) -> str:
-    """Return the MCAP file that ``path`` names, the file itself or the one in a bag's folder.
-
-    Raises
-    ------
-    BagError
-        When there is none, or a folder holds several.
-    """
+    """Return the MCAP file that ``path`` names, itself or alone in a folder; raises `BagError`."""
     name = os.fspath(path)
     if os.path.isdir(name):
         files = sorted(f for f in os.listdir(name) if f.endswith('.mcap'))
@@ -109,10 +102,14 @@ def _indexed(stream: io.BufferedReader) -> Iterator[RawMessage] | None:
     ):
         return None  # what is whole is found chunk by chunk
     return (
-        RawMessage(channel.topic, schema.name, message.log_time, message.data, channel, schema)
+        _raw(schema, channel, message)
         for schema, channel, message in reader.iter_messages(log_time_order=True)
         if schema is not None
     )
+
+
+def _raw(schema: Schema, channel: Channel, message: Message) -> RawMessage:
+    return RawMessage(channel.topic, schema.name, message.log_time, message.data, channel, schema)
 
 
 def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator[Any]:
@@ -157,11 +154,7 @@ def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[Ra
             channel = channels[record.channel_id]
             schema = schemas.get(channel.schema_id)
             if schema is not None:
-                messages.append(
-                    RawMessage(
-                        channel.topic, schema.name, record.log_time, record.data, channel, schema
-                    )
-                )
+                messages.append(_raw(schema, channel, record))
     messages.sort(key=lambda message: message.log_time_ns)
     return messages
 
@@ -169,12 +162,8 @@ def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[Ra
 def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[RawMessage]:
     """Yield the messages of a bag, or of its folder, by ascending log time.
 
-    What could not be read is filled into ``salvage``.
-
-    Raises
-    ------
-    BagError
-        When there is no such file, it is no MCAP file, or no message can be read.
+    What could not be read is filled into ``salvage``. Raises `BagError` when there is no such
+    file, it is no MCAP file, or no message can be read.
     """
     name = bag_file(path)
     with open(name, 'rb') as stream:
@@ -305,13 +294,7 @@ def _rename_words(topics: Mapping[str, str]) -> str:
 
 
 def read_bag(path: str | os.PathLike[str]) -> Bag:
-    """Read a recorded session.
-
-    Raises
-    ------
-    BagError
-        When the file can't be read, has no setup, or has no flux topic at all.
-    """
+    """Read a recorded session; raises `BagError`, also without a setup or without fluxes."""
     salvage, collector = Salvage(), _Collector()
     for raw in iter_messages(path, salvage):
         collector.add(raw)

@@ -1,12 +1,16 @@
 """Writes MCAP bags that survive a crash and a full disk, with or without ROS. The steps: an
 account is kept of topics, counts and times, which becomes rosbag2's ``metadata.yaml``; messages
-are gathered in chunks; a session is setup, fluxes and poses. Whatever happens, the data up to
-the last flush stay readable: a flush ends a chunk and hands all of it to the system in one go,
-and a write that fails is taken back. So that even a full disk leaves a bag with an index, a
-file without a name keeps the space for it.
+are gathered in chunks; a session is setup, fluxes and poses.
+
+Whatever happens, the data up to the last flush stay readable: a flush hands all messages to the
+system as a small chunk behind the file, and a write that fails is taken back. After some seconds
+one large chunk takes the place of the small ones, so that the index, which is in memory until the
+end, stays small. So that even a full disk leaves a bag with an index, a file without a name keeps
+the space for it.
 """
 
 import contextlib
+import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +21,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 import yaml
 from mcap.well_known import Profile, SchemaEncoding
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
@@ -74,10 +78,7 @@ class BagRecord:
 
 
 def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bool = True) -> None:
-    """Write ``metadata.yaml`` of the folder that holds one MCAP file, in place of an older one.
-
-    The bag may still be written: then it is not ``is_closed``.
-    """
+    """Write ``metadata.yaml`` of a folder with one MCAP file, which may not be closed yet."""
     times = {
         'duration': {'nanoseconds': record.last_ns - record.first_ns},
         'starting_time': {'nanoseconds_since_epoch': record.first_ns},
@@ -107,10 +108,7 @@ def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bo
 
 
 def bag_summary(folder: Path) -> dict[str, Any]:
-    """Return ``duration_s``, ``messages`` and ``closed`` of a bag's ``metadata.yaml``; {} if none.
-
-    A bag that was not closed may hold more than that; its readers do not use this file.
-    """
+    """Return ``duration_s``, ``messages``, ``closed`` of a bag's ``metadata.yaml``; or {}."""
     try:
         document = read_yaml((folder / 'metadata.yaml').read_text('utf-8'))
         info = document['rosbag2_bagfile_information']
@@ -146,20 +144,26 @@ def _topic(topic: TopicRecord) -> dict[str, Any]:
     }
 
 
-CHUNK_BYTES = 256 * 1024
-"""Size of a chunk, bytes. A recording that is cut off loses at most its last chunk; smaller chunks
-make larger files."""
+CHUNK_BYTES = 1024 * 1024
+"""Size of a chunk, bytes; smaller ones make larger files, and a larger index in memory."""
+CHUNK_NS = 4_000_000_000
+"""Longest time in a chunk while messages are flushed, ns. The index of an hour takes 1.6 MB of
+memory with twelve topics and 4 with forty, ten times that with a chunk for each flush."""
 RESERVE_BYTES = 1024 * 1024
 """Disk space that is reserved at the start, bytes, for the end of a recording on a full disk."""
 LIBRARY = 'anser_ros'
 
 
 class _Segments:
-    """The stream under the MCAP writer: collects, and writes a whole segment at each flush."""
+    """The stream under the MCAP writer: collects, and writes a whole segment at each flush.
+
+    Drafts lie behind all segments until the next one takes their place.
+    """
 
     def __init__(self, raw: BinaryIO) -> None:
         self._raw = raw
         self._waiting = bytearray()
+        self._drafts = b''
         self._written = 0
 
     def write(self, data: bytes) -> int:
@@ -169,21 +173,37 @@ class _Segments:
     def tell(self) -> int:
         return self._written + len(self._waiting)
 
+    @property
+    def is_waiting(self) -> bool:
+        return bool(self._waiting)
+
     def flush(self) -> None:
-        """Write all that waits; when that fails, the file has none of it and all of it waits."""
-        view = memoryview(bytes(self._waiting))
+        """Write all that waits; when that fails, the file is as before and all of it waits."""
+        self._put(self._written, bytes(self._waiting))
+        self._written += len(self._waiting)
+        self._waiting.clear()
+        self._drafts = b''
+
+    def add_draft(self, data: bytes) -> None:
+        """Write something for the time until the next segment."""
+        self._put(self._written + len(self._drafts), data)
+        self._drafts += data
+
+    def _put(self, place: int, data: bytes) -> None:
+        """Write the end of the file; when that fails, the drafts are its end again."""
         try:
-            done = 0
-            while done < len(view):
-                done += self._raw.write(view[done:])
-            self._raw.flush()
+            self._overwrite(place, data)
         except OSError:
             with contextlib.suppress(OSError):
-                self._raw.seek(self._written)
-                self._raw.truncate()
+                self._overwrite(self._written, self._drafts)
             raise
-        self._written += len(view)
-        self._waiting.clear()
+
+    def _overwrite(self, place: int, data: bytes) -> None:
+        self._raw.seek(place)
+        view = memoryview(data)
+        while view:
+            view = view[self._raw.write(view) :]
+        self._raw.truncate()
 
 
 class BagWriter:
@@ -191,13 +211,7 @@ class BagWriter:
 
     The file must not exist yet; its folder is made. An unbuffered binary stream may be given to be
     written to instead. A block that fails leaves no file, as half of one would be taken for a
-    whole session. Until the end the index of all chunks is in memory, 40 MB for an hour of forty
-    topics.
-
-    Raises
-    ------
-    BagError
-        The file exists already, or cannot be made.
+    whole session. Raises `BagError`: the file exists already, or cannot be made.
     """
 
     def __init__(self, path: str | Path, raw: BinaryIO | None = None) -> None:
@@ -217,13 +231,15 @@ class BagWriter:
         assert raw is not None
         self._raw = raw
         self._segments = _Segments(raw)
-        self._writer = Writer(
-            self._segments,  # type: ignore[arg-type]
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.ZSTD,
-        )
+        self._writer = Writer(self._segments, CHUNK_BYTES)  # type: ignore[arg-type]
+        # What came since the last flush; None where the file lacks a topic of it.
+        self._draft: Writer | None = None
+        self._draft_bytes = io.BytesIO()
+        self._flushed = 0
+        self._chunk_began_ns = 0
         self._schemas: dict[str, int] = {}
         self._writer.start(profile=Profile.ROS2, library=LIBRARY)
+        self._segments.flush()
 
     def __enter__(self) -> Self:
         return self
@@ -273,6 +289,7 @@ class BagWriter:
             },
         )
         self.record.topics[channel] = TopicRecord(name, type_name, type_hash, tuple(qos))
+        self._draft = None
         return channel
 
     def write(
@@ -281,6 +298,8 @@ class BagWriter:
         """Add a message to the running chunk; nothing reaches the disk before :meth:`flush`."""
         published_ns = log_time_ns if publish_time_ns is None else publish_time_ns
         self._writer.add_message(channel, log_time_ns, data, published_ns)
+        if self._draft is not None:
+            self._draft.add_message(channel, log_time_ns, data, published_ns)
         record = self.record
         record.first_ns = min(record.first_ns, log_time_ns) if record.messages else log_time_ns
         record.last_ns = max(record.last_ns, log_time_ns)
@@ -288,8 +307,21 @@ class BagWriter:
         record.topics[channel].messages += 1
 
     def flush(self) -> None:
-        """End the running chunk and hand it to the system; raises OSError on a full disk."""
-        self._writer.flush()
+        """Hand all messages to the system; raises OSError on a full disk."""
+        record = self.record
+        if record.messages == self._flushed:
+            return
+        draft, self._draft = self._draft, None
+        is_long = record.last_ns - self._chunk_began_ns >= CHUNK_NS
+        if draft is None or is_long or self._segments.is_waiting:
+            self._writer.flush()
+            self._chunk_began_ns = record.last_ns
+        else:
+            draft.flush()
+            self._segments.add_draft(self._draft_bytes.getvalue())
+        self._flushed = record.messages
+        self._draft_bytes = io.BytesIO()
+        self._draft = Writer(self._draft_bytes, CHUNK_BYTES)
 
     def close(self) -> None:
         """Write the index and close; raises OSError when the reserved space does not suffice.
@@ -329,13 +361,7 @@ FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
 
 
 class SessionWriter(BagWriter):
-    """Writes a session without ROS: setup, fluxes and poses of one frame, log time = stamp.
-
-    Raises
-    ------
-    BagError
-        The file exists already, or cannot be made.
-    """
+    """Writes a session without ROS: setup, fluxes and poses of one frame, log time = stamp."""
 
     def __init__(self, path: str | Path, frame_id: str = 'fg') -> None:
         super().__init__(path)
@@ -403,10 +429,7 @@ class SessionWriter(BagWriter):
 
 
 def _points(sensors: Sequence[SensorSpec], flux: NDArray[np.complex128]) -> FluxPoints:
-    """One window's cloud; a sensor lacks its reading where it has none of a driven emitter.
-
-    The place of a sensor that moves is not known to its fluxes.
-    """
+    """One window's cloud; a sensor lacks its reading where it has none of a driven emitter."""
     known, rows = np.isfinite(flux), SensorRows.of(sensors, fixed_only=True)
     lacks = (known != known.any(axis=0)).any(axis=1) | ~known.any()
     return FluxPoints(rows.channel, np.where(lacks, STALE, 0), flux, rows.position, rows.axis)

@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import SetupError
-from anser_ros.wire.text_files import read_yaml
+from anser_ros.wire.text_files import read_own_yaml
 
 SCHEMA = 'anser_channels/1'
 _KEYS = ('area_m2', 'delay_s')
@@ -33,10 +32,7 @@ class ChannelResponse:
 
 @dataclass(frozen=True)
 class ChannelCalibration:
-    """Holds the responses of channels by number, and a default for all others.
-
-    ``current_delay_s`` is the delay of the sum-of-currents channel.
-    """
+    """Holds channels' responses by number, that of all others, and the current's delay."""
 
     default: ChannelResponse
     channels: Mapping[int, ChannelResponse] = field(default_factory=dict)
@@ -76,17 +72,8 @@ def _response(item: Any, where: str, default: ChannelResponse | None) -> Channel
 
 
 def parse_channels(text: str) -> ChannelCalibration:
-    """Read and check a channel calibration document.
-
-    Raises
-    ------
-    SetupError
-        With the rule that is broken and where.
-    """
-    try:
-        root = read_yaml(text)
-    except (yaml.YAMLError, ValueError) as error:
-        raise SetupError(f'channels: not YAML: {" ".join(str(error).split())}') from error
+    """Read and check a channel calibration; `SetupError` names the rule that is broken."""
+    root = read_own_yaml(text, 'channels')
     if not isinstance(root, dict) or root.get('schema') != SCHEMA:
         raise SetupError(f'channels: schema must be {SCHEMA!r}')
     default = _response(root.get('default'), 'default', None)

@@ -40,12 +40,8 @@ def read_foreign(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[For
     """Yield the messages of a bag, one file after the other, each by its times of recording.
 
     The path is of a ``.db3`` or ``.mcap`` file, also with ``.zstd`` behind it, or of a bag's
-    folder. What could not be read is filled into ``salvage``.
-
-    Raises
-    ------
-    BagError
-        When there is no such bag, or a file of it is no bag or cannot be unpacked.
+    folder. What could not be read is filled into ``salvage``. Raises `BagError` when there is no
+    such bag, or a file of it is no bag or cannot be unpacked.
     """
     files, by_message = _parts(Path(path))
     for file in files:

@@ -1,7 +1,7 @@
-"""Encodes and decodes the records of the control unit's serial protocol, version 1. First what
-control unit and host exchange (hellos, samples, states, commands), then their bytes. The
-protocol is written down in `docs/cu_protocol.md`; the two must agree. Everything is little
-endian. `frame_reader` finds records in a stream; this module knows what is inside one.
+"""Encodes and decodes the records of the control unit's serial protocol, version 1.
+
+It is written down in `docs/cu_protocol.md`; the two must agree. Everything is little endian.
+`protocols` finds records in a stream; this module knows what is inside one.
 """
 
 from __future__ import annotations
@@ -177,12 +177,9 @@ class Record:
 def check_hello(hello: Hello) -> None:
     """Refuse a hello that no receiver could use.
 
-    Raises
-    ------
-    FrameError
-        When a rate, scale or tone is not finite and positive or absurdly large, a tone is not
-        below half the sample rate, a channel number appears twice, there is not exactly one
-        current channel, or a block does not fit one record.
+    Raises `FrameError` when a rate, scale or tone is not finite and positive or absurdly large, a
+    tone is not below half the sample rate, a channel number appears twice, there is not exactly
+    one current channel, or a block does not fit one record.
     """
     scales = [channel.full_scale for channel in hello.channels]
     positive = [hello.sample_rate_hz, hello.tick_hz, *scales, *hello.frequencies_hz]
@@ -357,13 +354,7 @@ def knows(number: int) -> bool:
 
 
 def encode(payload: Payload, tag: int = 0) -> bytes:
-    """Encode one record, header and CRC included.
-
-    Raises
-    ------
-    FrameError
-        When the payload does not fit one record.
-    """
+    """Encode one record, header and CRC included; raises `FrameError` when it is too long."""
     number = TYPE_OF[type(payload)]
     body = _LAYOUTS[number][1](payload)
     if len(body) > MAX_PAYLOAD:
@@ -380,13 +371,7 @@ def header_check(head: bytes | memoryview) -> int:
 
 
 def decode_payload(number: int, raw: memoryview) -> Payload:
-    """Decode the payload of a record whose CRC was right.
-
-    Raises
-    ------
-    FrameError
-        When its content breaks the layout of its type, or its type is unknown.
-    """
+    """Decode the payload of a record whose CRC was right; raises `FrameError`."""
     if number not in _LAYOUTS:
         raise FrameError(f'unknown record type {number:#04x}')
     try:

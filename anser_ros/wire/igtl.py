@@ -1,9 +1,7 @@
-"""Packs and reads messages of OpenIGTLink, protocol version 3: poses that are sent, clients'
-requests.
+"""Packs and reads messages of OpenIGTLink 3: poses that are sent, clients' requests.
 
-The layouts are those of the protocol's specification (openigtlink.org/developers/spec). All
-numbers are big-endian, lengths are in millimetres. Header version 1 is what the oldest clients
-read; version 2 adds metadata. The check sum is the CRC-64 of ECMA-182.
+Layouts as in openigtlink.org/developers/spec: big-endian, mm, CRC-64 of ECMA-182. Header version 1
+is what the oldest clients read; version 2 adds metadata.
 """
 
 import struct
@@ -96,11 +94,8 @@ def resolution_s(header: Header, body: bytes) -> float:
 def device_names(named: Mapping[str, str]) -> dict[str, str]:
     """Return the device of each name; one too long for the protocol loses its beginning.
 
-    Raises
-    ------
-    ParameterError
-        When one is empty or not ASCII, or two devices, or a device and the state of another, have
-        the same name.
+    Raises `ParameterError` when one is empty or not ASCII, or two devices, or a device and the
+    state of another, have the same name.
     """
     devices = {name: text[-NAME_BYTES:] for name, text in named.items()}
     owners: dict[str, str] = {}

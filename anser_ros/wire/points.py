@@ -1,8 +1,7 @@
 """Lays out the bytes of three point clouds, flux, field model and its uncertainty, without ROS.
-Fields are read by name and offset, never by position, so a cloud with other fields in between,
-or in another order, is read right. A field is the tuple ``(name, offset, datatype, count)``
-with the datatype codes of ``sensor_msgs/PointField``. The uncertainty (`ModelError`) has one
-layout only.
+
+Fields, tuples ``(name, offset, datatype, count)`` as in ``sensor_msgs/PointField``, are read by
+name and offset, so others may lie between them; the uncertainty has one layout only.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,8 +26,7 @@ DROPPED = 4
 """Flag bit of a reading with samples missing inside its window."""
 
 MOST_POINTS = 1 << 16
-"""Most points of a cloud. Channels, and dipoles of a model's uncertainty, are unsigned 16-bit
-numbers, so that more points repeat one; a smaller bound would refuse what the layouts allow."""
+"""Most points of a cloud: channels and dipoles are numbered by 16 bits."""
 UINT16, UINT32, FLOAT32, FLOAT64 = 4, 6, 7, 8
 """Numbers of the data types of sensor_msgs/PointField that are used here."""
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -141,12 +139,9 @@ def decode_flux(
 ) -> FluxPoints:
     """Read a flux cloud.
 
-    Raises
-    ------
-    LayoutError
-        When a field is missing, doubled, of an unknown type or outside the point, when there are
-        too many points, or not ``width * point_step`` bytes, when a channel appears twice, or when
-        a channel or flag is no integer.
+    Raises `LayoutError` when a field is missing, doubled, of an unknown type or outside the point,
+    when there are too many points, or not ``width * point_step`` bytes, when a channel appears
+    twice, or when a channel or flag is no integer.
     """
     records = _records(fields, point_step, width, data, is_bigendian)
     geometry = _columns(records, ('x', 'y', 'z', 'nx', 'ny', 'nz'))
@@ -228,8 +223,7 @@ def encode_field_model(points: DipolePoints) -> tuple[list[PointFieldTuple], int
 
 
 MOST_VALUES = 50_000_000
-"""Largest number of values of the modes that are unpacked, 400 MB; more means a damaged
-message."""
+"""Most values of modes that are unpacked, 400 MB; more means a damaged message."""
 _HEAD = [('mode', '<u2'), ('dipole', '<u2'), ('flux_error', '<f4'), ('follows', '<u4'),
          ('withheld', '<u4')]  # fmt: skip
 
@@ -268,13 +262,7 @@ def _layout(
 
 
 def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, bytes]:
-    """Pack a model's uncertainty: fields, point_step and bytes.
-
-    Raises
-    ------
-    LayoutError
-        When there are more modes or dipoles than the layout can count.
-    """
+    """Pack a model's uncertainty: fields, point_step and bytes; `LayoutError` if too large."""
     modes = np.asarray(error.modes, dtype=np.complex128)
     if modes.ndim != 3 or max(modes.shape[:2]) > 0xFFFF:
         raise LayoutError(f'modes must be (R, N, K) with R, N below 65536, got {modes.shape}')
@@ -302,11 +290,8 @@ def decode_model_error(
 ) -> ModelError:
     """Read the uncertainty of a model with so many dipoles and emitters.
 
-    Raises
-    ------
-    LayoutError
-        When the cloud is not laid out as `encode_model_error` does, names a dipole that the model
-        doesn't have, or holds values that are not finite.
+    Raises `LayoutError` when the cloud is not laid out as `encode_model_error` does, names a
+    dipole that the model doesn't have, or holds values that are not finite.
     """
     has_origin = any(field[0] == 'fingerprint' for field in fields)
     wanted, record = _layout(n_emitters, has_origin)

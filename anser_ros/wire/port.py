@@ -69,10 +69,8 @@ def cause_of(error: BaseException) -> str:
 def receiver_of(port: serial.SerialBase) -> Callable[[], bytes]:
     """Return a function that waits for bytes and takes all there are; empty when time is over.
 
-    pyserial's own read costs several system calls and an extra byte for every wake-up, which at a
-    thousand blocks a second is most of the work. With a file descriptor, two calls are enough. A
-    terminal hands out four kilobytes at a time; all that is there is taken before any of it is
-    looked at, so that nothing waits for the work on what came before it.
+    pyserial's own read costs several system calls and an extra byte for every wake-up. A terminal
+    hands out 4 kB at a time; all of it is taken before any is looked at.
     """
     try:
         descriptor = port.fileno()
@@ -106,11 +104,9 @@ STOP_S = 0.1
 DEFAULT_BAUD = 12_000_000
 """Baud rate of the port; USB devices ignore it."""
 SILENCE_S = 1.5
-"""Time without a byte that counts as a fault, s, unless a setting says another: a unit says hello
-once a second."""
+"""Usual time without a byte that counts as a fault, s: a unit says hello once a second."""
 _COMMANDS = 64
-"""Commands that may wait to be written, and of which the time is remembered; they are answered
-within a second, and asked at most a few times a second."""
+"""Commands that may wait, and whose time is remembered; a few a second are answered within one."""
 _GARBAGE_BYTES = 256
 """Bytes without a record within a second beyond which the line counts as garbled."""
 
@@ -159,11 +155,9 @@ class Batch:
 class ControlUnitPort:
     """Reads the control unit in a separate thread.
 
-    The device is a path or any pyserial URL; ``baud`` is without meaning on USB. No byte for
-    ``silence_s`` is a fault, as a hello comes once a second. So many blocks of samples may wait
-    for the receiver, and the pause between attempts to open is doubled up to the longest. The
-    receiver is woken for ``blocks_wanted`` blocks, which it may change by `want`: one that needs
-    twenty for a window is spared nineteen changes of threads.
+    The device is a path or a pyserial URL. No byte for ``silence_s`` is a fault. So many blocks
+    may wait for the receiver, which is woken for ``blocks_wanted`` of them; the pause between
+    attempts to open is doubled up to the longest.
     """
 
     def __init__(
@@ -201,13 +195,7 @@ class ControlUnitPort:
         self._tag = 0
 
     def start(self) -> None:
-        """Start the reader thread; the port may appear later.
-
-        Raises
-        ------
-        PortError
-            When it was started before.
-        """
+        """Start the reader thread, once (`PortError`); the port may appear later."""
         if self._thread is not None:
             raise PortError(f'the port {self.device} was started before')
         self._thread = threading.Thread(target=self._run, name='control_unit_port', daemon=True)
@@ -244,10 +232,7 @@ class ControlUnitPort:
             return None
 
     def send(self, command: Payload) -> int:
-        """Queue a command for the reader thread to write; returns its tag.
-
-        It is lost if the port closes first; the sender watches for the reply.
-        """
+        """Queue a command, which is lost if the port closes first; returns its tag."""
         self._tag = self._tag % 0xFFFF + 1
         self._commands.append((self._tag, self._protocol.encode(command, self._tag)))
         return self._tag
@@ -385,15 +370,7 @@ def find_port(
     baud: int = DEFAULT_BAUD,
     listen_s: float = 1.5,
 ) -> str:
-    """Find the control unit's port by listening for its hello; nothing is written to any device.
-
-    All serial ports of the computer are tried where no candidates are given.
-
-    Raises
-    ------
-    PortError
-        When no port carries a hello.
-    """
+    """Find the port, of the given or of all, that carries a hello, by listening only."""
     devices: list[str] = list(candidates or (port.device for port in list_ports.comports()))
     for device in devices:
         try:

@@ -1,8 +1,7 @@
 """Finds records in a byte stream, lists the protocols that do so, and chooses the next command.
-A protocol turns bytes into records and commands into bytes. The rest of the package knows a
-control unit only by its records (`frames.Hello`, `SampleBlock`, `DeviceStatus`, `Reply`):
-another unit's reader translates the received bytes into them. Everything above the port stays
-the same.
+
+The rest of the package knows a control unit only by its records (`frames.Hello`, `SampleBlock`,
+`DeviceStatus`, `Reply`), so another unit needs a reader only.
 """
 
 from __future__ import annotations
@@ -61,11 +60,7 @@ class FrameReader:
     a good record inside or right behind a damaged one is never lost. Bytes are copied only while a
     record is incomplete; sample blocks are views into the received bytes. Once a hello has stated
     the block size, the reader does not wait for a longer payload, so that a forged length cannot
-    hold back the records behind it.
-
-    Parameters
-    ----------
-    max_payload : longest payload to wait for before a hello, bytes
+    hold back the records behind it; before a hello it waits for ``max_payload`` bytes.
     """
 
     def __init__(self, max_payload: int = MAX_PAYLOAD) -> None:
@@ -154,10 +149,7 @@ def _magic_prefix(buffer: bytes, position: int) -> int:
 
 
 class RecordReader(Protocol):
-    """Finds records in received bytes; one instance serves one port for as long as it exists.
-
-    ``last_refusal`` says in words for an operator why the last refused record was refused.
-    """
+    """Finds records in one port's bytes; ``last_refusal`` says why the last was refused."""
 
     last_refusal: str
 
@@ -193,10 +185,7 @@ class SerialProtocol:
 def records_of(reader: RecordReader, data: bytes) -> list[Record]:
     """Return the records that a reader completes with these bytes.
 
-    Raises
-    ------
-    PortError
-        When the reader fails, or gives a hello that no receiver could use.
+    Raises `PortError` when the reader fails, or gives a hello that no receiver could use.
     """
     try:
         records = reader.feed(data)
@@ -219,13 +208,11 @@ PROTOCOLS = {'anser': ANSER}
 _REPEAT_NS = 500_000_000
 """Time (0.5 s) after which a command without effect is sent again; an answer takes far less."""
 _DOUBT_NS = 60_000_000_000
-"""Time (1 min) for which the unit is asked again after its hello has changed: by itself it says it
-once a second, and a wrong one has no poses until the next."""
+"""Time (1 min) for which the unit is asked again after its hello has changed."""
 _ASK_NS = 250_000_000
 """Time (0.25 s) from one such question to the next. Each costs a hello of some hundred bytes."""
 _TONE_TOLERANCE_HZ = 1.0
-"""Difference up to which a frequency of the device is that of the setup, Hz; synthesisers
-round."""
+"""Difference up to which a unit's tone is the setup's, Hz; synthesisers round."""
 
 
 class StreamControl:

@@ -1,7 +1,4 @@
-"""Holds a recorded session as arrays, names topics of poses, and judges quaternions from
-outside. Reading a session from a file is the business of `wire.bag`, without which this can be
-imported.
-"""
+"""Holds a recorded session as arrays, names topics of poses, and judges quaternions."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -13,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from anser_ros.wire.setup import Setup, topic_of
 
 LENGTH_TOLERANCE = 1e-2
-"""How far the length of a quaternion may be from 1. Components rounded to two decimals make it
-wrong by up to this, and normalising mends that; angles, or columns of something else, are farther
-off. Smaller refuses rounded files; larger takes other numbers for quaternions."""
+"""How far a quaternion's length may be from 1: as far as rounding to two decimals makes it;
+angles, or other columns, are farther off."""
 
 
 def unit_quaternions(given: ArrayLike) -> NDArray[np.float64]:
@@ -54,10 +50,7 @@ def optical_topic(body: str, namespace: str = OPTICAL) -> str:
 
 
 def optical_stem(topic: str) -> str:
-    """Return the stem of the body whose optical poses a topic has, in whatever namespace.
-
-    It is empty for a topic of anything else.
-    """
+    """Return the stem of the body whose optical poses a topic has; empty for any other topic."""
     return topic.partition(OPTICAL)[2].removesuffix(ENDING)
 
 

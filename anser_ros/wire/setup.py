@@ -1,8 +1,7 @@
 """Reads the setup document (`anser_setup/1`): which coils drive, which sense, and where they are.
 
-The YAML text is contained in every bag and published on the latched topic ``setup``. Sensor
-positions and axes are given in the frame of the sensor's body; the body ``fg`` is the field
-generator itself.
+It is in every bag and on the latched topic ``setup``. Sensors lie in the frame of their body; the
+body ``fg`` is the field generator itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +33,7 @@ from anser_ros.wire.setup_values import (
     refuse_unknown_bodies,
     take,
 )
-from anser_ros.wire.text_files import DUMPER, read_yaml
+from anser_ros.wire.text_files import DUMPER, read_own_yaml
 
 SCHEMA = 'anser_setup/1'
 KEYS = (
@@ -43,8 +42,7 @@ KEYS = (
 )  # fmt: skip
 FIELD_GENERATOR = 'fg'
 LOWEST_VOLUME_M = 1e-3
-"""A tracked volume ends at least so far over the board's copper (z = 0), m: nearer than the copper
-is thick, no model of its field holds, and heights are sampled in a geometric series."""
+"""Least height of a tracked volume over the copper (z = 0), m: no model holds nearer."""
 
 
 @dataclass(frozen=True)
@@ -133,25 +131,13 @@ class Setup:
         return self.refit.accuracy
 
     def with_stated(self, stated: Mapping[str, float]) -> 'Setup':
-        """Return the setup with further values stated, which go before the document's own.
-
-        Raises
-        ------
-        ParameterError
-            As `settings_from`.
-        """
+        """Return the setup with values stated before its own; raises `ParameterError`."""
         together = {**self.stated, **stated}
         settings_from(together)
         return replace(self, stated=together)
 
     def with_tips(self, tips: Mapping[str, TipSpec]) -> 'Setup':
-        """Return the setup with further tips, which go before its own.
-
-        Raises
-        ------
-        SetupError
-            When a tip is of no body, or its topic is that of a sensor.
-        """
+        """Return the setup with tips before its own; raises `SetupError` for no body."""
         topics = [topic_of(name) for name in (*(s.name for s in self.tool_sensors), *self.bodies)]
         refuse_unknown_bodies(tips, {body: topic_of(body) for body in self.bodies}, topics)
         return replace(self, tips={**self.tips, **tips})
@@ -313,18 +299,10 @@ def parse_setup(text: str) -> Setup:
     how the live refit follows. Their keys, with units and defaults, are the fields of
     `anser_ros.settings.Accuracy` and `anser_ros.settings.RefitSettings`; a value that is not
     stated has its default. ``fingerprint`` is for other readers and is computed again. Any other
-    key is kept in ``extra``; one that looks like a misspelling is refused.
-
-    Raises
-    ------
-    SetupError
-        With the rule that is broken and the key where it is.
+    key is kept in ``extra``; one that looks like a misspelling is refused. Raises `SetupError`
+    with the rule that is broken and the key where it is.
     """
-    try:
-        document = read_yaml(text)
-    except (yaml.YAMLError, UnicodeError, ValueError) as error:
-        raise SetupError(f'setup: not YAML: {" ".join(str(error).split())}') from error
-    root = read_mapping(document, 'the document')
+    root = read_mapping(read_own_yaml(text, 'setup'), 'the document')
     if root.get('schema') != SCHEMA:
         raise SetupError(f'setup: schema must be {SCHEMA!r}, got {root.get("schema")!r}')
     if root.get('flux_unit', 'T') != 'T':

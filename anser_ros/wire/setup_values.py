@@ -15,15 +15,15 @@ import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import SetupError
-from anser_ros.wire.text_files import read_yaml
+from anser_ros.wire.text_files import read_own_yaml, read_yaml
 
 AXIS_TOLERANCE = 1e-3
 """Largest deviation of an axis' length from one; axes with three written digits pass."""
 LARGEST_NUMBER = 1e300
 """Size from which on a number counts as infinite, in any unit."""
 LIKENESS = 0.8
-"""Ratio of equal letters (`difflib`) from which an unknown key is taken for a misspelt one: one
-letter off in a short key, two in a long one. Smaller, and a user's own keys are refused."""
+"""Ratio of equal letters (`difflib`) from which an unknown key is a misspelt one: one letter off
+in a short key, two in a long one. Smaller, and a user's own keys are refused."""
 NAME = re.compile(r'^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$')
 Vector = tuple[float, float, float]
 Winding = tuple[float, float, float, float]
@@ -143,13 +143,7 @@ class TipSpec:
 
 
 def parse_tips(item: Any) -> dict[str, TipSpec]:
-    """Return the tips of a mapping from bodies to places.
-
-    Raises
-    ------
-    SetupError
-        With the place of what is no tip.
-    """
+    """Return the tips of a mapping from bodies to places; `SetupError` names what is no tip."""
     tips = {}
     for body, value in read_mapping(item, KEY).items():
         where = f'{KEY}.{body}'
@@ -185,13 +179,7 @@ def parse_tips(item: Any) -> dict[str, TipSpec]:
 def refuse_unknown_bodies(
     tips: Iterable[str], bodies: Mapping[str, str], topics: Iterable[str]
 ) -> None:
-    """Refuse tips of unknown bodies, or whose topic exists; bodies are given with their topics.
-
-    Raises
-    ------
-    SetupError
-        With the body.
-    """
+    """Raise `SetupError` for tips of unknown bodies, or whose topic is taken."""
     taken = set(topics)
     for body in tips:
         if body not in bodies:
@@ -210,17 +198,8 @@ def tip_name(body: str) -> str:
 
 
 def read_tips(text: str) -> dict[str, TipSpec]:
-    """Return the tips of a setup document's text, or of a file of tips alone.
-
-    Raises
-    ------
-    SetupError
-        When it is no YAML, or has no tips.
-    """
-    try:
-        root = read_yaml(text)
-    except (yaml.YAMLError, UnicodeError, ValueError) as error:
-        raise SetupError(f'tips: not YAML: {" ".join(str(error).split())}') from error
+    """Return the tips of a setup document, or of a file of tips alone; raises `SetupError`."""
+    root = read_own_yaml(text, 'tips')
     if not isinstance(root, dict) or KEY not in root:
         raise SetupError(f'tips: the document has no key {KEY}')
     return parse_tips(root[KEY])
@@ -235,13 +214,7 @@ def dump_tips(tips: Mapping[str, TipSpec]) -> dict[str, Any]:
 
 
 def with_tips(text: str, tips: Mapping[str, TipSpec]) -> str:
-    """Return a document's text with these tips beside its own; all else stays letter for letter.
-
-    Raises
-    ------
-    SetupError
-        As `parse_tips`, for the tips that it has.
-    """
+    """Return a document's text with these tips beside its own; all else is unchanged."""
     root = read_mapping(read_yaml(text), 'the document')
     whole = {**(parse_tips(root[KEY]) if KEY in root else {}), **tips}
     kept, inside = [], False

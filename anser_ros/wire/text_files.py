@@ -20,13 +20,7 @@ from anser_ros.errors import AnserError, BagError, ModelFileError, ParameterErro
 
 
 def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterError) -> str:
-    """Return the text of a file, without the mark that some editors put at its beginning.
-
-    Raises
-    ------
-    AnserError
-        Of the kind that is asked for, when it cannot be read, or is no text in UTF-8.
-    """
+    """Return the text (UTF-8, with or without its mark) of a file; raises an error of a kind."""
     try:
         return Path(path).read_text(encoding='utf-8-sig')
     except OSError as error:
@@ -36,13 +30,7 @@ def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterEr
 
 
 def read_rows(path: str | os.PathLike[str]) -> tuple[list[str], list[dict[str, str]]]:
-    """Return the names in the head of a CSV file, and its rows by these names.
-
-    Raises
-    ------
-    ParameterError
-        When it cannot be read, or is no CSV in UTF-8.
-    """
+    """Return the head of a CSV file, and its rows by these names; raises `ParameterError`."""
     reader = csv.DictReader(io.StringIO(read_text(path), newline=''))
     try:
         rows = list(reader)
@@ -58,13 +46,7 @@ def numbers_of(
     *,
     with_gaps: bool = False,
 ) -> NDArray[np.float64]:
-    """Return columns of a table's rows as numbers, shape (rows, names).
-
-    Raises
-    ------
-    ParameterError
-        When a column is missing or a cell is no finite number; ``with_gaps`` empty ones are NaN.
-    """
+    """Return columns (rows, names) as finite numbers, gaps as NaN if allowed; `ParameterError`."""
     try:
         values = np.array(
             [[float((row[n] or 'nan') if with_gaps else row[n]) for n in names] for row in rows]
@@ -79,13 +61,7 @@ def numbers_of(
 
 
 def read_fiducials(path: Path) -> NDArray[np.float64]:
-    """Return the positions (P, 3), m, of a list of fiducials.
-
-    Raises
-    ------
-    BagError
-        When the file has no table of fiducials.
-    """
+    """Return the positions (P, 3), m, of a list of fiducials; raises `BagError`."""
     lines = read_text(path).splitlines()
     rows = [line.split(',') for line in lines if line.strip() and not line.startswith('#')]
     try:
@@ -102,28 +78,27 @@ _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 DUMPER: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 """What plain data is written with."""
 MOST_CHARACTERS = 32_000_000
-"""Longest text that is read. A model of 4000 dipoles with forty modes is half as long; the time to
-read grows with it, by a second for each megabyte."""
+"""Longest text that is read, a second for each megabyte; a large model is half as long."""
 DEEPEST = 40
-"""Deepest nesting. No document here has more than eight levels; the parser's own recursion ends
-the process from some ten thousand on."""
+"""Deepest nesting; ours has eight levels, and the parser's recursion ends the process at 10^4."""
 MOST_NODES = 5_000_000
-"""Most values of a document, with aliases written out, as whoever prints or copies it does. Thirty
-lines of aliases of aliases stand for a thousand million."""
+"""Most values of a document with aliases written out: thirty lines may stand for 10^9."""
 
 
 def read_yaml(text: str) -> Any:
-    """Return a document as plain data.
-
-    Raises
-    ------
-    yaml.YAMLError
-        When it is no YAML, has a tag of its own, or is beyond a bound.
-    """
+    """Return a document as plain data; `yaml.YAMLError` for another tag, or beyond a bound."""
     if len(text) > MOST_CHARACTERS:
         raise yaml.YAMLError(f'{len(text)} characters are too long, the most is {MOST_CHARACTERS}')
     _check(text)
     return yaml.load(text, Loader=_LOADER)
+
+
+def read_own_yaml(text: str, what: str) -> Any:
+    """Return a document of ours as plain data; raises `SetupError`, which names what it is."""
+    try:
+        return read_yaml(text)
+    except (yaml.YAMLError, ValueError) as error:  # of which UnicodeError is one
+        raise SetupError(f'{what}: not YAML: {" ".join(str(error).split())}') from error
 
 
 def _check(text: str) -> None:
@@ -188,13 +163,7 @@ _PACKAGE = 'anser_ros'
 
 
 def config_path(name: str) -> Path:
-    """Return the path of a file: `name` itself where it exists, else the one in `config/`.
-
-    Raises
-    ------
-    SetupError
-        When there is neither.
-    """
+    """Return the path of a file: `name` itself, or else in `config/`; raises `SetupError`."""
     given = Path(name).expanduser()
     if given.is_file():
         return given
@@ -207,11 +176,5 @@ def config_path(name: str) -> Path:
 
 
 def read_config(name: str) -> str:
-    """Return the text of a file that `config_path` finds.
-
-    Raises
-    ------
-    SetupError
-        When there is none, or it is no text.
-    """
+    """Return the text of a file that `config_path` finds; raises `SetupError`."""
     return read_text(config_path(name), SetupError)

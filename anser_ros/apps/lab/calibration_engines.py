@@ -33,7 +33,7 @@ from anser_ros.field.dipoles import Dipoles, size_parameters, spread_along
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.rotations import tilted
-from anser_ros.sessions.calibration_engine import SCAN, Engine, at_constant_strength, generator_of
+from anser_ros.sessions.calibration import SCAN, Engine, at_constant_strength, generator_of
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session
 

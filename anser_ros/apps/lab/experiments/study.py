@@ -31,8 +31,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import MU_0
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.rotations import axis_angles
-from anser_ros.sessions.calibration import calibrate_sessions
-from anser_ros.sessions.calibration_engine import generator_of
+from anser_ros.sessions.calibration import calibrate_sessions, generator_of
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 from anser_ros.sessions.tracked_session import track_session
