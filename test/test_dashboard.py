@@ -22,7 +22,12 @@ from tracking_world import certain_model
 from anser_ros.apps.dashboard import loop as loop_module
 from anser_ros.apps.dashboard.loop import RESULTS, CorrectionLoop, Job, RecordingFolder
 from anser_ros.apps.dashboard.nodes import live_view
-from anser_ros.apps.dashboard.nodes.dashboard import ChainClient, ChainError, DashboardParameters
+from anser_ros.apps.dashboard.nodes.dashboard import (
+    ChainClient,
+    ChainError,
+    Dashboard,
+    DashboardParameters,
+)
 from anser_ros.apps.dashboard.nodes.live_view import LiveView, read_pose
 from anser_ros.apps.dashboard.nodes.view_source import ViewSource, polling_node
 from anser_ros.apps.dashboard.server import (
@@ -152,10 +157,12 @@ def test_the_demo_serves_it_if_asked_to(tmp_path):
     parser = argparse.ArgumentParser()
     demo.add_arguments(parser)
     for words, served in (([], False), (['--dashboard'], True)):
-        commands = dict(demo._commands(tmp_path, tmp_path / 'cu', parser.parse_args(words)))
+        args = parser.parse_args(words)
+        commands = dict(demo._commands(tmp_path, tmp_path / 'cu', args))
         assert ('dashboard' in commands) == served
-    assert f'port:={DashboardParameters.port}' in commands['dashboard']
+    assert Dashboard.__module__ in commands['dashboard']
     assert f'directory:={tmp_path}' in commands['dashboard']
+    assert f':{DashboardParameters.port}/' in demo._asked(args)['dashboard']
 
 
 def bag(path):

@@ -16,12 +16,16 @@ import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from anser_ros.cli.diagnosis_words import verdict
 from anser_ros.errors import AnserError, BagError, ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.starting_model import NOMINAL
+
+if TYPE_CHECKING:  # the loop itself needs no ROS
+    from anser_ros.apps.dashboard.nodes.dashboard import ChainClient
+    from anser_ros.apps.dashboard.nodes.view_source import ViewSource
 
 RESULTS = 'results'
 """Folder inside it, in which every calibration and diagnosis gets a folder of its own."""
@@ -199,22 +203,6 @@ MOST_UNDONE = 20
 """Changes of the model that can be undone, which bounds what is kept of a long day."""
 
 
-class Chain(Protocol):
-    """States what the page can ask of the running nodes; they refuse by `AnserError`."""
-
-    async def trigger(self, service: str) -> str: ...
-    async def model_files(self) -> dict[str, str]: ...
-    async def load_model(self, files: Mapping[str, str]) -> None: ...
-    async def baseline_file(self) -> str: ...
-
-
-class LiveFigures(Protocol):
-    """States what the page knows of the present moment."""
-
-    def figures(self, since_s: float) -> dict[str, float | None]: ...
-    def mark(self, words: str) -> None: ...
-
-
 @dataclass(frozen=True)
 class Found:
     """Holds what a command has found.
@@ -234,8 +222,7 @@ class Found:
         return self.folder / 'model.yaml'
 
 
-@dataclass(frozen=True)
-class Loaded:
+class Loaded(NamedTuple):
     """Remembers a change of the model: what was there before, and how well it went with that."""
 
     before: dict[str, str]
@@ -266,7 +253,7 @@ class CorrectionLoop:
     on; ``model`` is the active model's file, as ``field_model`` has it.
     """
 
-    def __init__(self, chain: Chain, live: LiveFigures, folder: RecordingFolder) -> None:
+    def __init__(self, chain: 'ChainClient', live: 'ViewSource', folder: RecordingFolder) -> None:
         self._chain, self._live, self.folder = chain, live, folder
         self.chosen, self.model = '', ''
         self.job: Job | None = None
