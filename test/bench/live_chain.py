@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from anser_ros.cli.demo import BOARD_SEED
+from anser_ros.cli.demo import BOARD_SEED, node_command
 from anser_ros.cli.processes import Child, Supervisor
 from anser_ros.simulation.control_unit import ControlUnit
 from anser_ros.simulation.line import PseudoPort
@@ -240,14 +240,6 @@ class Run:
         return float(np.percentile(self.latency_ms, share, method='higher'))
 
 
-def _command(name: str, /, **parameters: object) -> list[str]:
-    command = [sys.executable, '-m', f'anser_ros.nodes.{name}', '--ros-args']
-    for key, value in parameters.items():
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        command += ['-p', f'{key.replace("__", ":")}:={text}']
-    return command
-
-
 def _chain(layout: Layout, link: Path, folder: str, topics: list[str]) -> dict[str, list[str]]:
     """Return the commands of the processes by name."""
     if layout.is_floor:
@@ -256,15 +248,15 @@ def _chain(layout: Layout, link: Path, folder: str, topics: list[str]) -> dict[s
     model = config_path('demo_model.yaml')
     refit = {'refit': layout.follows, 'baseline_at_start': layout.follows}
     port = {'device': link, 'rate_hz': layout.rate_hz, 'window_s': WINDOW_S}
-    recorder = {'recorder': _command('recorder', directory=folder, name='bag')}
+    recorder = {'recorder': node_command('recorder', directory=folder, name='bag')}
     if layout.composed:
         values = {f'acquisition__{k}': v for k, v in port.items()}
         values |= {f'field_model__{k}': v for k, v in refit.items()}
-        return recorder | {'live': _command('live', model_file=model, **values)}
+        return recorder | {'live': node_command('live', model_file=model, **values)}
     return recorder | {
-        'field_model': _command('field_model', model_file=model, **refit),
-        'tracker': _command('tracker', model_file=model),
-        'acquisition': _command('acquisition', **port),
+        'field_model': node_command('field_model', model_file=model, **refit),
+        'tracker': node_command('tracker', model_file=model),
+        'acquisition': node_command('acquisition', **port),
     }
 
 
@@ -281,8 +273,6 @@ def run_chain(layout: Layout, sent: list[bytes], measure_s: float) -> Run:
     """Run the chain and return what was measured after it had settled."""
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):  # as `anser` does for its nodes
-        os.environ.setdefault(variable, '1')
     setup = parse_setup(read_config('demo_setup.yaml'))
     names = [topic_of(sensor.name) for sensor in setup.tool_sensors]
     names = names[: layout.poses]
