@@ -20,14 +20,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import boards
 import harness
 import numpy as np
 import recording
 import scenarios
 from bench_refit import JITTER_M, rms_mm
+from boards import build
 from laboratory import FLUX_NOISE_T, Laboratory, measured, read_fluxes
-from motions import Wander
 
 from anser_ros.apps.lab.experiments.refit_ablation import spread_out
 from anser_ros.sessions.follower import with_references
@@ -117,8 +116,7 @@ def scene(board: Any, kind: str, seed: Sequence[int], folder: Path) -> tuple[Ses
     rng = np.random.default_rng(seed)
     lab = Laboratory.clean(board)
     getattr(scenarios, kind)(lab, rng)
-    low, high = board.heights_m
-    wander = Wander.drawn(rng, [-0.125, -0.125, low], [0.125, 0.125, high])
+    wander = recording.wander_over(board, rng)
     step = 1.0 / recording.FLUX_HZ
     begin = np.arange(0.0, CLEAN_S, step)
     time = np.concatenate([begin, rng.uniform(8.0, 24.0) + np.arange(0.0, SPAN_S, step)])
@@ -149,7 +147,7 @@ def of_scenes(
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for index in range(n_boards):
-            board = boards.build(index, np.random.default_rng([seed, index]))
+            board = build(index, np.random.default_rng([seed, index]))
             scan = folder / 'scan.mcap'
             scan.unlink(missing_ok=True)
             recording.record_scan(
