@@ -179,8 +179,7 @@ def _shade_metal(axes: Any, metal: NDArray[np.float64], begin: float) -> None:
 
 
 def _joined(results: Results, kind: str, rank: int) -> NDArray[np.float64]:
-    parts = [results[f'{kind}_{rank}_{i}'] for i in range(len(results['names']))]
-    return np.concatenate(parts) if parts else np.zeros(0)
+    return np.concatenate([results[f'{kind}_{rank}_{i}'] for i in range(len(results['names']))])
 
 
 SCHEMA = 'anser_demo/1'
@@ -409,11 +408,8 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, l
 
 
 def _monitor(data: Path, args: argparse.Namespace) -> list[str]:
+    note = f'"{MEANINGS[FROZEN]}"'  # quoted: a colon has a meaning to ROS
     return node_command(
-        'monitor',
-        duration_s=float(args.duration),
-        patience_s=PATIENCE_S,
-        compare=FROZEN,
-        compare_note=f'"{MEANINGS[FROZEN]}"',  # quoted: a colon has a meaning to ROS
-        output=data,
-    )
+        'monitor', duration_s=float(args.duration), patience_s=PATIENCE_S, compare=FROZEN,
+        compare_note=note, output=data,
+    )  # fmt: skip

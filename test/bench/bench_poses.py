@@ -214,20 +214,18 @@ def rows() -> Iterator[harness.Row]:
 def main() -> None:
     """Print each session as it comes, and the table."""
     parser = argparse.ArgumentParser(description='diagnosis of simulated trackers of poses')
-    parser.add_argument('--seeds', default=','.join(map(str, REPORTED)))
+    parser.add_argument('--seeds', type=harness.integers, default=REPORTED)
     parser.add_argument('--clean', type=int, default=CLEAN_ROUNDS, help='of each motion')
     parser.add_argument('--kinds', default=','.join(KINDS), help='of them')
     parser.add_argument('--pairs', type=int, default=PAIRS, help='pairs for every seed')
     parser.add_argument('--repeats', type=int, default=0, help='short sessions of one sensor')
-    parser.add_argument('--repeat-seeds', default=','.join(map(str, REPEATED)))
+    parser.add_argument('--repeat-seeds', type=harness.integers, default=REPEATED)
     args = parser.parse_args()
-    seeds = [int(seed) for seed in args.seeds.split(',')]
     outcomes = []
     kinds = [kind for kind in args.kinds.split(',') if kind]
-    again = [int(seed) for seed in args.repeat_seeds.split(',')]
     every = (
-        clean(seeds, args.clean), singles(seeds, kinds), pairs(seeds, args.pairs),
-        repeats(again, args.repeats),
+        clean(args.seeds, args.clean), singles(args.seeds, kinds), pairs(args.seeds, args.pairs),
+        repeats(args.repeat_seeds, args.repeats),
     )  # fmt: skip
     for part in every:
         for name, what, one in part:

@@ -149,20 +149,14 @@ def made_bytes(metal: bool, seconds: float) -> list[bytes]:
 
 
 class Feeder(threading.Thread):
-    """Streams prepared bytes, so little work is left in real time.
-
-    Attributes
-    ----------
-    begin_ns : when the first sample was taken; 0 before
-    taken_ns : when the line had taken the last byte of each millisecond
-    """
+    """Streams prepared bytes, so little work is left in real time."""
 
     def __init__(self, port: PseudoPort, sent: list[bytes]) -> None:
         super().__init__(name='feeder', daemon=True)
         self._unit = ControlUnit(world(False), parse_channels(read_config('demo_channels.yaml')))
         self._port, self._sent = port, sent
-        self.begin_ns = 0
-        self.taken_ns: list[int] = []
+        self.begin_ns = 0  # when the first sample was taken; 0 before
+        self.taken_ns: list[int] = []  # when the line had taken the last byte of each millisecond
         self.stopping = threading.Event()
 
     def run(self) -> None:
@@ -186,23 +180,14 @@ class Feeder(threading.Thread):
 
 @dataclass(frozen=True)
 class Layout:
-    """What runs: which processes, at which rate, and whether the model follows the references.
-
-    Attributes
-    ----------
-    composed : acquisition, field model and tracker in one process, or in three
-    follows : the refit in force from a baseline on, or a model that stays as it was
-    metal : whether metal comes and goes without a rest; its bytes must have been made with it
-    is_floor : nothing of these, but a node that reads the port and publishes poses
-    floor_poses : how many poses that node publishes a window
-    """
+    """What runs: which processes, at which rate, and whether the model follows the references."""
 
     rate_hz: float = 50.0
-    composed: bool = True
-    follows: bool = True
-    metal: bool = True
-    is_floor: bool = False
-    floor_poses: int = 1
+    composed: bool = True  # acquisition, field model and tracker in one process, or in three
+    follows: bool = True  # the refit active from a baseline on, or a model that stays as it was
+    metal: bool = True  # it comes and goes without a rest; its bytes must have been made with it
+    is_floor: bool = False  # nothing of these, but a node that reads the port and publishes poses
+    floor_poses: int = 1  # how many poses that node publishes a window
 
     @property
     def poses(self) -> int:
@@ -214,26 +199,15 @@ class Layout:
 class Run:
     """What one run of the chain gave.
 
-    Attributes
-    ----------
-    latency_ms : ndarray, from the last byte of a window to its pose; infinite where none came
-    lost : windows of a sensor without a pose
-    load : CPU seconds a second, by process
-    device_late_ms : how late the bytes themselves were at the 99th percentile; above a few ms the
-        machine was busy with something else, and the figures say more of that than of the chain
-    ages_s : largest age of a model that a pose used, of each second
+    ``device_late_ms`` is how late the bytes themselves were at the 99th percentile; above a few ms
+    the machine was busy with something else, and the figures say more of that than of the chain.
     """
 
-    latency_ms: np.ndarray
-    lost: int
-    load: dict[str, float]
+    latency_ms: np.ndarray  # from the last byte of a window to its pose; infinite if none came
+    lost: int  # windows of a sensor without a pose
+    load: dict[str, float]  # CPU seconds a second, by process
     device_late_ms: float
-    ages_s: np.ndarray
-
-    @property
-    def share(self) -> float:
-        """Poses that came, of those that should have."""
-        return 1.0 - self.lost / max(self.latency_ms.size, 1)
+    ages_s: np.ndarray  # largest age of a model that a pose used, of each second
 
     def percentile(self, share: float) -> float:
         """Latency, ms, that this many per cent of all windows have at most."""

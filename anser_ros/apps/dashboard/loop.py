@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from anser_ros.cli.diagnosis_words import verdict
+from anser_ros.cli.output import make_new_folder
 from anser_ros.errors import AnserError, BagError, ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.starting_model import NOMINAL
@@ -79,15 +80,7 @@ class RecordingFolder:
 
     def new_result(self, kind: str, recording: str) -> Path:
         """Make the folder of a result and return it."""
-        stem, number = f'{Path(recording).stem}_{kind}', 1
-        while True:
-            path = self.path / RESULTS / (stem if number == 1 else f'{stem}_{number}')
-            try:
-                path.mkdir(parents=True)
-            except FileExistsError:
-                number += 1
-            else:
-                return path
+        return make_new_folder(self.path / RESULTS, f'{Path(recording).stem}_{kind}')
 
     def shown(self, result: str, name: str) -> Path | None:
         """Return the path of a result's file that may be shown, None where there is none."""
