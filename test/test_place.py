@@ -94,19 +94,17 @@ def test_coils_that_receive_nothing_are_refused(scale, said, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ('more', 'said'),
+    ('count', 'more', 'said'),
     [
-        (['--references', '0'], 'coils to choose from'),
-        (['--references', '99'], 'coils to choose from'),
-        (['--references', '2', '--metal', 'above'], '--metal'),
-        (['--references', '2', '--error-mm', '-1'], '--error-mm'),
-        (['--references', '2', '--from', 'plane=x'], 'height'),
-        (['--references', '2', '--from', 'plane=50'], 'are in m'),
-        (['--references', '2', '--from', 'nowhere.csv'], 'nowhere.csv'),
+        ('0', '', 'coils to choose from'), ('99', '', 'coils to choose from'),
+        ('2', '--metal above', '--metal'), ('2', '--error-mm -1', '--error-mm'),
+        ('2', '--from plane=x', 'height'), ('2', '--from plane=50', 'are in m'),
+        ('2', '--from nowhere.csv', 'nowhere.csv'),
     ],
-)
-def test_bad_input_is_one_line(more, said, tmp_path, capsys):
-    assert main(['place', 'demo_setup.yaml', *more, '--out', str(tmp_path / 'out')]) == 2
+)  # fmt: skip
+def test_bad_input_is_one_line(count, more, said, tmp_path, capsys):
+    command = ['place', 'demo_setup.yaml', '--references', count, *more.split()]
+    assert main([*command, '--out', str(tmp_path / 'out')]) == 2
     words = capsys.readouterr().err
     assert said in words
     assert len(words.splitlines()) == 1

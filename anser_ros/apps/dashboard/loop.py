@@ -14,7 +14,6 @@ import signal
 import sys
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -196,8 +195,7 @@ MOST_UNDONE = 20
 """Changes of the model that can be undone, which bounds what is kept of a long day."""
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """Holds what a command has found.
 
     ``rows`` have a label and, as text, a figure before and after, on data held out.
@@ -357,17 +355,16 @@ class CorrectionLoop:
             raise ParameterError('a command is already running')
         name = self.chosen
         bag = self.folder.recording(name)
-        options: list[str] = []
         if kind == DIAGNOSE:
             await self.look()
-            options += ['--model', self.model or NOMINAL]
             baseline = await self._chain.baseline_file()
+            folder = self.folder.new_result(kind, name)
+            options = ['--model', self.model or NOMINAL]
             options += ['--baseline', baseline] if baseline else []
-        folder = self.folder.new_result(kind, name)
-        if kind == DIAGNOSE:
             options += ['--out', str(folder)]
         else:
-            options += ['--out', str(folder / 'model.yaml'), '--report', str(folder)]
+            folder = self.folder.new_result(kind, name)
+            options = ['--out', str(folder / 'model.yaml'), '--report', str(folder)]
         self.job = job = Job(kind, [str(bag), *options, '--json'], folder)
         self._running = asyncio.create_task(self._finish(job, name))
         return f'{kind} {name}'
