@@ -22,7 +22,12 @@ from tracking_world import certain_model
 from anser_ros.apps.dashboard import loop as loop_module
 from anser_ros.apps.dashboard.loop import RESULTS, CorrectionLoop, Job, RecordingFolder
 from anser_ros.apps.dashboard.nodes import live_view
-from anser_ros.apps.dashboard.nodes.dashboard import ChainClient, ChainError, DashboardParameters
+from anser_ros.apps.dashboard.nodes.dashboard import (
+    ChainClient,
+    ChainError,
+    Dashboard,
+    DashboardParameters,
+)
 from anser_ros.apps.dashboard.nodes.live_view import LiveView, read_pose
 from anser_ros.apps.dashboard.nodes.view_source import ViewSource, polling_node
 from anser_ros.apps.dashboard.server import (
@@ -71,15 +76,13 @@ async def inner(_scope, _receive, send):
 @pytest.mark.parametrize('stated', [None, ((-0.1, -0.12, 0.06), (0.1, 0.1, 0.3))])
 def test_the_drawn_volume_is_that_in_which_poses_are_accepted(ros, stated):
     node = polling_node('view', '/anser')
-    try:
-        source = ViewSource(node, 'optical', pytest.fail, lambda _: False)
-        setup = replace(parse_setup(ten_sensors()), volume=stated)
-        source.setup_text = dump_setup(setup)
-        source.look()
-        volume = tracked_volume(setup)
-        assert source.world()['volume_m'] == [list(volume.low), list(volume.high)]
-    finally:
-        node.destroy_node()
+    source = ViewSource(node, 'optical', pytest.fail, lambda _: False)
+    setup = replace(parse_setup(ten_sensors()), volume=stated)
+    source.setup_text = dump_setup(setup)
+    source.look()
+    volume = tracked_volume(setup)
+    assert source.world()['volume_m'] == [list(volume.low), list(volume.high)]
+    node.destroy_node()
 
 
 @pytest.mark.parametrize('kind', ['http', 'websocket'])
@@ -100,15 +103,11 @@ def test_the_guard_knows_this_machine_and_the_token(kind):
     assert asked(far, kind=kind, host='board.lab', cookie=f'{COOKIE}={TOKEN}') == 'passed'
 
 
-def test_the_guard_takes_the_token_out_of_the_address():
+def test_the_guard_takes_the_token_out_of_the_address_and_bounds_the_pages():
     answer = asked(Guard(inner, TOKEN), query=f'token={TOKEN}')
-    assert answer['status'] == 303
     headers = dict(answer['headers'])
-    assert headers[b'location'] == b'/'
+    assert (answer['status'], headers[b'location']) == (303, b'/')
     assert headers[b'set-cookie'].decode().startswith(f'{COOKIE}={TOKEN}; HttpOnly')
-
-
-def test_the_guard_bounds_the_pages():
     guard = Guard(inner, '')
     assert asked(guard, query='EIO=4&transport=polling')['status'] == 403
     guard.pages = MOST_PAGES
@@ -134,6 +133,8 @@ def test_the_address_for_other_machines_has_the_name_of_this_one(tmp_path):
     server = PageServer('0.0.0.0', 0, TOKEN, RecordingFolder(tmp_path))
     server.end()
     assert server.url == f'http://{socket.gethostname()}:{server.port}/?token={TOKEN}'
+    with pytest.raises(ParameterError, match=r'203\.0\.113\.7:8642'):
+        PageServer('203.0.113.7', 8642, TOKEN, RecordingFolder(tmp_path))
 
 
 def test_what_is_missing_is_said_in_a_line(monkeypatch, capsys):
@@ -143,19 +144,16 @@ def test_what_is_missing_is_said_in_a_line(monkeypatch, capsys):
     assert said == 'anser dashboard: nicegui is not installed: pip install nicegui\n'
 
 
-def test_an_address_that_is_taken_is_said(tmp_path):
-    with pytest.raises(ParameterError, match=r'203\.0\.113\.7:8642'):
-        PageServer('203.0.113.7', 8642, TOKEN, RecordingFolder(tmp_path))
-
-
 def test_the_demo_serves_it_if_asked_to(tmp_path):
     parser = argparse.ArgumentParser()
     demo.add_arguments(parser)
     for words, served in (([], False), (['--dashboard'], True)):
-        commands = dict(demo._commands(tmp_path, tmp_path / 'cu', parser.parse_args(words)))
+        args = parser.parse_args(words)
+        commands = dict(demo._commands(tmp_path, tmp_path / 'cu', args))
         assert ('dashboard' in commands) == served
-    assert f'port:={DashboardParameters.port}' in commands['dashboard']
+    assert Dashboard.__module__ in commands['dashboard']
     assert f'directory:={tmp_path}' in commands['dashboard']
+    assert f':{DashboardParameters.port}/' in demo._asked(args)['dashboard']
 
 
 def bag(path):
@@ -310,9 +308,9 @@ def test_the_loop_from_recording_to_undo(tmp_path, monkeypatch):
     assert chain.asked == ['recorder/start', 'recorder/stop']
 
 
-def pose(stamp_s, place, sigma_m=0.0):
+def pose(stamp_s, place, sigma_m=0.0, frame='left_fg'):
     message = PoseWithCovarianceStamped() if sigma_m else PoseStamped()
-    message.header.frame_id = 'left_fg'  # a length that needs padding
+    message.header.frame_id = frame
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(round(1e9 * stamp_s), 10**9)
     at = (message.pose.pose if sigma_m else message.pose).position
     at.x, at.y, at.z = place
@@ -321,17 +319,13 @@ def pose(stamp_s, place, sigma_m=0.0):
     return bytes(serialize_message(message)), {}
 
 
-@pytest.mark.parametrize('frame', ['', 'f', 'fg', 'left_fg', 'right_fg'])
-def test_poses_are_read_from_their_bytes(frame):
-    message = PoseStamped()
-    message.header.frame_id = frame
-    message.header.stamp.sec, message.header.stamp.nanosec = 12, 500_000_000
-    message.pose.position.y = 3.0
-    stamp_s, values = read_pose(bytes(serialize_message(message)))
-    assert stamp_s == 12.5
-    assert values.tolist() == [0, 3, 0, 0, 0, 0, 1]
-    with pytest.raises(ValueError, match='not a pose'):
-        read_pose(bytes(serialize_message(message))[:-8])
+def test_poses_are_read_from_their_bytes():
+    for frame in ('', 'f', 'fg', 'left_fg', 'right_fg'):  # lengths that need padding, and do not
+        data, _ = pose(12.5, (0.0, 3.0, 0.0), frame=frame)
+        stamp_s, values = read_pose(data)
+        assert (stamp_s, values.tolist()) == (12.5, [0, 3, 0, 0, 0, 0, 1])
+        with pytest.raises(ValueError, match='not a pose'):
+            read_pose(data[:-8])
 
 
 def test_a_replayed_pose_has_no_latency():

@@ -11,15 +11,9 @@ from anser_ros.cli import doctor
 from anser_ros.cli.main import main
 
 
-def states(findings):
-    return {finding.name: finding.state for finding in findings}
-
-
 def test_a_package_that_is_missing_has_a_remedy():
-    found = {
-        f.name: f
-        for f in doctor.packages(lambda name: name not in ('mcap_ros2', 'yaml', 'nicegui'))
-    }
+    gone = ('mcap_ros2', 'yaml', 'nicegui')
+    found = {f.name: f for f in doctor.packages(lambda name: name not in gone)}
     assert found['mcap-ros2-support'].remedy == 'pip install mcap-ros2-support'
     assert found['PyYAML'].state == doctor.BAD
     assert found['nicegui'].state == doctor.NOTE, 'only the live view needs it'
@@ -56,38 +50,33 @@ def test_ports_that_are_missing_or_closed(tmp_path, monkeypatch):
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize(
-    ('said', 'kernel', 'state'),
-    [
-        ('yes', None, doctor.GOOD), ('no', None, doctor.NOTE), ('', None, doctor.NOTE),
-        ('', True, doctor.GOOD), ('', False, doctor.NOTE), ('yes', False, doctor.GOOD),
-    ],
-)  # fmt: skip
-def test_the_clock(tmp_path, monkeypatch, said, kernel, state):
+def test_the_clock(tmp_path, monkeypatch):
     tool = tmp_path / 'timedatectl'
-    tool.write_text(f'#!/bin/sh\necho {said}\n')
-    tool.chmod(0o755)
     monkeypatch.setenv('PATH', f'{tmp_path}:{os.environ["PATH"]}')
-    monkeypatch.setattr(doctor, 'kernel_clock', lambda: kernel)
-    (found,) = doctor.clock()
-    assert found.state == state
-    assert bool(found.remedy) == (said == 'no' or (kernel is False and not said))
-    (alone,) = doctor.clock('no_such_tool')
-    assert (alone.state == doctor.GOOD) == (kernel is True)
+    for said, kernel, is_kept in (
+        ('yes', None, True), ('no', None, False), ('', None, None), ('', True, True),
+        ('', False, False), ('yes', False, True),
+    ):  # fmt: skip
+        tool.write_text(f'#!/bin/sh\necho {said}\n')
+        tool.chmod(0o755)
+        monkeypatch.setattr(doctor, 'kernel_clock', lambda kernel=kernel: kernel)
+        (found,) = doctor.clock()
+        assert found.state == (doctor.GOOD if is_kept else doctor.NOTE)
+        assert bool(found.remedy) == (is_kept is False)
+        (alone,) = doctor.clock('no_such_tool')
+        assert (alone.state == doctor.GOOD) == (kernel is True)
 
 
-@pytest.mark.parametrize(
-    ('text', 'state'),
-    [('0', None), ('101', None), ('150', doctor.NOTE), ('233', doctor.BAD), ('-1', doctor.BAD),
-     ('one', doctor.BAD)],
-)  # fmt: skip
-def test_a_domain_that_does_not_work_is_named(monkeypatch, text, state):
-    monkeypatch.setenv('ROS_DOMAIN_ID', text)
-    found = doctor.domain()
-    assert [one.state for one in found] == ([] if state is None else [state])
-    assert all(one.remedy for one in found)
-    if state == doctor.BAD:
-        assert doctor.graph(0.1) == [], 'it is said once'
+def test_a_domain_that_does_not_work_is_named(monkeypatch):
+    for text, states in (
+        ('0', []), ('101', []), ('150', [doctor.NOTE]), ('233', [doctor.BAD]),
+        ('-1', [doctor.BAD]), ('one', [doctor.BAD]),
+    ):  # fmt: skip
+        monkeypatch.setenv('ROS_DOMAIN_ID', text)
+        found = doctor.domain()
+        assert [one.state for one in found] == states
+        assert all(one.remedy for one in found)
+    assert doctor.graph(0.1) == [], 'it is said once'
 
 
 @pytest.mark.processes
@@ -122,7 +111,7 @@ def test_the_graph():
         'complaints': {'anser/field_model': 'references_lost: no fluxes'},
     }  # fmt: skip
     found = doctor.graph_findings(told)
-    assert states(found) == {
+    assert {one.name: one.state for one in found} == {
         'ROS': doctor.GOOD, '/anser/tracker': doctor.BAD, 'graph': doctor.GOOD,
         'anser/field_model': doctor.NOTE,
     }  # fmt: skip
@@ -140,7 +129,7 @@ def test_the_whole_on_this_machine(capsys, domain):
     assert code == (2 if document['problems'] else 0)
 
 
-@pytest.mark.parametrize('seconds', ['nan', '-1', '0', '1e9'])
-def test_a_look_that_is_no_time_is_refused(capsys, seconds):
-    assert main(['doctor', '--seconds', seconds]) == 2
-    assert '--seconds must be above 0 and at most 60' in capsys.readouterr().err
+def test_a_look_that_is_no_time_is_refused(capsys):
+    for seconds in ('nan', '-1', '0', '1e9'):
+        assert main(['doctor', '--seconds', seconds]) == 2
+        assert '--seconds must be above 0 and at most 60' in capsys.readouterr().err

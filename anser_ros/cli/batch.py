@@ -107,14 +107,10 @@ def _client(args: argparse.Namespace, sessions: int) -> Iterator[tuple['Client',
         return
     workers = min(args.workers, sessions)
     # Silent: what becomes of a session stands in its row.
+    options = {'dashboard_address': '127.0.0.1:0', 'silence_logs': logging.CRITICAL}
     with (
         dask.config.set(WORKERS),
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            dashboard_address='127.0.0.1:0',
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
+        LocalCluster(n_workers=workers, threads_per_worker=1, **options) as cluster,
         Client(cluster) as client,
     ):
         yield client, max(1, cores() // workers)

@@ -100,10 +100,6 @@ def _shown(record: EffectRecord) -> tuple[tuple[str, ...], str, Array, Array]:
     return ('rms',), unit, mean[0], mean[1]
 
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-
 def choice_figure(calibration: Calibration) -> 'Figure | None':
     """Draw held-out errors by the number of dipoles, and by damping for the six best layouts.
 

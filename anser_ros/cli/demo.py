@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros import extensions
 from anser_ros.cli import missing
 from anser_ros.cli.commands import COMPOSED, NODES
 from anser_ros.cli.output import add_json, add_out, make_new_folder
@@ -27,7 +28,6 @@ from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.errors import ParameterError
 from anser_ros.tracking.estimate import NO_GATE
 from anser_ros.wire.bag_writer import bag_summary
-from anser_ros.wire.tcp_ports import LIVE_VIEW
 from anser_ros.wire.text_files import config_path
 
 Results = dict[str, Any]
@@ -56,6 +56,8 @@ def load(path: Path) -> Results:
 
 def summarise(results: Results) -> dict[str, dict[str, Any]]:
     """Return the errors, rates and latencies of each chain over all its sensors and bodies."""
+    from anser_ros.sessions.tracked_session import error_statistics
+
     chains: dict[str, Any] = {}
     for rank, chain in enumerate(results['chains']):
         error = _joined(results, 'error', rank)
@@ -65,15 +67,15 @@ def summarise(results: Results) -> dict[str, dict[str, Any]]:
             continue
         longest = max(stamps, key=len)
         span = float(longest[-1] - longest[0]) if longest.size > 1 else 0.0
+        found = error_statistics('position', 'm', error)
         chains[str(chain) or LIVE] = {
             'poses': int(sum(len(s) for s in stamps)),
             'rate_hz': float((longest.size - 1) / span) if span > 0 else 0.0,
-            'position_rmse_m': float(np.sqrt(np.mean(error**2))),
-            'position_prc50_m': float(np.percentile(error, 50)),
-            'position_prc95_m': float(np.percentile(error, 95)),
+            **{f'position_{name}_m': found[f'position_{name}_m']
+               for name in ('rmse', 'prc50', 'prc95')},
             'position_max_m': float(error.max()),
             'latency_prc50_s': float(np.median(_joined(results, 'latency', rank))),
-        }
+        }  # fmt: skip
     return {'chains': chains}
 
 
@@ -177,8 +179,7 @@ def _shade_metal(axes: Any, metal: NDArray[np.float64], begin: float) -> None:
 
 
 def _joined(results: Results, kind: str, rank: int) -> NDArray[np.float64]:
-    parts = [results[f'{kind}_{rank}_{i}'] for i in range(len(results['names']))]
-    return np.concatenate(parts) if parts else np.zeros(0)
+    return np.concatenate([results[f'{kind}_{rank}_{i}'] for i in range(len(results['names']))])
 
 
 SCHEMA = 'anser_demo/1'
@@ -211,13 +212,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=Path('recordings'), metavar='DIR',
     )  # fmt: skip
     parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
-    words = 'serve the live view to a browser, too'
-    parser.add_argument('--dashboard', action='store_true', help=words)
+    for name, (words, _) in _beside().items():
+        parser.add_argument(f'--{name}', action='store_true', help=words)
     parser.add_argument('--no-metal', action='store_true', help='simulate no steel disc')
     parser.add_argument('--no-picture', action='store_true', help='draw no picture at the end')
     words = 'only draw the picture of an interrupted demo, from the folder of its results'
     parser.add_argument('--draw', type=Path, metavar='DIR', help=words)
     add_json(parser, 'only the summary, as JSON')
+
+
+def _beside() -> dict[str, tuple[str, str]]:
+    """Nodes of applications that may run beside it: the line of the option, and what is said."""
+    return {name: lines for table in extensions.tables('DEMO') for name, lines in table.items()}
+
+
+def _asked(args: argparse.Namespace) -> dict[str, str]:
+    return {name: said for name, (_, said) in _beside().items() if getattr(args, name)}
 
 
 def run(args: argparse.Namespace) -> int:
@@ -234,7 +244,8 @@ def run(args: argparse.Namespace) -> int:
         raise ParameterError(f'--duration must be 1 to 3600 s, got {args.duration:g}')
     if not 1.0 <= args.rate <= 200.0:
         raise ParameterError(f'--rate must be 1 to 200 Hz, got {args.rate:g}')
-    missing.check('dashboard' if args.dashboard else 'recorder')
+    for node in ('recorder', *_asked(args)):
+        missing.check(node)
     stopped: list[int] = []
     before = {
         number: signal.signal(number, lambda got, _: stopped.append(got))
@@ -263,8 +274,8 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
                 return _report(folder, args, interrupted=True)
             for name, command in _commands(folder, ports / 'cu', args).items():
                 supervisor.start(name, command)
-            if args.dashboard:
-                _say(f'live view: http://127.0.0.1:{LIVE_VIEW}/', args)
+            for said in _asked(args).values():
+                _say(said, args)
             monitor = supervisor.start(
                 'monitor', _monitor(folder / DATA, args), on_terminal=not args.json
             )
@@ -381,7 +392,7 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, l
     """The command line of each process by its name."""
     model = config_path('demo_model.yaml')
     apart = in_namespace(f'/anser/{FROZEN}')
-    commands = {
+    return {
         'cu_simulator': simulated_unit(
             port, metal=not args.no_metal, metal_radius_m=METAL_RADIUS_M
         ),
@@ -392,18 +403,13 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, l
         'field_model_frozen': node_command('field_model', *apart, model_file=model),
         'tracker_frozen': node_command('tracker', *apart, **FROZEN_TRACKER),
         'recorder': node_command('recorder', directory=folder, name='bag'),
+        **{name: node_command(name, directory=folder) for name in _asked(args)},
     }  # fmt: skip
-    if args.dashboard:
-        commands['dashboard'] = node_command('dashboard', directory=folder, port=LIVE_VIEW)
-    return commands
 
 
 def _monitor(data: Path, args: argparse.Namespace) -> list[str]:
+    note = f'"{MEANINGS[FROZEN]}"'  # quoted: a colon has a meaning to ROS
     return node_command(
-        'monitor',
-        duration_s=float(args.duration),
-        patience_s=PATIENCE_S,
-        compare=FROZEN,
-        compare_note=f'"{MEANINGS[FROZEN]}"',  # quoted: a colon has a meaning to ROS
-        output=data,
-    )
+        'monitor', duration_s=float(args.duration), patience_s=PATIENCE_S, compare=FROZEN,
+        compare_note=note, output=data,
+    )  # fmt: skip

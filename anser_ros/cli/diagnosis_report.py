@@ -259,23 +259,15 @@ def _structure(result: SessionDiagnosis) -> Iterator[str]:
     if found.unexplained > 0:
         yield paragraph(strongest(found.after))
     before = {test.variable: test.share for test in found.tests_before}
+    rows = []
+    for test in (test for test in found.tests_after if test.variable in before):
+        left = 'trace' if test.significant else 'no'
+        left = 'yes' if test.variable in found.depends_on else left
+        shares = f'{before[test.variable]:.2%}', f'{test.share:.2%}'
+        rows.append([test.variable, *shares, f'{test.probability:.2g}', left])
     yield table(
         ['residual against', 'share before', 'share after', 'probability in noise alone', 'left?'],
-        [
-            [
-                test.variable,
-                f'{before[test.variable]:.2%}',
-                f'{test.share:.2%}',
-                f'{test.probability:.2g}',
-                'yes'
-                if test.variable in found.depends_on
-                else 'trace'
-                if test.significant
-                else 'no',
-            ]
-            for test in found.tests_after
-            if test.variable in before
-        ],
+        rows,
     )
 
 

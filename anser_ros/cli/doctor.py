@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.markup import escape
-from rich.table import Table
 
 from anser_ros.cli.commands import NODES
 from anser_ros.cli.missing import OPTIONAL, PYPI, ROS_REMEDY
@@ -94,15 +93,12 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     words = f'{count} problem{"s" if count > 1 else ""}' if count else 'nothing is wrong'
     listed = [finding._asdict() for finding in findings]
     document = {'schema': SCHEMA, 'problems': count, 'findings': listed}
-    return Result(document, (), (_table(findings), words), code=2 if count else 0)
-
-
-def _table(findings: list[Observation]) -> Table:
     rows = [
         [f'[{COLOURS[one.state]}]{escape(one.name)}', escape(one.found), escape(one.remedy)]
         for one in findings
     ]
-    return terminal_table(['', 'found', 'remedy'], rows)
+    table = terminal_table(['', 'found', 'remedy'], rows)
+    return Result(document, (), (table, words), code=2 if count else 0)
 
 
 def python() -> list[Observation]:

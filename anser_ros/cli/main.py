@@ -32,10 +32,8 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb with its arguments, by default those of the process.
 
-    Returns
-    -------
-    int
-        0 done, 2 bad usage or bad input (one clear line on stderr), 1 a defect (a traceback).
+    The exit code is 0 done, 2 bad usage or bad input (one clear line on stderr), 1 a defect (a
+    traceback).
     """
     for variable in ONE_THREAD:  # before anything imports numpy
         os.environ.setdefault(variable, '1')
@@ -53,14 +51,17 @@ def _dispatch(arguments: list[str]) -> int:
         print(_usage())
         return EXIT_OK if arguments else EXIT_BAD_INPUT
     if arguments[0] == '--version':
-        print(_version())
+        try:
+            print(f'anser_ros {version("anser_ros")}')
+        except PackageNotFoundError:
+            print('anser_ros, not installed')
         return EXIT_OK
     name, rest = arguments[0].replace('-', '_'), arguments[1:]
     if name in NODES or name in COMPOSED:
         try:
             missing.check(name)
         except AnserError as error:
-            print(f'anser {name}: {" ".join(str(error).split())}', file=sys.stderr)
+            print(f'anser {name}: {_one_line(error)}', file=sys.stderr)
             return EXIT_BAD_INPUT
         exec_node(name, rest)
     if name in OFFLINE:
@@ -125,13 +126,10 @@ def _show(name: str, module: Any, args: argparse.Namespace) -> int:
 
 
 def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
-    """Do a piece of work of a command, and tell an error of the caller from a defect.
+    """Do a piece of work of a command, and distinguish an error of the caller from a defect.
 
-    Returns
-    -------
-    tuple of (int, object, str)
-        The exit code; what the work gave, None where it failed; why it failed: one line for what
-        is the caller's to mend, a traceback for a defect.
+    Returns the exit code; what the work gave, None where it failed; why it failed: one line for
+    what is the caller's to mend, a traceback for a defect.
     """
     try:
         return EXIT_OK, work(), ''
@@ -150,13 +148,6 @@ def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
 
 def _one_line(error: AnserError) -> str:
     return ' '.join(str(error).split())
-
-
-def _version() -> str:
-    try:
-        return f'anser_ros {version("anser_ros")}'
-    except PackageNotFoundError:
-        return 'anser_ros, not installed'
 
 
 def _usage() -> str:

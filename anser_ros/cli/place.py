@@ -2,10 +2,10 @@
 
 import argparse
 import csv
+import io
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,7 @@ RANDOM_TRIES, SEED = 20, 1
 """Choices by chance that the found one is compared with, and the seed of these."""
 
 
-@dataclass(frozen=True)
-class Proposal:
+class Proposal(NamedTuple):
     """Holds what was found: the candidates, the designs by number of coils, and random ones."""
 
     candidates: SensorTable
@@ -100,11 +99,11 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     make_folder(args.out)
     document = to_document(found, args.origin)
     figure = places_figure(found.candidates, found.region, found.designs, found.random)
-    written = write_files(args.out, {DOCUMENT: document, FIGURE: figure})
-    _write_table(args.out / TABLE, document['places'])
+    written = write_files(
+        args.out, {DOCUMENT: document, FIGURE: figure, TABLE: _table_of(document['places'])}
+    )
     head = ['references', 'expected error mm', 'random places mm (best to worst)']
-    table = terminal_table(head, _rows(document))
-    return Result(document, (), (table,), (*written, args.out / TABLE))
+    return Result(document, (), (terminal_table(head, _rows(document)),), written)
 
 
 def propose(
@@ -286,9 +285,9 @@ def _rows(document: dict[str, Any]) -> list[list[str]]:
     return rows
 
 
-def _write_table(path: Path, places: list[dict[str, Any]]) -> None:
-    with path.open('w', encoding='utf-8', newline='') as stream:
-        writer = csv.writer(stream, lineterminator='\n')
-        writer.writerow(['name', 'x_m', 'y_m', 'z_m', 'ax', 'ay', 'az', 'length_m'])
-        for row in places:
-            writer.writerow([row['name'], *row['position_m'], *row['axis'], row['length_m']])
+def _table_of(places: list[dict[str, Any]]) -> str:
+    rows = [(row['name'], *row['position_m'], *row['axis'], row['length_m']) for row in places]
+    head = ('name', 'x_m', 'y_m', 'z_m', 'ax', 'ay', 'az', 'length_m')
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator='\n').writerows([head, *rows])
+    return stream.getvalue()

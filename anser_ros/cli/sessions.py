@@ -322,14 +322,8 @@ def summed_up(command: str, outcomes: Sequence[Outcome], folder: Path) -> Result
     notes += [f'{one.name}: {one.words}' for one in failed]
     if failed:
         notes.append(f'{len(failed)} of {len(outcomes)} sessions failed')
-    return Result(
-        {'schema': SCHEMA, 'command': command, 'sessions': rows},
-        tuple(notes),
-        (table_of(command, rows),),
-        written,
-        EXIT_DEFECT
-        if EXIT_DEFECT in [one.code for one in failed]
-        else EXIT_BAD_INPUT
-        if failed
-        else EXIT_OK,
-    )
+    code = EXIT_BAD_INPUT if failed else EXIT_OK
+    if EXIT_DEFECT in [one.code for one in failed]:
+        code = EXIT_DEFECT
+    document = {'schema': SCHEMA, 'command': command, 'sessions': rows}
+    return Result(document, tuple(notes), (table_of(command, rows),), written, code)

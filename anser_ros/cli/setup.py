@@ -230,17 +230,12 @@ ONE_TOOL_COIL = {'channel': 0, 'name': 'tool/0', 'body': 'tool', 'position_m': [
 """Stands for the sensors while a board is checked before there are any."""
 
 
-def ask_all(ask: Callable[[str], str], say: Callable[[str], object]) -> Document:
-    """Ask for everything, and return the document.
+class Questions:
+    """The questions in their order, of which each is asked until its answer can be read.
 
     ``ask`` gives the answer to a question and raises `EOFError` where there is none; ``say`` shows
     a line.
     """
-    return _Questions(ask, say).document()
-
-
-class _Questions:
-    """The questions in their order, of which each is asked until its answer can be read."""
 
     def __init__(self, ask: Callable[[str], str], say: Callable[[str], object]) -> None:
         self._put, self._say = ask, say
@@ -414,7 +409,7 @@ def run(args: argparse.Namespace) -> int:
     elif any(parts):
         text, setup = text_of(_document(args))
     else:
-        text, setup = text_of(ask_all(_ask, _say))
+        text, setup = text_of(Questions(_ask, _say).document())
     return _write(args, text, setup)
 
 

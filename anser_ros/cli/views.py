@@ -34,11 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--optical', default='/optical', help='namespace of the optical poses (%(default)s)'
     )
-    parser.add_argument(
-        '--frame-prefix',
-        default='',
-        help="the tracker's frame_prefix, if there are several boards",
-    )
+    words = "the tracker's frame_prefix, if there are several boards"
+    parser.add_argument('--frame-prefix', default='', help=words)
     add_json(parser, 'the written files as JSON')
 
 

@@ -166,20 +166,20 @@ def metrics(series: PoseSeries) -> dict[str, Any]:
         ('position', 'm', series.position_error),
         ('orientation', 'rad', series.orientation_error),
     ):
-        for statistic, value in _statistics(errors[np.isfinite(errors)]).items():
-            result[f'{key}_{statistic}_{unit}'] = value
+        result |= error_statistics(key, unit, errors[np.isfinite(errors)])
     return result
 
 
-def _statistics(errors: Array) -> dict[str, float | None]:
+def error_statistics(key: str, unit: str, errors: Array) -> dict[str, float | None]:
+    """Return RMSE, mean and percentiles of errors by ``KEY_rmse_UNIT``, ...; None of no error."""
+    names = [f'{key}_{name}_{unit}' for name in ('rmse', 'me', 'prc50', 'prc95')]
     if not errors.size:
-        return dict.fromkeys(('rmse', 'me', 'prc50', 'prc95'))
-    return {
-        'rmse': float(np.sqrt(np.mean(errors**2))),
-        'me': float(errors.mean()),
-        'prc50': float(np.percentile(errors, 50)),
-        'prc95': float(np.percentile(errors, 95)),
-    }
+        return dict.fromkeys(names)
+    values = (
+        np.sqrt(np.mean(errors**2)), errors.mean(), np.percentile(errors, 50),
+        np.percentile(errors, 95),
+    )  # fmt: skip
+    return dict(zip(names, map(float, values), strict=True))
 
 
 @dataclass(frozen=True)

@@ -8,62 +8,50 @@ there, what the workers need to start weighs more.
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
-from typing import Any
 
-from anser_ros.calibration.calibrate import Options
-from anser_ros.sessions.calibration import calibrate_sessions
+import harness
+
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import save_model
 
-REPO = Path(__file__).resolve().parents[2]
 SESSIONS, WORKERS, MOST = 10, 2, 0.6
 
 
 def seconds(bags: list[Path], model: Path, baseline: Path, *arguments: str) -> float:
     """Run a command of `anser` on all sessions and return how long it took."""
-    command = [sys.executable, '-P', '-m', 'anser_ros.cli.main', *arguments, *map(str, bags)]
-    command += ['--model', str(model), '--refit', '--baseline', str(baseline)]
+    options = ('--model', model, '--refit', '--baseline', baseline)
     with tempfile.TemporaryDirectory() as out:
-        began_s = time.monotonic()
-        subprocess.run([*command, '--out', out], check=True, cwd=REPO, stdout=subprocess.DEVNULL)
-        return time.monotonic() - began_s
+        return harness.anser(*arguments, *bags, *options, '--out', out).wall_s
 
 
 def recordings(folder: Path) -> tuple[list[Path], Path, Path, str]:
     """Ten sessions, their model and baseline, and how the rows call them."""
-    shared = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared')) / 'sessions' / 'effects'
+    shared = harness.SESSIONS / 'effects'
     bags = sorted(shared.glob('s*.mcap'))[:SESSIONS]
     if len(bags) == SESSIONS:
         model = folder / 'model.yaml'
         scan = shared / 'factory.mcap'
-        save_model(model, calibrate_sessions([load_session(scan)], Options()).model)
+        save_model(model, harness.calibrated(load_session(scan), layout=None))
         return bags, model, scan, 'of effects/, 40 s each'
     for number in range(SESSIONS):
-        shutil.copy(REPO / 'bags' / 'moving.mcap', folder / f'session_{number}.mcap')
-    model, scan = REPO / 'config' / 'demo_model.yaml', REPO / 'bags' / 'scan.mcap'
+        shutil.copy(harness.BAGS / 'moving.mcap', folder / f'session_{number}.mcap')
+    model, scan = harness.REPO / 'config' / 'demo_model.yaml', harness.BAGS / 'scan.mcap'
     return sorted(folder.glob('*.mcap')), model, scan, 'copies of bags/moving (own)'
 
 
-def rows() -> list[dict[str, Any]]:
+def rows() -> list[harness.Row]:
     """The share of the time that is left."""
     with tempfile.TemporaryDirectory() as name:
         *given, what = recordings(Path(name))
         alone = seconds(*given, 'evaluate')
         shared = seconds(*given, 'batch', 'evaluate', '--workers', str(WORKERS))
+    name = f'{SESSIONS} sessions {what}, evaluated on {WORKERS} workers'
     return [
-        {
-            'name': f'{SESSIONS} sessions {what}, evaluated on {WORKERS} workers', 'value': shared,
-            'unit': 's', 'rival': 'one after the other in one process', 'rival_value': alone,
-        },
-        {
-            'name': 'the same as a share of the time one after the other',
-            'value': shared / alone, 'unit': '', 'target': MOST,
-        },
-    ]  # fmt: skip
+        harness.row(name, shared, 's', ('one after the other in one process', alone)),
+        harness.row(
+            'the same as a share of the time one after the other', shared / alone, target=MOST
+        ),
+    ]

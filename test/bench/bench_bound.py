@@ -26,36 +26,28 @@ measured ones contain, are not in them.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
+import harness
 import numpy as np
+from bound_block import Block, block_points
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 
-HERE = Path(__file__).resolve().parent
-sys.path[1:1] = [str(HERE.parents[1]), str(HERE)]
-
-from bench_refit import LAYOUT, recordings  # noqa: E402
-from bound_block import Block  # noqa: E402
-
-from anser_ros.apps.lab.experiments.refit_ablation import spread_out  # noqa: E402
-from anser_ros.calibration.calibrate import Options  # noqa: E402
-from anser_ros.field.model import FieldModel  # noqa: E402
-from anser_ros.physics.dipole import flux_jacobian  # noqa: E402
-from anser_ros.physics.rotations import tangents  # noqa: E402
-from anser_ros.physics.sensor import SensorTable  # noqa: E402
-from anser_ros.refit.clouds import Excitation, excitation_for  # noqa: E402
-from anser_ros.refit.witness import FREE_M, FREE_RAD, ToolReading, linearised  # noqa: E402
-from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.nominal_board import (  # noqa: E402
+from anser_ros.apps.lab.experiments.refit_ablation import spread_out
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.physics.rotations import tangents
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.clouds import Excitation, excitation_for
+from anser_ros.refit.witness import FREE_M, FREE_RAD, ToolReading, linearised
+from anser_ros.sessions.nominal_board import (
     NominalBoard,
     stated_volume,
 )
-from anser_ros.sessions.session import Session, load_session  # noqa: E402
+from anser_ros.sessions.session import Session, load_session
 
 PATHS = {
     'online/approach': (6.0, 30.0, (0.0, 0.0, -0.30), (0.0, 0.0, -0.006)),
@@ -114,7 +106,7 @@ class Scene:
             [accuracy.reference_gain] * 2 + [accuracy.reference_position_m] * 3
             + [accuracy.reference_axis_rad] * 2
         )  # fmt: skip
-        self.metal = 4 * len(body.points)
+        self.metal = 4 * len(block_points())
         self.shared = self.metal + 6 * KNOTS
         self.size = self.shared + len(self.tool_sigma) + 7 * len(chosen)
         self.frames = range(len(time))
@@ -231,12 +223,12 @@ def marginal(information: Any, kept: int) -> Any:
 
 def rows(
     counts: Sequence[int] = (0, 4), bodies: int = 2, every: int = 16
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[harness.Row]:
     """Bounds for both recorded sessions; none without them."""
-    scan, paths = recordings()
+    scan, paths = harness.online_recordings()
     if not set(PATHS) <= set(paths):
         return
-    model = calibrate_sessions([load_session(scan)], Options(layout=LAYOUT, damping=1e-6)).model
+    model = harness.calibrated(load_session(scan))
     sessions = {name: load_session(paths[name]) for name in PATHS}
     setup = sessions['online/sweep'].setup
     exc, _ = excitation_for(model, NominalBoard.of(setup).field, stated_volume(setup))
@@ -257,21 +249,21 @@ def rows(
                     found.setdefault((name, count, kind), []).append(bound)
     for (name, count, kind), bounds in found.items():
         for what, value in zip(('body', 'coils'), np.mean(bounds, axis=0), strict=True):
-            yield {
-                'name': f'bound, {name}, {count} references, metal {kind}, {what}: position error',
-                'value': float(value), 'unit': 'mm',
-            }  # fmt: skip
+            yield harness.row(
+                f'bound, {name}, {count} references, metal {kind}, {what}: position error',
+                float(value),
+                'mm',
+            )
 
 
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
-    parser.add_argument('--counts', default='0,4')
+    parser.add_argument('--counts', type=harness.integers, default=[0, 4])
     parser.add_argument('--bodies', type=int, default=2)
     parser.add_argument('--every', type=int, default=16, help='frames, each for so many')
     args = parser.parse_args()
-    for row in rows([int(n) for n in args.counts.split(',')], args.bodies, args.every):
-        print(f'{row["name"]}: {row["value"]:.3f} {row["unit"]}', flush=True)
+    harness.print_rows(rows(args.counts, args.bodies, args.every))
 
 
 if __name__ == '__main__':

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
+import harness
 import numpy as np
 
 from anser_ros.apps.poses.corrector import MODEL_SCHEMA, PoseCorrector
@@ -44,7 +44,7 @@ def corrector() -> PoseCorrector:
     )
 
 
-def rows() -> list[dict[str, Any]]:
+def rows() -> list[harness.Row]:
     """Return the rows of the benchmark table."""
     one, turn = corrector(), np.array([0.0, 0.0, 0.0, 1.0])
     places = np.random.default_rng(0).uniform(-0.08, 0.08, (POSES, 3)) + [0.0, 0.0, -0.3]
@@ -54,9 +54,5 @@ def rows() -> list[dict[str, Any]]:
         for place in places:
             one.correct(SENSOR, 1, place, turn)
         spent_ms.append(1e3 * (time.thread_time() - start) / POSES)
-    return [
-        {
-            'name': 'a tracked pose corrected, quadratic map with covariance',
-            'value': float(np.median(spent_ms)), 'unit': 'ms', 'target': TARGET_MS,
-        }
-    ]  # fmt: skip
+    name = 'a tracked pose corrected, quadratic map with covariance'
+    return [harness.row(name, float(np.median(spent_ms)), 'ms', target=TARGET_MS)]

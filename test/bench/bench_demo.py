@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 
+import harness
 import numpy as np
 
 from anser_ros.cli.demo import FROZEN
@@ -31,7 +30,7 @@ TRACKER, OTHERS = 'anser/tracker', f'/anser/{FROZEN}/'
 """The tracker whose poses count, and how the topics of the other chain begin."""
 
 
-def rows() -> Iterator[dict]:
+def rows() -> Iterator[harness.Row]:
     """Yield the rows of the benchmark table."""
     with tempfile.TemporaryDirectory() as folder:
         _run(folder, FILLING_S)
@@ -49,34 +48,26 @@ def rows() -> Iterator[dict]:
         f'demo, {len(poses)} poses a window, metal comes and goes, after the first {FIRST_S:g} s'
     )
     for share, key in ((50, 'p50'), (99, 'p99'), (100, 'max')):
-        yield {
-            'name': f'{what}: {key}',
-            'value': float(np.percentile(late, share, method='higher')),
-            'unit': 'ms',
-            'target': 40.0 if key == 'p99' else None,
-        }
-    yield {
-        'name': f'{what}: lost, of {late.size}',
-        'value': float(np.isinf(late).sum()),
-        'unit': '',
-        'target': 0.0,
-    }
-    yield {
-        'name': 'demo: age of the model that poses used, of each second the largest, 99 %',
-        'value': 1e3 * float(np.percentile([a for at, a in ages if at >= begin * NANO], 99)),
-        'unit': 'ms',
-        'target': 40.0,
-    }
+        yield harness.row(
+            f'{what}: {key}',
+            float(np.percentile(late, share, method='higher')),
+            'ms',
+            target=40.0 if key == 'p99' else None,
+        )
+    yield harness.row(f'{what}: lost, of {late.size}', float(np.isinf(late).sum()), target=0.0)
+    yield harness.row(
+        'demo: age of the model that poses used, of each second the largest, 99 %',
+        1e3 * float(np.percentile([a for at, a in ages if at >= begin * NANO], 99)),
+        'ms',
+        target=40.0,
+    )
 
 
 def _run(folder: str, seconds: float) -> str:
     """Run the demo and return its bag."""
-    command = [sys.executable, '-P', '-m', 'anser_ros.cli.main', 'demo', '--json']
-    options = ['--duration', f'{seconds:g}', '--no-picture', '--out', folder]
-    done = subprocess.run([*command, *options], capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(done.stderr)
-    return str(json.loads(done.stdout)['bag'])
+    options = ('--duration', f'{seconds:g}', '--no-picture', '--out', folder)
+    done = harness.anser('demo', '--json', *options)
+    return str(json.loads(done.printed)['bag'])
 
 
 def _told(bag: str) -> tuple[list[int], dict[str, dict[int, int]], list[tuple[float, float]]]:

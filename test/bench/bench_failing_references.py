@@ -11,20 +11,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
+import harness
 import numpy as np
-from bench_refit import JITTER_M, LAYOUT, recordings
+from bench_refit import JITTER_M
 
-from anser_ros.calibration.calibrate import Options
-from anser_ros.sessions.calibration import calibrate_sessions
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.tracked_session import track_session
 
@@ -88,7 +83,7 @@ def main() -> int:
     parser.add_argument('--cases', type=int, default=100)
     parser.add_argument('--json', type=Path, help='file for the figures')
     args = parser.parse_args()
-    scan, paths = recordings()
+    scan, paths = harness.online_recordings()
     sessions = {
         name: load_session(path) for name, path in paths.items() if name.startswith('online')
     }
@@ -96,7 +91,7 @@ def main() -> int:
         print('needs the recordings online/approach and online/sweep')
         return 2
     baseline = load_session(scan)
-    model = calibrate_sessions([baseline], Options(layout=LAYOUT, estimate=())).model
+    model = harness.calibrated(baseline, estimate=())
     rng, names = np.random.default_rng(args.seed), sorted(sessions)
     sums = np.zeros(3, dtype=int)
     for _ in range(args.cases):

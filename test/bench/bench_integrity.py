@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import harness
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
-from bench_refit import LAYOUT
-
-from anser_ros.calibration.calibrate import Options
 from anser_ros.frames.intake import Intake
 from anser_ros.integrity.streams import Freshness
-from anser_ros.sessions.calibration import calibrate_sessions
 from anser_ros.sessions.session import load_session
 from anser_ros.tracking import judgement
 from anser_ros.tracking.tracker import Tracker
 
-BAGS = Path(__file__).resolve().parents[2] / 'bags'
 CHECKS = {
     'order, flags and size of the readings': (Intake, 'admit'),
     'freshness': (Freshness, 'judged'),
@@ -60,11 +52,10 @@ class Clock:
         return float(1e3 * np.median(self.frames[WARM_UP:]))
 
 
-def rows() -> Iterator[dict[str, Any]]:
+def rows() -> Iterator[harness.Row]:
     """Yield the rows of the benchmark table."""
-    scan = load_session(BAGS / 'factory.mcap')
-    model = calibrate_sessions([scan], Options(layout=LAYOUT, estimate=())).model
-    tool = load_session(BAGS / 'moving.mcap').tools[0]
+    model = harness.calibrated(load_session(harness.BAGS / 'factory.mcap'), estimate=())
+    tool = load_session(harness.BAGS / 'moving.mcap').tools[0]
     tracker = Tracker(model, tool.sensors)
     clocks = {name: Clock() for name in (WHOLE, *CHECKS)}
     update, tracked, total = clocks[WHOLE].timed(tracker.update), 0, 0
@@ -77,10 +68,12 @@ def rows() -> Iterator[dict[str, Any]]:
                 clock.frames.append(0.0)
             poses = update(round(1e9 * (1 + seconds)), tool.sensors.channel, flux)
             tracked, total = tracked + sum(p.state == 'ok' for p in poses), total + len(poses)
-    yield {'name': 'integrity: poses that are ok', 'value': tracked / total, 'unit': '1'}
+    yield harness.row('integrity: poses that are ok', tracked / total, '1')
     for check in CHECKS:
-        yield {
-            'name': f'integrity: {check}, 9 coils and a body, a frame, median', 'unit': 'ms',
-            'value': clocks[check].median_ms(), 'target': TARGET_MS,
-            'rival': WHOLE, 'rival_value': clocks[WHOLE].median_ms(),
-        }  # fmt: skip
+        yield harness.row(
+            f'integrity: {check}, 9 coils and a body, a frame, median',
+            clocks[check].median_ms(),
+            'ms',
+            target=TARGET_MS,
+            rival=(WHOLE, clocks[WHOLE].median_ms()),
+        )

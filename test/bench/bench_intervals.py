@@ -11,13 +11,11 @@ those. The table goes into docs/howto/accuracy.md.
 from __future__ import annotations
 
 import argparse
-import json
-import os
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import harness
 import numpy as np
 
 from anser_ros.apps.poses.assessment.hummel import (
@@ -104,6 +102,13 @@ def row_of(count: int, length_m: float, boards: int) -> list[str]:
     return lines
 
 
+def lines(boards: int) -> Iterator[tuple[str, str]]:
+    """Yield each line of the table with its name."""
+    for count, length_m in ROWS:
+        for figure, line in zip(FIGURES, row_of(count, length_m, boards), strict=True):
+            yield f'{count} points, distortion of {length_m:g} m: {figure}', line
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
@@ -112,14 +117,7 @@ def main() -> None:
     args = parser.parse_args()
     print(f'| board | distortion | found correlated | figure | {" | ".join(KINDS.values())} |')
     print('|---' * (4 + len(KINDS)) + '|')
-    lines = []
-    for count, length_m in ROWS:
-        for figure, line in zip(FIGURES, row_of(count, length_m, args.boards), strict=True):
-            name = f'{count} points, distortion of {length_m:g} m: {figure}'
-            lines.append({'name': name, 'line': line})
-            print(line, flush=True)
-    if args.json:
-        args.json.write_text(json.dumps(lines, indent=1, ensure_ascii=False) + '\n')
+    harness.print_lines(lines(args.boards), args.json)
 
 
 if __name__ == '__main__':

@@ -8,12 +8,9 @@ the port and publishes a pose without any mathematics.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
+import harness
 import numpy as np
 from live_chain import (
     METAL_FROM_S,
@@ -34,7 +31,7 @@ BUSY_MS = 3.0
 """Lateness of the bytes themselves, ms, beyond which the machine was busy with something else."""
 
 
-def rows() -> Iterator[dict]:
+def rows() -> Iterator[harness.Row]:
     """Yield the rows of the benchmark table."""
     lead_s = START_S + SETTLE_S + 1.0
     metal = made_bytes(True, METAL_FROM_S + lead_s + LONG_S)
@@ -52,76 +49,61 @@ def rows() -> Iterator[dict]:
     yield from _latencies(f'three processes, {moving}{_busy(apart)}', apart, floor, 'floor')
     what = 'live in one process, no metal, model as calibrated'
     yield from _latencies(f'{what}{_busy(quiet)}', quiet, floor, 'floor')
-    yield {
-        'name': 'p50 with metal moving over that of a node that reads the port and publishes',
-        'value': one.percentile(50) / floor.percentile(50),
-        'unit': '',
-        'target': 3.0,
-    }
-    yield {
-        'name': 'the same over that of a node that publishes as many poses',
-        'value': one.percentile(50) / as_many.percentile(50),
-        'unit': '',
-    }
+    name = 'p50 with metal moving over that of a node that reads the port and publishes'
+    yield harness.row(name, one.percentile(50) / floor.percentile(50), target=3.0)
+    name = 'the same over that of a node that publishes as many poses'
+    yield harness.row(name, one.percentile(50) / as_many.percentile(50))
     if one.ages_s.size:
         # Of each second the largest; stamps jitter by microseconds, so windows are counted.
         windows = np.rint(one.ages_s * Layout().rate_hz)
-        yield {
-            'name': 'age of the model that poses used, 99 % of 60 s, one process',
-            'value': float(np.percentile(windows, 99)),
-            'unit': 'windows',
-            'target': 1.0,
-        }
-        yield {
-            'name': 'age of the model that poses used, the largest of 60 s, one process',
-            'value': 1e3 * float(one.ages_s.max()),
-            'unit': 'ms',
-            'rival': 'three processes',
-            'rival_value': 1e3 * float(apart.ages_s.max()) if apart.ages_s.size else None,
-        }
+        yield harness.row(
+            'age of the model that poses used, 99 % of 60 s, one process',
+            float(np.percentile(windows, 99)),
+            'windows',
+            target=1.0,
+        )
+        yield harness.row(
+            'age of the model that poses used, the largest of 60 s, one process',
+            1e3 * float(one.ages_s.max()),
+            'ms',
+            rival=(
+                'three processes',
+                1e3 * float(apart.ages_s.max()) if apart.ages_s.size else None,
+            ),
+        )
     for run, name in ((one, 'one process'), (apart, 'three processes')):
         parts = ', '.join(f'{who} {100 * share:.0f}' for who, share in sorted(run.load.items()))
-        yield {
-            'name': f'CPU at 50 Hz, metal moving, {name}',
-            'value': 100 * sum(run.load.values()),
-            'unit': f'% of a core ({parts})',
-            'target': 60.0,
-        }
-    yield {
-        'name': 'rate without a lost window, no metal, one process',
-        'value': _sustained_hz(clear),
-        'unit': 'Hz',
-        'rival': 'usual rate',
-        'rival_value': 50.0,
-        'target': 200.0,
-        'target_is': 'least',
-    }
+        yield harness.row(
+            f'CPU at 50 Hz, metal moving, {name}',
+            100 * sum(run.load.values()),
+            f'% of a core ({parts})',
+            target=60.0,
+        )
+    yield harness.row(
+        'rate without a lost window, no metal, one process',
+        _sustained_hz(clear),
+        'Hz',
+        rival=('usual rate', 50.0),
+        target=200.0,
+        target_is='least',
+    )
 
 
-TARGETS = {'p50': 2.5, 'p99': 6.0, 'max': None}
-"""Latency, ms, that is aimed at."""
-SHARES = {'p50': 50.0, 'p99': 99.0, 'max': 100.0}
+TARGETS = {'p50': (50.0, 2.5), 'p99': (99.0, 6.0), 'max': (100.0, None)}
+"""Percentiles of the latency, and the ms that are aimed at."""
 
 
-def _latencies(what: str, run: Run, rival: Run, name: str) -> Iterator[dict]:
+def _latencies(what: str, run: Run, rival: Run, name: str) -> Iterator[harness.Row]:
     """Yield the rows of one case beside a rival; a window without a pose counts as infinite."""
-    for key, target in TARGETS.items():
-        yield {
-            'name': f'{what}: {key}',
-            'value': run.percentile(SHARES[key]),
-            'unit': 'ms',
-            'rival': name,
-            'rival_value': rival.percentile(SHARES[key]),
-            'target': target,
-        }
-    yield {
-        'name': f'{what}: windows of a sensor without a pose, of {run.latency_ms.size}',
-        'value': float(run.lost),
-        'unit': '',
-        'rival': name,
-        'rival_value': float(rival.lost),
-        'target': 0.0,
-    }
+    for key, (share, target) in TARGETS.items():
+        ours, other = run.percentile(share), (name, rival.percentile(share))
+        yield harness.row(f'{what}: {key}', ours, 'ms', other, target=target)
+    yield harness.row(
+        f'{what}: windows of a sensor without a pose, of {run.latency_ms.size}',
+        float(run.lost),
+        rival=(name, float(rival.lost)),
+        target=0.0,
+    )
 
 
 def _busy(run: Run) -> str:

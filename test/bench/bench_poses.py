@@ -21,19 +21,14 @@ from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
-from typing import Any
 
+import harness
 import numpy as np
+from clean_poses import clean_worlds
+from pose_faults import KINDS, Truth
+from pose_world import World
 
-HERE = Path(__file__).resolve().parent
-sys.path[1:1] = [str(HERE.parents[1]), str(HERE.parent)]
-
-from clean_poses import clean_worlds  # noqa: E402
-from pose_faults import KINDS, Truth  # noqa: E402
-from pose_world import World  # noqa: E402
-
-from anser_ros.apps.poses.diagnosis import PoseDiagnosis, diagnose_poses  # noqa: E402
+from anser_ros.apps.poses.diagnosis import PoseDiagnosis, diagnose_poses
 
 REPORTED, REPEATED = (351,), (352,)
 REPEATS = 24  # sessions of a kind by which sigmas are judged: their rms is then known to 14 %
@@ -163,19 +158,20 @@ def repeats(seeds: Sequence[int], count: int) -> Iterator[Judged]:
                 yield f'{REPEATED_NAME}, {name}', f'{size:g}', said
 
 
-def summary(outcomes: Sequence[Judged]) -> Iterator[dict[str, Any]]:
+def summary(outcomes: Sequence[Judged]) -> Iterator[harness.Row]:
     """Rows for `run.py`: what was right of each kind, the errors over their sigmas, the time."""
     for name in dict.fromkeys(kind for kind, _, _ in outcomes):
         own = [one for kind, _, one in outcomes if kind == name]
-        yield {
-            'name': f'poses: {name} named, nothing else',
-            'value': sum(one.is_right for one in own), 'unit': f'of {len(own)}',
-            'target': len(own) if name == CLEAN else math.ceil(TARGET * len(own)),
-            'target_is': 'least',
-        }  # fmt: skip
+        yield harness.row(
+            f'poses: {name} named, nothing else',
+            sum(one.is_right for one in own),
+            f'of {len(own)}',
+            target=len(own) if name == CLEAN else math.ceil(TARGET * len(own)),
+            target_is='least',
+        )
     took = [one.took_s for _, _, one in outcomes]
     for name, value in (('median', np.median(took)), ('longest', max(took))):
-        yield {'name': f'poses: a session, wall time, {name}', 'value': float(value), 'unit': 's'}
+        yield harness.row(f'poses: a session, wall time, {name}', float(value), 's')
     right = [one for _, _, one in outcomes if one.is_right]
     errors: dict[str, list[float]] = {'lever arm': [v for one in right for v in one.levers]}
     for one in right:
@@ -186,20 +182,24 @@ def summary(outcomes: Sequence[Judged]) -> Iterator[dict[str, Any]]:
         if len(values) > 1:
             size = float(np.sqrt(np.mean(np.square(values))))
             if key in WIDE:
-                yield {
-                    'name': f'poses: {key}, rms of error over sigma ({WIDE[key]})',
-                    'value': size, 'unit': f'of {len(values)}', 'target': 'at most 1.3',
-                    'met': bool(size <= HONEST[1]),
-                }  # fmt: skip
+                yield harness.row(
+                    f'poses: {key}, rms of error over sigma ({WIDE[key]})',
+                    size,
+                    f'of {len(values)}',
+                    target='at most 1.3',
+                    met=bool(size <= HONEST[1]),
+                )
                 continue
-            yield {
-                'name': f'poses: {key}, rms of error over sigma', 'value': size,
-                'unit': f'of {len(values)}', 'target': '0.8 to 1.3',
-                'met': bool(HONEST[0] <= size <= HONEST[1]),
-            }  # fmt: skip
+            yield harness.row(
+                f'poses: {key}, rms of error over sigma',
+                size,
+                f'of {len(values)}',
+                target='0.8 to 1.3',
+                met=bool(HONEST[0] <= size <= HONEST[1]),
+            )
 
 
-def rows() -> Iterator[dict[str, Any]]:
+def rows() -> Iterator[harness.Row]:
     """Clean sessions, every kind, some pairs and the repeats, on the seeds for reports."""
     found = [
         *clean(REPORTED, CLEAN_ROUNDS), *singles(REPORTED, list(KINDS)), *pairs(REPORTED, PAIRS),
@@ -214,20 +214,18 @@ def rows() -> Iterator[dict[str, Any]]:
 def main() -> None:
     """Print each session as it comes, and the table."""
     parser = argparse.ArgumentParser(description='diagnosis of simulated trackers of poses')
-    parser.add_argument('--seeds', default=','.join(map(str, REPORTED)))
+    parser.add_argument('--seeds', type=harness.integers, default=REPORTED)
     parser.add_argument('--clean', type=int, default=CLEAN_ROUNDS, help='of each motion')
     parser.add_argument('--kinds', default=','.join(KINDS), help='of them')
     parser.add_argument('--pairs', type=int, default=PAIRS, help='pairs for every seed')
     parser.add_argument('--repeats', type=int, default=0, help='short sessions of one sensor')
-    parser.add_argument('--repeat-seeds', default=','.join(map(str, REPEATED)))
+    parser.add_argument('--repeat-seeds', type=harness.integers, default=REPEATED)
     args = parser.parse_args()
-    seeds = [int(seed) for seed in args.seeds.split(',')]
     outcomes = []
     kinds = [kind for kind in args.kinds.split(',') if kind]
-    again = [int(seed) for seed in args.repeat_seeds.split(',')]
     every = (
-        clean(seeds, args.clean), singles(seeds, kinds), pairs(seeds, args.pairs),
-        repeats(again, args.repeats),
+        clean(args.seeds, args.clean), singles(args.seeds, kinds), pairs(args.seeds, args.pairs),
+        repeats(args.repeat_seeds, args.repeats),
     )  # fmt: skip
     for part in every:
         for name, what, one in part:

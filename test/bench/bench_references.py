@@ -13,31 +13,25 @@ The references are spread out evenly. Without the recordings there are the scene
 from __future__ import annotations
 
 import argparse
-import sys
+import itertools
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import harness
 import numpy as np
+import recording
+import scenarios
+from bench_refit import JITTER_M, rms_mm
+from boards import build
+from laboratory import FLUX_NOISE_T, Laboratory, measured, read_fluxes
 
-HERE = Path(__file__).resolve().parent
-sys.path[1:1] = [str(HERE.parents[1]), str(HERE), str(HERE / 'world')]
-
-import boards  # noqa: E402
-import recording  # noqa: E402
-import scenarios  # noqa: E402
-from bench_refit import JITTER_M, LAYOUT, recordings, rms_mm  # noqa: E402
-from laboratory import FLUX_NOISE_T, Laboratory, measured, read_fluxes  # noqa: E402
-from motions import Wander  # noqa: E402
-
-from anser_ros.apps.lab.experiments.refit_ablation import spread_out  # noqa: E402
-from anser_ros.calibration.calibrate import Options  # noqa: E402
-from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.follower import with_references  # noqa: E402
-from anser_ros.sessions.session import Session, load_session  # noqa: E402
-from anser_ros.sessions.tracked_session import (  # noqa: E402
+from anser_ros.apps.lab.experiments.refit_ablation import spread_out
+from anser_ros.sessions.follower import with_references
+from anser_ros.sessions.session import Session, load_session
+from anser_ros.sessions.tracked_session import (
     PoseSeries,
     track_session,
 )
@@ -87,11 +81,11 @@ def judged(series: Sequence[PoseSeries], jitter_m: float) -> dict[str, float]:
     }
 
 
-def of_recordings(counts: Sequence[int], every: int, witnesses: bool) -> Iterator[dict[str, Any]]:
+def of_recordings(counts: Sequence[int], every: int, witnesses: bool) -> Iterator[harness.Row]:
     """Both online sessions, single coils and the body."""
-    scan, paths = recordings()
+    scan, paths = harness.online_recordings()
     baseline = load_session(scan)
-    model = calibrate_sessions([baseline], Options(layout=LAYOUT, damping=1e-6)).model
+    model = harness.calibrated(baseline)
     for name in (name for name in paths if name.startswith('online/')):
         session = thinned(load_session(paths[name]), every)
         for count in counts:
@@ -103,15 +97,18 @@ def of_recordings(counts: Sequence[int], every: int, witnesses: bool) -> Iterato
             for what, series in (('coils', found.sensors), ('body', found.bodies)):
                 figures = judged(list(series.values()), JITTER_M)
                 target = TARGETS.get((name.split('/')[1], what, count))
-                yield {
-                    'name': f'{name}, {count} references, {what}: position RMSE',
-                    'value': figures['rms'], 'unit': 'mm', 'target': target,
-                }  # fmt: skip
-                yield {
-                    'name': f'{name}, {count} references, {what}: withheld',
-                    'value': figures['withheld'], 'unit': '1',
-                    'target': 0.05 if count >= 4 else None,
-                }  # fmt: skip
+                yield harness.row(
+                    f'{name}, {count} references, {what}: position RMSE',
+                    figures['rms'],
+                    'mm',
+                    target=target,
+                )
+                yield harness.row(
+                    f'{name}, {count} references, {what}: withheld',
+                    figures['withheld'],
+                    '1',
+                    target=0.05 if count >= 4 else None,
+                )
 
 
 def scene(board: Any, kind: str, seed: Sequence[int], folder: Path) -> tuple[Session, Any, Any]:
@@ -119,8 +116,7 @@ def scene(board: Any, kind: str, seed: Sequence[int], folder: Path) -> tuple[Ses
     rng = np.random.default_rng(seed)
     lab = Laboratory.clean(board)
     getattr(scenarios, kind)(lab, rng)
-    low, high = board.heights_m
-    wander = Wander.drawn(rng, [-0.125, -0.125, low], [0.125, 0.125, high])
+    wander = recording.wander_over(board, rng)
     step = 1.0 / recording.FLUX_HZ
     begin = np.arange(0.0, CLEAN_S, step)
     time = np.concatenate([begin, rng.uniform(8.0, 24.0) + np.arange(0.0, SPAN_S, step)])
@@ -145,20 +141,20 @@ def exact(session: Session, position: Any, rotation: Any) -> Session:
 
 def of_scenes(
     counts: Sequence[int], n_boards: int, seed: int, witnesses: bool, kinds: Sequence[str] = KINDS
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[harness.Row]:
     """Scenes of other boards, tools and metal with exact truth."""
     totals: dict[tuple[int, str], list[dict[str, float]]] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for index in range(n_boards):
-            board = boards.build(index, np.random.default_rng([seed, index]))
+            board = build(index, np.random.default_rng([seed, index]))
             scan = folder / 'scan.mcap'
             scan.unlink(missing_ok=True)
             recording.record_scan(
                 scan, Laboratory.clean(board), np.random.default_rng([seed, index, 1])
             )
             baseline = load_session(scan)
-            model = calibrate_sessions([baseline], Options(layout=LAYOUT, damping=1e-6)).model
+            model = harness.calibrated(baseline)
             for kind in kinds:
                 told = [seed, index, 2, *kind.encode()]
                 session = exact(*scene(board, kind, told, folder))
@@ -180,27 +176,29 @@ def of_scenes(
     for (count, what), rows in totals.items():
         poses = max(sum(row['poses'] for row in rows), 1)
         for key, text in (('over', 'over 3 sigma'), ('gross', 'over 3 sigma and 1 mm')):
-            yield {
-                'name': f'scenes of seed {seed}, {count} references, {what}: ok but {text}',
-                'value': sum(row[key] for row in rows) / poses, 'unit': '1',
-                'target': 0.003,
-            }  # fmt: skip
-        yield {
-            'name': f'scenes of seed {seed}, {count} references, {what}: withheld', 'unit': '1',
-            'value': float(np.mean([row['withheld'] for row in rows])),
-        }  # fmt: skip
+            yield harness.row(
+                f'scenes of seed {seed}, {count} references, {what}: ok but {text}',
+                sum(row[key] for row in rows) / poses,
+                '1',
+                target=0.003,
+            )
+        yield harness.row(
+            f'scenes of seed {seed}, {count} references, {what}: withheld',
+            float(np.mean([row['withheld'] for row in rows])),
+            '1',
+        )
 
 
 def rows(
     counts: Sequence[int] = COUNTS, n_boards: int = 2, seed: int = REPORTED_SEED, every: int = 1
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[harness.Row]:
     """All figures, by the references alone and with the tools as witnesses."""
     for witnesses, label in ((False, ''), (True, 'with witnesses, ')):
         yield from named(label, of_recordings(counts, every, witnesses))
         yield from named(label, of_scenes(counts, n_boards, seed, witnesses))
 
 
-def named(label: str, rows: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+def named(label: str, rows: Iterator[harness.Row]) -> Iterator[harness.Row]:
     """Rows with a label before their names."""
     for row in rows:
         yield {**row, 'name': label + row['name']}
@@ -209,23 +207,19 @@ def named(label: str, rows: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
-    parser.add_argument('--counts', default=','.join(map(str, COUNTS)))
+    parser.add_argument('--counts', type=harness.integers, default=COUNTS)
     parser.add_argument('--boards', type=int, default=2, help='0: the recordings only')
     parser.add_argument('--seed', type=int, default=REPORTED_SEED)
     parser.add_argument('--every', type=int, default=1, help='frames; 0: the scenes only')
     parser.add_argument('--kinds', default=','.join(KINDS), help='of metal, of the scenes')
     parser.add_argument('--witnesses', action='store_true', help='the tools tell of metal, too')
     args = parser.parse_args()
-    counts = [int(count) for count in args.counts.split(',')]
     parts = []
     if args.every:
-        parts.append(of_recordings(counts, args.every, args.witnesses))
+        parts.append(of_recordings(args.counts, args.every, args.witnesses))
     kinds = args.kinds.split(',')
-    parts.append(of_scenes(counts, args.boards, args.seed, args.witnesses, kinds))
-    for part in parts:
-        for row in part:
-            target = '' if row.get('target') is None else f'   (target {row["target"]:g})'
-            print(f'{row["name"]}: {row["value"]:.4g} {row["unit"]}{target}', flush=True)
+    parts.append(of_scenes(args.counts, args.boards, args.seed, args.witnesses, kinds))
+    harness.print_rows(itertools.chain(*parts))
 
 
 if __name__ == '__main__':

@@ -6,35 +6,23 @@ Accuracy is that of tool coils tracked singly against the optical pose, which it
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
+import harness
 import numpy as np
+from refit_world import anser_world, metal_block
 
-HERE = Path(__file__).resolve().parent
-REPO = HERE.parents[1]
-sys.path.insert(0, str(REPO / 'test'))
-
-from refit_world import anser_world, metal_block  # noqa: E402
-
-from anser_ros.apps.lab.experiments import refit_ablation as ablation  # noqa: E402
-from anser_ros.calibration.calibrate import Options  # noqa: E402
-from anser_ros.calibration.layouts import Layout  # noqa: E402
-from anser_ros.refit.live_refit import LiveRefit  # noqa: E402
-from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.session import load_session  # noqa: E402
-from anser_ros.sessions.tracked_session import track_session  # noqa: E402
-from anser_ros.tracking.tracker import Tracker, TrackerSettings  # noqa: E402
-from anser_ros.wire.points import DipolePoints, encode_field_model  # noqa: E402
+from anser_ros.apps.lab.experiments import refit_ablation as ablation
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.sessions.session import load_session
+from anser_ros.sessions.tracked_session import track_session
+from anser_ros.tracking.tracker import Tracker, TrackerSettings
+from anser_ros.wire.points import DipolePoints, encode_field_model
 
 JITTER_M = 0.12e-3
-LAYOUT = Layout('coils', 3, 1.0, 0.0, prior='nominal', moved=True)
-"""What the choice by held-out error ends with on the shared scan, without its minutes."""
 TARGETS = {'online/approach': 0.27, 'online/sweep': 0.15, 'effects/s05': 0.18}
 TITLES = {
     'online/approach': 'metal comes near and stays',
@@ -42,20 +30,7 @@ TITLES = {
     'bags/metal (own)': 'metal comes from below',
 }
 """What the sessions of the plot are, for readers who do not know their names."""
-PLOT = REPO / 'docs' / 'refit_ablation.png'
-
-
-def recordings() -> tuple[Path, dict[str, Path]]:
-    """Calibration scan and baseline, and the sessions by the name that rows call them."""
-    shared = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared')) / 'sessions'
-    names = ('online/approach', 'online/sweep', 'effects/s05', 'effects/s01')
-    if all((shared / f'{name}.mcap').is_file() for name in names):
-        return shared / 'effects' / 'factory.mcap', {n: shared / f'{n}.mcap' for n in names}
-    bags = REPO / 'bags'
-    return bags / 'factory.mcap', {
-        'bags/metal (own)': bags / 'metal.mcap',
-        'bags/moving (own)': bags / 'moving.mcap',
-    }
+PLOT = harness.REPO / 'docs' / 'refit_ablation.png'
 
 
 def rms_mm(values: Any) -> float:
@@ -63,49 +38,34 @@ def rms_mm(values: Any) -> float:
     return float(1e3 * np.sqrt(np.nanmean(np.square(values))))
 
 
-def accuracy(name: str, session: Any, model: Any, baseline: Any) -> list[dict[str, Any]]:
+def accuracy(name: str, session: Any, model: Any, baseline: Any) -> Iterator[harness.Row]:
     """Error with the refit, beside the frozen model's with nothing refused."""
     frozen = ablation.ablate(session, name, model, baseline, counts=())[0].rmse_m
     followed = track_session(session, model, baseline=baseline, refit=True)
     series = list(followed.sensors.values())
     errors = np.array([s.position_error for s in series])
     sigma = np.array([[e.sigma_position_m for e in s.estimates] for s in series])
-    rows = [
-        {
-            'name': f'{name}: position RMSE', 'value': rms_mm(errors), 'unit': 'mm',
-            'rival': 'frozen model', 'rival_value': 1e3 * frozen, 'target': TARGETS.get(name),
-        },
-        {
-            'name': f'{name}: frames with a pose', 'value': float(np.isfinite(errors).mean()),
-            'unit': '1',
-        },
-    ]  # fmt: skip
+    whole, rival = rms_mm(errors), ('frozen model', 1e3 * frozen)
+    yield harness.row(f'{name}: position RMSE', whole, 'mm', rival, target=TARGETS.get(name))
+    yield harness.row(f'{name}: frames with a pose', float(np.isfinite(errors).mean()), '1')
     if name == 'online/approach':
-        late = session.tools[0].time > session.tools[0].time[-1] - 8.0
-        rows.append(
-            {'name': f'{name}, last 8 s: position RMSE', 'value': rms_mm(errors[:, late]),
-             'unit': 'mm', 'target': 0.35}
-        )  # fmt: skip
+        late = rms_mm(errors[:, session.tools[0].time > session.tools[0].time[-1] - 8.0])
+        yield harness.row(f'{name}, last 8 s: position RMSE', late, 'mm', target=0.35)
     score = errors / np.hypot(sigma, JITTER_M)
-    rows.append(
-        {'name': f'{name}: ok but over 3 sigma (optical jitter included)',
-         'value': float(np.mean(score[np.isfinite(score)] > 3.0)), 'unit': '1', 'target': 0.01}
-    )  # fmt: skip
+    over = float(np.mean(score[np.isfinite(score)] > 3.0))
+    what = f'{name}: ok but over 3 sigma (optical jitter included)'
+    yield harness.row(what, over, '1', target=0.01)
     if name in ('effects/s01', 'bags/moving (own)'):
         still = track_session(session, model)
-        before = np.array([s.position_error for s in still.sensors.values()])
-        rows.append(
-            {'name': f'{name}: RMSE with refit over frozen', 'target': 1.03, 'unit': '1',
-             'value': rms_mm(errors) / rms_mm(before)}
-        )  # fmt: skip
-    return rows
+        before = rms_mm([s.position_error for s in still.sensors.values()])
+        yield harness.row(f'{name}: RMSE with refit over frozen', whole / before, '1', target=1.03)
 
 
 PAUSE_S = 0.02
 """A processor that has slept runs the same code two to three times slower."""
 
 
-def costs(session: Any, model: Any, baseline: Any) -> Iterator[dict[str, Any]]:
+def costs(session: Any, model: Any, baseline: Any) -> Iterator[harness.Row]:
     """An update with 32 references and its message; a tracker's frame with and without refit.
 
     One frame after the other, and with a pause before each as live.
@@ -114,7 +74,7 @@ def costs(session: Any, model: Any, baseline: Any) -> Iterator[dict[str, Any]]:
     begin = time.perf_counter()
     drawing = ablation.NominalBoard.of(session.setup).field
     refit = LiveRefit(model, session.reference.sensors, clean, drawing=drawing)
-    yield {'name': 'refit made ready', 'value': time.perf_counter() - begin, 'unit': 's'}
+    yield harness.row('refit made ready', time.perf_counter() - begin, 's')
     spend(session, model, refit, slice(0, None, 3), 0.0)  # tables that are worked out once
     for how, frames, pause_s in (
         ('one after the other', slice(0, None), 0.0),
@@ -123,23 +83,14 @@ def costs(session: Any, model: Any, baseline: Any) -> Iterator[dict[str, Any]]:
         refit.reset()
         spent = spend(session, model, refit, frames, pause_s)
         median = {name: float(1e3 * np.median(values)) for name, values in spent.items()}
-        yield {
-            'name': f'update and model encoded, 32 references x 8 emitters, {how}: median',
-            'value': median['update'], 'unit': 'ms', 'target': 2.0,
-        }  # fmt: skip
-        yield {
-            'name': f'update, {how}: 99 %', 'unit': 'ms',
-            'value': float(1e3 * np.percentile(spent['update'], 99)),
-        }  # fmt: skip
-        yield {
-            'name': f"tracker's frame (9 coils and body) while the model is refitted, {how}",
-            'value': median['refit'], 'unit': 'ms', 'rival': 'frozen model',
-            'rival_value': median['frozen'],
-        }  # fmt: skip
-        yield {
-            'name': f'tracker takes in a new model, {how}: mean', 'unit': 'ms',
-            'value': float(1e3 * np.mean(spent['intake'])),
-        }  # fmt: skip
+        what = f'update and model encoded, 32 references x 8 emitters, {how}: median'
+        yield harness.row(what, median['update'], 'ms', target=2.0)
+        high = float(1e3 * np.percentile(spent['update'], 99))
+        yield harness.row(f'update, {how}: 99 %', high, 'ms')
+        what = f"tracker's frame (9 coils and body) while the model is refitted, {how}"
+        yield harness.row(what, median['refit'], 'ms', ('frozen model', median['frozen']))
+        mean = float(1e3 * np.mean(spent['intake']))
+        yield harness.row(f'tracker takes in a new model, {how}: mean', mean, 'ms')
 
 
 def spend(
@@ -170,7 +121,7 @@ def spend(
     return spent
 
 
-def detection() -> list[dict[str, Any]]:
+def detection() -> Iterator[harness.Row]:
     """Frames until metal that moves 0.1 mm of the tool's place is seen, and false alarms."""
     world = anser_world(32)
     refit, rng = world.refit(), np.random.default_rng(1)
@@ -185,42 +136,31 @@ def detection() -> list[dict[str, Any]]:
         delay += 1
         flux = world.baseline + change + world.noise(rng)
         state = refit.update(1000 + delay, world.references.channel, flux).state
-    return [
-        {'name': 'frames until metal 0.2 m below the board is seen', 'value': delay, 'unit': '1',
-         'target': 3},
-        {'name': 'false alarms in 500 frames', 'value': alarms, 'unit': '1', 'target': 0},
-    ]  # fmt: skip
+    yield harness.row('frames until metal 0.2 m below the board is seen', delay, '1', target=3)
+    yield harness.row('false alarms in 500 frames', alarms, '1', target=0)
 
 
 def against_references(
     sessions: dict[str, Any], model: Any, baseline: Any
-) -> list[dict[str, Any]]:
+) -> Iterator[harness.Row]:
     """The ablation, with its plot."""
     found = []
     for name in ('online/approach', 'online/sweep', 'bags/metal (own)'):
         if name in sessions:
             found += ablation.ablate(sessions[name], name, model, baseline)
     ablation.plot(found, PLOT, TITLES)
-    rows = []
-    for shared in (row for row in found if row.method == ablation.SHARED):
-        free = next(
-            row for row in found
-            if row.method == ablation.FREE and (row.session, row.references)
-            == (shared.session, shared.references)
-        )  # fmt: skip
-        rows.append(
-            {'name': f'{shared.session}: {shared.references} references', 'unit': 'mm',
-             'value': 1e3 * shared.rmse_m, 'rival': 'free dipoles',
-             'rival_value': 1e3 * free.rmse_m}
-        )  # fmt: skip
-    return rows
+    rmse_mm = {(row.method, row.session, row.references): 1e3 * row.rmse_m for row in found}
+    for (method, session, count), ours in rmse_mm.items():
+        if method == ablation.SHARED:
+            rival = 'free dipoles', rmse_mm[ablation.FREE, session, count]
+            yield harness.row(f'{session}: {count} references', ours, 'mm', rival)
 
 
-def rows() -> Iterator[dict[str, Any]]:
+def rows() -> Iterator[harness.Row]:
     """All figures of the refit."""
-    scan, paths = recordings()
+    scan, paths = harness.online_recordings()
     baseline = load_session(scan)
-    model = calibrate_sessions([baseline], Options(layout=LAYOUT, damping=1e-6)).model
+    model = harness.calibrated(baseline)
     model = replace(model, provenance={**model.provenance, 'layout': 'fixed by the benchmark'})
     sessions = {name: load_session(path) for name, path in paths.items()}
     for name, session in sessions.items():

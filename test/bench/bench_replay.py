@@ -7,46 +7,36 @@ small simulated bags of this package stand in, and the rows say so.
 
 from __future__ import annotations
 
-import os
 import random
-import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
+import harness
 import numpy as np
+from chain import replay_through_nodes
 
-HERE = Path(__file__).resolve().parent
-REPO = HERE.parents[1]
-sys.path.insert(0, str(REPO / 'test'))
-
-from chain import replay_through_nodes  # noqa: E402
-
-from anser_ros.calibration.calibrate import Options  # noqa: E402
-from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.session import load_session  # noqa: E402
-from anser_ros.sessions.starting_model import (  # noqa: E402
+from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import (
     load_model,
     model_for,
     save_model,
 )
-from anser_ros.sessions.tracked_session import (  # noqa: E402
+from anser_ros.sessions.tracked_session import (
     metrics,
     track_session,
 )
-from anser_ros.wire.setup import topic_of  # noqa: E402
+from anser_ros.wire.setup import topic_of
 
 
 def recordings() -> tuple[Path, Path, str]:
     """Calibration scan, session, and how the rows call them."""
-    shared = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared'))
-    effects = shared / 'sessions' / 'effects'
+    effects, bags = harness.SESSIONS / 'effects', harness.BAGS
     if (effects / 's01.mcap').is_file():
         return effects / 'factory.mcap', effects / 's01.mcap', 'effects/s01'
-    return REPO / 'bags' / 'factory.mcap', REPO / 'bags' / 'moving.mcap', 'bags/moving (own)'
+    return bags / 'factory.mcap', bags / 'moving.mcap', 'bags/moving (own)'
 
 
-def rows() -> list[dict[str, Any]]:
+def rows() -> list[harness.Row]:
     """Worst sensor's RMSE and tracked share."""
     scan, bag, name = recordings()
     session = load_session(bag)
@@ -55,7 +45,7 @@ def rows() -> list[dict[str, Any]]:
     topics = {sensor: f'/anser/{topic_of(sensor)}/pose' for sensor in sensors}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'model.yaml'
-        save_model(path, calibrate_sessions([load_session(scan)], Options()).model)
+        save_model(path, harness.calibrated(load_session(scan), layout=None))
         received = replay_through_nodes(
             bag, list(topics.values()), domain=random.randint(1, 100), model=path
         )
@@ -72,19 +62,18 @@ def rows() -> list[dict[str, Any]]:
         rmse.append(float(np.sqrt(np.mean(error**2))))
         share.append(np.unique(frames).size / stamps.size)
     return [
-        {
-            'name': f'replay {name}: worst sensor, position RMSE',
-            'value': 1e3 * max(rmse),
-            'unit': 'mm',
-            'rival': 'nominal Biot-Savart model',
-            'rival_value': 1e3 * float(np.nanmax(rival)),
-            'target': 0.25,
-        },
-        {
-            'name': f'replay {name}: least tracked share of a sensor',
-            'value': 100 * min(share),
-            'unit': '%',
-            'target': 100.0,
-            'target_is': 'least',
-        },
+        harness.row(
+            f'replay {name}: worst sensor, position RMSE',
+            1e3 * max(rmse),
+            'mm',
+            rival=('nominal Biot-Savart model', 1e3 * float(np.nanmax(rival))),
+            target=0.25,
+        ),
+        harness.row(
+            f'replay {name}: least tracked share of a sensor',
+            100 * min(share),
+            '%',
+            target=100.0,
+            target_is='least',
+        ),
     ]

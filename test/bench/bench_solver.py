@@ -1,16 +1,11 @@
 """Warm and cold 5-DoF solves beside scipy's least squares set up as the public tracker does."""
 
-import sys
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
+import harness
 import numpy as np
 from scipy.optimize import least_squares
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from tracking_world import NOISE_T, certain_model
 
 from anser_ros.physics.dipole import flux_basis
@@ -28,6 +23,7 @@ BOUNDS = (
     [0.5, 0.5, 0.5, np.pi, 3 * np.pi],
 )
 GATE_PROBABILITY = 1e-9
+RIVAL = 'scipy least_squares as python-anser'
 
 
 class World:
@@ -80,24 +76,24 @@ def angles(axis: Any) -> tuple[float, float]:
     return float(np.arccos(np.clip(axis[2], -1, 1))), float(np.arctan2(axis[1], axis[0]))
 
 
-def repeated(solve: Callable[[], Any]) -> tuple[float, Any]:
-    """Median time (s) of some solves of one pose, the same number for everybody, and a result."""
-    times = []
-    for _ in range(WARM_REPEATS):
-        begin = time.perf_counter()
-        found = solve()
-        times.append(time.perf_counter() - begin)
-    return float(np.median(times)), found
+def rows_of(
+    name: str, unit: str, scale: float, both: Sequence[Any], rival: str, high: int, target: float
+) -> Iterator[harness.Row]:
+    """Median and a high percentile of the times, s, of both ways."""
+    ours, theirs = (scale * np.percentile(times, (50, high)) for times in both)
+    words = f'{name}, median of {len(both[0])}', f'{name}, {high}th percentile'
+    yield harness.row(words[0], float(ours[0]), unit, (rival, float(theirs[0])), target=target)
+    yield harness.row(words[1], float(ours[1]), unit, (rival, float(theirs[1])))
 
 
-def warm(world: World) -> list[dict[str, Any]]:
+def warm(world: World) -> Iterator[harness.Row]:
     """100 points on 25 x 25 cm at z = 15 cm, from 2 mm and 2 degrees off."""
     rng = np.random.default_rng(1)
     points, axes = world.poses(rng, WARM_POINTS, z=0.15)
     side = np.linspace(-0.125, 0.125, 10)
     points[:, 0], points[:, 1] = np.repeat(side, 10), np.tile(side, 10)
     fluxes = world.fluxes(rng, points, axes)
-    ours, rival, errors, rival_errors = [], [], [], []
+    ours, theirs, errors, rival_errors = [], [], [], []
     for point, axis, flux in zip(points, axes, fluxes, strict=True):
         away = rng.normal(size=3)
         start = point + 2e-3 * away / np.linalg.norm(away)
@@ -105,77 +101,51 @@ def warm(world: World) -> list[dict[str, Any]]:
         first = axis + np.radians(2.0) * turn / np.linalg.norm(turn)
         first /= np.linalg.norm(first)
         given = (world.field, flux, world.whitening, start, first, world.low, world.high)
-        spent_s, found = repeated(lambda given=given: solve_coil(*given))
-        ours.append(spent_s)
+        spent, found = harness.timed(lambda given=given: solve_coil(*given), WARM_REPEATS)
+        ours.append(np.median(spent))
         errors.append(np.linalg.norm(found.position - point))
-        guess = np.array([*start, *angles(first)])
-        spent_s, p = repeated(lambda flux=flux, guess=guess: rival_solve(world, flux, guess))
-        rival.append(spent_s)
+        given = world, flux, np.array([*start, *angles(first)])
+        spent, p = harness.timed(lambda given=given: rival_solve(*given), WARM_REPEATS)
+        theirs.append(np.median(spent))
         rival_errors.append(np.linalg.norm(p[:3] - point))
     name = 'warm 5-DoF solve, 144 dipoles x 8 emitters, complex'
-    told = 'scipy least_squares as python-anser'
-    return [
-        {
-            'name': f'{name}, median of {WARM_POINTS}', 'value': 1e6 * float(np.median(ours)),
-            'unit': 'us', 'rival': told, 'rival_value': 1e6 * float(np.median(rival)),
-            'target': 20.0,
-        },
-        {
-            'name': f'{name}, 95th percentile', 'value': 1e6 * float(np.percentile(ours, 95)),
-            'unit': 'us', 'rival': told, 'rival_value': 1e6 * float(np.percentile(rival, 95)),
-        },
-        {
-            'name': 'warm solve, largest position error', 'value': 1e3 * float(np.max(errors)),
-            'unit': 'mm', 'rival': told, 'rival_value': 1e3 * float(np.max(rival_errors)),
-        },
-    ]  # fmt: skip
+    yield from rows_of(name, 'us', 1e6, (ours, theirs), RIVAL, 95, 20.0)
+    worst, other = 1e3 * float(np.max(errors)), 1e3 * float(np.max(rival_errors))
+    yield harness.row('warm solve, largest position error', worst, 'mm', (RIVAL, other))
 
 
-def cold(world: World) -> list[dict[str, Any]]:
+def cold(world: World) -> Iterator[harness.Row]:
     """Random poses, any axis, without a guess, each once; the rival starts from one point."""
     rng = np.random.default_rng(2)
     points, axes = world.poses(rng, COLD_POSES)
     fluxes = world.fluxes(rng, points, axes)
-    times, errors = np.empty(COLD_POSES), np.empty(COLD_POSES)
-    for i, flux in enumerate(fluxes):
-        begin = time.perf_counter()
-        found = solve_cold(
-            world.field, world.grid, flux, world.whitening, world.low, world.high, 0.0, world.gate
-        )
-        times[i] = time.perf_counter() - begin
-        errors[i] = np.linalg.norm(found[0].position - points[i])
-    rival, rival_errors = [], []
-    for point, flux in zip(points, fluxes, strict=True):
-        begin = time.perf_counter()
-        p = rival_solve(world, flux, np.array([0.0, 0.0, 0.2, 0.0, 0.0]))
-        rival.append(time.perf_counter() - begin)
-        rival_errors.append(np.linalg.norm(p[:3] - point))
+    begins = world.low, world.high, 0.0, world.gate
+    middle = np.array([0.0, 0.0, 0.2, 0.0, 0.0])
+
+    def ours(flux: Any) -> Any:
+        found = solve_cold(world.field, world.grid, flux, world.whitening, *begins)
+        return found[0].position
+
+    def theirs(flux: Any) -> Any:
+        return rival_solve(world, flux, middle)[:3]
+
+    times, errors = np.empty((2, COLD_POSES)), np.empty((2, COLD_POSES))
+    for way, solve in enumerate((ours, theirs)):
+        for i, flux in enumerate(fluxes):
+            (times[way, i],), found = harness.timed(lambda flux=flux, solve=solve: solve(flux))
+            errors[way, i] = np.linalg.norm(found - points[i])
     name = 'cold 5-DoF solve, any axis, 25 x 25 cm, z 8 to 25 cm'
-    told = 'least_squares from [0, 0, 0.2, 0, 0], the same poses'
-    return [
-        {
-            'name': f'{name}, median of {COLD_POSES}', 'value': 1e3 * float(np.median(times)),
-            'unit': 'ms', 'rival': told, 'rival_value': 1e3 * float(np.median(rival)),
-            'target': 0.35,
-        },
-        {
-            'name': f'{name}, 99th percentile', 'value': 1e3 * float(np.percentile(times, 99)),
-            'unit': 'ms', 'rival': told, 'rival_value': 1e3 * float(np.percentile(rival, 99)),
-        },
-        {
-            'name': 'cold solve, poses within 2 mm',
-            'value': 100.0 * float(np.mean(errors < NEAR_M)), 'unit': '%', 'rival': told,
-            'rival_value': 100.0 * float(np.mean(np.array(rival_errors) < NEAR_M)),
-            'ratio': None, 'target': 100.0, 'target_is': 'least',
-        },
-        {
-            'name': 'cold solve, largest position error', 'value': 1e3 * float(errors.max()),
-            'unit': 'mm', 'rival': told, 'rival_value': 1e3 * float(np.max(rival_errors)),
-        },
-    ]  # fmt: skip
+    rival = 'least_squares from [0, 0, 0.2, 0, 0], the same poses'
+    yield from rows_of(name, 'ms', 1e3, times, rival, 99, 0.35)
+    near, other = (100.0 * float(share) for share in np.mean(errors < NEAR_M, axis=1))
+    yield harness.row(
+        'cold solve, poses within 2 mm', near, '%', (rival, other), target=100.0, target_is='least'
+    )
+    worst, other = (1e3 * float(value) for value in errors.max(axis=1))
+    yield harness.row('cold solve, largest position error', worst, 'mm', (rival, other))
 
 
-def rows() -> Iterator[dict[str, Any]]:
+def rows() -> Iterator[harness.Row]:
     """Rows of the table."""
     world = World()
     rng = np.random.default_rng(3)

@@ -7,13 +7,10 @@ frame counts from the first on.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
+import harness
 import numpy as np
 from live_chain import METAL_FROM_S, world
 
@@ -29,7 +26,7 @@ TARGETS_MS = {50: None, 99: 3.0, 100: 6.0}
 """Largest time, ms, that is aimed at, by share of the frames in per cent."""
 
 
-def rows() -> Iterator[dict]:
+def rows() -> Iterator[harness.Row]:
     """Yield the rows of the benchmark table."""
     scene, rng = world(True), np.random.default_rng(1)
     setup = scene.setup
@@ -37,18 +34,10 @@ def rows() -> Iterator[dict]:
     clean = scene.flux(0.0)[first:]
     times = METAL_FROM_S + FRAME_S * np.arange(round(SECONDS / FRAME_S))
     frames = [scene.flux(float(t))[first:] for t in times]
-    references, model = (
-        sensor_table(setup.reference_sensors),
-        load_model(config_path('demo_model.yaml')),
-    )
-    refit = LiveRefit(
-        model,
-        references,
-        clean,
-        setup.refit,
-        NominalBoard.of(setup).field,
-        volume=stated_volume(setup),
-    )
+    references = sensor_table(setup.reference_sensors)
+    model, drawing = load_model(config_path('demo_model.yaml')), NominalBoard.of(setup).field
+    volume = stated_volume(setup)
+    refit = LiveRefit(model, references, clean, setup.refit, drawing, volume=volume)
     spent, due = [], time.monotonic()
     for number, flux in enumerate(frames):
         noise = noise_t * rng.standard_normal((*flux.shape, 2)) @ [1.0, 1.0j]
@@ -61,9 +50,9 @@ def rows() -> Iterator[dict]:
     shape = f'{len(references)} references x {flux.shape[1]} emitters'
     for share, target in TARGETS_MS.items():
         key = 'longest' if share == 100 else f'{share} %'
-        yield {
-            'name': f'update on the clock, {shape}, metal moving for {SECONDS:g} s: {key}',
-            'value': float(np.percentile(spent, share, method='higher')),
-            'unit': 'ms',
-            'target': target,
-        }
+        yield harness.row(
+            f'update on the clock, {shape}, metal moving for {SECONDS:g} s: {key}',
+            float(np.percentile(spent, share, method='higher')),
+            'ms',
+            target=target,
+        )

@@ -27,12 +27,8 @@ def block_points() -> Any:
 class Block:
     """A lattice without slopes; those that an estimator has to reckon with are in `columns`.
 
-    Parameters
-    ----------
-    answer : ndarray, shape (n,), complex
-        Of each point, in units of `BALL`.
-    tilt : ndarray, shape (K,)
-        Logarithm of each emitter's frequency over their mean.
+    ``answer`` (n,), complex, is of each point, in units of `BALL`; ``tilt`` (K,) the logarithm of
+    each emitter's frequency over their mean.
     """
 
     def __init__(self, answer: Any, tilt: Any) -> None:

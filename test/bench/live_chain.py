@@ -18,8 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from anser_ros.cli.commands import COMPOSED, NODES
-from anser_ros.cli.demo import BOARD_SEED
+from anser_ros.cli.demo import BOARD_SEED, node_command
 from anser_ros.cli.processes import Child, Supervisor
 from anser_ros.simulation.control_unit import ControlUnit
 from anser_ros.simulation.line import PseudoPort
@@ -150,20 +149,14 @@ def made_bytes(metal: bool, seconds: float) -> list[bytes]:
 
 
 class Feeder(threading.Thread):
-    """Streams prepared bytes, so little work is left in real time.
-
-    Attributes
-    ----------
-    begin_ns : when the first sample was taken; 0 before
-    taken_ns : when the line had taken the last byte of each millisecond
-    """
+    """Streams prepared bytes, so little work is left in real time."""
 
     def __init__(self, port: PseudoPort, sent: list[bytes]) -> None:
         super().__init__(name='feeder', daemon=True)
         self._unit = ControlUnit(world(False), parse_channels(read_config('demo_channels.yaml')))
         self._port, self._sent = port, sent
-        self.begin_ns = 0
-        self.taken_ns: list[int] = []
+        self.begin_ns = 0  # when the first sample was taken; 0 before
+        self.taken_ns: list[int] = []  # when the line had taken the last byte of each millisecond
         self.stopping = threading.Event()
 
     def run(self) -> None:
@@ -187,23 +180,14 @@ class Feeder(threading.Thread):
 
 @dataclass(frozen=True)
 class Layout:
-    """What runs: which processes, at which rate, and whether the model follows the references.
-
-    Attributes
-    ----------
-    composed : acquisition, field model and tracker in one process, or in three
-    follows : the refit in force from a baseline on, or a model that stays as it was
-    metal : whether metal comes and goes without a rest; its bytes must have been made with it
-    is_floor : nothing of these, but a node that reads the port and publishes poses
-    floor_poses : how many poses that node publishes a window
-    """
+    """What runs: which processes, at which rate, and whether the model follows the references."""
 
     rate_hz: float = 50.0
-    composed: bool = True
-    follows: bool = True
-    metal: bool = True
-    is_floor: bool = False
-    floor_poses: int = 1
+    composed: bool = True  # acquisition, field model and tracker in one process, or in three
+    follows: bool = True  # the refit active from a baseline on, or a model that stays as it was
+    metal: bool = True  # it comes and goes without a rest; its bytes must have been made with it
+    is_floor: bool = False  # nothing of these, but a node that reads the port and publishes poses
+    floor_poses: int = 1  # how many poses that node publishes a window
 
     @property
     def poses(self) -> int:
@@ -215,38 +199,19 @@ class Layout:
 class Run:
     """What one run of the chain gave.
 
-    Attributes
-    ----------
-    latency_ms : ndarray, from the last byte of a window to its pose; infinite where none came
-    lost : windows of a sensor without a pose
-    load : CPU seconds a second, by process
-    device_late_ms : how late the bytes themselves were at the 99th percentile; above a few ms the
-        machine was busy with something else, and the figures say more of that than of the chain
-    ages_s : largest age of a model that a pose used, of each second
+    ``device_late_ms`` is how late the bytes themselves were at the 99th percentile; above a few ms
+    the machine was busy with something else, and the figures say more of that than of the chain.
     """
 
-    latency_ms: np.ndarray
-    lost: int
-    load: dict[str, float]
+    latency_ms: np.ndarray  # from the last byte of a window to its pose; infinite if none came
+    lost: int  # windows of a sensor without a pose
+    load: dict[str, float]  # CPU seconds a second, by process
     device_late_ms: float
-    ages_s: np.ndarray
-
-    @property
-    def share(self) -> float:
-        """Poses that came, of those that should have."""
-        return 1.0 - self.lost / max(self.latency_ms.size, 1)
+    ages_s: np.ndarray  # largest age of a model that a pose used, of each second
 
     def percentile(self, share: float) -> float:
         """Latency, ms, that this many per cent of all windows have at most."""
         return float(np.percentile(self.latency_ms, share, method='higher'))
-
-
-def _command(name: str, /, **parameters: object) -> list[str]:
-    command = [sys.executable, '-m', {**NODES, **COMPOSED}[name][0], '--ros-args']
-    for key, value in parameters.items():
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        command += ['-p', f'{key.replace("__", ":")}:={text}']
-    return command
 
 
 def _chain(layout: Layout, link: Path, folder: str, topics: list[str]) -> dict[str, list[str]]:
@@ -257,15 +222,15 @@ def _chain(layout: Layout, link: Path, folder: str, topics: list[str]) -> dict[s
     model = config_path('demo_model.yaml')
     refit = {'refit': layout.follows, 'baseline_at_start': layout.follows}
     port = {'device': link, 'rate_hz': layout.rate_hz, 'window_s': WINDOW_S}
-    recorder = {'recorder': _command('recorder', directory=folder, name='bag')}
+    recorder = {'recorder': node_command('recorder', directory=folder, name='bag')}
     if layout.composed:
         values = {f'acquisition__{k}': v for k, v in port.items()}
         values |= {f'field_model__{k}': v for k, v in refit.items()}
-        return recorder | {'live': _command('live', model_file=model, **values)}
+        return recorder | {'live': node_command('live', model_file=model, **values)}
     return recorder | {
-        'field_model': _command('field_model', model_file=model, **refit),
-        'tracker': _command('tracker', model_file=model),
-        'acquisition': _command('acquisition', **port),
+        'field_model': node_command('field_model', model_file=model, **refit),
+        'tracker': node_command('tracker', model_file=model),
+        'acquisition': node_command('acquisition', **port),
     }
 
 
@@ -282,8 +247,6 @@ def run_chain(layout: Layout, sent: list[bytes], measure_s: float) -> Run:
     """Run the chain and return what was measured after it had settled."""
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):  # as `anser` does for its nodes
-        os.environ.setdefault(variable, '1')
     setup = parse_setup(read_config('demo_setup.yaml'))
     names = [topic_of(sensor.name) for sensor in setup.tool_sensors]
     names = names[: layout.poses]

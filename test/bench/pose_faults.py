@@ -4,7 +4,7 @@ sizes."""
 from __future__ import annotations
 
 from collections.abc import Callable, MutableMapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from pose_world import World
@@ -17,24 +17,13 @@ Truth = MutableMapping[str, tuple[str, float] | None]
 Stream = list[np.ndarray]
 
 
-@dataclass(frozen=True)
-class Kind:
-    """One thing that is wrong, at three sizes.
+class Kind(NamedTuple):
+    """One thing that is wrong, at three sizes."""
 
-    Attributes
-    ----------
-    change : callable
-        Takes a world and a size, makes it so, and returns what has to be found.
-    sensors : int
-        Fewest sensors that it needs.
-    parts : tuple of str
-        What of a world it uses; two kinds that share one make no pair.
-    """
-
-    change: Callable[[World, float], Truth]
+    change: Callable[[World, float], Truth]  # makes it so, and returns what has to be found
     sizes: tuple[float, ...]
-    parts: tuple[str, ...]
-    sensors: int = 1
+    parts: tuple[str, ...]  # what of a world it uses; two kinds that share one make no pair
+    sensors: int = 1  # fewest that it needs
 
 
 def _each(world: World, change: Callable[[str, Stream], None], *, also: bool = False) -> None:

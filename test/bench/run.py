@@ -8,7 +8,7 @@ Each row is printed as it comes; bench.json is written after every module.
 """
 
 import argparse
-import importlib.util
+import importlib
 import json
 import os
 import sys
@@ -17,23 +17,9 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-THREADS = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS')
-for variable in THREADS:  # before a benchmark imports numpy
-    os.environ[variable] = '1'
+import harness
 
-HERE = Path(__file__).resolve().parent
-REPO = HERE.parents[1]
 KEYS = ('name', 'value', 'unit', 'rival', 'rival_value', 'ratio', 'target', 'met')
-
-
-def load(path: Path) -> Any:
-    """Import one benchmark by its path."""
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def complete(row: dict[str, Any]) -> dict[str, Any]:
@@ -82,16 +68,21 @@ def main() -> int:
     """Run the benchmarks; 1 when one of them broke, whatever the figures."""
     parser = argparse.ArgumentParser(description='benchmarks beside their rivals, on one thread')
     parser.add_argument('names', nargs='*', help='run only these: demodulation, solve, ...')
-    parser.add_argument('--out', type=Path, default=REPO / 'bench.json', help='file to write')
+    parser.add_argument(
+        '--out', type=Path, default=harness.REPO / 'bench.json', help='file to write'
+    )
     args = parser.parse_args()
     # The others print a table of their own, and are run by their names.
-    paths = [path for path in sorted(HERE.glob('bench_*.py')) if 'def rows(' in path.read_text()]
-    known = {path.stem.removeprefix('bench_'): path for path in paths}
+    paths = [
+        path for path in sorted(harness.HERE.glob('bench_*.py')) if 'def rows(' in path.read_text()
+    ]
+    known = [path.stem.removeprefix('bench_') for path in paths]
     unknown = set(args.names) - set(known)
     if unknown:
         print(f'bench: no {", ".join(sorted(unknown))}; there are: {", ".join(known)}')
         return 2
-    chosen = {name: path for name, path in known.items() if not args.names or name in args.names}
+    chosen = [name for name in known if not args.names or name in args.names]
+    os.environ.update(dict.fromkeys(harness.THREADS, '1'))  # before numpy is imported
     rows: list[dict[str, Any]] = []
     try:
         broken = run(chosen, rows, args.out)
@@ -104,14 +95,14 @@ def main() -> int:
     return 1 if broken else 0
 
 
-def run(chosen: dict[str, Path], rows: list[dict[str, Any]], out: Path) -> list[str]:
+def run(chosen: list[str], rows: list[dict[str, Any]], out: Path) -> list[str]:
     """Run benchmarks one after the other into ``rows``; return the names of those that broke."""
     broken = []
-    for name, path in chosen.items():
+    for name in chosen:
         began_s = time.monotonic()
         print(f'{name} ...', file=sys.stderr, flush=True)
         try:
-            for row in load(path).rows():
+            for row in importlib.import_module(f'bench_{name}').rows():
                 rows.append(complete(row))
                 print(line(rows[-1]), flush=True)
         except Exception:  # noqa: BLE001 - the others are still worth their figures

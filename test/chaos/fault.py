@@ -1,68 +1,37 @@
-"""What a fault is, and the tables of all there are."""
+"""What a fault is, and what a hostile input to a command is."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rig import Rig
 
-Off = Callable[[], None]
+Off = Callable[[], object]
 """Takes a fault away again."""
 On = Callable[[Rig, np.random.Generator], Off]
 """Puts a fault on a running chain, and returns what takes it away."""
-LASTS_S = 3.0
-"""How long a fault lasts where its table says nothing, s: two or three rounds of diagnostics."""
 
 
-@dataclass(frozen=True)
-class Fault:
-    """One fault of the trial.
+class Fault(NamedTuple):
+    """One fault of the trial."""
 
-    Attributes
-    ----------
-    name : str
-        For the command line.
-    what : str
-        For the table.
-    on : callable
-        Puts it on.
-    lasts_s : float
-        How long it lasts.
-    world : str
-        Simulated world that it happens in.
-    combines : bool
-        Whether it may be drawn together with others.
-    spoils : bool
-        Whether the chain is started anew after it, since somebody keeps what it said.
-    """
-
-    name: str
-    what: str
+    name: str  # for the command line
+    what: str  # for the table
     on: On
-    lasts_s: float = LASTS_S
-    world: str = 'clean'
-    combines: bool = False
-    spoils: bool = False
+    lasts_s: float = 3.0  # two or three rounds of diagnostics
+    world: str = 'clean'  # simulated world that it happens in
+    combines: bool = False  # whether it may be drawn together with others
+    spoils: bool = False  # whether the chain is started anew, since somebody keeps what it said
 
 
-@dataclass(frozen=True)
-class Command:
-    """A hostile or implausible input to a command, which has to refuse it in one line.
-
-    Attributes
-    ----------
-    name, what : str
-        As for `Fault`.
-    arguments : callable
-        Makes the input in a folder and returns the arguments of `anser`.
-    says : str
-        A word that its answer has to have.
-    """
+class Command(NamedTuple):
+    """A hostile or implausible input to a command, which has to refuse it in one line."""
 
     name: str
     what: str
-    arguments: Callable[..., list[object]]
-    says: str
+    arguments: Callable[[Path], list[object]]  # makes the input in a folder; those of `anser`
+    says: str  # a word that its answer has to have
 
 
 def nothing() -> None:

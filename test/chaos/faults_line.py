@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import tampers as t
-from fault import Fault, Off
+from fault import Fault, Off, nothing
 from line import Tamper
 from rig import Rig
 
@@ -38,7 +38,7 @@ def _held(seconds: float) -> Callable[..., Off]:
         rig.line.is_held = True
         time.sleep(seconds)
         rig.line.is_held = False
-        return lambda: None
+        return nothing
 
     return on
 
@@ -54,7 +54,7 @@ def _flapping(rig: Rig, _rng: np.random.Generator) -> Off:
         time.sleep(0.15)
         rig.line.plug()
         time.sleep(0.15)
-    return lambda: None
+    return nothing
 
 
 def _old_bytes(rig: Rig, rng: np.random.Generator) -> Off:
@@ -69,7 +69,7 @@ def _old_bytes(rig: Rig, rng: np.random.Generator) -> Off:
     rig.line.take_off('keep')
     time.sleep(1.0)
     rig.line.inject(b''.join(kept))
-    return lambda: None
+    return nothing
 
 
 def _draw(rng: np.random.Generator, count: int) -> list[int]:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import tampers
 from fault import Fault, Off, nothing
 from rig import BOARD_SEED, Rig
 
@@ -14,13 +15,13 @@ from anser_ros.sessions.starting_model import board_of, is_snapshot, load_model,
 from anser_ros.simulation.world import manufactured
 
 
-def _served(change: Callable[[Rig, FieldModel], FieldModel], **more: object) -> Callable[..., Off]:
+def _served(change: Callable[[Rig, FieldModel], FieldModel]) -> Callable[..., Off]:
     """Start field_model anew with a file that it should not have been given."""
 
     def on(rig: Rig, _rng: np.random.Generator) -> Off:
         path = rig.folder / f'wrong_{time.monotonic_ns()}.yaml'
         save_model(path, change(rig, load_model(rig.model)))
-        return _restarted(rig, model_file=path, baseline_at_start=True, **more)
+        return _restarted(rig, model_file=path, baseline_at_start=True)
 
     return on
 
@@ -69,8 +70,6 @@ def _doubled_effect(rig: Rig, _rng: np.random.Generator) -> Off:
 
 
 def _no_gate(rig: Rig, rng: np.random.Generator) -> Off:
-    import tampers
-
     rig.set_parameter('tracker', 'gate', 1e6)
     rig.line.put('no_gate', tampers.gain(1.05, [4]))
 

@@ -3,6 +3,8 @@
 import os
 import resource
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -29,11 +31,11 @@ def _stopped(node: str) -> Callable[..., Off]:
 
 
 def _flicker(node: str) -> Callable[..., Off]:
-    def on(rig: Rig, _rng: np.random.Generator) -> Off:
+    def on(rig: Rig, rng: np.random.Generator) -> Off:
         for _ in range(8):
-            rig.signal(node, signal.SIGSTOP)
+            off = _stopped(node)(rig, rng)
             time.sleep(0.25)
-            rig.signal(node, signal.SIGCONT)
+            off()
             time.sleep(0.25)
         return nothing
 
@@ -41,9 +43,6 @@ def _flicker(node: str) -> Callable[..., Off]:
 
 
 def _busy(rig: Rig, _rng: np.random.Generator) -> Off:
-    import subprocess
-    import sys
-
     loops = [
         subprocess.Popen([sys.executable, '-c', 'while True: pass'])
         for _ in range(2 * (os.cpu_count() or 1))
@@ -65,26 +64,24 @@ def _full_disk(rig: Rig, _rng: np.random.Generator) -> Off:
     return lambda: rig.kill('recorder')
 
 
+def _limited(node: str, kind: int, most: Callable[[int], int]) -> Callable[..., Off]:
+    """Limit a resource of a node, by its process id."""
+
+    def on(rig: Rig, _rng: np.random.Generator) -> Off:
+        pid = rig.pid(node)
+        before = resource.prlimit(pid, kind)
+        resource.prlimit(pid, kind, (most(pid), before[1]))
+        return lambda: resource.prlimit(pid, kind, before)
+
+    return on
+
+
 def _little_memory(node: str) -> Callable[..., Off]:
-    def on(rig: Rig, _rng: np.random.Generator) -> Off:
-        pages = int(Path(f'/proc/{rig.pid(node)}/statm').read_text().split()[0])
-        now = pages * resource.getpagesize()
-        infinite = resource.RLIM_INFINITY
-        resource.prlimit(rig.pid(node), resource.RLIMIT_AS, (now + 4_000_000, infinite))
-        return lambda: (
-            resource.prlimit(rig.pid(node), resource.RLIMIT_AS, (infinite, infinite)) and None
-        )
+    def most(pid: int) -> int:
+        pages = int(Path(f'/proc/{pid}/statm').read_text().split()[0])
+        return pages * resource.getpagesize() + 4_000_000
 
-    return on
-
-
-def _few_files(node: str) -> Callable[..., Off]:
-    def on(rig: Rig, _rng: np.random.Generator) -> Off:
-        before = resource.prlimit(rig.pid(node), resource.RLIMIT_NOFILE)
-        resource.prlimit(rig.pid(node), resource.RLIMIT_NOFILE, (8, before[1]))
-        return lambda: resource.prlimit(rig.pid(node), resource.RLIMIT_NOFILE, before) and None
-
-    return on
+    return _limited(node, resource.RLIMIT_AS, most)
 
 
 def _joins_late(rig: Rig, _rng: np.random.Generator) -> Off:
@@ -113,6 +110,7 @@ PROCESSES = (
     Fault('memory-tracker', 'the tracker gets 4 MB more at most', _little_memory('tracker'), 4.0),
     Fault('memory-acquisition', 'acquisition gets 4 MB more at most',
           _little_memory('acquisition'), 4.0),
-    Fault('files-tracker', 'the tracker may open no file more', _few_files('tracker'), 3.0),
+    Fault('files-tracker', 'the tracker may open no file more',
+          _limited('tracker', resource.RLIMIT_NOFILE, lambda _: 8), 3.0),
 )  # fmt: skip
 """The processes themselves, and what they have."""

@@ -88,15 +88,7 @@ def with_crc(body: bytes) -> bytes:
 
 
 class Line:
-    """The line between a control unit and a host.
-
-    Parameters
-    ----------
-    unit : Path
-        Link of the control unit's port.
-    host : Path
-        Link that the host opens.
-    """
+    """The line between a control unit and a host, by the links of their ports."""
 
     def __init__(self, unit: Path, host: Path) -> None:
         self._unit_link = unit

@@ -17,6 +17,7 @@ from witness import WINDOW_S, Witness
 
 from anser_ros.cli.demo import BOARD_SEED, METAL_RADIUS_M, SAMPLE_RATE_HZ, node_command
 from anser_ros.cli.processes import Child, Supervisor, tail
+from anser_ros.parallel import ONE_THREAD
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import config_path, read_config
 
@@ -37,26 +38,23 @@ WORLDS: dict[str, dict[str, object]] = {
 REFUSED = 2  # exit code of a node that refuses a parameter or file
 
 
-class Rig:
-    """The processes, the line between them, and the witness.
+def domain_pool() -> Any:
+    """Return what gives out ROS domains that no other run on this machine has, to be closed."""
+    sys.path.append(str(Path(__file__).resolve().parents[1]))
+    from domain_pool import DomainPool
 
-    Parameters
-    ----------
-    folder : Path
-        For logs and files.
-    domain : int
-        ROS domain.
-    world : str
-        One of `WORLDS`.
-    """
+    return contextlib.closing(DomainPool())
+
+
+class Rig:
+    """The processes of a world of `WORLDS`, the line between them, and the witness."""
 
     def __init__(self, folder: Path, domain: int, world: str) -> None:
         self.folder, self.domain, self.world = folder, domain, world
         os.environ['ROS_DOMAIN_ID'] = str(domain)
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-        for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
-            os.environ.setdefault(variable, '1')
+        os.environ.update(dict.fromkeys(ONE_THREAD, '1'))
         self.setup = parse_setup(read_config('demo_setup.yaml'))
         self.model = config_path('demo_model.yaml')
         self.rate_hz = SAMPLE_RATE_HZ
@@ -99,7 +97,6 @@ class Rig:
     def kill(self, name: str) -> None:
         """Kill a node without a warning."""
         child = self.children.pop(name)
-        self._supervisor.forget(child)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.process.pid, signal.SIGKILL)
         child.process.wait(5.0)
@@ -123,7 +120,6 @@ class Rig:
         self.kill(name)
         self.start(name, **parameters)
         child = self.children.pop(name)
-        self._supervisor.forget(child)
         if child.process.wait(PATIENCE_S) != REFUSED:
             raise RuntimeError(f'{name} ended with {child.process.returncode}, not by a refusal')
 
@@ -154,7 +150,6 @@ class Rig:
         told = []
         for name in gone:
             child = self.children.pop(name)
-            self._supervisor.forget(child)
             told.append(f'{name} ended with {child.process.returncode}: {tail(child)[-300:]}')
         return told
 

@@ -8,9 +8,7 @@ ends, and poses that are not back a second after the fault has gone.
 """
 
 import argparse
-import fcntl
 import itertools
-import os
 import sys
 import tempfile
 import time
@@ -19,24 +17,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from fault import Command, Fault
+from fault import Command, Fault, nothing
 from faults_files import COMMANDS
 from faults_graph import GRAPH
 from faults_line import CLOCK, REFERENCES, SERIAL
 from faults_models import MODELS
 from faults_processes import PROCESSES
-from rig import RATE_HZ, Rig
+from rig import RATE_HZ, Rig, domain_pool
 from table import ALLOWED_S, Row, line, load, save, write_docs
 from witness import WINDOW_S, is_wrong
 
 DOCUMENT = Path(__file__).resolve().parents[2] / 'docs' / 'faults.md'
 
-QUIET = Fault('nothing', 'nothing', lambda rig, rng: lambda: None, 5.0)
-QUIET_METAL = Fault(
-    'nothing-metal', 'nothing, metal moves', lambda rig, rng: lambda: None, 9.0, 'metal'
+CONTROL = (
+    Fault('nothing', 'nothing', lambda rig, rng: nothing, 5.0),
+    Fault('nothing-metal', 'nothing, metal moves', lambda rig, rng: nothing, 9.0, 'metal'),
 )
 GROUPS: dict[str, tuple[Fault, ...]] = {
-    'control': (QUIET, QUIET_METAL),
+    'control': CONTROL,
     'serial': SERIAL,
     'clock': CLOCK,
     'references': REFERENCES,
@@ -117,26 +115,19 @@ def tried(chain: Chain, faults: Sequence[Fault], seed: int, lasts_s: float | Non
     crashed = tuple(rig.crashed())
     if any(fault.spoils for fault in faults):
         chain.end()
-    worst = max(bad, key=lambda one: one[1], default=None)
+    worst, error = max(bad, key=lambda one: one[1], default=(None, None))
     group = next((g for g, all_ in GROUPS.items() if faults[0] in all_), 'together')
     return Row(
-        group,
-        _name(faults),
-        ' and '.join(fault.what for fault in faults),
-        heard[0] if heard else '',
-        told[0].arrival_s - begin if told else None,
-        len(judged),
-        len(bad),
-        None if worst is None else worst[1],
-        None if worst is None else worst[0].sigma_m,
-        back,
-        crashed,
-        len(seen) - len(judged),
-        heard,
-    )
+        group, _name(faults), ' and '.join(fault.what for fault in faults),
+        said=heard[0] if heard else '',
+        detected_s=told[0].arrival_s - begin if told else None,
+        poses=len(judged), wrong=len(bad), worst_m=error,
+        sigma_m=None if worst is None else worst.sigma_m,
+        back_s=back, crashed=crashed, skipped=len(seen) - len(judged), heard=heard,
+    )  # fmt: skip
 
 
-def commanded(chain: Chain, command: Command) -> Row:
+def commanded(command: Command) -> Row:
     """Give a command its input, and return how it took it."""
     with tempfile.TemporaryDirectory() as folder:
         arguments = command.arguments(Path(folder))
@@ -169,23 +160,21 @@ def chosen(args: argparse.Namespace) -> tuple[list[list[Fault]], list[Command]]:
     """Return the faults to be tried, each alone or together, and the commands."""
     known = {fault.name: fault for group in GROUPS.values() for fault in group}
     commands = {command.name: command for command in COMMANDS}
-    if args.only:
-        trials: list[list[Fault]] = []
-        asked: list[Command] = []
-        for names in args.only:
-            if names in GROUPS:
-                trials += [[fault] for fault in GROUPS[names]]
-            elif names == 'files':
-                asked += COMMANDS
-            elif names in commands:
-                asked.append(commands[names])
-            else:
-                missing = [name for name in names.split('+') if name not in known]
-                if missing:
-                    raise SystemExit(f'chaos: no fault {missing[0]}; --list names them')
-                trials.append([known[name] for name in names.split('+')])
-        return trials, asked
-    return [[fault] for fault in known.values()], list(COMMANDS)
+    trials: list[list[Fault]] = []
+    asked: list[Command] = []
+    for names in args.only or (*GROUPS, 'files'):
+        if names in GROUPS:
+            trials += [[fault] for fault in GROUPS[names]]
+        elif names == 'files':
+            asked += COMMANDS
+        elif names in commands:
+            asked.append(commands[names])
+        else:
+            missing = [name for name in names.split('+') if name not in known]
+            if missing:
+                raise SystemExit(f'chaos: no fault {missing[0]}; --list names them')
+            trials.append([known[name] for name in names.split('+')])
+    return trials, asked
 
 
 def combinations(seed: int, count: int) -> list[list[Fault]]:
@@ -197,21 +186,6 @@ def combinations(seed: int, count: int) -> list[list[Fault]]:
                                      replace=False)]
         for _ in range(count)
     ]  # fmt: skip
-
-
-def domain() -> tuple[int, int]:
-    """Return a ROS domain that nobody on this machine has, and the lock that keeps it ours."""
-    folder = Path(tempfile.gettempdir()) / 'anser_ros_test_domains'  # as the tests share them
-    folder.mkdir(exist_ok=True)
-    for number in np.random.default_rng().permutation(np.arange(1, 101)).tolist():
-        lock = os.open(folder / f'{number}', os.O_CREAT | os.O_RDONLY, 0o644)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(lock)
-            continue
-        return number, lock
-    raise SystemExit('chaos: all ROS domains are taken')
 
 
 def main() -> int:
@@ -233,27 +207,27 @@ def main() -> int:
     args = parser.parse_args()
     trials, commands = chosen(args)
     if args.list:
-        for fault in itertools.chain.from_iterable(trials):
-            print(f'{fault.name:24} {fault.what}')
-        for command in commands:
-            print(f'{command.name:24} {command.what}')
+        for one in (*itertools.chain.from_iterable(trials), *commands):
+            print(f'{one.name:24} {one.what}')
         return 0
     if args.random:
         trials, commands = combinations(args.seed, args.random), []
     # Faults of one world share a chain.
     trials.sort(key=lambda faults: max(fault.world == 'metal' for fault in faults))
-    number, lock = domain()
     found: dict[str, Row] = {}
     if args.again:
         found = {row.name: row for row in load(args.again)}
         open_ = {row.name for row in found.values() if not row.is_judged}
         trials = [faults for faults in trials if _name(faults) in open_]
         commands = []
-    with tempfile.TemporaryDirectory(prefix='anser_chaos_') as folder:
-        chain = Chain(Path(folder), number)
+    with (
+        tempfile.TemporaryDirectory(prefix='anser_chaos_') as folder,
+        domain_pool() as domains,
+    ):
+        chain = Chain(Path(folder), domains.take())
         try:
             for command in commands:
-                _note(commanded(chain, command), found, args.out)
+                _note(commanded(command), found, args.out)
             for faults in trials:
                 row = _tried_surely(chain, faults, args)
                 _note(row, found, args.out)
@@ -261,7 +235,6 @@ def main() -> int:
                     print('  ' + minimised(chain, faults, args.seed, args.duration), flush=True)
         finally:
             chain.end()
-            os.close(lock)
     rows = list(found.values())
     failed = [row for row in rows if row.failed(ALLOWED_S)]
     poses, wrong = sum(row.poses for row in rows), sum(row.wrong for row in rows)

@@ -5,6 +5,7 @@ which everything is used for the first time. A node that grows by more than is a
 """
 
 import argparse
+import contextlib
 import os
 import sys
 import tempfile
@@ -13,8 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from rig import Rig
-from run import domain
+from rig import Rig, domain_pool
 
 GROWTH_MB = 5.0
 """Most that a node may grow in an hour, MB."""
@@ -97,16 +97,14 @@ def main() -> int:
     if args.duration < 20.0:
         print('soak: --duration must be at least 20 s', file=sys.stderr)
         return 2
-    number, lock = domain()
-    with tempfile.TemporaryDirectory(prefix='anser_soak_') as folder:
-        rig = Rig(Path(folder), number, 'metal')
-        try:
-            rig.start('recorder', directory=folder)
-            time.sleep(3.0)
-            series, latencies = watched(rig, args.duration)
-        finally:
-            rig.close()
-            os.close(lock)
+    with (
+        tempfile.TemporaryDirectory(prefix='anser_soak_') as folder,
+        domain_pool() as domains,
+        contextlib.closing(Rig(Path(folder), domains.take(), 'metal')) as rig,
+    ):
+        rig.start('recorder', directory=folder)
+        time.sleep(3.0)
+        series, latencies = watched(rig, args.duration)
     return report(series, latencies)
 
 

@@ -18,43 +18,23 @@ FOLDER = re.compile(r'/tmp/[^/\s]+/')
 
 @dataclass(frozen=True)
 class Row:
-    """What came of one fault.
-
-    Attributes
-    ----------
-    group, name, what : str
-        Which fault.
-    said : str
-        The first state that told of it.
-    detected_s : float or None
-        Time until then, s.
-    poses, wrong : int
-        Poses that were published from the beginning on, and those that were wrong.
-    worst_m, sigma_m : float or None
-        The largest error of a wrong pose, and the sigma that it stated, m.
-    back_s : float or None
-        Time from the fault's end until poses were back, s; None when they did not come.
-    crashed : tuple of str
-        What ended by itself, or answered as it should not.
-    skipped : int
-        Poses that were not judged, since the simulated unit itself was late.
-    heard : tuple of str
-        All new states that told of it, the first one included, whichever node was first.
-    """
+    """What came of one fault."""
 
     group: str
     name: str
     what: str
-    said: str
-    detected_s: float | None
-    poses: int
+    said: str  # the first state that told of it
+    detected_s: float | None  # time until then
+    poses: int  # published from the beginning on
     wrong: int
-    worst_m: float | None
-    sigma_m: float | None
-    back_s: float | None
-    crashed: tuple[str, ...] = ()
-    skipped: int = 0
-    heard: tuple[str, ...] = ()
+    worst_m: float | None  # the largest error of a wrong pose
+    sigma_m: float | None  # the sigma that it stated
+    back_s: (
+        float | None
+    )  # time from the fault's end until poses were back; None: they did not come
+    crashed: tuple[str, ...] = ()  # what ended by itself, or answered as it should not
+    skipped: int = 0  # poses that were not judged, since the simulated unit itself was late
+    heard: tuple[str, ...] = ()  # all new states that told of it, whichever node was first
 
     @property
     def is_judged(self) -> bool:

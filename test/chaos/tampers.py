@@ -1,7 +1,8 @@
 """What can happen to samples and records between the control unit and the host."""
 
+import itertools
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,36 +14,47 @@ TOOL, REFERENCE = slice(0, 9), slice(9, 41)
 """Columns of the demo's nine tool coils, and of its 32 reference coils; the current is last."""
 
 
-def columns(change: Callable[[np.ndarray, float], np.ndarray], where: object) -> Tamper:
-    """Change the codes (n, C) of some columns; the change gets the samples that went before."""
-    seen = [0]
+def _in_place(change: Callable[[np.ndarray], None]) -> Tamper:
+    """Change the codes (n, C) of every block where they stand."""
 
     def block(given: SampleBlock) -> SampleBlock:
         codes = np.array(given.codes)
-        altered = change(codes[:, where].astype(float), seen[0])
-        codes[:, where] = np.clip(np.rint(altered), -32768, 32767).astype(np.int16)
-        seen[0] += len(codes)
+        change(codes)
         return replace(given, codes=codes)
 
     return inside(block=block)
 
 
+def columns(change: Callable[[np.ndarray], np.ndarray], where: object) -> Tamper:
+    """Change the codes of some columns, which stay within the range of the converter."""
+
+    def altered(codes: np.ndarray) -> None:
+        codes[:, where] = _rounded(change(codes[:, where].astype(float)))
+
+    return _in_place(altered)
+
+
+def _rounded(codes: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(codes), -32768, 32767).astype(np.int16)
+
+
 def gain(factor: float, where: object) -> Tamper:
     """Multiply columns."""
-    return columns(lambda codes, _: factor * codes, where)
+    return columns(lambda codes: factor * codes, where)
 
 
 def offset(codes_up: float, where: object) -> Tamper:
     """Shift columns by a constant."""
-    return columns(lambda codes, _: codes + codes_up, where)
+    return columns(lambda codes: codes + codes_up, where)
 
 
-def hum(amplitude: float, where: object, rate_hz: float, mains_hz: float = 50.0) -> Tamper:
-    """Add mains hum."""
+def hum(amplitude: float, where: object, rate_hz: float) -> Tamper:
+    """Add mains hum of 50 Hz."""
+    seen = itertools.count()
 
-    def change(codes: np.ndarray, seen: float) -> np.ndarray:
-        time = (seen + np.arange(len(codes))) / rate_hz
-        wave = sum(np.sin(2 * np.pi * k * mains_hz * time) / k for k in (1, 3, 5))
+    def change(codes: np.ndarray) -> np.ndarray:
+        time = np.array([next(seen) for _ in codes]) / rate_hz
+        wave = sum(np.sin(2 * np.pi * k * 50.0 * time) / k for k in (1, 3, 5))
         return codes + amplitude * wave[:, None]
 
     return columns(change, where)
@@ -50,65 +62,57 @@ def hum(amplitude: float, where: object, rate_hz: float, mains_hz: float = 50.0)
 
 def noise(sigma: float, where: object, rng: np.random.Generator) -> Tamper:
     """Add white noise, codes rms."""
-    return columns(lambda codes, _: codes + sigma * rng.standard_normal(codes.shape), where)
+    return columns(lambda codes: codes + sigma * rng.standard_normal(codes.shape), where)
 
 
 def dead(where: object, rng: np.random.Generator) -> Tamper:
     """Leave noise only."""
-    return columns(lambda codes, _: 2.4 * rng.standard_normal(codes.shape), where)
+    return columns(lambda codes: 2.4 * rng.standard_normal(codes.shape), where)
 
 
 def constant(value: int, where: object) -> Tamper:
     """Replace columns by one code."""
-    return columns(lambda codes, _: np.full_like(codes, value), where)
+    return columns(lambda codes: np.full_like(codes, value), where)
 
 
 def clipped(share: float, where: object) -> Tamper:
     """Clip columns at the ends of the range, as an amplifier that is driven too far."""
-    return columns(lambda codes, _: codes / share, where)
+    return columns(lambda codes: codes / share, where)
 
 
 def swapped(one: int, other: int) -> Tamper:
     """Exchange two columns."""
 
-    def block(given: SampleBlock) -> SampleBlock:
-        codes = np.array(given.codes)
+    def change(codes: np.ndarray) -> None:
         codes[:, [one, other]] = codes[:, [other, one]]
-        return replace(given, codes=codes)
 
-    return inside(block=block)
+    return _in_place(change)
 
 
 def mixed(target: int, source: int, share: float) -> Tamper:
     """Let one column leak into another."""
 
-    def block(given: SampleBlock) -> SampleBlock:
-        codes = np.array(given.codes)
-        sum_ = codes[:, target] + share * codes[:, source].astype(float)
-        codes[:, target] = np.clip(np.rint(sum_), -32768, 32767)
-        return replace(given, codes=codes)
+    def change(codes: np.ndarray) -> None:
+        codes[:, target] = _rounded(codes[:, target] + share * codes[:, source].astype(float))
 
-    return inside(block=block)
+    return _in_place(change)
 
 
 def ring(samples: int, where: object = slice(None)) -> Tamper:
     """Repeat the last samples of some columns for ever, under fresh numbers and stamps."""
-    kept: deque[np.ndarray] = deque()
-    state = {'have': 0, 'next': 0}
+    memory = np.zeros((0, 0), dtype=np.int16)
+    place = 0
 
-    def block(given: SampleBlock) -> SampleBlock:
-        if state['have'] < samples:
-            kept.append(np.array(given.codes))
-            state['have'] += len(given.codes)
-            return given
-        memory = np.concatenate(kept)[-samples:]
-        rows = (state['next'] + np.arange(len(given.codes))) % samples
-        state['next'] += len(given.codes)
-        codes = np.array(given.codes)
+    def change(codes: np.ndarray) -> None:
+        nonlocal memory, place
+        if len(memory) < samples:
+            memory = np.concatenate([memory, codes]) if memory.size else codes.copy()
+            return
+        rows = len(memory) - samples + (place + np.arange(len(codes))) % samples
+        place += len(codes)
         codes[:, where] = memory[rows][:, where]
-        return replace(given, codes=codes)
 
-    return inside(block=block)
+    return _in_place(change)
 
 
 def without_columns(where: Sequence[int]) -> Tamper:
@@ -219,15 +223,15 @@ def doubled(share: float, rng: np.random.Generator) -> Tamper:
 def replayed(seconds: float) -> Tamper:
     """Let all records of the first seconds arrive again and again in place of the live ones."""
     kept: list[bytes] = []
-    at = [0]
+    again: Iterator[bytes] = iter(())
 
     def tamper(records: list[bytes], on_s: float) -> list[bytes]:
+        nonlocal again
         if on_s < seconds:
             kept.extend(records)
+            again = itertools.cycle(kept)
             return records
-        out = [kept[(at[0] + i) % len(kept)] for i in range(len(records))] if kept else []
-        at[0] += len(records)
-        return out
+        return list(itertools.islice(again, len(records)))
 
     return tamper
 
@@ -246,44 +250,41 @@ def shuffled(depth: int, rng: np.random.Generator) -> Tamper:
     return tamper
 
 
-def late(seconds: float) -> Tamper:
-    """Let everything arrive later by a constant."""
+def _delayed(delay: Callable[[float], float]) -> Tamper:
+    """Let everything arrive later, s, by a function of the time, s, that this goes on."""
     waiting: deque[tuple[float, bytes]] = deque()
 
     def tamper(records: list[bytes], on_s: float) -> list[bytes]:
-        waiting.extend((on_s + seconds, record) for record in records)
+        waiting.extend((on_s + delay(on_s), record) for record in records)
         out = []
         while waiting and waiting[0][0] <= on_s:
             out.append(waiting.popleft()[1])
         return out
 
     return tamper
+
+
+def late(seconds: float) -> Tamper:
+    """Let everything arrive later by a constant."""
+    return _delayed(lambda _: seconds)
 
 
 def creeping(per_second: float) -> Tamper:
     """Let everything arrive later and later, by so many seconds a second."""
-    waiting: deque[tuple[float, bytes]] = deque()
-
-    def tamper(records: list[bytes], on_s: float) -> list[bytes]:
-        waiting.extend((on_s + per_second * on_s, record) for record in records)
-        out = []
-        while waiting and waiting[0][0] <= on_s:
-            out.append(waiting.popleft()[1])
-        return out
-
-    return tamper
+    return _delayed(lambda on_s: per_second * on_s)
 
 
 def in_bursts(period_s: float) -> Tamper:
     """Let everything arrive in bursts, as from a host that is busy."""
     waiting: list[bytes] = []
-    next_s = [period_s]
+    next_s = period_s
 
     def tamper(records: list[bytes], on_s: float) -> list[bytes]:
+        nonlocal next_s
         waiting.extend(records)
-        if on_s < next_s[0]:
+        if on_s < next_s:
             return []
-        next_s[0] = on_s + period_s
+        next_s = on_s + period_s
         out = waiting[:]
         waiting.clear()
         return out
@@ -300,7 +301,7 @@ def hello_scaled(**factors: float) -> Tamper:
     """Multiply figures of hellos."""
     return inside(
         hello=lambda given: replace(
-            given, **{key: getattr(given, key) * factor for key, factor in factors.items()}
+            given, **{k: getattr(given, k) * f for k, f in factors.items()}
         )
     )
 

@@ -4,8 +4,7 @@ import bisect
 import threading
 import time
 from collections import defaultdict
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,37 +26,27 @@ TRUTH_GAP_S = 0.25
 its truth was heard later than its samples. Between closer ones a line is followed."""
 
 
-@dataclass(frozen=True)
-class SeenPose:
-    """One pose: arrival (monotonic, s), name, stamp (s), place (m) and sigma (m)."""
+class SeenPose(NamedTuple):
+    """One pose, with its place and sigma."""
 
-    arrival_s: float
+    arrival_s: float  # monotonic
     name: str
     stamp_s: float
-    place: np.ndarray
+    place: np.ndarray  # m
     sigma_m: float
 
 
-@dataclass(frozen=True)
-class SeenState:
-    """One status line when it changed: arrival (monotonic, s), name, level and words."""
+class SeenState(NamedTuple):
+    """One status line when it changed."""
 
-    arrival_s: float
+    arrival_s: float  # monotonic
     name: str
     level: int
     words: str
 
 
 class Witness:
-    """A node in a thread of its own that keeps all that comes, and can publish and call too.
-
-    Parameters
-    ----------
-    setup : Setup
-        Whose sensors and bodies are watched.
-    domain : int
-        ROS domain.
-    """
+    """A node in a thread of its own that keeps all that comes, and can publish and call too."""
 
     def __init__(self, setup: Setup, domain: int) -> None:
         import rclpy
@@ -67,7 +56,6 @@ class Witness:
         from sensor_msgs.msg import PointCloud2
 
         from anser_ros.nodes.runtime import qos
-        from anser_ros.nodes.runtime.process import make_executor
 
         self.setup = setup
         self.poses: list[SeenPose] = []
@@ -97,7 +85,7 @@ class Witness:
             self.node.create_subscription(
                 PointCloud2, f'{which}/flux', self._flux_taker(which), qos.STREAM
             )
-        self._executor = make_executor_of(make_executor, self.context)
+        self._executor = make_executor(self.context)
         self._executor.add_node(self.node)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._spin, name='witness', daemon=True)
@@ -229,7 +217,7 @@ def stamp_s(message: Any) -> float:
     return message.header.stamp.sec + NANO * message.header.stamp.nanosec
 
 
-def make_executor_of(make: Any, context: Any) -> Any:
+def make_executor(context: Any) -> Any:
     """Return an executor for a context that is not the process's."""
     from rclpy.executors import SingleThreadedExecutor
 

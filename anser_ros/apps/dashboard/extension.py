@@ -5,3 +5,9 @@ NODES = {
 }
 NEEDED = {'dashboard': ('nicegui',)}
 PASSIVE = ('dashboard',)
+DEMO = {
+    'dashboard': (
+        'serve the live view to a browser, too',
+        'live view: http://127.0.0.1:8642/',  # as `wire.tcp_ports` has it
+    ),
+}

@@ -14,14 +14,18 @@ import signal
 import sys
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from anser_ros.cli.diagnosis_words import verdict
+from anser_ros.cli.output import make_new_folder
 from anser_ros.errors import AnserError, BagError, ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.starting_model import NOMINAL
+
+if TYPE_CHECKING:  # the loop itself needs no ROS
+    from anser_ros.apps.dashboard.nodes.dashboard import ChainClient
+    from anser_ros.apps.dashboard.nodes.view_source import ViewSource
 
 RESULTS = 'results'
 """Folder inside it, in which every calibration and diagnosis gets a folder of its own."""
@@ -75,15 +79,7 @@ class RecordingFolder:
 
     def new_result(self, kind: str, recording: str) -> Path:
         """Make the folder of a result and return it."""
-        stem, number = f'{Path(recording).stem}_{kind}', 1
-        while True:
-            path = self.path / RESULTS / (stem if number == 1 else f'{stem}_{number}')
-            try:
-                path.mkdir(parents=True)
-            except FileExistsError:
-                number += 1
-            else:
-                return path
+        return make_new_folder(self.path / RESULTS, f'{Path(recording).stem}_{kind}')
 
     def shown(self, result: str, name: str) -> Path | None:
         """Return the path of a result's file that may be shown, None where there is none."""
@@ -199,24 +195,7 @@ MOST_UNDONE = 20
 """Changes of the model that can be undone, which bounds what is kept of a long day."""
 
 
-class Chain(Protocol):
-    """States what the page can ask of the running nodes; they refuse by `AnserError`."""
-
-    async def trigger(self, service: str) -> str: ...
-    async def model_files(self) -> dict[str, str]: ...
-    async def load_model(self, files: Mapping[str, str]) -> None: ...
-    async def baseline_file(self) -> str: ...
-
-
-class LiveFigures(Protocol):
-    """States what the page knows of the present moment."""
-
-    def figures(self, since_s: float) -> dict[str, float | None]: ...
-    def mark(self, words: str) -> None: ...
-
-
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """Holds what a command has found.
 
     ``rows`` have a label and, as text, a figure before and after, on data held out.
@@ -234,8 +213,7 @@ class Found:
         return self.folder / 'model.yaml'
 
 
-@dataclass(frozen=True)
-class Loaded:
+class Loaded(NamedTuple):
     """Remembers a change of the model: what was there before, and how well it went with that."""
 
     before: dict[str, str]
@@ -266,7 +244,7 @@ class CorrectionLoop:
     on; ``model`` is the active model's file, as ``field_model`` has it.
     """
 
-    def __init__(self, chain: Chain, live: LiveFigures, folder: RecordingFolder) -> None:
+    def __init__(self, chain: 'ChainClient', live: 'ViewSource', folder: RecordingFolder) -> None:
         self._chain, self._live, self.folder = chain, live, folder
         self.chosen, self.model = '', ''
         self.job: Job | None = None
@@ -377,17 +355,16 @@ class CorrectionLoop:
             raise ParameterError('a command is already running')
         name = self.chosen
         bag = self.folder.recording(name)
-        options: list[str] = []
         if kind == DIAGNOSE:
             await self.look()
-            options += ['--model', self.model or NOMINAL]
             baseline = await self._chain.baseline_file()
+            folder = self.folder.new_result(kind, name)
+            options = ['--model', self.model or NOMINAL]
             options += ['--baseline', baseline] if baseline else []
-        folder = self.folder.new_result(kind, name)
-        if kind == DIAGNOSE:
             options += ['--out', str(folder)]
         else:
-            options += ['--out', str(folder / 'model.yaml'), '--report', str(folder)]
+            folder = self.folder.new_result(kind, name)
+            options = ['--out', str(folder / 'model.yaml'), '--report', str(folder)]
         self.job = job = Job(kind, [str(bag), *options, '--json'], folder)
         self._running = asyncio.create_task(self._finish(job, name))
         return f'{kind} {name}'

@@ -6,12 +6,13 @@ import math
 from collections.abc import Awaitable, Callable
 from html import escape
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from nicegui import app, ui
 from nicegui.element import Element
 
 from anser_ros.apps.dashboard.loop import CALIBRATE, CorrectionLoop
+from anser_ros.apps.dashboard.nodes.view_source import ViewSource
 from anser_ros.errors import AnserError
 
 TICK_S = 1.0 / 12.0
@@ -27,22 +28,6 @@ LEVELS = ('ok', 'warn', 'bad', 'bad')
 _LIBRARIES = (ui.scene, ui.echart)
 
 
-class ShownGraph(Protocol):
-    """States what the page shows, as `ViewSource` does; numbers that are not known are None."""
-
-    @property
-    def version(self) -> int: ...
-    def look(self) -> None: ...
-    def add_point(self) -> None: ...
-    def world(self) -> dict[str, Any] | None: ...
-    def frame(self) -> list[Any]: ...
-    def table(self) -> list[list[Any]]: ...
-    def metal(self) -> list[list[float]]: ...
-    def point(self) -> list[Any]: ...
-    def marks(self) -> list[list[Any]]: ...
-    def status(self) -> dict[str, Any]: ...
-
-
 class Instrument(Element, component='instrument.js'):
     """Draws scene, table and curves."""
 
@@ -50,7 +35,7 @@ class Instrument(Element, component='instrument.js'):
 class Screen:
     """Holds one page that is open in a browser."""
 
-    def __init__(self, source: ShownGraph, loop: CorrectionLoop) -> None:
+    def __init__(self, source: ViewSource, loop: CorrectionLoop) -> None:
         self._source, self._loop = source, loop
         self._client = ui.context.client
         self._version, self._is_ready = -1, False
@@ -275,7 +260,7 @@ class Pages:
     """
 
     def __init__(
-        self, source: ShownGraph, loop: CorrectionLoop, guarded: Callable[[Any], Callable[[], Any]]
+        self, source: ViewSource, loop: CorrectionLoop, guarded: Callable[[Any], Callable[[], Any]]
     ) -> None:
         self._source, self._loop = source, loop
         self._screens: dict[str, Screen] = {}

@@ -1,6 +1,6 @@
 """Boards, tools and reference coils: as drawn (the setup document) and as they really are."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from filaments import coil_field
@@ -15,37 +15,29 @@ LENGTHS_M = (0.0, 0.006, 0.002)
 
 @dataclass(frozen=True)
 class Design:
-    """What a board's drawing says.
-
-    Attributes
-    ----------
-    name : of the design
-    winding : Winding
-    centres : ndarray, shape (K, 2), m
-    rotations_deg : ndarray, shape (K,)
-    clockwise : bool
-    half_x_m, half_y_m : half the board's sides
-    """
+    """What a board's drawing says."""
 
     name: str
     winding: Winding
-    centres: np.ndarray
+    centres: np.ndarray  # (K, 2), m
     rotations_deg: np.ndarray
     clockwise: bool
-    half_x_m: float
+    half_x_m: float  # half the board's sides
     half_y_m: float
 
     def emitter(self, frequencies):
         """The emitter's part of the setup document."""
         w = self.winding
-        square = w.side_x_m == w.side_y_m
-        sides = {'side_m': w.side_x_m}
-        if not square:
+        kind, sides = 'square_spiral_pcb', {'side_m': w.side_x_m}
+        if w.side_x_m != w.side_y_m:
+            kind = 'rectangular_spiral_pcb'
             sides = {'side_x_m': w.side_x_m, 'side_y_m': w.side_y_m}
-        geometry = {'turns': w.turns, **sides, 'pitch_m': w.pitch_m, 'layers': 2}
         return {
-            'kind': 'square_spiral_pcb' if square else 'rectangular_spiral_pcb',
-            **geometry,
+            'kind': kind,
+            'turns': w.turns,
+            **sides,
+            'pitch_m': w.pitch_m,
+            'layers': 2,
             'thickness_m': w.thickness_m,
             'current_a': CURRENT_A,
             'coils': [
@@ -91,29 +83,18 @@ class Sensors:
 
 @dataclass(frozen=True)
 class Board:
-    """A board that was built: tracks with errors, a tool, references as surveyed and as they are.
-
-    Attributes
-    ----------
-    paths : list of ndarray, shape (M, 3), m
-    amperes : ndarray, shape (K,)
-    reference_real : Sensors with the true geometry
-    reference_gain : ndarray, shape (R,)
-    scan : dict of the factory recording's grid
-    heights_m : lowest and highest z of the tool's origin in sessions
-    """
+    """A board that was built: tracks with errors, a tool, references as surveyed and as is."""
 
     design: Design
     frequencies: np.ndarray
-    paths: list
+    paths: list  # of each coil (M, 3), m
     amperes: np.ndarray
     tool: Sensors
     reference: Sensors
-    reference_real: Sensors
+    reference_real: Sensors  # with the true geometry
     reference_gain: np.ndarray
-    scan: dict
-    heights_m: tuple
-    extra: dict = field(default_factory=dict)
+    scan: dict  # the factory recording's grid
+    heights_m: tuple  # lowest and highest z of the tool's origin in sessions
 
     @property
     def omega(self):
@@ -240,30 +221,15 @@ def _references(design, below, rng):
     channel = 16 + np.arange(2 * count)
     drawn = Sensors(channel, names, 'fg', place, axis, length)
     tilt = Rotation.from_rotvec(np.radians(0.3) * rng.normal(size=(2 * count, 3)))
-    real = Sensors(
-        channel,
-        names,
-        'fg',
-        place + 0.2e-3 * rng.normal(size=place.shape),
-        tilt.apply(axis / np.linalg.norm(axis, axis=1)[:, None]),
-        length * (1 + 0.02 * rng.normal(size=2 * count)),
-    )
+    moved = place + 0.2e-3 * rng.normal(size=place.shape)
+    tilted = tilt.apply(axis / np.linalg.norm(axis, axis=1)[:, None])
+    longer = length * (1 + 0.02 * rng.normal(size=2 * count))
+    real = Sensors(channel, names, 'fg', moved, tilted, longer)
     return drawn, real, 1 + 0.004 * rng.normal(size=2 * count)
 
 
 def build(index, rng):
-    """Build a board.
-
-    Parameters
-    ----------
-    index : int
-        Which design; they are gone through in turn.
-    rng : numpy Generator
-
-    Returns
-    -------
-    Board
-    """
+    """Build a board; ``index`` goes through the designs in turn."""
     design = DESIGNS[index % len(DESIGNS)](rng)
     count = len(design.centres)
     coils = [

@@ -4,8 +4,9 @@ Every function changes a laboratory and returns what it did, in the words and un
 effect names where the effect has one there.
 """
 
+from dataclasses import replace
+
 import numpy as np
-from boards import Sensors
 from scipy.spatial.transform import Rotation
 
 SAMPLES, RATE_HZ = 1600, 40_000.0
@@ -31,11 +32,6 @@ def _tool_channel(lab, rng):
 
 def _emitter(lab, rng):
     return int(rng.integers(lab.board.omega.size))
-
-
-def _changed(tool, **parts):
-    values = {**{key: getattr(tool, key) for key in Sensors.__dataclass_fields__}, **parts}
-    return Sensors(**values)
 
 
 def _on_channel(lab, channel, change):
@@ -68,7 +64,7 @@ def sensor_axis(lab, rng):
     across = np.cross(axis[row], _direction(rng))
     across *= np.radians(angle) / np.linalg.norm(across)
     axis[row] = Rotation.from_rotvec(across).apply(axis[row])
-    lab.tool = _changed(lab.tool, axis=axis)
+    lab.tool = replace(lab.tool, axis=axis)
     return {
         'channel': int(lab.tool.channel[row]),
         'tilt_deg': angle,
@@ -81,7 +77,7 @@ def cluster_axis(lab, rng):
     rows, turn = _cluster(lab, rng), rng.uniform(0.5, 3.0) * _direction(rng)
     axis = lab.tool.axis.copy()
     axis[rows] = Rotation.from_rotvec(np.radians(turn)).apply(axis[rows])
-    lab.tool = _changed(lab.tool, axis=axis)
+    lab.tool = replace(lab.tool, axis=axis)
     return {'channels': lab.tool.channel[rows].tolist(), 'rotation_deg': turn.tolist()}
 
 
@@ -97,14 +93,14 @@ def sensor_polarity(lab, rng):
 def sensor_size(lab, rng):
     """The tool's coils are longer than the setup says."""
     length = float(lab.tool.length[0]) + rng.uniform(0.007, 0.012)
-    lab.tool = _changed(lab.tool, length=np.full(len(lab.tool.channel), length))
+    lab.tool = replace(lab.tool, length=np.full(len(lab.tool.channel), length))
     return {'length_m': length}
 
 
 def lever_arm(lab, rng):
     """All sensors elsewhere in the body."""
     offset = rng.uniform(0.5e-3, 2e-3) * _direction(rng)
-    lab.tool = _changed(lab.tool, place=lab.tool.place + offset)
+    lab.tool = replace(lab.tool, place=lab.tool.place + offset)
     return {'offset_m': offset.tolist()}
 
 

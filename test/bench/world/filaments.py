@@ -55,19 +55,9 @@ def _weighted(points, start, end, currents):
 
 
 def coil_field(points, coils):
-    """Field of closed paths, each carrying one ampere.
+    """Field (P, K, 3), T/A, of K closed paths at points (P, 3), m, each carrying one ampere.
 
-    Parameters
-    ----------
-    points : ndarray, shape (P, 3)
-        m.
-    coils : sequence of K ndarrays, shape (M_k, 3)
-        Corners of each path, m; the last corner is joined to the first.
-
-    Returns
-    -------
-    ndarray, shape (P, K, 3)
-        T/A.
+    Of each path there are the corners (M, 3), m; the last is joined to the first.
     """
     start = np.concatenate(coils)
     end = np.concatenate([np.roll(path, -1, axis=0) for path in coils])
@@ -84,21 +74,10 @@ def weighted_field(points, start, end, currents):
 
 
 def along(points, axes, lengths):
-    """Gauss points along sensors and their weights.
+    """Gauss points (..., Q, 3), m, along sensors, and their weights (Q,), which add up to one.
 
-    Parameters
-    ----------
-    points, axes : ndarray, shape (..., 3)
-        Middle (m) and unit axis of each sensor.
-    lengths : ndarray, shape (...)
-        m.
-
-    Returns
-    -------
-    nodes : ndarray, shape (..., Q, 3)
-        m; one node only where all sensors are points.
-    weights : ndarray, shape (Q,)
-        Adding up to one.
+    Sensors have middles and unit axes (..., 3) and lengths (...), m; where all are points, there
+    is one node only.
     """
     if not np.any(lengths):
         return points[..., None, :], np.ones(1)

@@ -25,29 +25,19 @@ ROUNDS = 4
 class Laboratory:
     """What an effect may change.
 
-    Attributes
-    ----------
-    tool : Sensors as they really are
-    paths : list of ndarray
-        The emitters' tracks.
-    metals : list of (Body, Travel)
-    sheets : list of Sheet
-    on_flux : functions ``(lab, time, channels, flux) -> flux``
-        In the order of the signal: emitters first, then channels; tool and references alike.
-    on_optical : functions ``(time, position, rotation) -> the same``
-        From the true pose at a true time to what is stamped and reported.
-    noise : dict
-        Factor on the flux noise by channel; key -1 for all.
+    ``on_flux`` are functions ``(lab, time, channels, flux) -> flux`` in the order of the signal:
+    emitters first, then channels; tool and references alike. ``on_optical``, ``(time, position,
+    rotation) -> the same``, go from the true pose to what is stamped and reported.
     """
 
     board: Board
-    tool: Sensors
-    paths: list
-    metals: list = field(default_factory=list)
+    tool: Sensors  # as they really are
+    paths: list  # the emitters' tracks
+    metals: list = field(default_factory=list)  # of (Body, Travel)
     sheets: list = field(default_factory=list)
     on_flux: list[Callable] = field(default_factory=list)
     on_optical: list[Callable] = field(default_factory=list)
-    noise: dict = field(default_factory=dict)
+    noise: dict = field(default_factory=dict)  # factor by channel; key -1 for all
 
     @classmethod
     def clean(cls, board):
@@ -63,13 +53,8 @@ class Laboratory:
 class Scattered:
     """The answer of all metal at given times.
 
-    Attributes
-    ----------
-    place : list of ndarray, shape (T, N, 3)
-        Spheres of each body; T = 1 when nothing moves.
-    moments : list of ndarray, shape (T, N, 3, K)
-    currents : list of ndarray, shape (T, E, K)
-        Of the edges of each sheet's mesh.
+    ``place`` (T, N, 3) and ``moments`` (T, N, 3, K) are of the spheres of each body, T being 1
+    where nothing moves; ``currents`` (T, E, K) of the edges of each sheet's mesh.
     """
 
     def __init__(self, lab, time):

@@ -70,14 +70,14 @@ def _write(path, board, rate_hz, flux_stamps, fluxes, optical_stamps, poses):
                 writer.write_flux(f'/anser/{name}/flux', stamp, fields, step, count, data)
 
 
-def record_scan(path, lab, rng):
-    """The factory's recording: the tool at rest at one point after another, a frame each.
+def wander_over(board, rng):
+    """A motion through the volume of a board's sessions."""
+    low, high = board.heights_m
+    return Wander.drawn(rng, [-0.125, -0.125, low], [0.125, 0.125, high])
 
-    Returns
-    -------
-    dict
-        ``stamp_ns``, ``position`` and ``rotation`` as they truly were.
-    """
+
+def record_scan(path, lab, rng):
+    """Write the factory's recording, the tool at rest at point after point; its true path."""
     position, rotation = raster(lab.board.scan, rng)
     time = np.arange(len(position), dtype=np.float64)
     fluxes = measured(lab, time, read_fluxes(lab, time, position, rotation), STATIC_NOISE_T, rng)
@@ -101,19 +101,14 @@ def _tracked(lab, wander, rng):
 
 
 def record_session(path, lab, rng):
-    """A session of 40 s: the tool moves, the optical tracker watches.
+    """Write a session of 40 s in which the tool moves; return its true path.
 
-    Returns
-    -------
-    dict
-        ``stamp_ns``, ``position``, ``rotation`` of the tool's body in fg as they truly were at
-        every flux stamp, ``sensor_position`` (F, S, 3), ``metal_m`` (B, F, 3), where each metal
-        body's origin was, and ``metal_flux_t``, the root mean square of a phasor component of what
-        all metal adds to the tool's fluxes.
+    That is ``stamp_ns``, ``position``, ``rotation`` of the tool's body in fg at every flux stamp,
+    ``sensor_position`` (F, S, 3), ``metal_m`` (B, F, 3), where each metal body's origin was, and
+    ``metal_flux_t``, the root mean square of a phasor component of what all metal adds to the
+    tool's fluxes.
     """
-    low, high = lab.board.heights_m
-    reach = 0.125
-    wander = Wander.drawn(rng, [-reach, -reach, low], [reach, reach, high])
+    wander = wander_over(lab.board, rng)
     time = np.arange(0, LENGTH_S, 1 / FLUX_HZ)
     position, rotation = wander.at(time)
     true = read_fluxes(lab, time, position, rotation)
@@ -128,8 +123,6 @@ def record_session(path, lab, rng):
         'position': position,
         'rotation': rotation,
         'sensor_position': position[:, None] + np.einsum('fij,sj->fsi', rotation, lab.tool.place),
-        'metal_m': np.array([travel.at(time)[0] for _, travel in lab.metals]).reshape(
-            -1, len(time), 3
-        ),
+        'metal_m': np.reshape([way.at(time)[0] for _, way in lab.metals], (-1, len(time), 3)),
         'metal_flux_t': np.sqrt(0.5 * np.mean(np.abs(true[0] - bare[0]) ** 2)),
     }

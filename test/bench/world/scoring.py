@@ -115,13 +115,7 @@ def parameter_error(name, true, found):
 
 
 def judge_names(truth, found, unexplained):
-    """Say in a word or two whether the names are right.
-
-    Returns
-    -------
-    verdict : str
-        ``right``, or what was ``missed`` and what was found that is not there (``wrong``).
-    """
+    """Return ``right``, or what was ``missed`` and what is not there (``wrong``)."""
     names = [effect['name'] for effect in found]
     taken, missed = set(), []
     for name in truth:
@@ -156,49 +150,28 @@ def describe(truth, found):
 
 
 def exact_errors(poses_csv, stamp_ns, places):
-    """How far the poses with state ok are off.
+    """How far the poses with state ok are off true places (F, S, 3), of the sensors by name.
 
-    Parameters
-    ----------
-    poses_csv : path
-    stamp_ns : array, shape (F,)
-    places : array, shape (F, S, 3)
-        Of the sensors by name.
-
-    Returns
-    -------
-    tuple of ndarray, shape (n,), and int
-        Number of the sensor, stamp, error and sigma of the position of each, m; and of how many
-        poses, ok or not.
+    Number of the sensor, stamp, error and sigma of the position of each, m; and of how many
+    poses, ok or not.
     """
-    frame = {int(s): i for i, s in enumerate(stamp_ns)}
     with open(poses_csv, newline='', encoding='utf-8') as stream:
         rows = list(csv.DictReader(stream))
-    sensors = {name: i for i, name in enumerate(sorted({row['sensor'] for row in rows}))}
-    numbers, stamps, errors, sigmas = [], [], [], []
-    for row in rows:
-        if row['status'] != 'ok':
-            continue
-        numbers.append(sensors[row['sensor']])
-        stamps.append(int(row['stamp_ns']))
-        place = np.array([float(row[k]) for k in ('x_m', 'y_m', 'z_m')])
-        errors.append(np.linalg.norm(place - places[frame[stamps[-1]], numbers[-1]]))
-        sigmas.append(float(row['sigma_position_m']))
-    return (
-        np.array(numbers, int), np.array(stamps, np.int64), np.array(errors), np.array(sigmas),
-        len(rows),
-    )  # fmt: skip
+    ok = [row for row in rows if row['status'] == 'ok']
+    _, numbers = np.unique([row['sensor'] for row in rows], return_inverse=True)
+    numbers = numbers[[row['status'] == 'ok' for row in rows]]
+    stamps = np.array([int(row['stamp_ns']) for row in ok], np.int64)
+    found = np.array([[float(row[k]) for k in ('x_m', 'y_m', 'z_m')] for row in ok])
+    true = places[np.searchsorted(stamp_ns, stamps), numbers]
+    sigmas = np.array([float(row['sigma_position_m']) for row in ok])
+    return numbers, stamps, np.linalg.norm(found.reshape(-1, 3) - true, axis=1), sigmas, len(rows)
 
 
 def true_errors(poses_csv, path_npz):
-    """Errors of every sensor's poses against the exact path.
+    """Errors of every sensor's poses against the exact path, over all frames with a pose.
 
-    Returns
-    -------
-    dict
-        ``rmse_m`` and ``p95_m`` over all sensors and frames with a pose, ``tracked`` (share),
-        ``over_3_sigma``: share of all frames with a pose that is further off than three of its
-        own sigmas; ``last_m``: the root mean square of the last 8 s.
+    ``tracked`` is their share, ``over_3_sigma`` that of poses further off than three of their own
+    sigmas, and ``last_m`` the root mean square of the last 8 s.
     """
     truth = np.load(path_npz)
     _, stamps, errors, sigmas, count = exact_errors(

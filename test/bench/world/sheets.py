@@ -106,15 +106,7 @@ def flux_nodes(grid, sheet):
 
 
 def edge_currents(grid, normal_field, omega):
-    """Currents (E, K) of all edges.
-
-    Parameters
-    ----------
-    normal_field : ndarray, shape (L, K)
-        Mean normal field of every cell, T.
-    omega : ndarray, shape (K,)
-        rad/s.
-    """
+    """Currents (E, K) of all edges by the mean normal field (L, K) of every cell, T."""
     loops = [
         np.linalg.solve(
             grid.resistance + 1j * w * grid.inductance, -1j * w * grid.area * normal_field[:, k]

@@ -19,22 +19,12 @@ from numba import njit
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body.
+    """A rigid body of N spheres."""
 
-    Attributes
-    ----------
-    place : ndarray, shape (N, 3)
-        Sphere centres in the body's own frame, m.
-    radius : ndarray, shape (N,)
-        m.
-    conductivity, permeability : ndarray, shape (N,)
-        S/m, relative.
-    """
-
-    place: np.ndarray
-    radius: np.ndarray
-    conductivity: np.ndarray
-    permeability: np.ndarray
+    place: np.ndarray  # centres (N, 3) in the body's own frame, m
+    radius: np.ndarray  # m
+    conductivity: np.ndarray  # S/m
+    permeability: np.ndarray  # relative
 
 
 def polarizability(radius, conductivity, permeability, omega):

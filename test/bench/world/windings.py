@@ -12,21 +12,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Winding:
-    """What a coil is meant to be.
+    """What a coil is meant to be."""
 
-    Attributes
-    ----------
-    side_x_m, side_y_m : outer sides between track centres
-    pitch_m : distance of neighbouring turns
-    turns : of both layers together
-    thickness_m : of the board, hence between the layers
-    """
-
-    side_x_m: float
+    side_x_m: float  # outer sides between track centres
     side_y_m: float
-    pitch_m: float
-    turns: float
-    thickness_m: float
+    pitch_m: float  # distance of neighbouring turns
+    turns: float  # of both layers together
+    thickness_m: float  # of the board, hence between the layers
 
 
 @dataclass(frozen=True)
@@ -65,26 +57,9 @@ def _tracks(winding, pitch):
 def draw(winding, centre, rotation_deg, lead_to, errors, rng, clockwise=True):
     """Draw one coil with errors of its own.
 
-    Parameters
-    ----------
-    winding : Winding
-    centre : ndarray, shape (3,)
-        Nominal centre on the top copper, m.
-    rotation_deg : float
-        Nominal turn about z.
-    lead_to : ndarray, shape (2,)
-        Where on the board's edge the leads end, m.
-    errors : Errors
-    rng : numpy Generator
-    clockwise : bool
-        Way of a positive current seen from +z.
-
-    Returns
-    -------
-    path : ndarray, shape (M, 3)
-        Corners, m; the last is joined to the first.
-    strength : float
-        What the current is really worth, near 1.
+    Returns its corners (M, 3), m, of which the last is joined to the first, and what the current
+    is really worth, near 1. ``centre`` (3,), m, is on the top copper; the leads end at ``lead_to``
+    (2,), m, on the board's edge; a positive current goes ``clockwise`` seen from +z, or not.
     """
     pitch = winding.pitch_m * (1 + errors.pitch * rng.normal())
     gap = winding.thickness_m * (1 + errors.gap * rng.normal())

@@ -40,7 +40,7 @@ class ChainError(AnserError):
 
 
 class ChainClient:
-    """Reaches the nodes of a namespace, as `anser_ros.apps.dashboard.loop.Chain` has them.
+    """Reaches the nodes of a namespace; they refuse by `ChainError`.
 
     The node's executor must be spinning in another thread than that of the page.
     """

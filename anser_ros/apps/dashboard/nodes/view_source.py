@@ -124,7 +124,7 @@ COIL_M = 0.07
 
 
 class ViewSource:
-    """Shows the graph to the page, as `anser_ros.apps.dashboard.page.ShownGraph` has it.
+    """Shows the graph to the page; numbers that are not known are None.
 
     ``refused`` is called for what can't be read. ``setup_text`` is the setup document that came
     last, which another thread may put there; ``version`` changes with the view.

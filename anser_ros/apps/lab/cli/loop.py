@@ -43,6 +43,7 @@ from anser_ros.sessions.recorded_health import (
 from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.tracked_session import error_statistics
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.effects import CATALOGUE, NONE, RANDOM
 from anser_ros.stamps import NANO
@@ -124,9 +125,8 @@ def _figures(errors: list[LiveErrors]) -> dict[str, float | None]:
     out: dict[str, float | None] = {}
     for key, unit in (('position', 'm'), ('orientation', 'rad')):
         values = np.concatenate([getattr(error, key) for error in errors])
-        has = bool(values.size)
-        out[f'{key}_rmse_{unit}'] = float(np.sqrt(np.mean(values**2))) if has else None
-        out[f'{key}_prc95_{unit}'] = float(np.percentile(values, 95)) if has else None
+        found = error_statistics(key, unit, values)
+        out |= {name: found[name] for name in (f'{key}_rmse_{unit}', f'{key}_prc95_{unit}')}
     return out
 
 

@@ -49,6 +49,7 @@ from anser_ros.cli.page import (
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.pictures import legend_below, spell_out
+from anser_ros.sessions.tracked_session import error_statistics
 
 UNSHOWN = ('centre_m', 'size_m', 'lowest', 'middle_s', 'degree', 'strain')
 """Parameters that tell how a map or a course is written, and not what it does."""
@@ -450,12 +451,7 @@ def _evaluation(found: PoseDiagnosis, document: dict[str, Any]) -> dict[str, Any
             ('orientation', 'rad', slice(3, 6)),
         ):
             size = np.linalg.norm(part.residual[part.used, columns], axis=1)
-            row |= {
-                f'{key}_rmse_{unit}': float(np.sqrt(np.mean(size**2))),
-                f'{key}_me_{unit}': float(size.mean()),
-                f'{key}_prc50_{unit}': float(np.percentile(size, 50)),
-                f'{key}_prc95_{unit}': float(np.percentile(size, 95)),
-            }
+            row |= error_statistics(key, unit, size)
         sensors[name] = row
     return {
         'schema': 'anser_evaluation/1', 'sensors': sensors, 'bodies': {},
