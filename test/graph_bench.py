@@ -11,8 +11,7 @@ from std_msgs.msg import String
 from tracking_world import certain_model, setup_of, triaxial_tool
 
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.streams.clouds import FluxCloud
-from anser_ros.nodes.streams.model_clouds import CloudMaker
+from anser_ros.nodes.streams.clouds import CloudMaker, FluxCloud
 from anser_ros.nodes.tracker import TrackerNode
 from anser_ros.wire.points import DipolePoints, FluxPoints, encode_field_model
 from anser_ros.wire.setup import SensorSpec, dump_setup

@@ -10,7 +10,7 @@ from std_srvs.srv import SetBool, Trigger
 from tracking_world import certain_model
 
 from anser_ros.nodes.field_model import FieldModelNode
-from anser_ros.nodes.streams.model_clouds import read_dipoles, read_error
+from anser_ros.nodes.streams.clouds import read_dipoles, read_error
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.stamps import stamp_of

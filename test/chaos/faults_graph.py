@@ -151,7 +151,7 @@ def _models(change: Callable[[FieldModel], FieldModel]) -> Callable[..., Off]:
     """Somebody publishes a field model of his own."""
 
     def on(rig: Rig, _rng: np.random.Generator) -> Off:
-        from anser_ros.nodes.streams.model_clouds import ModelWriter
+        from anser_ros.nodes.streams.clouds import ModelWriter
 
         model = change(load_model(rig.model))
         publisher = _Publisher(
@@ -164,7 +164,7 @@ def _models(change: Callable[[FieldModel], FieldModel]) -> Callable[..., Off]:
 
 
 def _model_of_nan(rig: Rig, _rng: np.random.Generator) -> Off:
-    from anser_ros.nodes.streams.model_clouds import ModelWriter
+    from anser_ros.nodes.streams.clouds import ModelWriter
 
     message = ModelWriter().dipoles(load_model(rig.model), 'fg', time.time_ns())
     publisher = _Publisher(rig, 'field_model', lambda: _not_a_number(message), 0.5)
