@@ -81,6 +81,11 @@ class Bench:
                 status.message, {item.key: item.value for item in status.values}
             )  # fmt: skip
 
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.peer.destroy_node()
+
     def state(self, name):
         return self.states.get(name, ('', {}))[0]
 
@@ -147,6 +152,4 @@ def tracker_bench(ros):
     bench = Bench(ros, node)
     bench.connect(bench.setup, bench.flux, bench.model)
     yield bench
-    bench.executor.shutdown()
-    node.destroy_node()
-    bench.peer.destroy_node()
+    bench.close()

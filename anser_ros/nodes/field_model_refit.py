@@ -84,13 +84,7 @@ class RefitStart:
             self._kept = self._worker.submit(self._keep, self._folder, made)  # nobody waits for it
 
     def taken(self) -> LiveRefit | None:
-        """Return the refit once, as soon as it is made.
-
-        Raises
-        ------
-        FitError
-            When no refit can be made for this model, these references or this baseline.
-        """
+        """Return the refit once, as soon as it is made; raises `FitError` where none can be."""
         made = self._made
         if made is None or not made.done():
             return None
@@ -158,17 +152,9 @@ class ActiveRefit:
     """Keeps the refit, its last result, and what it is made from.
 
     ``count`` counts an event by its name, ``kept`` is what a process after this one takes up, and
-    ``ahead`` what is read of it before references and setup are known.
-
-    Attributes
-    ----------
-    start : RefitStart or None
-        Makes the refits of the active model; None without references.
-    current : LiveRefit or None
-    result : RefitResult or None
-        Of the newest frame, since the refit began or was reset.
-    update_s : float
-        Time that the last result took, s.
+    ``ahead`` what is read of it before references and setup are known. ``start`` makes the refits
+    of the active model, None without references; ``result`` is that of the newest frame since the
+    refit began or was reset, and took ``update_s``.
     """
 
     def __init__(
@@ -216,12 +202,7 @@ class ActiveRefit:
         """Begin to make a refit to what differs from a baseline, shape (S, K), T.
 
         No pose is given before the first one is there, since metal may come meanwhile; one that is
-        active goes on until the next one is there.
-
-        Raises
-        ------
-        FitError
-            When there are no references.
+        active goes on until the next one is there. Raises `FitError` without references.
         """
         if self.start is None:
             raise FitError('the setup has no reference sensors')
@@ -270,10 +251,7 @@ class ActiveRefit:
     def take(self) -> bool:
         """Activate a refit that has been made meanwhile; return whether there was one.
 
-        Raises
-        ------
-        FitError
-            When none can be made.
+        Raises `FitError` when none can be made.
         """
         started = None if self.start is None else self.start.taken()
         if started is None:

@@ -173,7 +173,7 @@ class IgtlServer:
             raise PortError(f'cannot listen on {host}:{port}: {error.strerror}') from error
         self.port: int = self._listener.getsockname()[1]
         self._listener.settimeout(POLL_S)
-        self._clients: list[_Client] = []
+        self._connections: list[_Client] = []
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._dropped_before = 0
@@ -185,26 +185,26 @@ class IgtlServer:
     def n_clients(self) -> int:
         """Return the number of connected clients."""
         self._forget_the_gone()
-        return len(self._clients)
+        return len(self._connections)
 
     @property
     def dropped(self) -> int:
         """Return how many messages slow clients have missed."""
         with self._lock:
-            return self._dropped_before + sum(client.dropped for client in self._clients)
+            return self._dropped_before + sum(client.dropped for client in self._connections)
 
     def send(self, data: bytes, newer: bytes = b'') -> None:
         """Queue a packed message for every client, ``newer`` instead for those that have asked in
         a header of version 2; never blocks.
         """
         with self._lock:
-            for client in self._clients:
+            for client in self._connections:
                 client.put(newer if newer and client.version > 1 else data)
 
     def send_tracking(self, tracking: Callable[[], bytes], now_s: float) -> None:
         """Queue a TDATA for the clients that want one by now; none is made for nobody."""
         with self._lock:
-            due = [client for client in self._clients if client.is_due(now_s)]
+            due = [client for client in self._connections if client.is_due(now_s)]
             data = tracking() if due else b''
             for client in due:
                 client.put_tracking(data, now_s)
@@ -215,9 +215,9 @@ class IgtlServer:
         self._thread.join()
         self._listener.close()
         with self._lock:
-            for client in self._clients:
+            for client in self._connections:
                 client.end()
-            self._clients.clear()
+            self._connections.clear()
 
     def _accept(self) -> None:
         while not self._ending.is_set():
@@ -228,19 +228,19 @@ class IgtlServer:
             except OSError:  # the client was gone before it was accepted
                 continue
             self._forget_the_gone()
-            if len(self._clients) >= MOST_CLIENTS:
+            if len(self._connections) >= MOST_CLIENTS:
                 self.refused += 1
                 connection.close()
                 continue
             _set_options(connection)
             with self._lock:
-                self._clients.append(_Client(connection, self._answer))
+                self._connections.append(_Client(connection, self._answer))
 
     def _forget_the_gone(self) -> None:
         with self._lock:
-            for client in [one for one in self._clients if not one.thread.is_alive()]:
+            for client in [one for one in self._connections if not one.thread.is_alive()]:
                 self._dropped_before += client.dropped
-                self._clients.remove(client)
+                self._connections.remove(client)
 
 
 WATCH_PERIOD_S = 0.05
