@@ -11,8 +11,7 @@ from std_msgs.msg import String
 from tracking_world import certain_model, setup_of, triaxial_tool
 
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.streams.clouds import FluxCloud
-from anser_ros.nodes.streams.model_clouds import CloudMaker
+from anser_ros.nodes.streams.clouds import CloudMaker, FluxCloud
 from anser_ros.nodes.tracker import TrackerNode
 from anser_ros.wire.points import DipolePoints, FluxPoints, encode_field_model
 from anser_ros.wire.setup import SensorSpec, dump_setup
@@ -82,6 +81,11 @@ class Bench:
                 status.message, {item.key: item.value for item in status.values}
             )  # fmt: skip
 
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.peer.destroy_node()
+
     def state(self, name):
         return self.states.get(name, ('', {}))[0]
 
@@ -148,6 +152,4 @@ def tracker_bench(ros):
     bench = Bench(ros, node)
     bench.connect(bench.setup, bench.flux, bench.model)
     yield bench
-    bench.executor.shutdown()
-    node.destroy_node()
-    bench.peer.destroy_node()
+    bench.close()

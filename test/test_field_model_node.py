@@ -10,7 +10,7 @@ from std_srvs.srv import SetBool, Trigger
 from tracking_world import certain_model
 
 from anser_ros.nodes.field_model import FieldModelNode
-from anser_ros.nodes.streams.model_clouds import read_dipoles, read_error
+from anser_ros.nodes.streams.clouds import read_dipoles, read_error
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.stamps import stamp_of
@@ -28,9 +28,7 @@ def server(ros, tmp_path):
     bench = Bench(ros, node)
     bench.connect(bench.setup, bench.reference)
     yield bench
-    bench.executor.shutdown()
-    node.destroy_node()
-    bench.peer.destroy_node()
+    bench.close()
 
 
 def call(bench, kind, name, **request):
@@ -142,6 +140,4 @@ def test_a_model_file_is_served_at_once_and_must_fit_the_setup(ros, tmp_path):
         node.publish_diagnostics()
         bench.spin_until(lambda: 'emitters' in bench.state('anser/field_model'))
     finally:
-        bench.executor.shutdown()
-        node.destroy_node()
-        bench.peer.destroy_node()
+        bench.close()

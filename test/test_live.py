@@ -3,7 +3,7 @@
 import signal
 import socket
 import threading
-from dataclasses import make_dataclass, replace
+from dataclasses import make_dataclass
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
-from tracked_tool import CHANNELS, MODEL, TOOL
 
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import process, qos
@@ -22,9 +21,6 @@ from anser_ros.nodes.runtime.handover import DirectSubscription, HandedFlux, Han
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.runtime.parameters import names_for
 from anser_ros.nodes.streams.one_source import OneSource
-from anser_ros.nodes.tracker_models import LONGEST_S, Rehearsal
-from anser_ros.tracking.estimate import TrackerSettings
-from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux
 
 
@@ -115,49 +111,6 @@ def test_what_is_put_off_is_done_one_thing_a_pause_while_there_are_pauses():
     for _ in range(4):
         handover.pause()
     assert done == ['first', 'second', 'first']
-
-
-def test_a_node_prepares_for_each_frame_that_is_due(ros):
-    class Preparing(AnserNode):
-        NAME = 'preparing'
-
-    handover, done = Handover(), []
-
-    def work():
-        done.append(1)
-        if len(done) == 2:
-            raise ValueError('a fault in it')
-
-    node, alone = Preparing(handover=handover), Preparing()
-    node.prepare(work)
-    alone.prepare(work)
-    for _ in range(3):
-        node.frame_is_due()
-        alone.frame_is_due()
-    assert len(done) == 3, 'what fails once stops neither the frame nor the next preparation'
-    assert node.counters['callback_faults'] == 1
-    for one in (node, alone):
-        one.destroy_node()
-
-
-def test_only_a_frame_that_gave_poses_in_time_is_rehearsed():
-    rehearsal, tracker = Rehearsal(TOOL, TrackerSettings()), Tracker(MODEL, TOOL)
-    flux = MODEL.flux(TOOL.position + [0.0, 0.0, 0.15], TOOL.axis, TOOL.length)
-    nowhere = np.full((len(CHANNELS), 3), np.nan)
-    points = FluxPoints(np.asarray(CHANNELS), np.zeros(len(CHANNELS), int), flux, nowhere, nowhere)
-    played = rehearsal._past.counters
-    rehearsal.play(tracker)
-    assert not played['frames'], 'there was none yet'
-    rehearsal.note(10, points, 0.001, has_poses=True)
-    rehearsal.play(tracker)
-    assert played['frames'] == played['cold_starts'] / len(CHANNELS) == 1
-    for took_s, has_poses in ((2 * LONGEST_S, True), (0.001, False)):
-        rehearsal.note(20, points, took_s, has_poses=has_poses)
-        rehearsal.play(tracker)
-    rehearsal.note(20, points, 0.001, has_poses=True)
-    rehearsal.play(tracker.with_model(replace(MODEL, moments=2 * MODEL.moments)))
-    assert played['frames'] == 2, 'with another model too'
-    assert not tracker.counters['frames']
 
 
 def test_handed_fluxes_are_those_that_are_published():

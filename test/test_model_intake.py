@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from tracking_world import certain_model, setup_of, triaxial_tool
 
-from anser_ros.nodes.streams.model_clouds import ModelWriter
+from anser_ros.nodes.streams.clouds import ModelWriter
 from anser_ros.nodes.tracker_models import ActiveModel, ModelIntake
 from anser_ros.physics.volume import TrackedVolume
 

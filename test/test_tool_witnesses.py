@@ -1,5 +1,7 @@
 """What the node hands to the refit: readings and poses of the same frame, once."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
@@ -53,7 +55,7 @@ def pose(stamp_ns, x, frame_id='fg'):
 
 
 def test_readings_and_poses_of_one_frame_come_together_in_any_order(witnesses):
-    refit, found = Refit(), witnesses._pose_taker('tool_a')
+    refit, found = Refit(), partial(witnesses._on_pose, 'tool_a')
     assert witnesses.noise_t > 0
     witnesses._on_flux(flux(100, 1e-9))
     found(pose(100, 0.01))
@@ -69,7 +71,7 @@ def test_readings_and_poses_of_one_frame_come_together_in_any_order(witnesses):
 
 
 def test_what_has_no_partner_is_forgotten_and_an_earlier_recording_is_taken(witnesses):
-    refit, found = Refit(), witnesses._pose_taker('tool_a')
+    refit, found = Refit(), partial(witnesses._on_pose, 'tool_a')
     for stamp_ns in range(1000, 3000, 100):
         found(pose(stamp_ns, 0.01))
         witnesses._on_flux(flux(stamp_ns + 1, 1e-9))
@@ -83,7 +85,7 @@ def test_what_has_no_partner_is_forgotten_and_an_earlier_recording_is_taken(witn
 def test_poses_of_another_frame_are_refused(witnesses):
     refit = Refit()
     witnesses._on_flux(flux(100, 1e-9))
-    witnesses._pose_taker('tool_a')(pose(100, 0.01, 'world'))
+    witnesses._on_pose('tool_a', pose(100, 0.01, 'world'))
     witnesses.pass_on(refit, 100)
     assert not refit.given
     ((counter, error),) = witnesses.refused
@@ -97,7 +99,7 @@ def test_a_body_whose_poses_have_two_publishers_witnesses_nothing(ros, witnesses
     publishers = [stranger.create_publisher(PoseStamped, '/anser/tool_a/pose', 5) for _ in 'ab']
     assert spin_until(stranger, lambda: stranger.count_publishers('/anser/tool_a/pose') == 2)
     witnesses._on_flux(flux(100, 1e-9))
-    witnesses._pose_taker('tool_a')(pose(100, 0.01))
+    witnesses._on_pose('tool_a', pose(100, 0.01))
     assert spin_until(stranger, lambda: not witnesses._has_one_source('tool_a'))
     witnesses.pass_on(refit, 100)
     assert not refit.given

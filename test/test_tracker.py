@@ -64,24 +64,6 @@ def test_a_tracker_that_was_replaced_is_gone_at_once(rng):
         gc.enable()
 
 
-def test_a_frame_that_is_rehearsed_leaves_no_trace(rng):
-    """Also where models change from frame to frame, as they do while they follow references."""
-    tracker, alone = Tracker(MODEL, TOOL, EXACT), Tracker(MODEL, TOOL, EXACT)
-    rehearsal = Tracker(None, TOOL, EXACT)
-    for k, (stamp, position, rotation) in enumerate(path(12, 0)):
-        flux = fluxes(MODEL, TOOL, position, rotation, rng)
-        model = replace(MODEL, moments=MODEL.moments * (1 + 1e-9 * k))
-        tracker, alone = tracker.with_model(model), alone.with_model(model)
-        found = tracker.update(stamp, CHANNELS, flux)
-        for one, other in zip(found, alone.update(stamp, CHANNELS, flux), strict=True):
-            assert np.array_equal(one.position, other.position)
-            assert np.array_equal(one.covariance, other.covariance)
-        again = tracker.with_past_of(rehearsal).update(stamp, CHANNELS, flux)
-        assert [pose.state for pose in again] == [pose.state for pose in found]
-    assert tracker.counters == alone.counters and tracker.counters['frames'] == 12
-    assert rehearsal.counters['frames'] == 12
-
-
 @pytest.mark.long
 @pytest.mark.parametrize('noise_t', [20e-12, 100e-12])
 def test_the_noise_is_learnt_from_residuals(rng, noise_t):

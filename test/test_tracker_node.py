@@ -266,10 +266,8 @@ def test_both_nodes_track_a_recorded_session(ros, shared):
             bench.say_flux(tool.flux[frame], stamp_ns=session.start_ns + round(4e7 * frame) + 1)
         bench.spin_until(lambda: len(bench.full.get(BODY, [])) >= 30)
     finally:
-        bench.executor.shutdown()
-        for one in (server, node):
-            one.destroy_node()
-        bench.peer.destroy_node()
+        bench.close()
+        server.destroy_node()
     for frame, message in zip(range(0, 60, 2), bench.full[BODY], strict=True):
         away = np.linalg.norm(place_of(message.pose.pose) - tool.position[frame])
         sigma = np.sqrt(np.trace(message.pose.covariance.reshape(6, 6)[:3, :3]))

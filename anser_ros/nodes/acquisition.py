@@ -1,6 +1,6 @@
-"""Turns samples of a control unit's serial port into fluxes. It has three threads, none of
-which waits for another: the port's thread reads and queues, this node's worker demodulates and
-publishes, and the executor serves parameters and diagnostics.
+"""Turns samples of a control unit's serial port into fluxes. The port's thread reads and queues,
+this node's worker demodulates and publishes, the executor serves parameters and diagnostics; none
+waits for another.
 """
 
 import sys
@@ -110,14 +110,7 @@ class AcquisitionParameters:
 
 AUTO = 'auto'
 ASK_NS = 50_000_000
-"""Time (50 ms) from one question to the device about its time to the next, while its answer would
-help: windows wait for it. Each costs the device a hello of some hundred bytes."""
-MANY_BLOCKS = 8
-"""Blocks still wanted by a window, above which the node is woken early, so that what takes most of
-the time is done when the last block arrives."""
-FEW_BLOCKS = 4
-"""Blocks still to come when it is woken first. The second time one is missing: fewer at the first,
-and the work on those before is not over when it comes; more, and that of the second time isn't."""
+"""Time (50 ms) between questions about the device's time, while windows wait for its answer."""
 WAIT_S = 0.1
 """Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
 
@@ -148,7 +141,7 @@ class Acquisition(AnserNode):
         self._device: DeviceStatus | None = None
         self._stream: FluxStream | None = None
         self._refusal = ''
-        self._rebuild = self._woken_early = False
+        self._rebuild = False
         self._frame: FluxFrame | None = None
         self._interval = self._last = Interval(time.monotonic())
         self._past: Counter[str] = Counter()
@@ -164,13 +157,13 @@ class Acquisition(AnserNode):
         self._publish_setup(self._setup)
         self._port: ControlUnitPort | None = None
         self._closing = threading.Event()
-        step = self._guard(self._step)
-        self._worker = threading.Thread(target=self._work, args=(step,), name='demodulation')
+        self._worker = threading.Thread(target=self._work, name='demodulation')
         self._worker.start()
 
     # Worker thread ------------------------------------------------------------------------
 
-    def _work(self, step: Any) -> None:
+    def _work(self) -> None:
+        step = self._guard(self._step)
         while not self._closing.is_set():
             step()
         if self._port is not None:
@@ -179,25 +172,22 @@ class Acquisition(AnserNode):
 
     def _step(self) -> None:
         """Take one batch from the port, or find the port first."""
-        if self._port is None:
+        port = self._port
+        if port is None:
             self._open()
             return
-        batch = self._port.get(WAIT_S)
+        batch = port.get(WAIT_S)
         if batch is not None:
-            self._take(batch)
-        command = self._control.due(time.monotonic_ns())
-        if command is not None and self._port.state not in (PortState.ABSENT, PortState.CLOSED):
-            self._port.send(command)
-        self._ask()
-
-    def _ask(self) -> None:
-        """Ask the device for an answer, from which follows what time it is, where that helps."""
-        stream, port, now_ns = self._stream, self._port, time.monotonic_ns()
-        if stream is None or port is None or port.state is not PortState.RECEIVING:
-            return
-        if stream.clock.wants_answer and now_ns - self._asked_ns > ASK_NS:
+            self._take(batch, port)
+        stream, now_ns = self._stream, time.monotonic_ns()
+        command = self._control.due(now_ns)
+        if command is not None and port.state not in (PortState.ABSENT, PortState.CLOSED):
+            port.send(command)
+        wants_answer = stream is not None and stream.clock.wants_answer
+        is_due = wants_answer and now_ns - self._asked_ns > ASK_NS
+        if is_due and port.state is PortState.RECEIVING:
             self._asked_ns = now_ns
-            port.send(Identify())
+            port.send(Identify())  # from its answer follows what time it is for the device
 
     def _open(self) -> None:
         table = self.parameters
@@ -216,7 +206,7 @@ class Acquisition(AnserNode):
         port.start()
         self._port = port
 
-    def _take(self, batch: Batch) -> None:
+    def _take(self, batch: Batch, port: ControlUnitPort) -> None:
         if not batch.records:
             self._control.reset()
             self._drop_stream()
@@ -224,36 +214,12 @@ class Acquisition(AnserNode):
         for record, arrival_ns in zip(batch.records, batch.arrivals_ns, strict=True):
             self._control.take(record, arrival_ns)
             self._dispatch(record, arrival_ns)
-        if self._port is not None:
-            self._port.want(self._wake_after(self._port))
-
-    def _wake_after(self, port: ControlUnitPort) -> int:
-        """Blocks after which to go on: those of a window, the last of many apart.
-
-        Meanwhile the last window is demodulated and tracked once more, for nothing but to have the
-        processor awake and its caches full: the real one then needs a third of the time.
-        """
-        if self._stream is None:
-            return 1
-        wanted = self._stream.blocks_wanted
-        if wanted > MANY_BLOCKS:
-            self._woken_early = True
-            return wanted - FEW_BLOCKS
-        if wanted == 1 and self._woken_early:
-            self._woken_early = False
-            if not port.has_more:
-                self._stream.warm_up()
-        if self._woken_early and wanted > 1:
-            if not port.has_more:
-                self.frame_is_due()
-            return wanted - 1
-        return wanted
+        port.want(1 if self._stream is None else self._stream.blocks_wanted)
 
     def _dispatch(self, record: Record, arrival_ns: int) -> None:
         payload = record.payload
-        if isinstance(payload, SampleBlock):
-            if not self._control.started:
-                return  # left over in a buffer from before the connection
+        # Before the start they are left over in a buffer from before the connection.
+        if isinstance(payload, SampleBlock) and self._control.started:
             if self._rebuild:
                 self._drop_stream()
             if self._stream is None and not self._refusal:
@@ -308,7 +274,7 @@ class Acquisition(AnserNode):
         if self._hello is None or not self._control.tones_agree:
             return
         try:
-            self._stream = FluxStream(self._hello, self._setup, self._calibration, self._options())
+            self._stream = self._new_stream(self._hello)
         except AnserError as error:
             self._refusal = str(error)
             raise
@@ -317,10 +283,11 @@ class Acquisition(AnserNode):
         if self._start_sent_ns is not None:
             self._stream.clock.bound(0, self._start_sent_ns)
 
-    def _options(self) -> StreamOptions:
+    def _new_stream(self, hello: Hello) -> FluxStream:
         table = self.parameters
         rate_hz = table.rate_hz or self._setup.flux_rate_hz
-        return StreamOptions(table.window_s, rate_hz, table.mains_hz)
+        options = StreamOptions(table.window_s, rate_hz, table.mains_hz)
+        return FluxStream(hello, self._setup, self._calibration, options)
 
     def _publish_setup(self, setup: Setup) -> None:
         text = dump_setup(setup)
@@ -338,8 +305,7 @@ class Acquisition(AnserNode):
             self._tool_publisher.publish(self._cloud.message(frame.tool, stamp_ns))
         if len(frame.reference.channel):
             self._reference_publisher.publish(self._cloud.message(frame.reference, stamp_ns))
-        # The model is refitted when the poses and all messages are on their way, and no further
-        # frame waits.
+        # The model is refitted once poses and messages are on their way, if no frame waits.
         age_s = (time.monotonic_ns() - arrival_ns) / 1e9
         if self.hands_over and self._backlog.gives_way(age_s):
             self.count('refits_left_out')
@@ -359,7 +325,7 @@ class Acquisition(AnserNode):
     def on_parameters(self, old: Any, new: Any) -> None:
         """Demodulate the new way from the next block on; what cannot be done is refused."""
         if self._hello is not None and self._stream is not None:
-            FluxStream(self._hello, self._setup, self._calibration, self._options())
+            self._new_stream(self._hello)
         self._rebuild = True
 
     def close(self) -> None:
@@ -415,7 +381,7 @@ class Acquisition(AnserNode):
         device = self.parameters.device if self._port is None else self._port.device
         if level is Level.OK:
             self.get_logger().info(f'{device}: {message}')
-        else:  # a line of code has one severity
+        else:  # rclpy allows one severity a line of code
             self.get_logger().error(f'{device}: {message}')
 
     def _verdict(self, interval: Interval, rises: dict[str, int]) -> tuple[Level, str]:

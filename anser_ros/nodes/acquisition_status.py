@@ -1,6 +1,4 @@
-"""Reports the state of line, emitters and sensors: a line for each, with what is wrong in
-words.
-"""
+"""Reports the state of line, emitters and sensors, with what is wrong in words."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -71,8 +69,7 @@ MOST = 3
 class RecentFaults:
     """Remembers which counters rose, and says so for some seconds.
 
-    Faults counted before the first check, while a connection began in the middle of a record, are
-    ignored.
+    Faults before the first look are ignored: a connection may begin in the middle of a record.
     """
 
     def __init__(self) -> None:
@@ -81,10 +78,11 @@ class RecentFaults:
 
     def note(self, counters: Mapping[str, int], now_s: float) -> None:
         """Compare the counters with those of the last look."""
-        seen, self._seen = self._seen, dict(counters)
+        seen = counters if self._seen is None else self._seen
+        self._seen = dict(counters)
         self._recent = {n: r for n, r in self._recent.items() if now_s - r[0] < MEMORY_S}
         for name, count in counters.items():
-            rise = count - (seen.get(name, 0) if seen is not None else count)
+            rise = count - seen.get(name, 0)
             if rise > 0:
                 before = self._recent.get(name, (0.0, 0))[1]
                 self._recent[name] = (now_s, before + rise)
@@ -125,9 +123,8 @@ STATES = (
 def signal_troubles(
     coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame | None, past: Interval
 ) -> list[tuple[Level, str]]:
-    """Return what is wrong with the signals, by the names of emitters and sensors.
-
-    Lost samples are not reported here: the counters of the line say where they were lost.
+    """Return what is wrong with the signals, by the names of emitters and sensors; lost samples
+    apart, which the counters of the line report.
     """
     found = []
     if stream.missing:
@@ -144,10 +141,8 @@ def signal_troubles(
         for row in np.flatnonzero(past.flags & bit).tolist():
             why = _why_stale(past.staleness, row) if bit == STALE else ''
             bad.setdefault(why, []).append(stream.sensors[row].name)
-        found += [
-            (level, f'{word}: {named(names, MOST_NAMES)} {why}'.strip())
-            for why, names in bad.items()
-        ]
+        for why, names_of in bad.items():
+            found.append((level, f'{word}: {named(names_of, MOST_NAMES)} {why}'.strip()))
     return found
 
 
@@ -189,22 +184,16 @@ def emitter_statuses(coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame
     window = frame.window
     statuses = []
     for k, coil in enumerate(coils):
-        driven = bool(window.driven[k])
-        statuses.append(
-            Status(
-                f'emitter {coil.name}',
-                Level.OK if driven else Level.ERROR,
-                'driven' if driven else 'no current',
-                {
-                    'frequency_hz': float(stream.tones_hz[k]),
-                    'current_a': float(abs(window.current[k])),
-                    'nominal_current_a': float(stream.nominal_a[k]),
-                    'current_noise_a': float(window.current_sigma[k]),
-                    'flux_rms_t': _rms(window.flux[:, k]),
-                    'flux_noise_t': _rms(window.sigma[:, k]),
-                },
-            )
-        )
+        values = {
+            'frequency_hz': float(stream.tones_hz[k]),
+            'current_a': float(abs(window.current[k])),
+            'nominal_current_a': float(stream.nominal_a[k]),
+            'current_noise_a': float(window.current_sigma[k]),
+            'flux_rms_t': _rms(window.flux[:, k]),
+            'flux_noise_t': _rms(window.sigma[:, k]),
+        }
+        level, state = (Level.OK, 'driven') if window.driven[k] else (Level.ERROR, 'no current')
+        statuses.append(Status(f'emitter {coil.name}', level, state, values))
     return statuses
 
 

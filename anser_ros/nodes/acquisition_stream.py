@@ -1,8 +1,6 @@
-"""Turns one connection's samples into fluxes: windows, demodulation, tesla, flags and stamps.
-Blocks are cut into windows, these demodulated and converted (`FluxStream`); frames wait until
-their stamps are good (`WaitingFrames`). What only the stream shows, noise and the stamps'
-uncertainty, is measured for the setup document, and the system's clock is compared with the
-monotonic one.
+"""Turns one connection's samples into fluxes: blocks are cut into windows, these demodulated and
+converted to tesla (`FluxStream`); frames wait until their stamps are good (`WaitingFrames`).
+`MeasuredAccuracy` measures noise and the stamps' uncertainty for the setup document.
 """
 
 from __future__ import annotations
@@ -12,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +29,8 @@ from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, Setup
 
 PATIENCE_NS = 300_000_000
-"""Host time (0.3 s) that a frame waits for an arrival that confirms its stamp. Stalls of the host
-are shorter, and a new line settles in less; a pose that is older is of little use."""
+"""Host time (0.3 s) that a frame waits for an arrival that confirms its stamp: stalls of the host
+are shorter."""
 
 
 @dataclass(frozen=True)
@@ -60,27 +59,17 @@ class FluxFrame:
     repeats: bool = False
 
 
-@dataclass(frozen=True)
-class _Waiting:
-    """A frame, its middle and end in samples, and when its last block arrived."""
-
-    frame: FluxFrame
-    middle_sample: float
-    end_sample: float
-    arrival_ns: int
-
-
 class WaitingFrames:
     """Holds frames until a block that was in time has confirmed their stamps.
 
-    On a punctual line no frame waits. A frame that nothing confirms for `PATIENCE_NS` is withheld.
-
+    On a punctual line no frame waits. A frame that nothing confirms for `PATIENCE_NS` is withheld;
     ``withheld`` counts these.
     """
 
     def __init__(self, clock: SampleClock) -> None:
         self._clock = clock
-        self._queue: deque[_Waiting] = deque()
+        # Each with its middle and end in samples, and when its last block arrived, ns.
+        self._queue: deque[tuple[FluxFrame, float, float, int]] = deque()
         self.withheld = 0
 
     def __len__(self) -> int:
@@ -91,21 +80,20 @@ class WaitingFrames:
         self, frame: FluxFrame, middle_sample: float, end_sample: float, arrival_ns: int
     ) -> None:
         """Let a frame wait from the arrival of its last block on."""
-        self._queue.append(_Waiting(frame, middle_sample, end_sample, arrival_ns))
+        self._queue.append((frame, middle_sample, end_sample, arrival_ns))
 
     def release(self, now_ns: int) -> list[FluxFrame]:
         """Return the frames that need not wait any longer, stamped."""
         clock, frames = self._clock, []
         while self._queue:
-            first = self._queue[0]
+            frame, middle, end, arrival_ns = self._queue[0]
             # What repeats itself is marked so; its stamp need not be better than the line is.
-            is_good = clock.is_good(first.end_sample) or (first.frame.repeats and clock.is_settled)
-            if not is_good and now_ns - first.arrival_ns < PATIENCE_NS:
+            is_good = clock.is_good(end) or (frame.repeats and clock.is_settled)
+            if not is_good and now_ns - arrival_ns < PATIENCE_NS:
                 break
             self._queue.popleft()
             if is_good:
-                host_ns = clock.host_ns(first.middle_sample)
-                frames.append(replace(first.frame, host_ns=host_ns))
+                frames.append(replace(frame, host_ns=clock.host_ns(middle)))
             else:
                 self.withheld += 1
         return frames
@@ -170,18 +158,16 @@ class FluxStream:
         self._demodulator = Demodulator(
             rate, self.tones_hz, window, mains_hz=options.mains_hz or None
         )
-        self._converter = _converter(hello, self, columns, calibration)
+        self._current_column = [c.kind for c in hello.channels].index(ChannelKind.CURRENT)
+        self._columns = np.array([columns[s.channel] for s in self.sensors])
+        self._converter = self._converter_of(hello, calibration)
         self._rates = None if self._demodulator.follows_motion else FluxRates()
-        watch = RepetitionWatch(len(hello.channels), rate, self.tones_hz)
+        self._watch = RepetitionWatch(len(hello.channels), rate, self.tones_hz)
         self.ticks = TickCheck(rate, hello.tick_hz)
-        self._cutter = WindowCutter(window, hop, watch, self.ticks)
-        self._watch = watch
+        self._cutter = WindowCutter(window, hop, self._watch, self.ticks)
         self.counters = self._cutter.counters
         self.clock = SampleClock(rate)
         self.waiting = WaitingFrames(self.clock)
-        self._current_column = _current_column(hello)
-        self._newest: Window | None = None
-        self._columns = np.array([columns[s.channel] for s in self.sensors])
         self._split = sum(s.body != FIELD_GENERATOR for s in self.sensors)
         self._tool = SensorRows.of(self.sensors[: self._split], fixed_only=True)
         self._reference = SensorRows.of(self.sensors[self._split :], fixed_only=True)
@@ -236,14 +222,22 @@ class FluxStream:
             self.waiting.add(frame, window.middle_sample, end, arrival_ns)
         return self.waiting.release(arrival_ns)
 
-    def warm_up(self) -> None:
-        """Demodulate the newest window again, only to keep caches warm; see `Acquisition`."""
-        if self._newest is not None:
-            fit = self._demodulator.demodulate(self._newest.codes, self._newest.present)
-            self._converter.convert(fit)
+    def _converter_of(self, hello: Hello, calibration: ChannelCalibration) -> FluxConverter:
+        per_code = np.array([channel.full_scale / FULL_SCALE_CODE for channel in hello.channels])
+        numbers = [sensor.channel for sensor in self.sensors]
+        return FluxConverter(
+            self.tones_hz,
+            self._columns,
+            per_code[self._columns],
+            calibration.areas_m2(numbers),
+            calibration.delays_s(numbers),
+            current_column=self._current_column,
+            amperes_per_code=float(per_code[self._current_column]),
+            nominal_currents_a=self.nominal_a,
+            current_delay_s=calibration.current_delay_s,
+        )
 
     def _frame(self, window: Window) -> FluxFrame:
-        self._newest = window
         fit = self._demodulator.demodulate(window.codes, window.present)
         converted = self._converted(fit, window.middle_sample / self._sample_rate_hz)
         staleness = self._staleness(window)
@@ -290,11 +284,6 @@ def _points(
     return FluxPoints(rows.channel, flags, flux, rows.position, rows.axis)
 
 
-def _current_column(hello: Hello) -> int:
-    """Column of the sum of the emitters' currents."""
-    return [channel.kind for channel in hello.channels].index(ChannelKind.CURRENT)
-
-
 def _nominal_currents(setup: Setup, hello: Hello) -> NDArray[np.float64]:
     """Currents that the setup's field is given for; the control unit's where it says nothing."""
     current = setup.emitter.geometry.get('current_a')
@@ -303,32 +292,10 @@ def _nominal_currents(setup: Setup, hello: Hello) -> NDArray[np.float64]:
     return np.array(hello.currents_a)
 
 
-def _converter(
-    hello: Hello, stream: FluxStream, columns: dict[int, int], calibration: ChannelCalibration
-) -> FluxConverter:
-    per_code = np.array([channel.full_scale / FULL_SCALE_CODE for channel in hello.channels])
-    current = _current_column(hello)
-    numbers = [sensor.channel for sensor in stream.sensors]
-    chosen = np.array([columns[number] for number in numbers])
-    return FluxConverter(
-        stream.tones_hz,
-        chosen,
-        per_code[chosen],
-        calibration.areas_m2(numbers),
-        calibration.delays_s(numbers),
-        current_column=current,
-        amperes_per_code=float(per_code[current]),
-        nominal_currents_a=stream.nominal_a,
-        current_delay_s=calibration.current_delay_s,
-    )
-
-
 EARLIEST_S = 10.0
-"""Least time, s, from one setup document to the next for the sake of the stamps: trackers start
-again with it, and a host's load changes within seconds."""
+"""Least time, s, between setup documents that only state another uncertainty of the stamps."""
 _FACTOR = 2.0
-"""Ratio by which the stamps' uncertainty must differ from what was published to be published
-again."""
+"""Ratio to the published uncertainty of the stamps from which it is published again."""
 
 
 class MeasuredAccuracy:
@@ -375,13 +342,12 @@ class MeasuredAccuracy:
 
 
 _TRIES = 5
-"""Readings of both clocks of which the closest together counts: between two readings a thread may
-have to wait, and the wait would be taken for a part of the difference."""
+"""Readings of both clocks of which the closest together counts: a thread may wait between two."""
 _CLOSE_NS = 20_000
 """Time (20 us) from one reading to the next that is close enough to try no more."""
 _STEP_NS = 5_000_000
-"""Change of the difference (5 ms) from one look to the next that is no drift but a setting. A
-clock that is being slewed moves by 0.5 ms a second."""
+"""Change of the difference (5 ms) that is a setting: a clock that is slewed moves 0.5 ms a
+second."""
 
 
 class WallClock:
@@ -401,15 +367,15 @@ class WallClock:
 
     def offset_ns(self) -> int:
         """Return the system's time minus the monotonic time now, ns."""
-        best_ns, offset_ns = -1, 0
+        best = math.inf, 0
         for _ in range(_TRIES):
             before_ns = self._monotonic_ns()
             wall_ns = self._wall_ns()
             width_ns = self._monotonic_ns() - before_ns
-            if best_ns < 0 or width_ns < best_ns:
-                best_ns, offset_ns = width_ns, wall_ns - before_ns - width_ns // 2
-            if best_ns <= _CLOSE_NS:
+            best = min(best, (width_ns, wall_ns - before_ns - width_ns // 2), key=itemgetter(0))
+            if width_ns <= _CLOSE_NS:
                 break
+        offset_ns = best[1]
         if self._offset_ns is not None and abs(offset_ns - self._offset_ns) > _STEP_NS:
             self.sets += 1
         self._offset_ns = offset_ns

@@ -1,5 +1,6 @@
 """Simulates a control unit behind a pseudo-terminal, with the optical truth beside it."""
 
+import functools
 import json
 import math
 import sys
@@ -44,14 +45,13 @@ from anser_ros.simulation.world import (
 from anser_ros.stamps import set_stamp
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.recorded import optical_topic
-from anser_ros.wire.setup import Setup, parse_setup
+from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import read_config
 
 STRETCH_S = 0.005
 """Stretch of samples that is made at a time, s: it bounds how unevenly they are sent."""
 LONGEST_LAG_S = 0.25
-"""Lag behind the clock, s, beyond which samples are left out instead of made up for: a machine
-that is so late would hardly catch up, and what it sent would be old."""
+"""Lag behind the clock, s, beyond which samples are left out instead of made up for."""
 
 
 @dataclass(frozen=True)
@@ -140,29 +140,27 @@ class CuSimulator(AnserNode):
         drawn = draw(table.effect, setup, channels, rng)
         if table.effect_file:
             _write_effect(Path(table.effect_file), drawn)
-        effects = drawn.effects
-        real = setup
-        for effect in effects:
-            real = effect.setup(real)
-        self._effects = effects
+        self._effects = drawn.effects
+        real = functools.reduce(lambda made, effect: effect.setup(made), drawn.effects, setup)
+        if table.board_seed:
+            made = manufactured(real, np.random.default_rng(table.board_seed))
+        else:
+            made = real
         self._begin_ns = time.monotonic_ns()
         self._stream_begin_s = math.inf
         self._metal = [*_metal(table, lambda: self._stream_begin_s), *drawn.metal]
         paths = tool_paths(setup.bodies, table.path_phase_rad)
-        source = board_source(_board(table, real))
-        self._world = World(real, source, paths=paths, metal=self._metal)
+        self._world = World(real, board_source(made), paths=paths, metal=self._metal)
         self._world.flux(0.0)  # loads the kernels now, not while samples are due
         front = FrontEnd(
-            table.sample_rate_hz,
-            noise_codes=table.noise_codes,
-            current_drift=table.current_drift,
+            table.sample_rate_hz, noise_codes=table.noise_codes, current_drift=table.current_drift
         )
         self._unit = ControlUnit(
             self._world,
             channels,
             front,
             block_samples=table.block_samples,
-            effects=effects,
+            effects=drawn.effects,
             seed=table.seed,
         )
         self._least_late_ns = math.inf
@@ -178,18 +176,22 @@ class CuSimulator(AnserNode):
         self._frame_id = setup.frame_id
         self._prepared: deque[Piece] = deque()
         self._closing = threading.Event()
-        step = self._guard(self._step)
-        self._thread = threading.Thread(target=self._run, args=(step,), name='control_unit')
+        self._thread = threading.Thread(target=self._run, name='control_unit')
         self._thread.start()
         self.create_timer(1 / table.optical_rate_hz, self._publish_truth, clock=self.steady_clock)
         self.get_logger().info(f'control unit at {table.link}')
 
     # Device thread ------------------------------------------------------------------------
 
-    def _run(self, step: Any) -> None:
+    def _run(self) -> None:
+        step = self._guard(self._step)
         while not self._closing.is_set():
             step()
-            self._port.wait(max(self._next_s() - self._elapsed_s(), 1e-4))
+            # Until a block is to be sent, or the next ones are to be made.
+            next_s = self._due_s(self._unit.samples) - STRETCH_S
+            if self._prepared:
+                next_s = self._due_s(self._prepared[0].end_sample)
+            self._port.wait(max(next_s - self._elapsed_s(), 1e-4))
 
     def _elapsed_s(self) -> float:
         return (time.monotonic_ns() - self._begin_ns) / 1e9
@@ -197,12 +199,6 @@ class CuSimulator(AnserNode):
     def _due_s(self, samples: int) -> float:
         """When so many samples have been taken since power-up, and can go out."""
         return samples / self._unit.sample_rate_hz
-
-    def _next_s(self) -> float:
-        """When there is something to do again: a block to be sent, or the next ones to be made."""
-        if self._prepared:
-            return self._due_s(self._prepared[0].end_sample)
-        return self._due_s(self._unit.samples) - STRETCH_S
 
     def _step(self) -> None:
         """Send what is due. The next stretch is worked out before its time, so nothing is late.
@@ -260,12 +256,11 @@ class CuSimulator(AnserNode):
         now_ns = unit_ns + time.time_ns() - time.monotonic_ns()
         for effect in self._effects:
             now_ns += round(1e9 * (effect.optical_time(time_s) - time_s))
+        noise_m = self.parameters.optical_noise_m
         for body, publisher in self._publishers_of.items():
             position, rotation = self._world.pose(body, time_s)
-            if self.parameters.optical_noise_m:
-                position = position + self.parameters.optical_noise_m * self._rng.standard_normal(
-                    3
-                )
+            if noise_m:
+                position = position + noise_m * self._rng.standard_normal(3)
             publisher.publish(_pose(self._frame_id, now_ns, position, rotation))
 
     def on_parameters(self, old: Any, new: Any) -> None:
@@ -293,13 +288,6 @@ def _write_effect(path: Path, drawn: Drawn) -> None:
         path.write_text(json.dumps(drawn.document()) + '\n')
     except OSError as error:
         raise ParameterError(f'cannot write {path}: {error.strerror}') from error
-
-
-def _board(table: CuSimulatorParameters, setup: Setup) -> Setup:
-    """The setup whose geometry makes the field."""
-    if table.board_seed == 0:
-        return setup
-    return manufactured(setup, np.random.default_rng(table.board_seed))
 
 
 def _metal(table: CuSimulatorParameters, begin_s: Callable[[], float]) -> list[MetalBody]:

@@ -1,7 +1,4 @@
-"""Serves the field model: from a file or drawn from the setup, refitted live to references.
-``field_model`` carries the dipoles, ``field_model_error`` their uncertainty with the same
-stamp.
-"""
+"""Serves the field model: from a file or drawn from the setup, refitted live to references."""
 
 import sys
 import time
@@ -19,7 +16,6 @@ from anser_ros import pose_states as states
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.nodes import field_model_refit
 from anser_ros.nodes.field_model_io import (
     CONFIRM_S,
     KeptBaseline,
@@ -28,12 +24,21 @@ from anser_ros.nodes.field_model_io import (
     PlaceWatch,
     ToolWitnesses,
 )
-from anser_ros.nodes.field_model_refit import ActiveRefit
+from anser_ros.nodes.field_model_refit import (
+    ACTIVE,
+    PREPARING,
+    TROUBLED,
+    ActiveRefit,
+    activity,
+    model_values,
+    no_baseline,
+    reference_statuses,
+)
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.streams.model_clouds import read_frame
+from anser_ros.nodes.streams.clouds import read_frame
 from anser_ros.nodes.streams.one_source import LOOK_S, NewestSource, sender_words, setup_source
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.frame import MOST_RATE_HZ, Pace, ReadingWindow, check_enough
@@ -130,8 +135,7 @@ class FieldModelNode(AnserNode):
         self._place = PlaceWatch()
         self._trouble = Trouble()
         self._frames: Intake | None = None
-        self._stamp_ns = 0
-        self._received_s = 0.0
+        self._stamp_ns, self._received_s = 0, 0.0
         self._pace = Pace(table.refit_rate_hz)
         self._output = ModelOutput(self)
         self._metal = MetalView(self)
@@ -194,7 +198,7 @@ class FieldModelNode(AnserNode):
         elif len(self._references) and table.refit:
             self._look()
             if not (table.baseline_at_start or self._refit.is_making):
-                self.get_logger().warning(field_model_refit.no_baseline(self.get_namespace()))
+                self.get_logger().warning(no_baseline(self.get_namespace()))
 
     def _on_flux(self, message: PointCloud2) -> None:
         setup, window, frames = self._setup, self._window, self._frames
@@ -212,14 +216,19 @@ class FieldModelNode(AnserNode):
                 self.count(f'readings_{kind}', many)
             window.add(frame)
             self._received_s = time.monotonic()
-            if self._refit.is_awaited and not is_live(stamp_ns, time.time_ns()):
-                self._refit.wait()  # a recording that is played is worked off whole
+            start = self._refit.start if self._refit.is_awaited else None
+            if start is not None and not is_live(stamp_ns, time.time_ns()):
+                start.wait()  # a recording that is played is worked off whole
             self._take_refit()
             if self._place.look(frame, window) and not self._follows and self._model is not None:
                 self._serve(self._model, stamp_ns)
             has_none = self._refit.current is None and not self._refit.is_making
             if has_none and self.parameters.baseline_at_start and window.full:
-                self._begin(window, setup)
+                try:
+                    self._follow(clean_mean(window, self._base, self._references, setup))
+                except FitError as error:
+                    self._refuse_baseline(error)
+                    window.clear()
             if self._refit.current is not None and self._follows:
                 self._update(frame)
         except AnserError as error:
@@ -287,14 +296,6 @@ class FieldModelNode(AnserNode):
         base, allowed = self._base, self.parameters.allow_uncalibrated
         return base is not None and is_nominal(base) and not allowed
 
-    def _begin(self, window: ReadingWindow, setup: Setup) -> None:
-        """Take the first readings for the distortion-free ones, or wait for others."""
-        try:
-            self._follow(clean_mean(window, self._base, self._references, setup))
-        except FitError as error:
-            self._refuse_baseline(error)
-            window.clear()
-
     def _refuse_baseline(self, error: AnserError) -> None:
         self._no_baseline = str(error)
         self._refuse('baselines_refused', error)
@@ -315,7 +316,7 @@ class FieldModelNode(AnserNode):
         """Refit to what differs from a baseline, shape (S, K), T, as soon as that can be done."""
         self._refit.begin(baseline)
         if self._refit.current is None:
-            self.get_logger().info(field_model_refit.PREPARING)
+            self.get_logger().info(PREPARING)
         self._no_baseline = ''
         self._announce_changes()
         self.count('baselines')
@@ -326,7 +327,7 @@ class FieldModelNode(AnserNode):
             if not self._refit.take():
                 return
             self._received_s = time.monotonic()
-            self.get_logger().info(field_model_refit.ACTIVE)
+            self.get_logger().info(ACTIVE)
         except FitError as error:
             self._refuse_baseline(error)
         self._announce_changes()
@@ -334,18 +335,15 @@ class FieldModelNode(AnserNode):
     def _exchange(self, file_model: FieldModel | None) -> None:
         """Start from another model; the baseline holds, as no model is in the readings.
 
-        Raises
-        ------
-        ModelFileError, SetupError
-            When there is no such model for the setup.
+        Raises `ModelFileError` or `SetupError` when there is no such model for the setup.
         """
         setup, references = self._setup, self._references
         base = file_model if setup is None else starting_model(setup, file_model)
         self._file_model, self._base = file_model, base
         if base is None:
             return
-        self._place = PlaceWatch.of(base, references, setup, self._fluxes.publishers)
         if setup is not None and references is not None:
+            self._place = PlaceWatch.of(base, references, setup, self._fluxes.publishers)
             self._refit.prepare(setup, base, references, self.parameters.refit)
             self._refit.begin_again()
         self._unfit, self._received_s = False, time.monotonic()
@@ -424,37 +422,33 @@ class FieldModelNode(AnserNode):
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values['fingerprint'] = '' if self._base is None else self._base.fingerprint
-        values |= field_model_refit.model_values(model, self.parameters.model_file)
+        values |= model_values(model, self.parameters.model_file)
         values |= {'stamp_ns': self._stamp_ns, 'freeze': self._frozen}
         values['refit_time_s'] = self._refit.update_s
         is_wanted, refused = self.parameters.refit, self._no_baseline
-        activity = field_model_refit.activity(
-            self._refit, self._frozen, is_wanted, refused, values
-        )
+        words = activity(self._refit, self._frozen, is_wanted, refused, values)
         if self._is_uncalibrated:
-            activity = f'{states.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
+            words = f'{states.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {words}'
         dead = '' if self._frames is None else ', '.join(self._frames.dead)
         values['dead_emitters'] = dead
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)
         trouble = self._trouble.recent(time.monotonic())
         if trouble:
-            return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
+            return Status('', Level.WARN, f'{words}; lately: {trouble}', values)
         lost = f'{states.REFERENCES_LOST}: no reference fluxes'
         if self._place.is_waiting:
             return Status('', Level.WARN, f'{lost} yet', values)
         silent_s, setup = time.monotonic() - self._received_s, self._setup
         if setup is not None and self._follows and silent_s > setup.refit.references_age_s:
             return Status('', Level.ERROR, f'{lost} for {silent_s:.1f} s', values)
-        is_troubled = values.get('refit_state') in field_model_refit.TROUBLED
-        is_troubled |= self._refit.is_awaited and self._follows
-        is_troubled |= bool(refused and is_wanted)
-        level = Level.WARN if is_troubled or self._is_uncalibrated else Level.OK
-        return Status('', level, activity, values)
+        is_troubled = values.get('refit_state') in TROUBLED or bool(refused and is_wanted)
+        is_troubled |= self._is_uncalibrated or (self._refit.is_awaited and self._follows)
+        return Status('', Level.WARN if is_troubled else Level.OK, words, values)
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every reference sensor that the refit looks at."""
-        return field_model_refit.reference_statuses(self._refit.result)
+        return reference_statuses(self._refit.result)
 
     def stop_working(self) -> bool:
         """End what is worked on aside, a refit that is being made among it."""

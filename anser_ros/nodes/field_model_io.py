@@ -1,16 +1,15 @@
-"""What a field_model receives besides its references, publishes, and keeps on disk. The model
-and its uncertainty go out as two topics, the metal that the refit sees as a marker; poses and
-fluxes of rigid tools come in as witnesses of metal. `PlaceWatch` asks whether the references
-locate the board where the model has it, and `KeptBaseline` keeps what a node that was killed
-leaves to the next one: a baseline cannot be taken while metal is near. It holds as long as the
-sender of the references goes on and nothing speaks against it; the node confirms it every
-second, and whoever starts soon after the last time takes it up.
+"""What a field_model publishes (`ModelOutput`, `MetalView`), keeps on disk (`KeptBaseline`), asks
+of its references (`PlaceWatch`: is the board where the model has it?) and receives besides them
+(`ToolWitnesses`). A baseline cannot be taken while metal is near, so a node that was killed leaves
+its own to the next one: the node confirms it every second, as long as the sender of the references
+goes on and nothing speaks against it.
 """
 
 import contextlib
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +28,9 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.frames.intake import Frame
 from anser_ros.integrity.board_place import BoardPlace
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.incoming import pose_numbers
 from anser_ros.nodes.runtime.node import AnserNode
-from anser_ros.nodes.streams.model_clouds import ModelWriter, read_frame
+from anser_ros.nodes.streams.clouds import ModelWriter, read_frame
 from anser_ros.nodes.streams.one_source import OneSource
 from anser_ros.physics.rotations import rotation_of_quaternion
 from anser_ros.physics.sensor import SensorTable
@@ -53,16 +53,12 @@ Array = NDArray[np.float64]
 def pose_in(message: PoseStamped, frame_id: str, body: str) -> tuple[Array, Array]:
     """Return position (3,), m, and rotation (3, 3) of a body in a frame.
 
-    Raises
-    ------
-    FrameError
-        When the pose is given in another frame, or is no pose.
+    Raises `FrameError` when the pose is given in another frame, or is no pose.
     """
     if message.header.frame_id != frame_id:
         raise FrameError(f'the pose of {body} is in {message.header.frame_id!r}, not {frame_id!r}')
-    p, q = message.pose.position, message.pose.orientation
-    quaternion = unit_quaternions((q.x, q.y, q.z, q.w))
-    position = np.array([p.x, p.y, p.z])
+    numbers = pose_numbers(message.pose)
+    position, quaternion = np.array(numbers[:3]), unit_quaternions(numbers[3:])
     if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
         raise FrameError(f'the pose of {body} is not finite, or its quaternion has no unit length')
     return position, rotation_of_quaternion(quaternion)
@@ -82,18 +78,15 @@ class ModelOutput(ModelWriter):
     def publish(
         self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool, withheld: str
     ) -> None:
-        """Publish a model, and its uncertainty where that is news.
-
-        The uncertainty is published first, so that a receiver has both when the model arrives.
-        """
+        """Publish a model, and before it its uncertainty where that is news."""
         error = self.new_error(model, frame_id, stamp_ns, follows, code_of(withheld))
-        dipoles = self.dipoles(model, frame_id, stamp_ns)
+        sent = [(self.models, self.dipoles(model, frame_id, stamp_ns))]
         if error is not None:
-            self._node.hand_over(self.errors, error)
-        self._node.hand_over(self.models, dipoles)
-        if error is not None:
-            self.errors.publish(error)
-        self.models.publish(dipoles)
+            sent.insert(0, (self.errors, error))
+        for publisher, message in sent:
+            self._node.hand_over(publisher, message)
+        for publisher, message in sent:
+            publisher.publish(message)
 
 
 LEAST_SHOWN_DENSITY = 0.15
@@ -116,18 +109,15 @@ class MetalView:
 
     def show(self, result: RefitResult, frame_id: str, stamp_ns: int) -> None:
         """Show what a refit found, or take away what was shown when it found nothing."""
-        now_s = time.monotonic()
-        if result.find is None:
-            if self._shown_s is not None:
-                self._markers.publish(metal_markers(None, frame_id, stamp_ns))
-                self._shown_s = None
-            return
-        is_due = self._shown_s is None or now_s - self._shown_s >= VIEW_PERIOD_S
-        if not is_due or result.metal is None:
-            return
-        self._shown_s = now_s
-        self._markers.publish(metal_markers(result.metal, frame_id, stamp_ns))
-        self._centroid.publish(centroid_message(result.metal, frame_id, stamp_ns))
+        now_s, shown_s = time.monotonic(), self._shown_s
+        is_due = shown_s is None or now_s - shown_s >= VIEW_PERIOD_S
+        if result.find is None and shown_s is not None:
+            self._markers.publish(metal_markers(None, frame_id, stamp_ns))
+            self._shown_s = None
+        elif result.find is not None and is_due and result.metal is not None:
+            self._shown_s = now_s
+            self._markers.publish(metal_markers(result.metal, frame_id, stamp_ns))
+            self._centroid.publish(centroid_message(result.metal, frame_id, stamp_ns))
 
 
 def centroid_message(metal: Metal, frame_id: str, stamp_ns: int) -> PointStamped:
@@ -142,12 +132,12 @@ def centroid_message(metal: Metal, frame_id: str, stamp_ns: int) -> PointStamped
 def metal_markers(metal: Metal | None, frame_id: str, stamp_ns: int) -> MarkerArray:
     """Return spheres as large as the space they stand for, and one at the centroid.
 
-    Without metal, the markers shown before are deleted.
+    The markers shown before are deleted: their number changes, and without metal there are none.
     """
+    clear = _marker(frame_id, stamp_ns, 0)
+    clear.action = Marker.DELETEALL
     if metal is None:
-        gone = _marker(frame_id, stamp_ns, 0)
-        gone.action = Marker.DELETEALL
-        return MarkerArray(markers=[gone])
+        return MarkerArray(markers=[clear])
     density = np.abs(metal.polarisability) / metal.volumes
     rows = np.argsort(-density)[:MOST_SHOWN]
     rows = rows[density[rows] >= LEAST_SHOWN_DENSITY * density[rows[0]]]
@@ -169,9 +159,6 @@ def metal_markers(metal: Metal | None, frame_id: str, stamp_ns: int) -> MarkerAr
     centre.pose.position = _point(metal.centroid)
     centre.scale.x = centre.scale.y = centre.scale.z = CENTROID_M
     centre.color = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.9)
-    # The number of lists changes; what is left of a longer array must not stay.
-    clear = _marker(frame_id, stamp_ns, 0)
-    clear.action = Marker.DELETEALL
     return MarkerArray(markers=[clear, *markers, centre])
 
 
@@ -190,22 +177,17 @@ def _point(values: np.ndarray) -> Point:
 
 
 BASELINE_S = 60.0
-"""How long after it was last confirmed, s, a baseline is taken up: a supervisor starts a process
-again sooner, and nobody moves coils meanwhile."""
+"""How long after it was last confirmed, s, a baseline is taken up: a supervisor is faster."""
 CONFIRM_S = 1.0
 """Time from one confirmation of a baseline to the next, s."""
 
 
 class KeptBaseline:
-    """Keeps the baseline of a running node of that whole name.
+    """Keeps the baseline of a running node of that whole name, in a ``folder``, None for not at
+    all.
 
     ``sender`` returns what identifies the only sender of the references; empty where there is
     none.
-
-    Attributes
-    ----------
-    folder : Path or None
-        Where files are kept; None where they are not.
     """
 
     def __init__(self, folder: Path | None, node: str, sender: Callable[[], str]) -> None:
@@ -225,7 +207,7 @@ class KeptBaseline:
         return self._path() is not None
 
     def read(self) -> NDArray[np.complex128] | None:
-        """Return the baseline that another process confirmed lately; None where there is none."""
+        """Return the baseline that another process confirmed lately, shape (R, K), T, or None."""
         path = self._path()
         with contextlib.suppress(*DAMAGED):
             if path is not None and 0.0 <= time.time() - used_s(path) <= BASELINE_S:
@@ -235,10 +217,7 @@ class KeptBaseline:
     def confirm(self, flux: NDArray[np.complex128]) -> None:
         """Keep a baseline, shape (R, K), T, to which nothing is opposed at this moment.
 
-        Raises
-        ------
-        OSError
-            When the disk is full, or must not be written.
+        Raises `OSError` when the disk is full, or must not be written.
         """
         path = self._path()
         if path != self._kept:
@@ -271,25 +250,16 @@ DISCOVERY_S = 1.0
 has its first pose as much later."""
 
 
-def none_announced() -> int:
-    """Return 0: no references are announced."""
-    return 0
-
-
 class PlaceWatch:
     """Asks with the first frame, and again while the model was found to lie aside.
 
     ``place`` is None where nothing can be compared; ``announced`` returns how many publishers of
-    references the graph knows.
-
-    Attributes
-    ----------
-    misplaced : str
-        How the model lies aside; empty where it does not, or it is not known yet.
+    references the graph knows. ``misplaced`` is how the model lies aside; empty where it does not,
+    or it is not known yet.
     """
 
     def __init__(
-        self, place: BoardPlace | None = None, announced: Callable[[], int] = none_announced
+        self, place: BoardPlace | None = None, announced: Callable[[], int] = lambda: 0
     ) -> None:
         self._place, self._announced = place, announced
         self._has_frame = self._has_looked = False
@@ -299,14 +269,12 @@ class PlaceWatch:
     @classmethod
     def of(
         cls,
-        base: FieldModel | None,
-        references: SensorTable | None,
-        setup: Setup | None,
+        base: FieldModel,
+        references: SensorTable,
+        setup: Setup,
         announced: Callable[[], int],
     ) -> 'PlaceWatch':
-        """Return what watches a model, given what is known yet."""
-        if base is None or references is None or setup is None:
-            return cls()
+        """Return what watches a model."""
         return cls(board_place_of(base, references, setup), announced)
 
     @property
@@ -341,19 +309,15 @@ class PlaceWatch:
 
 MOST_FRAMES = 8
 """Frames whose fluxes and poses wait for the references of theirs and of the next: two, and some
-for a busy machine. Fewer, and what comes late witnesses nothing; more only take memory."""
+for a busy machine."""
 
 
 class ToolWitnesses:
     """Hands the readings of rigid tools to the active refit, once a frame.
 
     Nothing is subscribed to unless it ``is_wanted``. ``frame_id`` returns the frame of the board,
-    and ``refuse`` gets a counter's name and the error of what is refused.
-
-    Attributes
-    ----------
-    sources : list of OneSource
-        Topics of which only one publisher is believed.
+    ``refuse`` gets a counter's name and the error of what is refused, and ``sources`` are topics
+    of which only one publisher is believed.
     """
 
     def __init__(
@@ -369,11 +333,10 @@ class ToolWitnesses:
         self._frames: dict[int, FluxPoints] = {}
         self._poses: dict[int, dict[str, ToolPose]] = {}
         self._subscriptions: dict[str, Any] = {}
-        self.sources: list[Any] = []
-        if is_wanted:
-            self.sources.append(
-                OneSource(node, PointCloud2, 'tool/flux', self._on_flux, qos.STREAM)
-            )
+        topics = ('tool/flux',) if is_wanted else ()
+        self.sources = [
+            OneSource(node, PointCloud2, topic, self._on_flux, qos.STREAM) for topic in topics
+        ]
 
     def expect(self, setup: Setup, model: FieldModel) -> None:
         """Have to do with the tools of a setup, and with a model's effects, from now on."""
@@ -386,7 +349,7 @@ class ToolWitnesses:
         self._frames, self._poses = {}, {}
         for body in set(sensors.body) - set(self._subscriptions):
             self._subscriptions[body] = self._node.create_subscription(
-                PoseStamped, f'{topic_of(body)}/pose', self._pose_taker(body), qos.STREAM
+                PoseStamped, f'{topic_of(body)}/pose', partial(self._on_pose, body), qos.STREAM
             )
         for body in set(self._subscriptions) - set(sensors.body):
             self._node.destroy_subscription(self._subscriptions.pop(body))
@@ -423,18 +386,13 @@ class ToolWitnesses:
         except AnserError as error:
             self._refuse('tool_fluxes_refused', error)
 
-    def _pose_taker(self, body: str) -> Callable[[PoseStamped], None]:
-        """Return what takes the poses of a body."""
-
-        def take(message: PoseStamped) -> None:
-            try:
-                pose = pose_in(message, self._frame_id(), body)
-                stamp_ns = stamp_of(message)
-                _keep(self._poses, stamp_ns, {**self._poses.get(stamp_ns, {}), body: pose})
-            except AnserError as error:
-                self._refuse('tool_poses_refused', error)
-
-        return take
+    def _on_pose(self, body: str, message: PoseStamped) -> None:
+        try:
+            pose = pose_in(message, self._frame_id(), body)
+            stamp_ns = stamp_of(message)
+            _keep(self._poses, stamp_ns, {**self._poses.get(stamp_ns, {}), body: pose})
+        except AnserError as error:
+            self._refuse('tool_poses_refused', error)
 
 
 def _keep(kept: dict[int, Any], stamp_ns: int, what: Any) -> None:

@@ -1,8 +1,7 @@
 """Makes the refit that a field_model follows its references with, keeps it, and reports it in
-``/diagnostics``. A refit is made in the background, while the callbacks go on. Its tables,
-seconds of work, need the model and the references' places only, so they are begun before there
-is a baseline, and kept on disk. What a baseline adds is half a second more, for each baseline
-again.
+``/diagnostics``. A refit is made in the background. Its tables, seconds of work, need the model
+and the references' places only, so they are begun before there is a baseline, and kept on disk;
+each baseline adds half a second.
 """
 
 import contextlib
@@ -37,13 +36,6 @@ WORKER = 'refit_start'
 """Name of the thread that makes a refit."""
 
 
-def warm_up() -> None:
-    """Let the compiler load what it needs for its first kernel, half a second, while the graph is
-    still being discovered.
-    """
-    loop_field(np.eye(3), np.ones((1, 3)), 1.0)
-
-
 class _EndedError(Exception):
     """The tables are no longer needed."""
 
@@ -73,31 +65,26 @@ class RefitStart:
         self._kept: Future[None] | None = None
         self._share, self._is_over = 0.0, False
 
-    def prepare(self) -> None:
-        """Begin with what needs no baseline, unless that is done."""
+    def prepare(self) -> Future[tables.RefitTables]:
+        """Begin with what needs no baseline, unless that is done; return the tables to come."""
         if self._tables is None:
             self._tables = self._worker.submit(self._work_tables_out)
+        return self._tables
 
     def begin(self, baseline: NDArray[np.complex128]) -> None:
         """Begin to make the refit to what differs from a baseline, in place of one being made.
 
         The baseline, shape (R, K), T, is what the references read without metal.
         """
-        self.prepare()
+        made = self.prepare()
         if self._made is not None:
             self._made.cancel()
-        self._made = self._worker.submit(self._make, baseline)
+        self._made = self._worker.submit(self._make, baseline, made)
         if self._kept is None and self._folder is not None:
-            self._kept = self._worker.submit(self._keep, self._folder)  # nobody waits for it
+            self._kept = self._worker.submit(self._keep, self._folder, made)  # nobody waits for it
 
     def taken(self) -> LiveRefit | None:
-        """Return the refit once, as soon as it is made.
-
-        Raises
-        ------
-        FitError
-            When no refit can be made for this model, these references or this baseline.
-        """
+        """Return the refit once, as soon as it is made; raises `FitError` where none can be."""
         made = self._made
         if made is None or not made.done():
             return None
@@ -141,22 +128,21 @@ class RefitStart:
             self._model, self._references, settings, drawing, volume, report=self._report
         )
 
-    def _keep(self, folder: Path) -> None:
-        assert self._tables is not None
+    def _keep(self, folder: Path, made: Future[tables.RefitTables]) -> None:
         with contextlib.suppress(OSError):  # a full disk only makes the next start slower
-            self._file(folder).write(self._tables.result())
+            self._file(folder).write(made.result())
 
     def _report(self, share: float) -> None:
         if self._is_over:
             raise _EndedError
         self._share = share
 
-    def _make(self, baseline: NDArray[np.complex128]) -> LiveRefit:
-        assert self._tables is not None
-        made = self._tables.result()
+    def _make(
+        self, baseline: NDArray[np.complex128], made: Future[tables.RefitTables]
+    ) -> LiveRefit:
+        ready, settings = made.result(), self._setup.refit
         self._share = 1.0
-        settings = self._setup.refit
-        refit = LiveRefit(self._model, self._references, baseline, settings, tables=made)
+        refit = LiveRefit(self._model, self._references, baseline, settings, tables=ready)
         if self._witness_noise_t is not None:
             refit.enable_witnesses(self._witness_noise_t, ready=True)
         return refit
@@ -166,15 +152,9 @@ class ActiveRefit:
     """Keeps the refit, its last result, and what it is made from.
 
     ``count`` counts an event by its name, ``kept`` is what a process after this one takes up, and
-    ``ahead`` what is read of it before references and setup are known.
-
-    Attributes
-    ----------
-    current : LiveRefit or None
-    result : RefitResult or None
-        Of the newest frame, since the refit began or was reset.
-    update_s : float
-        Time that the last result took, s.
+    ``ahead`` what is read of it before references and setup are known. ``start`` makes the refits
+    of the active model, None without references; ``result`` is that of the newest frame since the
+    refit began or was reset, and took ``update_s``.
     """
 
     def __init__(
@@ -185,12 +165,13 @@ class ActiveRefit:
         kept: KeptBaseline,
         ahead: ReadAhead,
     ) -> None:
-        warm_up()
+        # The compiler loads for half a second, now, while the graph is still being discovered.
+        loop_field(np.eye(3), np.ones((1, 3)), 1.0)
         self._witnesses, self._pace, self._count = witnesses, pace, count
         self._kept, self._ahead = kept, ahead
         self._has_looked = False
         self._confirmed: RefitResult | None = None
-        self._start: RefitStart | None = None
+        self.start: RefitStart | None = None
         self._baseline: NDArray[np.complex128] | None = None
         self.current: LiveRefit | None = None
         self.result: RefitResult | None = None
@@ -201,15 +182,15 @@ class ActiveRefit:
     ) -> None:
         """Be without a refit, and begin at once with what needs no baseline for the next one."""
         self.end()
-        self.current = self.result = self._start = None
+        self.current = self.result = self.start = None
         self._has_looked = False
         self._kept.expect(setup, base)
         self._witnesses.expect(setup, base)
         if len(references):
             folder, noise_t = self._kept.folder, self._witnesses.noise_t
-            self._start = RefitStart(setup, base, references, folder, self._ahead, noise_t)
+            self.start = RefitStart(setup, base, references, folder, self._ahead, noise_t)
             if at_once:
-                self._start.prepare()
+                self.start.prepare()
         else:
             self._ahead.drop()
 
@@ -221,18 +202,13 @@ class ActiveRefit:
         """Begin to make a refit to what differs from a baseline, shape (S, K), T.
 
         No pose is given before the first one is there, since metal may come meanwhile; one that is
-        active goes on until the next one is there.
-
-        Raises
-        ------
-        FitError
-            When there are no references.
+        active goes on until the next one is there. Raises `FitError` without references.
         """
-        if self._start is None:
+        if self.start is None:
             raise FitError('the setup has no reference sensors')
         self._kept.drop()
         self._baseline = baseline
-        self._start.begin(baseline)
+        self.start.begin(baseline)
 
     def begin_again(self) -> None:
         """Begin to make one to the last baseline, if there is one."""
@@ -245,7 +221,7 @@ class ActiveRefit:
         It is looked for once for a setup and model, as soon as the sender is known.
         """
         has_one = self.current is not None or self.is_making
-        if not is_wanted or self._start is None or self._has_looked or has_one:
+        if not is_wanted or self.start is None or self._has_looked or has_one:
             return
         self._has_looked, baseline = self._kept.is_known, self._kept.read()
         if baseline is not None:
@@ -272,20 +248,12 @@ class ActiveRefit:
         except OSError:  # a full disk: the node goes on, and one after it begins without baseline
             self._count('baselines_not_kept')
 
-    def wait(self) -> None:
-        """Wait until the refit is made that is being made, if there is one."""
-        if self._start is not None:
-            self._start.wait()
-
     def take(self) -> bool:
         """Activate a refit that has been made meanwhile; return whether there was one.
 
-        Raises
-        ------
-        FitError
-            When none can be made.
+        Raises `FitError` when none can be made.
         """
-        started = None if self._start is None else self._start.taken()
+        started = None if self.start is None else self.start.taken()
         if started is None:
             return False
         self.current, self.result = started, None
@@ -294,17 +262,12 @@ class ActiveRefit:
 
     def end(self, longest_s: float = 0.0) -> bool:
         """Give up what is being made; return whether that ended within some seconds."""
-        return self._start is None or self._start.end(longest_s)
-
-    @property
-    def words(self) -> str:
-        """Return how far the refit is that is being made; empty where none is."""
-        return '' if self._start is None else self._start.words
+        return self.start is None or self.start.end(longest_s)
 
     @property
     def is_making(self) -> bool:
         """Return whether a refit is being made."""
-        return self._start is not None and self._start.is_making
+        return self.start is not None and self.start.is_making
 
     @property
     def is_awaited(self) -> bool:
@@ -367,10 +330,8 @@ def model_values(model: FieldModel, name: str) -> dict[str, object]:
     }
 
 
-def refit_values(result: RefitResult | None) -> dict[str, object]:
+def refit_values(result: RefitResult) -> dict[str, object]:
     """Return the figures of a frame's refit by their names in `/diagnostics`."""
-    if result is None:
-        return {}
     return {
         'refit_state': result.state,
         'refit_reason': result.reason,
@@ -382,39 +343,28 @@ def refit_values(result: RefitResult | None) -> dict[str, object]:
     }
 
 
-def refit_words(result: RefitResult | None, refused: str = '', making: str = '') -> str:
-    """Return what the refit did in this frame, and why where something was in its way.
+def activity(
+    refit: ActiveRefit, is_held: bool, is_wanted: bool, refused: str, values: dict[str, object]
+) -> str:
+    """Return what the refit does, or why none is made, and add its figures to the values.
 
-    ``refused`` is why a baseline that was requested since then is not active, ``making`` the
-    progress of the refit to another one.
+    ``refused`` is why a baseline that was requested last is not active.
     """
-    words = f'; a new baseline was refused: {refused}' if refused else ''
-    words += f'; the next {making}' if making else ''
-    if result is None:
-        return f'baseline set{words}'
-    return (result.state if not result.reason else f'{result.state}: {result.reason}') + words
-
-
-def rest_words(is_held: bool, is_wanted: bool, no_baseline: str, making: str = '') -> str:
-    """Return why the model does not follow the references."""
+    result, making = refit.result, '' if refit.start is None else refit.start.words
     if is_held:
         return 'held as it is: freeze was called'
     if not is_wanted:
         return 'constant'
-    if making:
+    if refit.current is None and making:
         return f'constant, {making}'
-    return f'constant, no baseline: {no_baseline}' if no_baseline else 'constant, no baseline yet'
-
-
-def activity(
-    refit: ActiveRefit, is_held: bool, is_wanted: bool, refused: str, values: dict[str, object]
-) -> str:
-    """Return what the refit does, and add its figures to the values."""
-    result, making = refit.result, refit.words
-    if refit.current is None or is_held or not is_wanted:
-        return rest_words(is_held, is_wanted, refused, making)
-    values |= refit_values(result)
-    return refit_words(result, refused, making)
+    if refit.current is None:
+        return f'constant, no baseline: {refused}' if refused else 'constant, no baseline yet'
+    words = 'baseline set'
+    if result is not None:
+        values |= refit_values(result)
+        words = ': '.join(filter(None, (result.state, result.reason)))
+    words += f'; a new baseline was refused: {refused}' if refused else ''
+    return words + (f'; the next {making}' if making else '')
 
 
 def reference_statuses(result: RefitResult | None) -> list[Status]:

@@ -1,10 +1,9 @@
 """Runs acquisition, field model and tracker in one process, which hands frames on as objects.
 
-The nodes, their names, topics, parameters and services are those of three processes. A frame is
-demodulated and tracked in one thread, and its poses go out before anything else is done with it:
-then its fluxes are published, and last another thread refits the model, so that each pose uses the
-model of the window before. Parameters and names are given to one node as ``-p tracker:gate:=4``
-and ``-r tracker:__node:=NAME``.
+A frame is demodulated and tracked in one thread, and its poses go out first; then its fluxes are
+published, and last another thread refits the model, so that each pose uses the model of the window
+before. Parameters and names are given to one node as ``-p tracker:gate:=4`` and
+``-r tracker:__node:=NAME``.
 """
 
 import sys

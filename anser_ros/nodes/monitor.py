@@ -24,7 +24,15 @@ from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.traces import OpticalTrace, Row, Traces, latency_of, middle, targets_of
+from anser_ros.nodes.traces import (
+    OpticalTrace,
+    PoseTrace,
+    Row,
+    Traces,
+    latency_of,
+    middle,
+    targets_of,
+)
 from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
@@ -101,27 +109,23 @@ class Monitor(AnserNode):
             return
         for subscription in self._pose_subscriptions:
             self.destroy_subscription(subscription)
-        self._pose_subscriptions = []
-        names = [''] + ([self.parameters.compare] if self.parameters.compare else [])
-        self._chains = {name: Traces(targets_of(setup)) for name in names}
+        chains = dict.fromkeys(('', self.parameters.compare))
+        self._chains = {chain: Traces(targets_of(setup)) for chain in chains}
         self._optical = {body: OpticalTrace() for body in setup.bodies}
+        wanted: list[tuple[type, str, Any]] = [
+            (PoseStamped, optical_topic(body, self.parameters.optical),
+             partial(self._on_optical, seen)) for body, seen in self._optical.items()
+        ]  # fmt: skip
         for chain, traces in self._chains.items():
-            prefix = f'{chain}/' if chain else ''
             for name, trace in traces.of.items():
-                self._subscribe(
-                    PoseWithCovarianceStamped,
-                    f'{prefix}{topic_of(name)}/pose_with_covariance',
-                    partial(self._on_pose, trace),
-                )
-        for body, seen in self._optical.items():
-            topic = optical_topic(body, self.parameters.optical)
-            self._subscribe(PoseStamped, topic, partial(self._on_optical, seen))
+                topic = '/'.join(filter(None, (chain, topic_of(name), 'pose_with_covariance')))
+                wanted.append((PoseWithCovarianceStamped, topic, partial(self._on_pose, trace)))
+        self._pose_subscriptions = [
+            self.create_subscription(kind, topic, callback, qos.STREAM)
+            for kind, topic, callback in wanted
+        ]
 
-    def _subscribe(self, kind: type, topic: str, callback: Any) -> None:
-        subscription = self.create_subscription(kind, topic, callback, qos.STREAM)
-        self._pose_subscriptions.append(subscription)
-
-    def _on_pose(self, trace: Any, message: PoseWithCovarianceStamped) -> None:
+    def _on_pose(self, trace: PoseTrace, message: PoseWithCovarianceStamped) -> None:
         now_s = time.time()
         if self._first_s is None:
             self._first_s = time.monotonic()
@@ -169,10 +173,10 @@ class Monitor(AnserNode):
             self.stop(0)
 
     def _problems(self) -> str:
-        """What the other nodes complain of."""
         return '; '.join(self._causes()) or 'no node complains'
 
     def _causes(self) -> list[str]:
+        """What the other nodes complain of."""
         rate_hz = 0.0 if self._setup is None else self._setup.flux_rate_hz
         return causes(self._statuses, self.get_namespace().strip('/'), rate_hz)
 
@@ -196,7 +200,10 @@ class Monitor(AnserNode):
             table.add_column(heading, justify='right', no_wrap=True)
         others = {row.name: row for row in rows.get(second, [])} if second else {}
         for row in rows.get('', []):
-            cells = [row.name, self._state_cell('', row.name, narrow)]
+            level, state = self._state('', row.name)
+            if narrow:  # the reason stands below the table
+                state = state.split(':')[0][:STATE_WIDTH]
+            cells = [row.name, f'[{LEVELS.get(level, "red")}]{state}']
             cells.append(' '.join(f'{_mm(v, 1):>6}' for v in row.position_m))
             cells += [_mm(row.sigma_m), _mm(row.error_m)]
             if second:
@@ -206,12 +213,6 @@ class Monitor(AnserNode):
             cells += [f'{row.rate_hz:.0f}', _number(1e3 * row.latency_s, 1)]
             table.add_row(*cells)
         return table
-
-    def _state_cell(self, chain: str, name: str, narrow: bool) -> str:
-        level, state = self._state(chain, name)
-        if narrow:  # the reason stands below the table
-            state = state.split(':')[0][:STATE_WIDTH]
-        return f'[{LEVELS.get(level, "red")}]{state}'
 
     def _title(self) -> str:
         if self._first_s is None:

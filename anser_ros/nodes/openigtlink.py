@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -37,21 +37,16 @@ SEND_TIMEOUT_S = 2.0
 POLL_S = 0.1
 """How often threads look whether the server was closed, s."""
 QUEUE_LENGTH = 256
-"""Messages that may wait for a slow client; then the oldest is dropped. A second's or so, for ten
-sensors at 25 Hz: older poses are of no use to it."""
+"""Messages that may wait for a slow client, a second's of ten sensors; then the oldest is
+dropped."""
 MOST_CLIENTS = 16
-"""Clients that are served at once; each has a thread and a queue. A room has a few screens; more
-connections than this are a mistake or an attack, and are closed as they come."""
+"""Clients that are served at once, each by a thread; more are closed as they come."""
 READ_BYTES = 1 << 14
-"""Bytes that are read of a client at a time. A client that sends without end is slowed down by the
-system, and takes no time from the others."""
-IDLE_S, PROBE_S, PROBES = 10, 5, 3
-"""Time, s, after which a silent connection is probed, time between probes, and how many go
-unanswered before it counts as gone: a machine that is switched off is forgotten in half a
-minute."""
+"""Bytes that are read of a client at a time."""
+KEEP_ALIVE = {'TCP_KEEPIDLE': 10, 'TCP_KEEPINTVL': 5, 'TCP_KEEPCNT': 3}
+"""A machine that is switched off is forgotten in half a minute."""
 LONGEST_ASKED = 1024
-"""Bytes of the longest request that is read whole; what clients may ask has 60. Longer ones are
-skipped."""
+"""Bytes of the longest request that is not skipped; what clients may ask has 60."""
 
 Answer = Callable[[igtl.Header], bytes]
 """Gives the reply to a request of a client."""
@@ -60,35 +55,31 @@ ASKED = ('GET_CAPABIL', 'GET_STATUS', 'STT_TDATA', 'STP_TDATA')
 
 
 class _Requests:
-    """Finds requests in what a client says; after bytes that are no message it hears no more."""
+    """Finds requests in what a client sends; after bytes that are no message it ignores all."""
 
     def __init__(self) -> None:
-        self._bytes = b''
-        self._skip = 0
-        self._deaf = False
+        self._bytes, self._skip, self._is_broken = b'', 0, False
 
-    def feed(self, data: bytes) -> list[tuple[igtl.Header, bytes]]:
-        found: list[tuple[igtl.Header, bytes]] = []
-        if self._deaf:
-            return found
+    def feed(self, data: bytes) -> Iterator[tuple[igtl.Header, bytes]]:
         self._bytes += data
-        while True:
+        while not self._is_broken:
             skipped = min(self._skip, len(self._bytes))
             self._bytes, self._skip = self._bytes[skipped:], self._skip - skipped
             if self._skip or len(self._bytes) < igtl.HEADER_BYTES:
-                return found
+                return
             header = igtl.read_header(self._bytes)
             if header is None:
-                self._deaf, self._bytes = True, b''
-                return found
+                self._is_broken = True
+                break
             end = igtl.HEADER_BYTES + header.body_bytes
             if header.kind not in ASKED or header.body_bytes > LONGEST_ASKED:
                 self._skip = end
                 continue
             if len(self._bytes) < end:
-                return found
-            found.append((header, self._bytes[igtl.HEADER_BYTES : end]))
-            self._bytes = self._bytes[end:]
+                return
+            body, self._bytes = self._bytes[igtl.HEADER_BYTES : end], self._bytes[end:]
+            yield header, body
+        self._bytes = b''
 
 
 class _Client:
@@ -106,12 +97,8 @@ class _Client:
         self._filled = threading.Condition()
         self._ending = False
         self.dropped = 0
-        self._thread = threading.Thread(target=self._serve, name='igtl client', daemon=True)
-        self._thread.start()
-
-    @property
-    def is_connected(self) -> bool:
-        return self._thread.is_alive()
+        self.thread = threading.Thread(target=self._serve, name='igtl client', daemon=True)
+        self.thread.start()
 
     def put(self, data: bytes) -> None:
         with self._filled:
@@ -131,7 +118,7 @@ class _Client:
         with self._filled:
             self._ending = True
             self._filled.notify()
-        self._thread.join(2 * SEND_TIMEOUT_S)
+        self.thread.join(2 * SEND_TIMEOUT_S)
 
     def _serve(self) -> None:
         with self._connection, contextlib.suppress(OSError):
@@ -165,9 +152,7 @@ def _set_options(connection: socket.socket) -> None:
     """Send at once, and find out when the other end is no longer there."""
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in (
-        ('TCP_KEEPIDLE', IDLE_S), ('TCP_KEEPINTVL', PROBE_S), ('TCP_KEEPCNT', PROBES),
-    ):  # fmt: skip
+    for name, value in KEEP_ALIVE.items():
         if hasattr(socket, name):
             connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
@@ -175,9 +160,9 @@ def _set_options(connection: socket.socket) -> None:
 class IgtlServer:
     """Listens on one address and sends to all who connect.
 
-    ``answer`` is called by the threads of clients; ``refused`` counts connections that were closed
-    because there were `MOST_CLIENTS` already. Port 0 stands for a free one. Raises `PortError`:
-    the address can't be listened on.
+    ``answer`` is called by the threads of clients; ``refused`` counts connections beyond
+    `MOST_CLIENTS`. Port 0 stands for a free one. Raises `PortError`: the address can't be listened
+    on.
     """
 
     def __init__(self, host: str, port: int, answer: Answer) -> None:
@@ -188,7 +173,7 @@ class IgtlServer:
             raise PortError(f'cannot listen on {host}:{port}: {error.strerror}') from error
         self.port: int = self._listener.getsockname()[1]
         self._listener.settimeout(POLL_S)
-        self._clients: list[_Client] = []
+        self._connections: list[_Client] = []
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._dropped_before = 0
@@ -200,27 +185,26 @@ class IgtlServer:
     def n_clients(self) -> int:
         """Return the number of connected clients."""
         self._forget_the_gone()
-        return len(self._clients)
+        return len(self._connections)
 
     @property
     def dropped(self) -> int:
         """Return how many messages slow clients have missed."""
         with self._lock:
-            return self._dropped_before + sum(client.dropped for client in self._clients)
+            return self._dropped_before + sum(client.dropped for client in self._connections)
 
     def send(self, data: bytes, newer: bytes = b'') -> None:
-        """Queue a packed message for every client; never blocks.
-
-        ``newer`` goes instead to clients that have asked in a header of version 2.
+        """Queue a packed message for every client, ``newer`` instead for those that have asked in
+        a header of version 2; never blocks.
         """
         with self._lock:
-            for client in self._clients:
+            for client in self._connections:
                 client.put(newer if newer and client.version > 1 else data)
 
     def send_tracking(self, tracking: Callable[[], bytes], now_s: float) -> None:
         """Queue a TDATA for the clients that want one by now; none is made for nobody."""
         with self._lock:
-            due = [client for client in self._clients if client.is_due(now_s)]
+            due = [client for client in self._connections if client.is_due(now_s)]
             data = tracking() if due else b''
             for client in due:
                 client.put_tracking(data, now_s)
@@ -231,9 +215,9 @@ class IgtlServer:
         self._thread.join()
         self._listener.close()
         with self._lock:
-            for client in self._clients:
+            for client in self._connections:
                 client.end()
-            self._clients.clear()
+            self._connections.clear()
 
     def _accept(self) -> None:
         while not self._ending.is_set():
@@ -244,19 +228,19 @@ class IgtlServer:
             except OSError:  # the client was gone before it was accepted
                 continue
             self._forget_the_gone()
-            if len(self._clients) >= MOST_CLIENTS:
+            if len(self._connections) >= MOST_CLIENTS:
                 self.refused += 1
                 connection.close()
                 continue
             _set_options(connection)
             with self._lock:
-                self._clients.append(_Client(connection, self._answer))
+                self._connections.append(_Client(connection, self._answer))
 
     def _forget_the_gone(self) -> None:
         with self._lock:
-            gone = [client for client in self._clients if not client.is_connected]
-            self._dropped_before += sum(client.dropped for client in gone)
-            self._clients = [client for client in self._clients if client.is_connected]
+            for client in [one for one in self._connections if not one.thread.is_alive()]:
+                self._dropped_before += client.dropped
+                self._connections.remove(client)
 
 
 WATCH_PERIOD_S = 0.05
@@ -351,13 +335,11 @@ class OpenIGTLink(AnserNode):
         except AnserError as error:
             self._devices, self._refused = {}, str(error)
             self.warn('setups_refused', str(error))
-        names = list(self._devices)
-        for name in set(self._pose_subscriptions) - set(names):
+        for name in set(self._pose_subscriptions) - set(self._devices):
             self.destroy_subscription(self._pose_subscriptions.pop(name))
-            self._states.pop(name, None)
-            self._last_pose_s.pop(name, None)
-            self._tracked.pop(name, None)
-        for name in names:
+            for known in (self._states, self._last_pose_s, self._tracked):
+                known.pop(name, None)  # type: ignore[attr-defined]
+        for name in self._devices:
             if name not in self._pose_subscriptions:
                 self._set_state(name, 'no pose yet')
                 self._pose_subscriptions[name] = self.create_subscription(
@@ -456,12 +438,10 @@ def devices_of(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
 
     Raises `ParameterError` as `anser_ros.wire.igtl.device_names`.
     """
-    named = {
-        sensor.name: table.coil_name.format(
-            name=sensor.name, body=sensor.body, sensor=sensor.name.removeprefix(f'{sensor.body}/')
-        )
-        for sensor in (setup.tool_sensors if table.coils else ())
-    }
+    named = {}
+    for coil in setup.tool_sensors if table.coils else ():
+        own = coil.name.removeprefix(f'{coil.body}/')
+        named[coil.name] = table.coil_name.format(name=coil.name, body=coil.body, sensor=own)
     bodies = (*setup.bodies, *map(tip_name, setup.tips))
     named |= {body: table.body_name.format(body=body) for body in bodies}
     return igtl.device_names(named)

@@ -1,6 +1,4 @@
-"""Puts what nodes report and what a watcher finds into words for an operator, the gravest
-first. A service answers with the same words, because both come from the node concerned.
-"""
+"""Puts what nodes report and what a watcher finds into words for an operator."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -22,7 +20,8 @@ LEAST_LOSS = 0.05
 def causes(
     statuses: Mapping[str, LastStatus], namespace: str, flux_rate_hz: float = 0.0
 ) -> list[str]:
-    """Name what is wrong: nodes that complain, then sensors without pose, by their reasons.
+    """Name what is wrong, the gravest first: nodes that complain, then sensors without pose, by
+    their reasons.
 
     ``statuses`` has what was reported last, by ``node`` or ``node: part``; the namespace is
     without slashes around it, and the rate of frames is 0 where it is not known.
@@ -42,8 +41,8 @@ def causes(
     reasons = [
         f'{words} ({named(names, MOST_NAMES)})' for (_, words), names in sorted(silent.items())
     ]
-    texts = [words for _, words in found] + reasons
-    return [_short(text) for text in texts[:MOST_CAUSES]]
+    texts = ([words for _, words in found] + reasons)[:MOST_CAUSES]
+    return [text if len(text) <= MOST_TEXT else f'{text[: MOST_TEXT - 3]}...' for text in texts]
 
 
 def _loss(one: LastStatus, flux_rate_hz: float) -> str:
@@ -54,10 +53,6 @@ def _loss(one: LastStatus, flux_rate_hz: float) -> str:
         return ''
     share = 1.0 - rate_hz / flux_rate_hz if flux_rate_hz > 0 else 0.0
     return f'; {share:.0%} of the frames are missing' if share > LEAST_LOSS else ''
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= MOST_TEXT else text[: MOST_TEXT - 3] + '...'
 
 
 if TYPE_CHECKING:  # words must not load the kernels
@@ -115,11 +110,8 @@ def title_of(record: 'EffectRecord') -> str:
 
 def figures_of(record: 'EffectRecord') -> str:
     """Return the parameters that are short enough for a line."""
-    parts = [
-        f'{key} {text}'
-        for key, value in record.parameters.items()
-        if key not in SITES and len(text := plain_text(value)) <= MOST_FIGURE_TEXT
-    ]
+    texts = {k: plain_text(v) for k, v in record.parameters.items() if k not in SITES}
+    parts = [f'{key} {text}' for key, text in texts.items() if len(text) <= MOST_FIGURE_TEXT]
     return ', '.join(parts) or 'found'
 
 

@@ -35,18 +35,13 @@ class Tally:
     latest_s: float = -math.inf
 
 
-STAMP = struct.Struct('<iI')
-STAMP_OFFSET = 4
-"""Where the bytes of a message with a header have its stamp: after what says how it is packed."""
+STAMP, STAMP_OFFSET = struct.Struct('<iI'), 4
+"""How and where the bytes of a message with a header have its stamp."""
 
 
 class PackedMessage:
-    """Keeps the bytes of a message that begins with a header and ends with numbers.
-
-    Bytes are published in half the time of a message, whose fields are taken from Python objects
-    one by one.
-
-    The stamp and the ``count`` numbers at its end, in double precision, are written over.
+    """Keeps the bytes of a message that begins with a header and ends with ``count`` doubles,
+    which are published in half the time of a message.
     """
 
     def __init__(self, message: Any, count: int) -> None:
@@ -86,14 +81,13 @@ class PoseTopic:
     @property
     def listeners(self) -> int:
         """Return how many subscriptions get what is published now."""
-        both = self._pose, self._uncertain
-        return sum(publisher.get_subscription_count() for publisher in both)
+        return sum(one.get_subscription_count() for one in (self._pose, self._uncertain))
 
     def is_matched(self, node: Any) -> bool:
         """Return whether all who subscribe to the topics would get what is published now."""
         return all(
-            publisher.get_subscription_count() >= node.count_subscribers(publisher.topic_name)
-            for publisher in (self._pose, self._uncertain)
+            one.get_subscription_count() >= node.count_subscribers(one.topic_name)
+            for one in (self._pose, self._uncertain)
         )
 
     def destroy(self, node: Any) -> None:
@@ -102,7 +96,7 @@ class PoseTopic:
         node.destroy_publisher(self._uncertain)
 
     def publish(self, estimate: PoseEstimate) -> None:
-        """Publish an estimate that is good, and nothing else: other topics wait for it."""
+        """Publish a good estimate, and nothing else, as other topics wait for it."""
         if estimate.state != OK:
             return
         if estimate.rotation is None:
@@ -126,11 +120,7 @@ class PoseTopic:
         return changed
 
     def publish_covariance(self) -> None:
-        """Publish the good pose just noted once more, with its covariance.
-
-        Noting and this are separate steps, so that no sensor's plain pose waits for what is done
-        with another's.
-        """
+        """Publish the good pose just noted once more, with its covariance."""
         if self.estimate is None or self.estimate.state != OK:
             return
         stamp_ns, covariance = self.estimate.stamp_ns, self.estimate.covariance.ravel().tolist()
@@ -174,9 +164,7 @@ class PoseTopic:
 
 def transform_publisher(node: Any) -> Any:
     """Return a publisher of /tf, or None where its message type is not installed."""
-    if TFMessage is None:
-        return None
-    return node.create_publisher(TFMessage, '/tf', qos.EVENTS)
+    return None if TFMessage is None else node.create_publisher(TFMessage, '/tf', qos.EVENTS)
 
 
 def transform_message(topics: list[PoseTopic]) -> Any:

@@ -4,7 +4,6 @@ import os
 import struct
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,8 +67,7 @@ class Recorder(AnserNode):
         self._bag: BagWriter | None = None
         self._logs: dict[str, TopicLog] = {}
         self._topic_subscriptions: dict[str, Any] = {}
-        self._error = ''
-        self._last_report = ''
+        self._error = self._last_report = ''
         self._described_s = 0.0
         self.create_service(Trigger, 'recorder/start', self._on_start)
         self.create_service(Trigger, 'recorder/stop', self._on_stop)
@@ -132,19 +130,14 @@ class Recorder(AnserNode):
     # Callbacks ----------------------------------------------------------------------------
 
     def _on_start(self, _request: Any, response: Any) -> Any:
-        if self._bag is not None:
-            response.success, response.message = False, 'records already'
-            return response
-        response.message = str(self.start())
-        response.success = True
+        response.success = self._bag is None
+        response.message = str(self.start()) if self._bag is None else 'records already'
         return response
 
     def _on_stop(self, _request: Any, response: Any) -> Any:
-        response.success = self._bag is not None
-        response.message = self.stop_recording()
-        if self._error:
-            response.success = False
-            response.message = f'{self._error}; {response.message}'
+        was_recording, words = self._bag is not None, self.stop_recording()
+        response.success = was_recording and not self._error
+        response.message = f'{self._error}; {words}' if self._error else words
         return response
 
     def _flush(self) -> None:
@@ -160,15 +153,13 @@ class Recorder(AnserNode):
             self.publish_diagnostics()
             return
         if time.monotonic() - self._described_s >= METADATA_PERIOD_S:
-            self._describe()
+            self._describe(self._bag)
 
-    def _describe(self) -> None:
+    def _describe(self, bag: BagWriter) -> None:
         """Write what the running bag holds so far, for whoever finds it after a crash."""
-        if self._bag is None:
-            return
         self._described_s = time.monotonic()
         try:
-            write_metadata(self._bag.path, self._bag.record, _ros_distro(), is_closed=False)
+            write_metadata(bag.path, bag.record, _ros_distro(), is_closed=False)
         except OSError as error:  # the next flush will stop the recording
             self.warn('metadata_errors', _reason(error))
 
@@ -183,7 +174,7 @@ class Recorder(AnserNode):
             elif self._wanted(topic) and len(type_names) == 1:
                 added = self._add(topic, type_names[0]) or added
         if added:
-            self._describe()
+            self._describe(self._bag)
 
     def _wanted(self, topic: str) -> bool:
         own = self.get_namespace().rstrip('/') + '/'
@@ -207,30 +198,30 @@ class Recorder(AnserNode):
             self._logs[topic] = TopicLog()
             self._topic_subscriptions[topic] = None
             return False
-        profiles = [_described(profile) for profile in offered]
+        profiles = [
+            qos_profile(
+                reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
+                latched=profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                depth=max(profile.depth, 1),  # the graph does not state the depth
+            )
+            for profile in offered
+        ]
         channel = self._bag.add_topic(topic, type_name, text, profiles, type_hash(type_name))
         log = self._logs[topic] = TopicLog(len(offered))
-        callback = self._writer_of(channel, log, type_name in STAMPED)
-        self._topic_subscriptions[topic] = self.create_subscription(
-            message, topic, callback, _matching(offered), raw=True
-        )
-        return True
-
-    def _writer_of(
-        self, channel: int, log: TopicLog, is_stamped: bool
-    ) -> Callable[[bytes, dict[str, int]], None]:
-        """Return the callback that writes one topic's messages."""
+        is_stamped = type_name in STAMPED
 
         def write(data: bytes, info: dict[str, int]) -> None:
             if self._bag is None:
                 return
             received_ns = info.get('received_timestamp') or time.time_ns()
             self._bag.write(channel, received_ns, data, info.get('source_timestamp') or None)
-            log.add(
-                info.get('publication_sequence_number'), _stamp_ns(data) if is_stamped else None
-            )
+            stamp_ns = _stamp_ns(data) if is_stamped else None
+            log.add(info.get('publication_sequence_number'), stamp_ns)
 
-        return write
+        self._topic_subscriptions[topic] = self.create_subscription(
+            message, topic, write, _matching(offered), raw=True
+        )
+        return True
 
     def _new_folder(self) -> Path:
         parent = Path(self.parameters.directory).expanduser()
@@ -250,14 +241,6 @@ def _matching(offered: list[QoSProfile]) -> QoSProfile:
         depth=DEPTH,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-    )
-
-
-def _described(profile: QoSProfile) -> dict[str, Any]:
-    return qos_profile(
-        reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
-        latched=profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-        depth=max(profile.depth, 1),  # the graph does not state the depth
     )
 
 

@@ -30,10 +30,7 @@ FIELD = re.compile(r'^([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w+')
 def message_class(type_name: str) -> type:
     """Return the class of a type such as ``std_msgs/msg/String``.
 
-    Raises
-    ------
-    BagError
-        The type is not installed.
+    Raises `BagError` where it is not installed.
     """
     package, kind, name = _split(type_name)
     try:
@@ -46,23 +43,17 @@ def message_class(type_name: str) -> type:
 def definition(type_name: str) -> str:
     """Return the text of a type followed by those of all types in it, as rosbag2 stores them.
 
-    Raises
-    ------
-    BagError
-        A definition is not installed.
+    Raises `BagError` where a definition is not installed.
     """
     parts: list[str] = []
-    seen, waiting = {type_name}, [type_name]
-    while waiting:
-        current = waiting.pop(0)
+    names = [type_name]
+    for current in names:  # which grows meanwhile
         text = _file(current, 'msg').read_text(encoding='utf-8')
         package, _, name = _split(current)
         title = f'{SEPARATOR}\nMSG: {package}/{name}\n' if parts else ''
         parts.append(title + text)
-        for inner in _contained(text, package):
-            if inner not in seen:
-                seen.add(inner)
-                waiting.append(inner)
+        inner = dict.fromkeys(_contained(text, package))
+        names += [one for one in inner if one not in names]
     return '\n'.join(parts)
 
 
@@ -116,12 +107,8 @@ REFRESH_EVERY = 50
 
 
 class Consumers:
-    """Finds the nodes that subscribe to topics.
-
-    Parameters
-    ----------
-    node : Node
-        Asks them; its executor must be spinning in another thread.
+    """Finds the nodes that subscribe to topics; the executor of the ``node`` that asks them must
+    be spinning in another thread.
     """
 
     def __init__(self, node: Node) -> None:
@@ -133,12 +120,8 @@ class Consumers:
         self._given_up = threading.Event()
 
     def wait(self, *topics: str, attempts: int = ATTEMPTS) -> None:
-        """Wait until all listeners of the topics have handled what was published.
-
-        Parameters
-        ----------
-        topics : fully qualified names
-        attempts : how often one who is silent is asked, before the next is gone on without it
+        """Wait until all listeners of the topics, by their full names, have handled what was
+        published; after so many ``attempts`` to ask one it is gone on without it.
         """
         if self._calls % REFRESH_EVERY == 0:
             self._listeners.clear()
@@ -216,14 +199,9 @@ class TopicLog:
     @property
     def faults(self) -> str:
         """Return what is wrong with the topic, in words; empty when nothing is."""
-        found = []
-        if self.lost:
-            found.append(f'{self.lost} lost')
-        if self.gaps:
-            found.append(f'{self.gaps} gaps up to {self.longest_gap_s:.3g} s')
-        if self.jumps_back:
-            found.append(f'{self.jumps_back} jumps back in time')
-        return ', '.join(found)
+        gaps = f'{self.gaps} gaps up to {self.longest_gap_s:.3g} s'
+        found = [f'{self.lost} lost', gaps, f'{self.jumps_back} jumps back in time']
+        return ', '.join(words for words in found if not words.startswith('0 '))
 
     def publishers(self, count: int) -> None:
         """Note how many publish the topic now."""
@@ -244,23 +222,16 @@ class TopicLog:
     def _add_interval(self, interval_s: float) -> None:
         if interval_s < 0.0:
             self.jumps_back += 1
-        elif not self._period_s:
-            self._intervals_s.append(interval_s)
-            if len(self._intervals_s) == LEARNING:
-                self._learn()
-        elif interval_s > GAP_FACTOR * self._period_s:
-            self._add_gap(interval_s)
-
-    def _learn(self) -> None:
-        self._period_s = statistics.median(self._intervals_s)
-        for interval_s in self._intervals_s:
-            if interval_s > GAP_FACTOR * self._period_s:
-                self._add_gap(interval_s)
+            return
+        self._intervals_s.append(interval_s)
+        if not self._period_s:
+            if len(self._intervals_s) < LEARNING:
+                return
+            self._period_s = statistics.median(self._intervals_s)
+        gaps = [s for s in self._intervals_s if s > GAP_FACTOR * self._period_s]
+        self.gaps += len(gaps)
+        self.longest_gap_s = max(self.longest_gap_s, *gaps, 0.0)
         self._intervals_s.clear()
-
-    def _add_gap(self, interval_s: float) -> None:
-        self.gaps += 1
-        self.longest_gap_s = max(self.longest_gap_s, interval_s)
 
 
 def report(
@@ -280,6 +251,5 @@ def report(
         f'{sum(log.jumps_back > 0 for log in faulty.values())} that jump back in time',
     ]
     words = ', '.join(word for word in found if not word.startswith('0 '))
-    return f'{text}; {words} (named in the log)', tuple(
-        f'{name} {log.faults}' for name, log in faulty.items()
-    )
+    faults = tuple(f'{name} {log.faults}' for name, log in faulty.items())
+    return f'{text}; {words} (named in the log)', faults

@@ -34,8 +34,7 @@ OUTPUT_ENDINGS = ('/pose', '/pose_with_covariance', '/field_model')
 OUTPUT_TOPICS = ('/diagnostics', '/tf', '/tf_static', '/clock')
 # How long listeners are waited for, s, before the bag is played without them.
 WAIT_S = 30.0
-# A node that is there and starting is given so many times that before it counts: on a slow or busy
-# machine it takes a minute or two to compile its kernels for the first time.
+# A node that is there and starting, and may compile its kernels, is given so many times that.
 STARTING_FACTOR = 5.0
 # How often a paused or waiting replay looks whether it may go on, s.
 POLL_S = 0.05
@@ -109,10 +108,8 @@ class Replay(AnserNode):
         self._types: dict[str, type] = {}
         self._outlets: dict[str, Any] = {}
         self._latched: dict[str, RawMessage] = {}
-        self._total = 0
+        self._total = self._done = self._passes = 0
         self._lost = ''
-        self._done = 0
-        self._passes = 0
         self._poses: list[str] = []
         self._ending = threading.Event()
         self._scan()
@@ -175,19 +172,16 @@ class Replay(AnserNode):
         if profile is qos.LATCHED and _message_of(message, kind) is not None:
             self._latched[message.topic] = message
 
-    def _publish_latched(self) -> str:
-        """Publish what nodes need before they can take fluxes; return the setup's text."""
+    def _wait_for_listeners(self) -> None:
+        """Publish what nodes need before they can take fluxes, and wait until all who can be known
+        to listen are ready, at most as long as wanted.
+        """
         setup = ''
         for topic, message in self._latched.items():
             self._outlets[topic].publish(message.data)
             self._done += 1
             if topic.endswith('/setup'):
                 setup = getattr(_message_of(message, self._types[topic]), 'data', '')
-        return setup
-
-    def _wait_for_listeners(self) -> None:
-        """Wait until all who can be known to listen are ready, at most as long as wanted."""
-        setup = self._publish_latched()
         fluxes = [o for t, o in self._outlets.items() if t.endswith(FLUX_ENDINGS)]
         readiness = Readiness(self, fluxes or list(self._outlets.values()), setup)
         self._poses = readiness.poses
@@ -242,21 +236,19 @@ class Replay(AnserNode):
                 if self._ending.wait(max(due_s - time.monotonic(), 0.0)):
                     return False
             if now_ns - clock_ns >= CLOCK_PERIOD_NS or now_ns < clock_ns:
-                clock_ns = now_ns
-                self._publish_clock(now_ns)
+                clock_ns, tick = now_ns, Clock()
+                set_stamp(tick.clock, now_ns)
+                self._ticks.publish(tick)
             self._outlets[message.topic].publish(message.data)
             self._done += 1
             if self._rate == 0.0 and message.topic.endswith(FLUX_ENDINGS):
-                self._wait_for_consumers(self._outlets[message.topic].topic_name)
+                # Those who take fluxes, and those who take poses made of them, catch up. After
+                # every frame: of several messages that wait an executor may have worked off one
+                # when it answers.
+                self._consumers.wait(self._outlets[message.topic].topic_name)
+                if self._poses:
+                    self._consumers.wait(*self._poses, attempts=ATTEMPTS_OF_LISTENERS)
         return not self._ending.is_set()
-
-    def _wait_for_consumers(self, topic: str) -> None:
-        """Let those who take fluxes, and those who take poses made of them, catch up."""
-        self._consumers.wait(topic)
-        # After every frame: of a topic with several messages waiting, an executor may have worked
-        # off only one when it answers.
-        if self._poses:
-            self._consumers.wait(*self._poses, attempts=ATTEMPTS_OF_LISTENERS)
 
     def _messages(self) -> Iterator[RawMessage]:
         """Yield what can be published; bytes that are no message of their type are left out."""
@@ -271,36 +263,26 @@ class Replay(AnserNode):
                 continue
             yield message
 
-    def _publish_clock(self, stamp_ns: int) -> None:
-        tick = Clock()
-        set_stamp(tick.clock, stamp_ns)
-        self._ticks.publish(tick)
-
     def _finish(self) -> None:
         """Wait until all is received, and end the process."""
         for outlet in self._outlets.values():
             if not self._ending.is_set():
                 outlet.wait_for_all_acked(Duration(seconds=LAST_ACK_S))
         left_out = self.counters['messages_left_out']
-        lost = f'; lost: {self._lost}' if self._lost else ''
-        lost += f'; {left_out} messages that do not decode left out' if left_out else ''
-        self.get_logger().info(f'published {self._played()}{lost}')
+        played = f'{self._done} of {self._total} messages'
+        if self._loop:  # in which every pass counts again
+            played = f'the bag {self._passes} times, and {played} once more'
+        played += f'; lost: {self._lost}' if self._lost else ''
+        played += f'; {left_out} messages that do not decode left out' if left_out else ''
+        self.get_logger().info(f'published {played}')
         self.stop(0)
-
-    def _played(self) -> str:
-        """How much was published, in words; `_done` counts again in every pass."""
-        part = f'{self._done} of {self._total} messages'
-        if not self._loop:
-            return part
-        return f'the bag {self._passes} times, and {part} once more'
 
 
 def name_played(topic: str, home: str, optical: str) -> str:
     """Return the name that a bag's topic is played under.
 
-    ``home`` is the namespace, with a slash at its end, that the bag's nodes had; it gives way to
-    the player's. ``optical`` is that of the optical poses here; in a bag they may be in one of
-    their own.
+    The player's namespace replaces ``home``, that of the bag's nodes with a slash at its end, and
+    ``optical`` that of the bag's optical poses.
     """
     _, is_optical, rest = topic.partition(OPTICAL)
     if is_optical:

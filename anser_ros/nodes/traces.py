@@ -34,11 +34,7 @@ def middle(values: Sequence[float] | Array, of: Callable[[Array], Any] = np.medi
 
 @dataclass(frozen=True)
 class Target:
-    """Names a sensor or a body that is tracked.
-
-    ``position_m`` and ``axis`` are in the frame of the body that it sits on; a body's own axis is
-    z.
-    """
+    """Names a sensor or a body that is tracked, with its place and axis in the body's frame."""
 
     name: str
     body: str
@@ -91,10 +87,7 @@ class OpticalTrace:
 
 @dataclass
 class PoseTrace:
-    """Keeps poses of one target by one tracker.
-
-    Every list has an item per pose; latency is counted from the middle of the window.
-    """
+    """Keeps poses of one target by one tracker; latencies are from the middle of the window."""
 
     target: Target
     stamp_s: list[float] = field(default_factory=list)
@@ -104,8 +97,7 @@ class PoseTrace:
     latency_s: list[float] = field(default_factory=list)
 
     def errors(self, optical: PoseTrack, since: int = 0) -> tuple[Array, Array]:
-        """Return distance (m) and angle (rad) to the truth of the poses from number `since` on.
-
+        """Return distance (m) and angle (rad) to the truth of the poses from number `since` on,
         NaN where the optical track does not reach.
         """
         stamps = np.array(self.stamp_s[since:])
@@ -120,10 +112,8 @@ class PoseTrace:
 
 @dataclass(frozen=True)
 class Row:
-    """Holds the newest of one target, for a table.
-
-    Error, latency and sigma are medians over the interval, NaN without a pose in it, and so is the
-    place.
+    """Holds the newest of one target, for a table: its place, and medians over the interval of
+    sigma, error and latency; NaN without a pose in it.
     """
 
     name: str
@@ -154,16 +144,8 @@ class Traces:
             error = float('nan')
             if count and track is not None:
                 # the last poses may be newer than the last optical one
-                away = trace.errors(track, max(0, since - 5))[0]
-                error = middle(away)
-            rows.append(
-                Row(
-                    name,
-                    trace.position[-1] if count else (float('nan'),) * 3,
-                    middle(trace.sigma_m[since:]),
-                    error,
-                    count / elapsed_s,
-                    middle(trace.latency_s[since:]),
-                )
-            )
+                error = middle(trace.errors(track, max(0, since - 5))[0])
+            position = trace.position[-1] if count else (float('nan'),) * 3
+            sigma, latency = middle(trace.sigma_m[since:]), middle(trace.latency_s[since:])
+            rows.append(Row(name, position, sigma, error, count / elapsed_s, latency))
         return rows

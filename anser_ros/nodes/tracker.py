@@ -24,7 +24,7 @@ from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import STALE_AFTER_S, parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.streams.model_clouds import read_frame
+from anser_ros.nodes.streams.clouds import read_frame
 from anser_ros.nodes.streams.one_source import (
     NewestSource,
     OneSource,
@@ -33,13 +33,7 @@ from anser_ros.nodes.streams.one_source import (
     too_slow,
 )
 from anser_ros.nodes.streams.readiness import digest_of
-from anser_ros.nodes.tracker_models import (
-    ActiveModel,
-    AnsweredFrames,
-    GivenModel,
-    ModelIntake,
-    Rehearsal,
-)
+from anser_ros.nodes.tracker_models import ActiveModel, AnsweredFrames, GivenModel, ModelIntake
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OK, TWO_SOURCES, Withheld
 from anser_ros.sessions.prepared import settings_for
@@ -168,11 +162,10 @@ EARLIEST_DIAGNOSTICS_S = 0.1
 """Least time between two messages in /diagnostics that a changed state asks for, s: a state that
 flickers from frame to frame must not flood the topic."""
 WAIT_PERIOD_S = 0.02
-"""How often, s, frames that wait for a model are looked at beside the arrival of models: a part of
-the parameter ``model_wait_s``, which it makes inexact by as much."""
+"""How often, s, frames that wait for a model are looked at beside the arrival of models: how
+inexact the parameter ``model_wait_s`` is."""
 WIDE_GATE = 2.0 * USUAL_GATE
-"""A gate that is wider than this is warned of. Smaller, and who has a rough model is warned for
-nothing; larger, and a gate that was opened for a trial stays open unseen."""
+"""A gate that is wider than this is warned of: one that was opened for a trial."""
 
 
 class TrackerNode(AnserNode):
@@ -194,18 +187,14 @@ class TrackerNode(AnserNode):
         self._setup_text = ''
         self._setup: Setup | None = None
         self._tracker: Tracker | None = None
-        self._rehearsal: Rehearsal | None = None
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
         self._active: ActiveModel | None = None
         self._given: GivenModel | None = None
-        self._frames = AnsweredFrames[GivenModel, tuple[int, FluxPoints]](
-            self._activate, self._track
-        )
+        self._frames = AnsweredFrames(self._activate, self._track)
         self._withheld: Withheld | None = None
         self._trouble = Trouble()
-        self._solve_s = 0.0
-        self._diagnosed_s = 0.0
+        self._solve_s = self._diagnosed_s = 0.0
         self._counted = 0, 0
         self._model_age_ns = 0
         self._transforms = transform_publisher(self) if table.publish_tf else None
@@ -222,7 +211,6 @@ class TrackerNode(AnserNode):
             self, 'tool/flux', self._on_flux, self._on_doubted, works_later=True
         )
         self._sources = [setups, models, self._fluxes]
-        self.prepare(self._rehearse)
         self._wait = self.create_timer(WAIT_PERIOD_S, self._on_wait, clock=self.steady_clock)
         self._wait.cancel()
 
@@ -234,7 +222,8 @@ class TrackerNode(AnserNode):
         try:
             setup = parse_setup(message.data).with_stated(self._stated)
             setup = setup.with_tips(self._file_tips)
-            if self._differs_in_measured(setup):
+            known = self._setup
+            if known is not None and setup.follows_as(known) and setup.tips == known.tips:
                 self._measure_anew(message.data, setup)
                 return
             sensors = sensor_table(setup.tool_sensors)
@@ -246,10 +235,7 @@ class TrackerNode(AnserNode):
             self._refuse('setups_refused', error)
             return
         self._setup_text, self._setup, self._tracker = message.data, setup, tracker
-        self._rehearsal = Rehearsal(sensors, settings) if self.hands_over else None
-        self._active = ActiveModel(
-            setup, settings.box, self._file_model, self.parameters.allow_uncalibrated
-        )
+        self._active = self._new_active(setup, settings)
         for topic in self._topics.values():
             topic.destroy(self)
         self._tips = {
@@ -265,13 +251,8 @@ class TrackerNode(AnserNode):
         self._trouble.forget()
         self._use_model()
 
-    def _differs_in_measured(self, setup: Setup) -> bool:
-        """Whether a setup is the present one but for rate, noise and stamps' uncertainty."""
-        known = self._setup
-        return known is not None and setup.follows_as(known) and setup.tips == known.tips
-
     def _measure_anew(self, text: str, setup: Setup) -> None:
-        """Track on with what `acquisition` has measured meanwhile: topics and model hold.
+        """Track on with another rate, noise and stamps' uncertainty: topics and model hold.
 
         To make them again takes 0.1 s, for which no frame would be tracked.
         """
@@ -297,6 +278,10 @@ class TrackerNode(AnserNode):
         """Track with another model from now on."""
         self._given = given
         self._use_model()
+
+    def _new_active(self, setup: Setup, settings: TrackerSettings) -> ActiveModel:
+        allowed = self.parameters.allow_uncalibrated
+        return ActiveModel(setup, settings.box, self._file_model, allowed)
 
     def _use_model(self) -> None:
         """Give the tracker the active model, once the setup is known too."""
@@ -410,17 +395,9 @@ class TrackerNode(AnserNode):
                 self._transforms.publish(transform_message(moved))
         self.count('frames')
         self._solve_s = time.perf_counter() - begin_s
-        if self._rehearsal is not None:
-            has_poses = standing.withheld is None
-            self._rehearsal.note(stamp_ns, points, self._solve_s, has_poses=has_poses)
         self._fluxes.backlog.worked(self._solve_s)
         if changed and time.monotonic() - self._diagnosed_s > EARLIEST_DIAGNOSTICS_S:
             self.publish_diagnostics()
-
-    def _rehearse(self) -> None:
-        """Prepare for a frame that is due."""
-        if self._tracker is not None and self._rehearsal is not None:
-            self._rehearsal.play(self._tracker)
 
     # What is reported ---------------------------------------------------------------------
 
@@ -443,9 +420,7 @@ class TrackerNode(AnserNode):
             check_emitters(setup, file_model)
         self._file_model = file_model
         if setup is not None:
-            box = settings_for(setup, self._settings).box
-            allowed = self.parameters.allow_uncalibrated
-            self._active = ActiveModel(setup, box, file_model, allowed)
+            self._active = self._new_active(setup, settings_for(setup, self._settings))
             self._use_model()
 
     def status(self) -> Status:
@@ -457,12 +432,14 @@ class TrackerNode(AnserNode):
         if slow:
             self.warn('seconds_too_slow', slow)
         tracker, newest = self._tracker, self._intake.newest
-        values: dict[str, object] = {'frame_time_s': self._solve_s}
-        values['model_age_s_max'] = self._model_age_ns / SECOND_NS
+        values: dict[str, object] = {
+            'frame_time_s': self._solve_s,
+            'model_age_s_max': self._model_age_ns / SECOND_NS,
+            'last_refusal': self._trouble.last,
+            'ready_for': self._ready_for(),
+            'pose_listeners': sum(topic.listeners for topic in self._topics.values()),
+        }
         self._model_age_ns = 0
-        values['last_refusal'] = self._trouble.last
-        values['ready_for'] = self._ready_for()
-        values['pose_listeners'] = sum(topic.listeners for topic in self._topics.values())
         if tracker is not None:
             values |= {name: count for name, count in tracker.counters.items() if name != 'frames'}
         conflict = sender_words(self._sources)
@@ -472,53 +449,46 @@ class TrackerNode(AnserNode):
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         if tracker is None or tracker.model is None:
             return Status('', Level.WARN, self._trouble.last or 'no field model yet', values)
+        stale_after_s = self.parameters.stale_after_s
+        good = sum(topic.state(stale_after_s)[0] == OK for topic in self._topics.values())
+        dead = ', '.join(tracker.dead_emitters)
         values |= {
             'dipoles': len(tracker.model.positions),
             'emitters': len(tracker.model.emitters),
             'model_stamp_ns': '' if newest is None else newest.stamp_ns,
             'models_late': self._frames.late,
+            'tracked': good,
+            'dead_emitters': dead,
+            # A drift takes no recorded course here: field_model follows it by its references.
+            'left_to_references': ', '.join(tracker.drifting_effects),
+            'corrected': ', '.join(tracker.corrected_effects),
         }
-        stale_after_s = self.parameters.stale_after_s
-        good = sum(topic.state(stale_after_s)[0] == OK for topic in self._topics.values())
-        values['tracked'] = good
-        dead = ', '.join(tracker.dead_emitters)
-        values['dead_emitters'] = dead
-        # A drift takes no recorded course here: field_model follows it where references determine
-        # it.
-        values['left_to_references'] = ', '.join(tracker.drifting_effects)
-        values['corrected'] = ', '.join(tracker.corrected_effects)
         if self._withheld is not None and self._withheld.state != TWO_SOURCES:
             return Status('', Level.ERROR, ': '.join(self._withheld), values)
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)
-        tracked = f'{good} of {len(self._topics)} tracked'
+        trouble, gate = self._trouble.recent(time.monotonic()), tracker.settings.gate
+        words = tracked = f'{good} of {len(self._topics)} tracked'
         if slow:
-            return Status('', Level.WARN, f'{slow}; {tracked}', values)
-        trouble = self._trouble.recent(time.monotonic())
-        if trouble:
-            return Status('', Level.WARN, f'{tracked}; lately: {trouble}', values)
-        gate = tracker.settings.gate
-        if gate > WIDE_GATE:
-            return Status(
-                '', Level.WARN, f'{tracked}; a gate of {gate:g} lets wrong poses through', values
-            )
-        return Status('', Level.OK, tracked, values)
+            words = f'{slow}; {tracked}'
+        elif trouble:
+            words += f'; lately: {trouble}'
+        elif gate > WIDE_GATE:
+            words += f'; a gate of {gate:g} lets wrong poses through'
+        return Status('', Level.OK if words == tracked else Level.WARN, words, values)
 
     def _ready_for(self) -> str:
         """Digest of the setup that no pose will be lost of: all listeners and the model are there.
 
         A sender of fluxes (a replay) reads it in ``/diagnostics`` before it starts.
         """
-        tracker = self._tracker
-        if tracker is None or tracker.model is None:
+        tracker, intake = self._tracker, self._intake
+        lacks_model = intake.newest is None and self.count_publishers('field_model')
+        lacks_error = not intake.has_error and self.count_publishers('field_model_error')
+        if tracker is None or tracker.model is None or lacks_model or lacks_error:
             return ''
-        if self._intake.newest is None and self.count_publishers('field_model'):
-            return ''
-        if not self._intake.has_error and self.count_publishers('field_model_error'):
-            return ''
-        if not all(topic.is_matched(self) for topic in self._topics.values()):
-            return ''
-        return digest_of(self._setup_text)
+        is_matched = all(topic.is_matched(self) for topic in self._topics.values())
+        return digest_of(self._setup_text) if is_matched else ''
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every sensor and body."""

@@ -3,28 +3,24 @@
 references are silent (`ActiveModel`), and joined with the frames that it answers
 (`AnsweredFrames`): a server that follows the references answers each of their frames by a model
 with its stamp, for which a tool frame waits a few milliseconds, so that live poses are the same
-as offline. Just before a frame comes, the last one is tracked once more (`Rehearsal`).
+as offline.
 """
 
-import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 from sensor_msgs.msg import PointCloud2
 
-from anser_ros.errors import AnserError, LayoutError
+from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.model_trust import FrameModel, ModelAge
-from anser_ros.nodes.streams.model_clouds import read_dipoles, read_error
-from anser_ros.physics.sensor import SensorTable
+from anser_ros.nodes.streams.clouds import read_dipoles, read_error
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld, state_of
 from anser_ros.stamps import stamp_of
-from anser_ros.tracking.estimate import TrackerSettings
-from anser_ros.tracking.tracker import Tracker
-from anser_ros.wire.points import DipolePoints, FluxPoints, ModelError
+from anser_ros.wire.points import DipolePoints, ModelError
 from anser_ros.wire.setup import Setup
 
 MOST_EARLY = 32
@@ -65,17 +61,17 @@ class GivenModel:
             raise LayoutError(
                 f'the field model has {points.moments.shape[1]} emitters, the setup {count}'
             )
-        model = FieldModel(
+        own: dict[str, Any] = {}
+        if file_model is not None:
+            names = 'flux_error_t', 'shift_sigma_m', 'effects'
+            own = {name: getattr(file_model, name) for name in names}
+        if self.error is not None:
+            modes = self.error.modes if len(self.error.modes) else None
+            own |= {'flux_error_t': self.error.flux_error_t, 'modes': modes}
+        return FieldModel(
             points.positions, points.directions, points.moments, setup.emitter_names,
-            setup.frequencies_hz,
-            flux_error_t=0.0 if file_model is None else file_model.flux_error_t,
-            shift_sigma_m=0.0 if file_model is None else file_model.shift_sigma_m,
-            effects=() if file_model is None else file_model.effects,
+            setup.frequencies_hz, **own,
         )  # fmt: skip
-        if self.error is None:
-            return model
-        modes = self.error.modes if len(self.error.modes) else None
-        return replace(model, flux_error_t=self.error.flux_error_t, modes=modes)
 
 
 class ModelIntake:
@@ -135,8 +131,8 @@ class ModelIntake:
         return read[1] if read is not None and read[0] == n_dipoles else None
 
 
-REASONS = {REFERENCES_LOST: 'no reference readings yet, or too few'}
-"""What is said of a state that the server names, where it needs words."""
+NO_READINGS = 'no reference readings yet, or too few'
+"""What is said where the server has none."""
 OTHER_CLOCK_NS = 5_000_000_000
 """A model whose stamp is that far ahead of the frames' has it from another clock: the host's,
 where a recording is played. Its age counts from when it came."""
@@ -211,12 +207,11 @@ class ActiveModel:
         state = '' if self.given is None else self.given.withheld
         if state == UNCALIBRATED and self._uncalibrated:
             state = ''
-        standing = self._age.at(stamp_ns, REASONS.get(state, ''))
-        if standing.model is None:
-            standing = replace(standing, model=self.field)
+        aged = self._age.at(stamp_ns, NO_READINGS if state == REFERENCES_LOST else '')
+        withheld = aged.withheld
         if state and state != REFERENCES_LOST:
-            return FrameModel(standing.model, Withheld(state, 'reported by field_model'))
-        return standing
+            withheld = Withheld(state, 'reported by field_model')
+        return FrameModel(self.field if aged.model is None else aged.model, withheld)
 
     def soon(self) -> FieldModel | None:
         """Return the model that a frame will be tracked with that comes just after the newest."""
@@ -225,34 +220,28 @@ class ActiveModel:
         return self._age.at(self._age.newest_ns + 1).model or self.field
 
 
-Model = TypeVar('Model')
-Frame = TypeVar('Frame')
-
 FAR_AHEAD_NS = 1_000_000_000
 """A model that far from a frame has its stamp from another clock (a recording's, the host's)."""
 MOST_LATE = 5
 """Frames in a row that waited in vain, after which none waits until an answer has come again."""
-NO_WAIT_S = -math.inf
-"""Time until which a frame waits that is not to wait."""
 MOST_WAITING = 200
-"""Most frames and models that are kept waiting, each; older models are dropped, and the oldest
-frame is tracked at once. At 50 frames a second that is four seconds, beyond any useful wait."""
+"""Most frames and models that wait, each: four seconds at 50 Hz, beyond any useful wait. Older
+models are dropped, and the oldest frame is tracked at once."""
 
 
-class AnsweredFrames(Generic[Model, Frame]):
+class AnsweredFrames:
     """Keeps frames and models in the order in which they are to be used.
 
     ``use`` activates a model, ``track`` works on a frame with the active one. ``follows`` is
     whether the server answers frames, by its own word; ``late`` counts frames that waited in vain.
     """
 
-    def __init__(self, use: Callable[[Model], None], track: Callable[[Frame], None]) -> None:
+    def __init__(self, use: Callable[[Any], None], track: Callable[[Any], None]) -> None:
         self._use, self._track = use, track
-        self._models: deque[tuple[int, Model]] = deque(maxlen=MOST_WAITING)
-        self._frames: deque[tuple[int, Frame, float]] = deque()
-        self._last_frame_ns = 0
-        self._active_ns = 0
-        self._in_vain = 0
+        self._models: deque[tuple[int, Any]] = deque(maxlen=MOST_WAITING)
+        # Each with the time until which it waits; None where it is not to wait.
+        self._frames: deque[tuple[int, Any, float | None]] = deque()
+        self._last_frame_ns = self._active_ns = self._in_vain = 0
         self.follows = False
         self.late = 0
 
@@ -261,7 +250,7 @@ class AnsweredFrames(Generic[Model, Frame]):
         """Return whether a frame waits for its model."""
         return bool(self._frames)
 
-    def add_model(self, stamp_ns: int, model: Model, now_s: float) -> None:
+    def add_model(self, stamp_ns: int, model: Any, now_s: float) -> None:
         """Take a model, and what becomes possible by it."""
         frames = (self._last_frame_ns, *(stamp for stamp, _, _ in self._frames))
         if stamp_ns in frames:
@@ -269,12 +258,12 @@ class AnsweredFrames(Generic[Model, Frame]):
         self._models.append((stamp_ns, model))
         self.work(now_s)
 
-    def add_frame(self, stamp_ns: int, frame: Frame, now_s: float, longest_wait_s: float) -> None:
+    def add_frame(self, stamp_ns: int, frame: Any, now_s: float, longest_wait_s: float) -> None:
         """Take a frame, and track it once its model is there, at most so much later.
 
         A frame that should not wait, with 0, is not late.
         """
-        until_s = now_s + longest_wait_s if longest_wait_s > 0 else NO_WAIT_S
+        until_s = now_s + longest_wait_s if longest_wait_s > 0 else None
         self._frames.append((stamp_ns, frame, until_s))
         self.work(now_s)
 
@@ -283,14 +272,14 @@ class AnsweredFrames(Generic[Model, Frame]):
         while self._frames:
             stamp_ns, frame, until_s = self._frames[0]
             self._use_models(stamp_ns)
-            if not self._is_answered(stamp_ns):
-                overdue = now_s >= until_s or len(self._frames) > MOST_WAITING
-                waits = until_s != NO_WAIT_S
-                if self.follows and waits and self._in_vain < MOST_LATE:
-                    if not overdue:
-                        return
-                    self.late += 1
-                    self._in_vain += 1
+            # Its model is active, or a later one says that it has none.
+            is_answered = self._active_ns == stamp_ns or bool(self._models)
+            may_wait = self.follows and not is_answered and self._in_vain < MOST_LATE
+            if may_wait and until_s is not None:
+                if now_s < until_s and len(self._frames) <= MOST_WAITING:
+                    return
+                self.late += 1
+                self._in_vain += 1
             self._frames.popleft()
             self._last_frame_ns = stamp_ns
             self._track(frame)
@@ -307,37 +296,3 @@ class AnsweredFrames(Generic[Model, Frame]):
         if newest is not None:
             self._active_ns = newest[0]
             self._use(newest[1])
-
-    def _is_answered(self, stamp_ns: int) -> bool:
-        """Whether the model of a frame is active, or a later one says that it has none."""
-        return self._active_ns == stamp_ns or bool(self._models)
-
-
-LONGEST_S = 0.006
-"""A frame that took longer, s, is not rehearsed: 3 ms are usual, and there are 4. Shorter, and a
-busy machine does without when it needs it most; longer, and a rehearsal is not over when the next
-frame comes."""
-
-
-class Rehearsal:
-    """Has a tracker of its own, whose poses nobody gets."""
-
-    def __init__(self, sensors: SensorTable, settings: TrackerSettings) -> None:
-        self._past = Tracker(None, sensors, settings)
-        self._frame: tuple[int, FluxPoints] | None = None
-
-    def note(self, stamp_ns: int, points: FluxPoints, took_s: float, *, has_poses: bool) -> None:
-        """Take in a frame that was tracked, how long that took, and whether poses were allowed."""
-        self._frame = (stamp_ns, points) if has_poses and took_s < LONGEST_S else None
-
-    def play(self, tracker: Tracker) -> None:
-        """Track the last frame as a tracker did; nothing of it is left in that one."""
-        if self._frame is None:
-            return
-        stamp_ns, points = self._frame
-        try:
-            tracker.with_past_of(self._past).update(
-                stamp_ns, points.channel, points.flux, points.flags
-            )
-        except AnserError:  # the frame itself was refused with these words
-            return

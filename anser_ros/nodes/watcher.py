@@ -22,7 +22,7 @@ from anser_ros.nodes.runtime.incoming import pose_numbers
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.streams.model_clouds import read_frame
+from anser_ros.nodes.streams.clouds import read_frame
 from anser_ros.nodes.streams.one_source import OneSource, sender_words, setup_source
 from anser_ros.pose_states import TWO_SOURCES
 from anser_ros.sessions.prepared import prepare
@@ -91,15 +91,11 @@ class Streams(Protocol):
     `FluxStreams` are those of this package's own fluxes; others come by `streams_of`.
     """
 
-    WHAT: str
-    """What comes, in a word."""
+    WHAT: str  # what comes, in a word
     sources: list[OneSource]
-    received_s: float
-    """When the last of it came, by the monotonic clock."""
-    window: Any
-    """Has ``span_s`` and ``restarts``; None before anything can be taken."""
-    watch: Any
-    """Has ``searches``; another one where all begins again."""
+    received_s: float  # when the last of it came, by the monotonic clock
+    window: Any  # has ``span_s`` and ``restarts``; None before anything can be taken
+    watch: Any  # has ``searches``; another one where all begins again
 
     def quiet_topics(self) -> tuple[str, ...]: ...
     def look(self) -> Callable[[], Any] | None:
@@ -177,11 +173,10 @@ class FluxStreams:
         take = window.take_tool if topic == 'tool/flux' else window.take_reference
         try:
             take(*read_frame(message, window.setup.frame_id, self._node.count))
+            self.received_s = time.monotonic()
+            self._node.count('frames')
         except AnserError as error:
             self._node.refuse('fluxes_refused', error)
-            return
-        self.received_s = time.monotonic()
-        self._node.count('frames')
 
     def quiet_topics(self) -> tuple[str, ...]:
         """Return none: silence is that of all fluxes."""
@@ -194,13 +189,8 @@ class FluxStreams:
             return None
         return partial(self.watch.look, session, self.window.first_ns)
 
-    def words(self, seen: Sighting) -> str:
-        """Return what was seen as one line."""
-        return words_of(seen)
-
-    def values(self, seen: Sighting) -> dict[str, object]:
-        """Return the figures of what was seen, by name."""
-        return values_of(seen)
+    words = staticmethod(words_of)
+    values = staticmethod(values_of)
 
 
 def streams_of(node: 'Watcher', table: WatcherParameters) -> Streams:
@@ -211,10 +201,10 @@ def streams_of(node: 'Watcher', table: WatcherParameters) -> Streams:
 
 
 class Watcher(AnserNode):
-    """Subscribes to fluxes and optical poses, and publishes ``/diagnostics`` alone.
+    """Subscribes to fluxes and optical poses, or to the tracked poses that are named and a
+    reference's, and publishes ``/diagnostics`` alone.
 
-    If topics of tracked poses are named, it uses these and a reference's, and no fluxes. The
-    diagnosis runs in a separate thread, which pauses after each run to keep to its share of the
+    The diagnosis runs in a thread, which pauses after each run to keep to its share of the
     processor.
     """
 
@@ -319,20 +309,16 @@ class Watcher(AnserNode):
 
     def part_statuses(self) -> list[Status]:
         """Return a line for everything that was found since the setup came."""
-        seen = self._seen
-        there = {} if seen is None else {title_of(record): record for record in seen.findings}
+        there = [] if self._seen is None else [title_of(one) for one in self._seen.findings]
         statuses = []
         for title, record in self._known.items():
-            if title in there:
-                record = there[title]
-                values = {
-                    **{key: plain_text(value) for key, value in record.parameters.items()},
-                    **{f'{k}_sigma': plain_text(value) for k, value in record.uncertainty.items()},
-                    **{key: plain_text(value) for key, value in record.evidence.items()},
-                }
-                statuses.append(Status(title, Level.WARN, figures_of(record), values))
-            else:
+            if title not in there:
                 statuses.append(Status(title, Level.OK, 'gone'))
+                continue
+            sigmas = {f'{key}_sigma': value for key, value in record.uncertainty.items()}
+            found = {**record.parameters, **sigmas, **record.evidence}
+            values = {key: plain_text(value) for key, value in found.items()}
+            statuses.append(Status(title, Level.WARN, figures_of(record), values))
         return statuses
 
 

@@ -249,15 +249,6 @@ class Tracker:
             scene = bare.with_model(scene.model, settings, scene.context.model_id)
         return Tracker(scene.model, self.sensors, settings, past=self._past, scene=scene)
 
-    def with_past_of(self, other: 'Tracker') -> 'Tracker':
-        """Return a tracker like this one that goes on from where another one of its sensors is.
-
-        What it sees from now on, the other one has seen, and this one has not.
-        """
-        return Tracker(
-            self.model, self.sensors, self.settings, past=other._past, scene=copy(self._scene)
-        )
-
     def _copy(self, scene: TrackedScene) -> 'Tracker':
         return Tracker(scene.model, self.sensors, self.settings, past=self._past, scene=scene)
 

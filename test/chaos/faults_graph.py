@@ -131,7 +131,7 @@ def _models(change: Callable[[FieldModel], FieldModel]) -> Callable[..., Off]:
 
 
 def _cloud_of(model: FieldModel) -> Any:
-    from anser_ros.nodes.streams.model_clouds import ModelWriter
+    from anser_ros.nodes.streams.clouds import ModelWriter
 
     return ModelWriter().dipoles(model, 'fg', time.time_ns())
 

@@ -1,4 +1,4 @@
-"""Reports what a node says of itself: statuses, counters, and warnings that do not flood."""
+"""Reports what a node says of itself: statuses, and warnings that do not flood."""
 
 import math
 from collections import Counter
@@ -88,10 +88,8 @@ def named(names: Iterable[str], most: int) -> str:
 class Trouble:
     """Remembers what went wrong last, and whether that is still news."""
 
-    def __init__(self, held_s: float = TROUBLE_HELD_S) -> None:
-        self._held_s = held_s
-        self._at_s = -math.inf
-        self.last = ''
+    def __init__(self) -> None:
+        self.forget()
 
     def say(self, words: str, now_s: float) -> None:
         """Take what has just gone wrong, at a monotonic time."""
@@ -99,7 +97,7 @@ class Trouble:
 
     def recent(self, now_s: float) -> str:
         """Return what went wrong lately; empty when nothing did."""
-        return self.last if now_s - self._at_s < self._held_s else ''
+        return self.last if now_s - self._at_s < TROUBLE_HELD_S else ''
 
     def forget(self) -> None:
         """Take the trouble for over."""

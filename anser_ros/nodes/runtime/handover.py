@@ -17,7 +17,7 @@ from anser_ros.wire.points import FluxPoints
 Taker = Callable[[Any], object]
 LONGEST_PAUSE_S = 0.2
 """Time without a pause, s, after which no frames flow, and nothing is put off: more than any stall
-of a host, less than the time between two words of a node on itself."""
+of a host, less than the time between two diagnostics of a node."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,9 @@ class NewestWorker:
     """
 
     def __init__(self, skipped: Callable[[], object]) -> None:
-        self._skipped = skipped
+        self._skipped, self._is_ending = skipped, False
         self._waiting: dict[str, tuple[Taker, Any]] = {}
         self._news = threading.Condition()
-        self._is_ending = False
         self._thread = threading.Thread(target=self._run, name='aside', daemon=True)
         self._thread.start()
 
@@ -82,22 +81,19 @@ class Handover:
     """Keeps the topics that nodes of this process offer each other, by their full names.
 
     The node that hands over frames reports when there is a pause before the next: diagnostics are
-    put off until then, so that no pose waits for them. It reports too when a frame is due within
-    milliseconds: who prepares for frames does so then.
+    put off until then, so that no pose waits for them.
     """
 
     def __init__(self) -> None:
         self._put_off: deque[Callable[[], bool]] = deque()
-        self._preparations: list[Callable[[], object]] = []
         self._paused_s = -math.inf
         self._takings: defaultdict[str, list[DirectSubscription]] = defaultdict(list)
         self._offered: dict[str, bool] = {}
         self._last: dict[str, Any] = {}
 
     def offer(self, topic: str, *, lasts: bool = False) -> None:
-        """Declare that the messages of a topic will be passed to receivers directly.
-
-        A receiver that registers later gets the last one at once if it ``lasts``.
+        """Declare that the messages of a topic will be passed to receivers directly, the last one
+        to a later receiver too if it ``lasts``.
         """
         self._offered[topic] = lasts
 
@@ -118,9 +114,8 @@ class Handover:
         self._takings[taking.topic_name].remove(taking)
 
     def defer(self, work: Callable[[], bool]) -> bool:
-        """Do some work in the next pause; return False if no node makes pauses at present.
-
-        Work that returns False could not be done, and is tried again in the pause after.
+        """Do some work in the next pause, or in a later one where it returns False; return False
+        if no node makes pauses at present.
         """
         if time.monotonic() - self._paused_s > LONGEST_PAUSE_S:
             return False
@@ -135,15 +130,6 @@ class Handover:
             work = self._put_off.popleft()
             if not work():
                 self._put_off.append(work)
-
-    def prepare(self, work: Callable[[], object]) -> None:
-        """Do some work each time that a frame is due, in the thread that hands it over."""
-        self._preparations.append(work)
-
-    def frame_is_due(self) -> None:
-        """Do what prepares for a frame."""
-        for work in self._preparations:
-            work()
 
     def give(self, topic: str, what: Any) -> None:
         """Give something to all who take a topic."""

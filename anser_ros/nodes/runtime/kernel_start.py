@@ -8,19 +8,16 @@ from collections.abc import Callable
 from anser_ros.kernel_cache import KernelCache
 
 POLL_S = 0.1
-"""Time from one look at the compiling process to the next, s: how late its end is noticed."""
+"""Time from one look at the compiling process to the next, s."""
 LINE_INTERVAL_S = 1.0
-"""Time from one word about the progress to the next, s, as of a node that runs."""
+"""Time from one line about the progress to the next, s."""
 
 
 def wait_for_kernels(say: Callable[[str], None]) -> str:
-    """Have all kernels compiled if they are not, and tell meanwhile how far that is.
+    """Have all kernels compiled if they are not; return why it failed, empty when all is there.
 
-    Of nodes that start together one process compiles, and the others wait for it.
-
-    ``say`` gets a line at once and every second, none where all kernels are there. What is
-    returned is why it failed, empty when all is there: the node may go on all the same, and then
-    compiles what it needs when it needs it.
+    Of nodes that start together one process compiles, and the others wait for it. ``say`` gets a
+    line at once and every second, none where all kernels are there.
     """
     cache = KernelCache()
     if cache.is_full:

@@ -52,7 +52,7 @@ LONGEST_TURN_S = 0.05
 the next time: other nodes of the process wait meanwhile."""
 LONGEST_END_S = 0.2
 """Time, s, that the end of a process waits for what its nodes work on aside: longer than a frame
-takes. The start of a refit takes seconds, which nobody waits for."""
+takes, less than the start of a refit."""
 
 
 @dataclass(frozen=True)
@@ -64,16 +64,9 @@ class AnserNode(Node):
     """Gives all nodes their parameters, diagnostics and guarded callbacks.
 
     ``beside`` are the other nodes of the process: values that are given to all of them may be
-    meant for one.
-
-    Attributes
-    ----------
-    parameters : instance of ``PARAMETERS``
-        The present values, frozen; a change that is allowed swaps the whole instance.
-    counters : collections.Counter
-        Events by name; all of them are shown in ``/diagnostics``.
-    exit_code : int or None
-        What the process ends with once :meth:`stop` was called.
+    meant for one. ``parameters`` is a frozen instance of ``PARAMETERS``; an allowed change swaps
+    it. ``counters`` are shown in ``/diagnostics``. The process ends with ``exit_code`` once that
+    is not None.
     """
 
     NAME: ClassVar[str]
@@ -93,8 +86,7 @@ class AnserNode(Node):
         **options: Any,
     ) -> None:
         # The base class already creates services, so what guards them must be there first.
-        self._handover = handover
-        self._beside = tuple(beside)
+        self._handover, self._beside = handover, tuple(beside)
         # Where frames are handed over, they come in another thread than the executor's.
         self._aside: NewestWorker | None = None
         self._turn: Any = contextlib.nullcontext() if handover is None else threading.RLock()
@@ -162,16 +154,6 @@ class AnserNode(Node):
         if self._handover is not None:
             self._handover.pause()
 
-    def prepare(self, work: Callable[[], object]) -> None:
-        """Do some work each time that a node of this process is about to hand over a frame."""
-        if self._handover is not None:
-            self._handover.prepare(self._guard(work))
-
-    def frame_is_due(self) -> None:
-        """Let the nodes of this process prepare for a frame that comes within milliseconds."""
-        if self._handover is not None:
-            self._handover.frame_is_due()
-
     @property
     def hands_over(self) -> bool:
         """Return whether other nodes of this process get what this one publishes directly."""
@@ -202,19 +184,18 @@ class AnserNode(Node):
             self._report()
 
     def _report_if_free(self) -> bool:
-        is_free = bool(self._turn.acquire(blocking=False))
-        if is_free:
-            try:
-                self._report()
-            finally:
-                self._turn.release()
-        return is_free
+        if not self._turn.acquire(blocking=False):
+            return False
+        try:
+            self._report()
+        finally:
+            self._turn.release()
+        return True
 
     def publish_end(self) -> None:
         """Publish that the node has ended, so that its last state is not taken for a live one."""
-        self._send_statuses(
-            replace(self._status_with_counters(), level=Level.STALE, message='ended')
-        )
+        last = replace(self._status_with_counters(), level=Level.STALE, message='ended')
+        self._send_statuses(last)
 
     def _say_starting(self, text: str) -> None:
         """State what the start waits for, in the log once and in ``/diagnostics``."""
@@ -223,13 +204,12 @@ class AnserNode(Node):
         self._send_statuses(Status('', Level.WARN, text))
 
     def _status_with_counters(self) -> Status:
-        own = self.status()
-        level, message = own.level, own.message
-        if self.counters['callback_faults'] > self._faults_reported:
-            self._faults_reported = self.counters['callback_faults']
-            level, message = Level.ERROR, f'callback failed: {self._fault}'
-        values = {**own.values, **self.counters, 'uptime_s': time.monotonic() - self.started_s}
-        return Status(own.name, level, message, values)
+        own, uptime_s = self.status(), time.monotonic() - self.started_s
+        own = replace(own, values={**own.values, **self.counters, 'uptime_s': uptime_s})
+        if self.counters['callback_faults'] == self._faults_reported:
+            return own
+        self._faults_reported = self.counters['callback_faults']
+        return replace(own, level=Level.ERROR, message=f'callback failed: {self._fault}')
 
     def _send_statuses(self, *statuses: Status) -> None:
         name = self.get_fully_qualified_name().strip('/')
@@ -247,28 +227,25 @@ class AnserNode(Node):
         An object handed over by a node of this process goes to ``handed``, by default to the
         callback.
         """
-        bounded = incoming.is_bounded(msg_type) and not options.get('raw', False)
-
-        @functools.wraps(callback)
-        def opened(message: Any, *info: Any) -> Any:
-            return callback(incoming.opened(message, msg_type) if bounded else message, *info)
-
         name = self.resolve_topic_name(topic)
         if self._handover is not None and self._handover.offers(name):
             taker = self._guard(self._in_turn(handed or callback))
-            return self._handover.take(name, self._put_aside(name, taker))
-        guarded = self._guard(self._in_turn(opened))
+            if self.WORKS_ASIDE:
+                self._aside = self._aside or NewestWorker(lambda: self.count('frames_skipped'))
+                taker = functools.partial(self._aside.put, name, taker)
+            return self._handover.take(name, taker)
+        bounded = incoming.is_bounded(msg_type) and not options.get('raw', False)
 
         @functools.wraps(callback)
         def unpacked(*args: Any) -> Any:
             # The events executor gives message and its information as one pair.
-            if len(args) == 1 and isinstance(args[0], tuple):
-                args = args[0]
-            return guarded(*args)
+            message, *info = args[0] if isinstance(args[0], tuple) else args
+            return callback(incoming.opened(message, msg_type) if bounded else message, *info)
 
         if bounded:
             options['raw'] = True
-        return super().create_subscription(msg_type, topic, unpacked, qos_profile, **options)
+        guarded = self._guard(self._in_turn(unpacked))
+        return super().create_subscription(msg_type, topic, guarded, qos_profile, **options)
 
     def create_timer(
         self, timer_period_sec: float, callback: Callback, *args: Any, **options: Any
@@ -290,12 +267,6 @@ class AnserNode(Node):
             self._handover.drop(subscription)
             return True
         return super().destroy_subscription(subscription)
-
-    def _put_aside(self, topic: str, taker: Callback) -> Callback:
-        if not self.WORKS_ASIDE:
-            return taker
-        aside = self._aside = self._aside or NewestWorker(lambda: self.count('frames_skipped'))
-        return lambda what: aside.put(topic, taker, what)
 
     def stop_working(self) -> bool:
         """End what is worked on aside; False where that still goes on after a while."""
@@ -337,9 +308,10 @@ class AnserNode(Node):
                 if self.context.ok() and not self._is_ending:
                     reason = f'{type(error).__name__}: {error}'
                     self._report_fault(reason)
-            if is_service:
-                return _failed(args[1], reason)
-            return None
+            response: Any = args[1] if is_service else None
+            if hasattr(response, 'success'):
+                response.success, response.message = False, reason
+            return response
 
         return guarded
 
@@ -364,40 +336,30 @@ class AnserNode(Node):
             parameters.build(table, dict.fromkeys(sorted(unknown)))
         for name, rule in parameters.rules(table).items():
             default = getattr(table, name)
+            ros_default = list(default) if isinstance(default, tuple) else default
             descriptor = ParameterDescriptor(
                 description=rule.description,
                 additional_constraints=', '.join(rule.choices),
                 read_only=not rule.live,
                 dynamic_typing=True,  # so that a whole number will do for a float
             )
-            given = self.declare_parameter(name, _as_ros(default), descriptor).value
+            given = self.declare_parameter(name, ros_default, descriptor).value
             values[name] = default if given is None else given
         return parameters.build(table, values)
 
     def _on_set_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
         own = {p.name: p.value for p in changed if not parameters.is_foreign(p.name)}
-        if not own:
-            return SetParametersResult(successful=True)
         old = self.parameters
         try:
-            new = parameters.build(self.PARAMETERS, {**vars(old), **own})
-            with self._turn:
-                self.parameters = new
-                self.on_parameters(old, new)
+            if own:
+                new = parameters.build(self.PARAMETERS, {**vars(old), **own})
+                with self._turn:
+                    self.parameters = new
+                    self.on_parameters(old, new)
         except AnserError as error:
             self.parameters = old
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
-
-
-def _as_ros(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _failed(response: Any, reason: str) -> Any:
-    if hasattr(response, 'success'):
-        response.success, response.message = False, reason
-    return response
 
 
 __all__ = ['AnserNode', 'Level', 'Status']

@@ -1,10 +1,7 @@
-"""Defines a node's parameter table: a frozen dataclass of fields made by :func:`parameter`. The
-dataclass is the only place that knows a parameter's name, type, default, range and meaning. The
-node declares it, ``--help`` prints it, and an instance of it is what the node reads::
-@dataclass(frozen=True)     class TrackerParameters:         gate: float = parameter(4.0,
-'largest residual in standard deviations', minimum=0.0) Then follow the parameters that several
-nodes have: values that the setup document may state too (0, the default, leaves them to it),
-names outside a node's namespace, and what parameter files say.
+"""Defines a node's parameter table, a frozen dataclass of fields made by :func:`parameter`: the
+only place that knows a parameter's name, type, default, range and meaning. The node declares it,
+``--help`` prints it, and an instance of it is what the node reads. Then follow the parameters that
+several nodes have, and what parameter files say.
 """
 
 import dataclasses
@@ -74,7 +71,10 @@ def is_known(table: type, name: str) -> bool:
 
 
 def types(table: type) -> dict[str, Any]:
-    """Return the type of every parameter of a table."""
+    """Return the type of every parameter of a table.
+
+    Raises `ParameterError` where ROS has no parameters of a type.
+    """
     hints = typing.get_type_hints(table)
     for name, kind in hints.items():
         if kind not in SCALARS and kind not in LIST_ITEMS:
@@ -88,32 +88,23 @@ def build(table: type, values: Mapping[str, Any]) -> Any:
     Raises `ParameterError`: a name that the table does not have, a value of the wrong type, or one
     out of its range.
     """
-    known = types(table)
+    known, rule_of = types(table), rules(table)
     unknown = sorted(set(values) - set(known))
     if unknown:
         raise ParameterError(
             f'no parameter {", ".join(unknown)}; there are: {", ".join(known) or "none"}'
         )
-    checked = {
-        name: _check(name, known[name], rules(table)[name], values[name]) for name in values
-    }
-    return table(**checked)
+    return table(**{n: _check(n, known[n], rule_of[n], value) for n, value in values.items()})
 
 
 def _check(name: str, kind: Any, rule: Rule, value: Any) -> Any:
-    """One value in the type of its field.
-
-    A whole number will do for a float: a YAML file that says ``rate_hz: 25`` is right.
-    """
-    if kind not in LIST_ITEMS:
-        return _check_scalar(name, kind, rule, value)
-    is_text = isinstance(value, str | bytes) and len(value) > 0
-    if is_text or not isinstance(value, Iterable):
-        raise ParameterError(f'parameter {name}: {value!r} is not a list')
-    return tuple(_check_scalar(name, LIST_ITEMS[kind], rule, item) for item in value)
-
-
-def _check_scalar(name: str, kind: type[Any], rule: Rule, value: Any) -> Any:
+    """One value in the type of its field."""
+    if kind in LIST_ITEMS:
+        is_text = isinstance(value, str | bytes) and len(value) > 0
+        if is_text or not isinstance(value, Iterable):
+            raise ParameterError(f'parameter {name}: {value!r} is not a list')
+        return tuple(_check(name, LIST_ITEMS[kind], rule, item) for item in value)
+    # A YAML file that says ``rate_hz: 25`` is right.
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
@@ -206,17 +197,17 @@ def _documents(arguments: Sequence[str]) -> Iterator[tuple[str, Any]]:
 def complaints(arguments: Sequence[str], node: str) -> list[str]:
     """Return one line for each parameter file without a section for a node.
 
-    rclpy ignores such a file silently, and the node runs with its defaults. A file that is not a
-    parameter file is left to rclpy, which refuses it.
+    rclpy ignores such a file silently, and the node runs with its defaults.
     """
     found = []
     for value, document in _documents(arguments):
         keys = [key for key, _ in _sections(document)]
         names = [key.rsplit('/', 1)[-1] for key in keys]
-        if node in names or any(name in WILDCARDS for name in names):
+        if any(name in names for name in (node, *WILDCARDS)):
             continue
         close = difflib.get_close_matches(node, names, n=1)
-        hint = f"is '{keys[names.index(close[0])]}' meant?" if close else f'it has: {_list(keys)}'
+        hint = f'it has: {", ".join(keys) or "no section at all"}'
+        hint = f"is '{keys[names.index(close[0])]}' meant?" if close else hint
         found.append(f'{value} has nothing for {node}; {hint}')
     return found
 
@@ -261,7 +252,3 @@ def _sections(document: Any, path: str = '') -> Iterator[tuple[str, Any]]:
     for key, value in document.items():
         if key != LEAF:
             yield from _sections(value, f'{path}/{key}' if path else str(key))
-
-
-def _list(keys: Sequence[str]) -> str:
-    return ', '.join(keys) or 'no section at all'

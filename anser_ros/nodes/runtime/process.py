@@ -1,9 +1,4 @@
-"""Runs the process of one or several nodes: memory, arguments, signals, executor and exit code.
-The allocator is set so that a node that runs for days does not break its memory into pieces:
-glibc gives blocks of 128 KiB and more back when they are freed, but raises this bound to the
-size of the largest block that was freed so far, and gives each thread a heap of its own.
-`field_model` had 612 MB after twenty minutes, in steps of megabytes, and has 511 so.
-"""
+"""Runs the process of one or several nodes: memory, arguments, signals, executor and exit code."""
 
 import argparse
 import ctypes
@@ -35,15 +30,18 @@ from anser_ros.wire.text_files import config_path
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Parameters of glibc's ``mallopt``, as <malloc.h> numbers them."""
 LARGE = 4 * 1024 * 1024
-"""Bytes from which on a block has pages of its own, which are given back. What is made for a frame
-is smaller: with 256 KiB, `field_model` asks for 9000 pages a second and waits for them."""
+"""Bytes from which on a block has pages of its own, which are given back: more than is made for a
+frame, which `field_model` otherwise waits for."""
 MOST_FREE = 64 * 1024 * 1024
-"""Free bytes at the end of the heap that are kept, as many as glibc itself comes to keep; with
-8 MiB the same node still asks for 3000 pages a second."""
+"""Free bytes at the end of the heap that are kept, as many as glibc itself comes to keep."""
 
 
 def keep_in_one_piece() -> None:
-    """Set the allocator of this process so; do nothing where it is not glibc's."""
+    """Set the allocator so that a node that runs for days does not break its memory into pieces.
+
+    glibc raises the bound from which blocks are given back, and has a heap for each thread:
+    `field_model` had 612 MB after twenty minutes, and has 511 so. Others' allocators are left.
+    """
     try:
         set_option = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):
@@ -62,11 +60,10 @@ PROFILES = 'fastdds.xml'
 READ_PROFILES = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
 ENDING = (signal.SIGINT, signal.SIGTERM)
 NOTICE_S = 1.0
-"""How long, s, a busy process may take to notice that it is to end: the start of a refit takes
-seconds, and who presses Ctrl-C has the prompt back within 1.5 s."""
+"""How long, s, a busy process may take to notice that it is to end, before it is ended."""
 TURN_S = 1e-3
-"""Time, s, after which a thread lets another one have its turn where samples are received.
-Python's usual 5 ms would be as much error in the time at which bytes arrive."""
+"""Time, s, after which a thread lets another one have its turn where samples are received, and so
+the error in the time at which bytes arrive; Python's own is 5 ms."""
 RENAMING = ('__node:=', '__name:=')
 """Rules that rename all nodes of a process, which several can't be."""
 
@@ -76,11 +73,11 @@ def main(
     argv: Sequence[str] | None = None,
     name: str = '',
 ) -> int:
-    """Run nodes until one of them ends, or until SIGINT or SIGTERM.
+    """Run nodes until one of them ends, or until SIGINT or SIGTERM; return the exit code.
 
     Several classes, in the order of the chain, hand their frames over to each other; the process
-    then needs a name of its own. The exit code is 0 where it ended as asked, 2 for a wrong
-    argument or parameter, reported in one line, and 1 for a defect.
+    then needs a name of its own. The code is 0 where it ended as asked, 2 for a wrong argument or
+    parameter, reported in one line, and 1 for a defect.
     """
     arguments = list(sys.argv if argv is None else argv)
     classes = tuple(node_class) if isinstance(node_class, Sequence) else (node_class,)
@@ -107,10 +104,7 @@ def main(
 
 
 def _choose_profile() -> None:
-    """Let the middleware announce nodes more often, and give back the memory of messages.
-
-    The first lets nodes find each other at once, the second releases the memory of a huge message.
-    """
+    """Let nodes find each other at once, and the middleware give back the memory of messages."""
     if not any(os.environ.get(variable) for variable in PROFILE_VARIABLES):
         os.environ[PROFILE_VARIABLES[0]] = str(config_path(PROFILES))
         os.environ.setdefault(READ_PROFILES, '1')
@@ -151,8 +145,7 @@ def _meant_for(
 ) -> tuple[list[str], dict[str, list[str]]]:
     """Split off the parameters of one node among several, ``-p NODE:NAME:=VALUE``.
 
-    ROS can do this too, but does not find a node in a namespace in this way, and ignores the
-    value.
+    ROS does not find a node in a namespace in this way, and ignores the value.
     """
     common, meant = [], {node.NAME: ['--ros-args'] for node in classes}
     left = iter(arguments)
@@ -160,19 +153,15 @@ def _meant_for(
         value = next(left, '') if text in ('-p', '--param') else None
         node, _, rule = (value or '').partition(':')
         if len(classes) > 1 and node in meant and ':=' in rule:
-            _check_known(classes, node, rule.partition(':=')[0])
+            name = rule.partition(':=')[0]
+            owners = [c.NAME for c in classes if parameters.is_known(c.PARAMETERS, name)]
+            if node not in owners:
+                hint = f'; {" and ".join(owners)} has it' if owners else ''
+                raise ParameterError(f'{node} has no parameter {name}{hint}')
             meant[node] += [text, rule]
         else:
             common += [text] if value is None else [text, value]
     return common, meant
-
-
-def _check_known(classes: Sequence[type[AnserNode]], node: str, name: str) -> None:
-    """Refuse a value for one node among several that another one of them knows, or none."""
-    owners = [c.NAME for c in classes if parameters.is_known(c.PARAMETERS, name)]
-    if node not in owners:
-        hint = f'; {" and ".join(owners)} has it' if owners else ''
-        raise ParameterError(f'{node} has no parameter {name}{hint}')
 
 
 class _Interrupted(BaseException):
@@ -191,10 +180,9 @@ def _is_compiling(frame: FrameType | None) -> bool:
 class _Signals:
     """Catches SIGINT and SIGTERM from now on.
 
-    rclpy's own handlers end the context at once, so that a node could neither close its files
-    properly nor publish its last diagnostics. A node that is still being constructed is abandoned
-    at once; one whose main thread cannot react, because a kernel is being compiled, is ended by
-    another thread.
+    rclpy's own handlers end the context before a node could close its files or publish its last
+    diagnostics. A node that is still being constructed is abandoned at once; one whose main thread
+    cannot react, because a kernel is being compiled, is ended by another thread.
     """
 
     def __init__(self) -> None:
@@ -238,10 +226,10 @@ class _Signals:
 
 
 def make_executor() -> Executor:
-    """Return the executor of a node: one thread, called for events where rclpy can do that.
+    """Return the executor of a node: one thread, called for events where rclpy has that (7.1.4).
 
-    With a dozen topics the waiting of the older one, which looks through all entities for every
-    message, costs several times what is done with the message. Jazzy has both since rclpy 7.1.4.
+    The older one looks through all entities for every message, which costs several times what is
+    done with the message.
     """
     try:
         from rclpy.experimental import EventsExecutor
@@ -261,14 +249,13 @@ def _run(
     code = 0
     keep_in_one_piece()
     executor = make_executor()
-    handover = Handover()
+    shared: dict[str, Any] = (
+        {'handover': Handover(), 'beside': classes} if len(classes) > 1 else {}
+    )
     try:
         for node_class in classes:
-            options: dict[str, Any] = {}
-            if len(classes) > 1:
-                arguments_of = meant[node_class.NAME]
-                options = {'handover': handover, 'beside': classes, 'cli_args': arguments_of}
-            nodes.append(node_class(**own, **options))
+            only: dict[str, Any] = {'cli_args': meant[node_class.NAME]} if shared else {}
+            nodes.append(node_class(**own, **shared, **only))
             signals.abandon_calls.append(nodes[-1].on_abandon)
         _complain(nodes, arguments)
         for node in nodes:

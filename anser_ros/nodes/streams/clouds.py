@@ -1,27 +1,41 @@
-"""Writes clouds as messages, reads what all clouds have, and names what of a setup is measured."""
+"""Writes fluxes and field models as messages, and reads them. What is no message of the setup
+is refused and counted; the contents of a frame are judged by `frames.intake`. A model is two
+messages: its dipoles and their uncertainty.
+"""
 
 import array
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
+from anser_ros.effects.correction import needs_correction
 from anser_ros.errors import LayoutError
-from anser_ros.stamps import set_stamp
-from anser_ros.wire.points import FluxPoints, PointFieldTuple, encode_flux
+from anser_ros.field.model import FieldModel
+from anser_ros.frames.intake import Count
+from anser_ros.nodes.runtime.handover import HandedFlux
+from anser_ros.stamps import SECOND_NS, set_stamp, stamp_of
+from anser_ros.wire.points import (
+    DipolePoints,
+    FluxPoints,
+    ModelError,
+    PointFieldTuple,
+    decode_field_model,
+    decode_flux,
+    decode_model_error,
+    encode_field_model,
+    encode_flux,
+    encode_model_error,
+)
 
-FLUX_NOISE = 'flux_noise_t'
-"""Key of the setup document: what the fluxes' components scatter by, T."""
-STAMP_SIGMA = 'stamp_sigma_s'
-"""Key of the setup document: what the stamps are uncertain by, s."""
-FLUX_RATE = 'flux_rate_hz'
-"""Key of the setup document: the fluxes' rate, which is the stream's own once there is one, Hz."""
+FLUX_NOISE, STAMP_SIGMA, FLUX_RATE = 'flux_noise_t', 'stamp_sigma_s', 'flux_rate_hz'
+"""Keys of the setup document that acquisition measures: by what the components of fluxes scatter,
+T, by what the stamps are uncertain, s, and the stream's own rate."""
 
 
 def without_measured(text: str) -> str:
-    """Return a setup document's text without the values that acquisition measures.
-
-    What is left never changes while a sender runs: board, coils and sensors.
-    """
+    """Return a setup document's text without the values that acquisition measures."""
     keys = tuple(f'{key}:' for key in (FLUX_NOISE, STAMP_SIGMA, FLUX_RATE))
     return '\n'.join(line for line in text.split('\n') if not line.startswith(keys))
 
@@ -46,17 +60,12 @@ class CloudMaker:
                 PointField(name=name, offset=offset, datatype=datatype, count=count)
                 for name, offset, datatype, count in fields
             ]
-        message = PointCloud2()
+        message = PointCloud2(height=1, width=len(data) // step, is_dense=True)
         message.header.frame_id = frame_id
         set_stamp(message.header.stamp, stamp_ns)
-        message.height, message.width = 1, len(data) // step
         message.fields = self._fields[key]
         message.point_step, message.row_step = step, len(data)
-        # An array is handed over in microseconds; bytes are checked one by one.
-        buffer = array.array('B')
-        buffer.frombytes(data)
-        message.data = buffer
-        message.is_dense = True
+        message.data = array.array('B', data)  # taken in microseconds; bytes are checked singly
         return message
 
 
@@ -74,16 +83,106 @@ class FluxCloud:
         return message
 
 
-def layout_of(message: PointCloud2) -> list[PointFieldTuple]:
-    """Return the fields of a cloud as plain tuples."""
-    return [(f.name, f.offset, f.datatype, f.count) for f in message.fields]
+def layout_of(message: PointCloud2) -> tuple[list[PointFieldTuple], int, int, Any]:
+    """Return the fields of a cloud as plain tuples, its point_step, its points and its bytes.
 
-
-def width_of(message: PointCloud2) -> int:
-    """Return the number of points of a cloud that has one row.
-
-    Raises `LayoutError` when the cloud has more rows.
+    Raises `LayoutError` when the cloud has more rows than one.
     """
     if message.height != 1:
         raise LayoutError(f'the cloud must have height 1, got {message.height}')
-    return int(message.width)
+    fields = [(f.name, f.offset, f.datatype, f.count) for f in message.fields]
+    return fields, message.point_step, int(message.width), message.data
+
+
+def read_frame(
+    message: PointCloud2 | HandedFlux, frame_id: str, count: Count
+) -> tuple[int, FluxPoints]:
+    """Read a flux message that must be in a frame; its peculiarities are counted.
+
+    The counters are ``fluxes_big_endian``, ``fluxes_other_frame_id``, ``fluxes_without_stamp``.
+    Raises `LayoutError` when it is in another frame, has no stamp, or is no flux cloud.
+    """
+    given_id = message.frame_id if isinstance(message, HandedFlux) else message.header.frame_id
+    if given_id != frame_id:
+        count('fluxes_other_frame_id', 1)
+        raise LayoutError(f'fluxes in the frame {given_id!r}, the setup is in {frame_id!r}')
+    if isinstance(message, HandedFlux):
+        return message.stamp_ns, message.points
+    if message.is_bigendian:
+        count('fluxes_big_endian', 1)
+    stamp_ns, nanosec = stamp_of(message), message.header.stamp.nanosec
+    if stamp_ns <= 0 or nanosec >= SECOND_NS:
+        count('fluxes_without_stamp', 1)
+    if nanosec >= SECOND_NS:
+        raise LayoutError(f'the stamp has {nanosec} nanoseconds, a second or more')
+    if stamp_ns <= 0:
+        raise LayoutError('the flux message has no stamp')
+    return stamp_ns, decode_flux(*layout_of(message), bool(message.is_bigendian))
+
+
+class ModelWriter:
+    """Makes the two messages of a model."""
+
+    def __init__(self) -> None:
+        self._maker = CloudMaker()
+        self._encoded: tuple[FieldModel, PointCloud2] | None = None
+        self._uncertainty: tuple[object, float, int, bool, int, str, int] | None = None
+        self._origin = '', 0
+
+    def name_origin(self, base: FieldModel) -> None:
+        """Tell from now on which model the served ones are made from."""
+        self._origin = base.fingerprint, sum(needs_correction(record) for record in base.effects)
+
+    def dipoles(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
+        """Return the ``field_model`` message; for the model of the last one, that one renamed."""
+        if self._encoded is not None and self._encoded[0] is model:
+            message = self._encoded[1]
+            message.header.frame_id = frame_id
+            set_stamp(message.header.stamp, stamp_ns)
+            return message
+        points = DipolePoints(model.positions, model.directions, model.moments)
+        message = self._maker.message(encode_field_model(points), frame_id, stamp_ns)
+        self._encoded = (model, message)
+        return message
+
+    def new_error(
+        self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool, withheld: int = 0
+    ) -> PointCloud2 | None:
+        """Return the ``field_model_error`` message; None where the last one still holds."""
+        kept = self._uncertainty
+        size = len(model.positions)
+        now = (model.modes, model.flux_error_t, size, follows, withheld, *self._origin)
+        if kept is not None and kept[0] is now[0] and kept[1:] == now[1:]:
+            return None
+        self._uncertainty = now
+        return self.error(model, frame_id, stamp_ns, follows, withheld)
+
+    def error(
+        self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool, withheld: int = 0
+    ) -> PointCloud2:
+        """Return the ``field_model_error`` message."""
+        modes = model.modes
+        if modes is None:
+            modes = np.zeros((0, *model.moments.shape), dtype=complex)
+        error = ModelError(float(model.flux_error_t), modes, follows, withheld, *self._origin)
+        return self._maker.message(encode_model_error(error), frame_id, stamp_ns)
+
+
+def read_dipoles(message: PointCloud2) -> DipolePoints:
+    """Read a ``field_model`` message.
+
+    Raises `LayoutError` when it is not a field model, has no dipole, or a direction is no unit
+    vector.
+    """
+    points = decode_field_model(*layout_of(message), bool(message.is_bigendian))
+    if len(points.positions) == 0:
+        raise LayoutError('the field model has no dipole')
+    norms = np.linalg.norm(points.directions, axis=1)
+    if np.abs(norms - 1.0).max() > 1e-3:
+        raise LayoutError('a dipole direction is not a unit vector')
+    return points
+
+
+def read_error(message: PointCloud2, n_dipoles: int, n_emitters: int) -> ModelError:
+    """Read a ``field_model_error`` message for a model of that size; raises `LayoutError`."""
+    return decode_model_error(*layout_of(message), n_dipoles, n_emitters)

@@ -1,15 +1,14 @@
-"""Subscribes to a topic: a single publisher is believed, and late frames give way to the
-newest. Poses that are late by several windows are useless for guidance, so a node that is
-slower than its input discards the waiting messages, takes the newest and reports so. A node
-that only paused may catch up, and loses nothing.
+"""Subscribes to a topic: a single publisher is believed, and late frames give way to the newest. A
+node that is slower than its input discards the waiting messages, takes the newest and reports so;
+one that only paused may catch up, and loses nothing.
 """
 
 import os
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
+from functools import partial
 from statistics import median
-from types import MappingProxyType
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -26,10 +25,8 @@ from anser_ros.stamps import NANO, SECOND_NS, is_live, stamp_of
 
 
 def too_slow(skipped: int, worked: int) -> str:
-    """Return what part of the windows since the last look gave way to newer ones; empty for none.
-
-    The load is the system's own mean over the last minute, in processes that need a core; the
-    number of cores is given with it.
+    """Return what part of the windows since the last look gave way to newer ones, with the
+    system's load; empty for none.
     """
     if not skipped:
         return ''
@@ -40,8 +37,8 @@ def too_slow(skipped: int, worked: int) -> str:
 
 
 LATE_WINDOWS = 3.0
-"""Age of a message, in the spacing of messages, from which it may be late. Smaller, and the jitter
-of a loaded machine looks like a backlog; larger, and poses are that many windows old."""
+"""Age of a message, in the spacing of messages, from which it may be late: more than the jitter of
+a loaded machine."""
 SHORTEST_LATE_S = 0.05
 """Age, s, below which no message is late, however fast messages come: the executor has delays."""
 CATCH_UP_S = 1.0
@@ -51,8 +48,7 @@ MEMORY = 25
 FEWEST_MESSAGES = 10
 """Messages that must have been worked on before a backlog is judged: the first ones are slow."""
 MOST_LEFT_OUT = 2
-"""Frames in a row that are left out by what gives way to newer ones. Fewer, and poses of a
-computer that is a tenth too slow fall behind; more, and the model is older than metal in a hand
+"""Frames in a row that may be left out: more, and the model is older than metal in a hand
 allows."""
 
 
@@ -98,15 +94,10 @@ class Backlog:
 
 
 LOOK_S = 0.1
-"""How often the graph is asked at most, s, while messages go on as before: it takes 15 us.
-Smaller costs more; larger, and who only begins to publish is noticed later."""
+"""How often the graph is asked at most, s, while messages go on as before."""
 SETTLED_S = 0.3
 """Time, s, after the first refused message in which the graph has to go on knowing one publisher
-before it is asked again what holds. Smaller, and a second publisher is believed whose message came
-before the graph knew it, which takes about 0.1 s; larger, and a successor is believed later."""
-NO_INFORMATION: Mapping[str, Any] = MappingProxyType({})
-"""What is known of a message that was handed over within the process: its sender is ours, and a
-second one is known to the graph alone."""
+before it is asked again what holds: it takes 0.1 s to know one whose message came already."""
 NUMBER = 'publication_sequence_number'
 """Key of a message's information: which of its publisher's messages it is."""
 
@@ -149,9 +140,9 @@ class OneSource:
         now_s = time.monotonic()
         complaint = self._sources.look(self._count(now_s), now_s)
         latched = self._arguments[1].durability == DurabilityPolicy.TRANSIENT_LOCAL
-        if self._publishers > 1 and self._refused_s is not None:
+        if self._refused_s is not None and self._publishers > 1:
             self._refused_s = now_s
-        if latched and self._refused_s is not None and now_s - self._refused_s > SETTLED_S:
+        elif latched and self._refused_s is not None and now_s - self._refused_s > SETTLED_S:
             # Who is left says again what holds.
             self._refused_s = None
             self._sources.forget()
@@ -185,12 +176,11 @@ class OneSource:
 
     def _subscribed(self) -> Any:
         message_type, profile = self._arguments
+        # Of what is handed over within the process nothing more is known: its sender is ours.
+        handed = partial(self._take, info={})
         return self._node.create_subscription(
-            message_type, self._topic, self._take, profile, handed=self._take_handed
+            message_type, self._topic, self._take, profile, handed=handed
         )
-
-    def _take_handed(self, what: Any) -> None:
-        self._take(what, NO_INFORMATION)
 
     def _take(self, message: Any, info: Mapping[str, Any]) -> None:
         lasting = None if self._lasting is None else self._lasting(message)
@@ -239,9 +229,9 @@ class NewestSource(OneSource):
         )
 
     def _on_frame(self, message: PointCloud2 | HandedFlux, info: Mapping[str, Any]) -> None:
-        newest = message
-        if not isinstance(message, HandedFlux):  # what is handed over has no queue
-            newest = self._newest(message, info)
+        # What is handed over has no queue.
+        is_handed = isinstance(message, HandedFlux)
+        newest = message if is_handed else self._newest(message, info)
         begin_s = time.perf_counter()
         if newest is not None:
             self._work(newest)
@@ -270,10 +260,6 @@ class NewestSource(OneSource):
 
 def take_waiting(subscription: Any) -> list[tuple[bytes, dict[str, int]]]:
     """Take the messages that wait in a queue, oldest first, as bytes with their information."""
-    taken: list[tuple[bytes, dict[str, int]]] = []
     with subscription.handle:
-        while True:
-            item = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-            if item is None:
-                return taken
-            taken.append((item[0], item[1]))
+        take = partial(subscription.handle.take_message, subscription.msg_type, subscription.raw)
+        return [(data, info) for data, info, *_ in iter(take, None)]
