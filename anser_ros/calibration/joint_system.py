@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.least_squares import NormalFactor, as_complex, as_real, subtract_gram
-from anser_ros.calibration.pose_correction import PoseTerms, pose_slopes
+from anser_ros.calibration.pose_correction import PoseTerms, PoseWhitener, pose_slopes
 from anser_ros.calibration.readings import DipoleSites, basis_rows, flux_slopes, frame_blocks
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
 from anser_ros.field.measurements import Measurements
@@ -120,13 +120,11 @@ def open_directions(
 
     ``linear``: F frames. ``share`` (F,): share of its variance that is left after interpolation.
     """
-    slope = linear.slope * (np.sqrt(weights) / noise_t)[:, :, None, None]
-    flat = slope.reshape(len(slope), -1, 6)
     prior = 1.0 / (np.maximum(jitter, 1e-9) ** 2 * share[:, None])
-    precision = flat.transpose(0, 2, 1) @ flat + prior[:, :, None] * np.eye(6)
+    white = PoseWhitener(linear.slope, weights, noise_t, prior)
     # The inverse of the transposed factor is a root of the pose's covariance.
-    along = np.linalg.solve(np.linalg.cholesky(precision), flat.transpose(0, 2, 1))
-    return np.asarray(along.reshape(len(slope), 6, *slope.shape[1:3]))
+    along = np.linalg.solve(np.linalg.cholesky(white.precision), white.slope.transpose(0, 2, 1))
+    return np.asarray(along.reshape(len(along), 6, *linear.slope.shape[1:3]))
 
 
 def tied_parts(along: Sequence[Array]) -> NDArray[np.bool_]:

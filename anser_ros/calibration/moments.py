@@ -25,10 +25,10 @@ from anser_ros.calibration.least_squares import (
 )
 from anser_ros.calibration.pose_correction import (
     SMALLEST_NOISE_T,
+    PoseWhitener,
     most_probable_step,
     moved,
     outlier_weights,
-    pose_freedom,
     pose_precision,
     pose_terms,
 )
@@ -165,7 +165,7 @@ class MomentFitter:
                 power += float((weight[:, :, None] * left**2).sum())
                 turned += float((weight[:, :, None] * left[:, :, 1::2] ** 2).sum())
                 count += float(weight.sum()) * left.shape[2]
-                used += pose_freedom(terms, weight, self.noise_t, precision)
+                used += PoseWhitener(terms.slope, weight, self.noise_t, precision).freedom
             state.corrected = moved(state.measured, state.offset)
         left_over = max(count - used - freedom * 2 * self.emitters, LEAST_FREEDOM * count)
         halved = max(count / 2.0 - freedom * self.emitters, LEAST_FREEDOM / 2.0 * count)

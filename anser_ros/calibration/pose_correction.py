@@ -80,20 +80,15 @@ def pose_slopes(
 
 
 def most_probable_step(
-    terms: PoseTerms, weights: Array, noise_t: float, precision: Array, offset: Array
+    terms: PoseTerms, weights: Array, noise_t: float, precision: Array, offset: Array | float = 0.0
 ) -> tuple[Array, Array]:
     """Return the step of each frame's pose to its most probable value.
 
     ``offset`` (F, 6): difference between the present pose and the measured one, m and rad.
     Returns the steps (F, 6), and the residuals (F, S, 2K) after them to first order, T.
     """
-    slope, weighted, normal = _normal_equations(terms, weights, noise_t)
-    normal = normal + np.diag(precision)
-    residual = terms.residual.reshape(len(slope), -1)
-    gradient = np.einsum('fri,fr->fi', weighted, residual / noise_t) - precision * offset
-    step = np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
-    left = residual - noise_t * np.einsum('fri,fi->fr', slope, step)
-    return step, left.reshape(terms.residual.shape)
+    step = PoseWhitener(terms.slope, weights, noise_t, precision).step(terms.residual, offset)
+    return step, terms.residual - np.einsum('fsci,fi->fsc', terms.slope, step)
 
 
 def moved(measurements: Measurements, step: Array) -> Measurements:
@@ -122,44 +117,36 @@ def outlier_weights(residual: Array, weights: Array) -> Array:
     return np.where(used, np.minimum(1.0, (limit / np.maximum(size, limit)) ** 2), 0.0)
 
 
-def pose_freedom(terms: PoseTerms, weights: Array, noise_t: float, precision: Array) -> float:
-    """Return the effective number of pose parameters that the readings of all frames determine.
-
-    The arguments are those of `most_probable_step`.
-    """
-    _, _, normal = _normal_equations(terms, weights, noise_t)
-    share = np.linalg.solve(normal + np.diag(precision), normal)
-    return float(np.trace(share, axis1=1, axis2=2).sum())
-
-
-def _normal_equations(
-    terms: PoseTerms, weights: Array, noise_t: float
-) -> tuple[Array, Array, Array]:
-    """Return slopes over the noise (F, 2KS, 6), the same weighted, and their product (F, 6, 6)."""
-    slope = terms.slope.reshape(len(terms.slope), -1, 6) / noise_t
-    weighted = slope * np.repeat(weights, terms.residual.shape[2], axis=1)[:, :, None]
-    return slope, weighted, np.einsum('fri,frj->fij', weighted, slope, optimize=True)
-
-
 class PoseWhitener:
-    """Keeps the inverse of each frame's covariance C, prepared once for many residuals.
+    """Keeps what weighted readings say of each frame's pose, and the inverse of its covariance C.
 
-    By the matrix inversion lemma it takes a 6 x 6 matrix a frame (Golub and Van Loan, Matrix
+    By the matrix inversion lemma that takes a 6 x 6 matrix a frame (Golub and Van Loan, Matrix
     Computations, section 2.1.4).
 
     ``slope`` (F, S, 2K, 6): derivatives of the fluxes by the pose, as in `PoseTerms`.
+    ``precision`` (6,) or (F, 6): inverse variances of the stated poses.
     """
 
     def __init__(self, slope: Array, weights: Array, noise_t: float, precision: Array) -> None:
         frames, _, parts, _ = slope.shape
-        self.noise_t = noise_t
+        self.noise_t, self.stated = noise_t, precision
         self.root = np.repeat(np.sqrt(weights), parts, axis=1)
-        flat = slope.reshape(frames, -1, 6) * (self.root / noise_t)[:, :, None]
-        normal = np.einsum('fri,frj->fij', flat, flat, optimize=True)
-        self.inverse = np.linalg.inv(normal + np.diag(precision))
-        self.slope = flat
+        self.slope = slope.reshape(frames, -1, 6) * (self.root / noise_t)[:, :, None]
+        normal = self.slope.transpose(0, 2, 1) @ self.slope
+        self.precision = normal + precision[..., None] * np.eye(6)
+        self.inverse = np.linalg.inv(self.precision)
         self.share = np.asarray(self.inverse @ normal)
         self.readings = self.root.astype(bool).sum(axis=1)
+
+    @property
+    def freedom(self) -> float:
+        """Return the effective number of pose parameters that all readings determine."""
+        return float(np.trace(self.share, axis1=1, axis2=2).sum())
+
+    def step(self, residual: Array, offset: Array | float = 0.0) -> Array:
+        """Return the steps (F, 6) to the most probable poses; the rest as `most_probable_step`."""
+        along = self._projected(residual)[1] - self.stated * offset
+        return np.asarray(np.einsum('fij,fj->fi', self.inverse, along))
 
     def _projected(self, residual: Array) -> tuple[Array, Array]:
         """Return residuals in units of the noise (F, 2KS) and their products with J (F, 6)."""

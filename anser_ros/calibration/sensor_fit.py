@@ -49,6 +49,7 @@ from anser_ros.calibration.population import (
 )
 from anser_ros.calibration.pose_correction import (
     SMALLEST_NOISE_T,
+    PoseWhitener,
     most_probable_step,
     moved,
     outlier_weights,
@@ -482,22 +483,15 @@ class SensorFitter:
         self, at: Linear, weights: Array, judged: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], Array]:
         """Frames whose poses are far from where the fluxes put them, and what no pose explains."""
-        zero = np.zeros((len(weights), 6))
-        step, left = most_probable_step(at, weights, self.noise_t, FREE_POSE, zero)
+        step, left = most_probable_step(at, weights, self.noise_t, FREE_POSE)
         scaled = step / np.sqrt(interpolation_share(at.part))[:, None]
         return glitches(scaled, judged, self.accuracy.pose_jitter), left
 
     def _pose_steps(self, at: Linear, weights: Array) -> tuple[Array, Array]:
         """Most probable steps (F, 6) of the poses and their variances."""
         prior = 1.0 / (self.optical.jitter**2 * interpolation_share(at.part)[:, None])
-        count = len(at.slope)
-        root = np.sqrt(weights) / self.noise_t
-        slope = (at.slope * root[:, :, None, None]).reshape(count, -1, 6)
-        residual = (at.residual * root[:, :, None]).reshape(count, -1)
-        precision = slope.transpose(0, 2, 1) @ slope + prior[:, :, None] * np.eye(6)
-        inverse = np.linalg.inv(precision)
-        step = (inverse @ np.einsum('fri,fr->fi', slope, residual)[:, :, None])[:, :, 0]
-        return step, np.diagonal(inverse, axis1=1, axis2=2)
+        white = PoseWhitener(at.slope, weights, self.noise_t, prior)
+        return white.step(at.residual), np.diagonal(white.inverse, axis1=1, axis2=2)
 
     def _all_frames(
         self, steady: Sequence[NDArray[np.bool_]]
