@@ -12,13 +12,13 @@ from anser_ros.apps.lab.cli.loop import (
     MISSED,
     NAMED,
     PARTLY,
+    TONES_HZ,
     UNEXPLAINED,
     WRONG,
     parameter_errors,
     table,
     verdict,
 )
-from anser_ros.apps.lab.cli.loop_run import TONES_HZ
 from anser_ros.cli.demo import SAMPLE_RATE_HZ
 from anser_ros.cli.main import main
 from anser_ros.effects.registry import all_effects, effect_named

@@ -33,7 +33,7 @@ class TestFrames:
         flux = 1e-6 * (rng.normal(size=(2, 2, 3)) + 1j * rng.normal(size=(2, 2, 3)))
         place, turn = np.array([[0, 0, 0.1], [0, 0, 0.2]]), np.tile([0, 0, 0, 1.0], (2, 1))
         path = tmp_path / 'frames.mcap'
-        write_frames(path, setup, [10, 20], flux, {'tool': (place, turn)})
+        write_frames(path, setup, flux, {'tool': (place, turn)}, [10, 20])
         session = load_session(path)
         (tool,) = session.tools
         np.testing.assert_allclose(tool.flux[:, 0], flux[:, 1], rtol=1e-6)
@@ -41,7 +41,7 @@ class TestFrames:
         np.testing.assert_allclose(tool.position, place)
         assert session.setup.sensors[0] == sensors[0]
         with pytest.raises(BagError, match='already exists'):
-            write_frames(path, setup, [10], flux)
+            write_frames(path, setup, flux)
 
 
 def write_plate(folder, rng, signs):
