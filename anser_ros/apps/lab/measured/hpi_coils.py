@@ -214,8 +214,8 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
             bool((named[1] | ~truth).all()), SPECIAL_INVERTED,
         ),
         ReportRow(
-            NAME, 'a fifth of the channels predicted by the others, RMSE', errors[0], errors[1], 'pT',
-            'field and signs on the others',
+            NAME, 'a fifth of the channels predicted by the others, RMSE', errors[0], errors[1],
+            'pT', 'field and signs on the others',
         ),
         ReportRow(
             NAME, 'channels falsely named inverted', float((named[0] & ~truth).sum()),
