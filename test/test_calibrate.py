@@ -145,7 +145,7 @@ def refusal(capsys, *arguments):
     captured = capsys.readouterr()
     assert captured.out == ''
     # On a slow machine lines about the progress come before it.
-    (line,) = [x for x in captured.err.splitlines() if not x.startswith('calibrating: ')]
+    (line,) = [x for x in captured.err.splitlines() if not x.startswith('calibrate: ')]
     return line
 
 
