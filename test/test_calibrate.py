@@ -62,17 +62,12 @@ def calibrate(*arguments):
     return main(['calibrate', *map(str, arguments)])
 
 
-@pytest.fixture(scope='module')
-def done(factory_calibration):
-    return factory_calibration
-
-
 @pytest.mark.long
-def test_calibration_json_is_that_of_the_interfaces(done):
-    document = json.loads((done / 'calibration.json').read_text())
+def test_calibration_json_is_that_of_the_interfaces(factory_calibration):
+    document = json.loads((factory_calibration / 'calibration.json').read_text())
     assert document['schema'] == 'anser_calibration/1'
     assert document['n_measurements'] == 169 * 9
-    assert document['n_dipoles'] == len(load_model(done / 'model.yaml').positions)
+    assert document['n_dipoles'] == len(load_model(factory_calibration / 'model.yaml').positions)
     for key in ('flux_rmse_t', 'heldout_flux_rmse_t'):
         assert 0 < document[key] < 2e-9
         assert all(0 < emitter[key] < 2e-9 for emitter in document['emitters'])
@@ -82,12 +77,12 @@ def test_calibration_json_is_that_of_the_interfaces(done):
     curve = document['choice']['curve']
     assert len({row['layout'] for row in curve}) > 10
     assert {'layout', 'n_dipoles', 'damping', 'heldout_t'} == set(curve[0])
-    assert (done / 'choice.png').read_bytes()[:4] == b'\x89PNG'
+    assert (factory_calibration / 'choice.png').read_bytes()[:4] == b'\x89PNG'
 
 
 @pytest.mark.long
-def test_the_model_file_says_where_it_comes_from(done):
-    text = yaml.safe_load((done / 'model.yaml').read_text())
+def test_the_model_file_says_where_it_comes_from(factory_calibration):
+    text = yaml.safe_load((factory_calibration / 'model.yaml').read_text())
     assert text['provenance']['sessions'] == ['factory.mcap']
     assert text['provenance']['heldout_flux_rmse_t'] > 0
     assert text['units']['moment'] == 'A m^2'
@@ -95,8 +90,10 @@ def test_the_model_file_says_where_it_comes_from(done):
 
 
 @pytest.mark.long
-def test_the_model_tracks_to_the_optical_jitter(done):
-    evaluation = track_session(load_session(BAGS / 'moving.mcap'), load_model(done / 'model.yaml'))
+def test_the_model_tracks_to_the_optical_jitter(factory_calibration):
+    evaluation = track_session(
+        load_session(BAGS / 'moving.mcap'), load_model(factory_calibration / 'model.yaml')
+    )
     for series in evaluation.sensors.values():
         assert np.sqrt(np.nanmean(series.position_error**2)) < 0.16e-3
 
@@ -147,25 +144,22 @@ def refusal(capsys, *arguments):
     captured = capsys.readouterr()
     assert captured.out == ''
     # On a slow machine lines about the progress come before it.
-    (line,) = [x for x in captured.err.splitlines() if not x.startswith('calibrating: ')]
+    (line,) = [x for x in captured.err.splitlines() if not x.startswith('calibrate: ')]
     return line
 
 
-def test_without_poses(factory, tmp_path, capsys):
-    bag = write_bag(tmp_path / 'b.mcap', factory.setup, factory.tools[0], poses=False)
-    text = refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
-    assert 'at least 10 frames with a pose, got 0 of 169' in text
+@pytest.mark.parametrize(
+    ('part', 'message'),
+    [
+        ('poses', 'at least 10 frames with a pose, got 0 of 169'),
+        ('fluxes', 'no readable flux'),
+        ('with_setup', 'no setup'),
+    ],
+)
+def test_a_bag_that_lacks_something_is_refused(factory, tmp_path, capsys, part, message):
+    bag = write_bag(tmp_path / 'b.mcap', factory.setup, factory.tools[0], **{part: False})
+    assert message in refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
     assert not (tmp_path / 'm.yaml').exists()
-
-
-def test_without_fluxes(factory, tmp_path, capsys):
-    bag = write_bag(tmp_path / 'b.mcap', factory.setup, factory.tools[0], fluxes=False)
-    assert 'no readable flux' in refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
-
-
-def test_without_setup(factory, tmp_path, capsys):
-    bag = write_bag(tmp_path / 'b.mcap', factory.setup, factory.tools[0], with_setup=False)
-    assert 'no setup' in refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
 
 
 def test_two_drawings(factory, tmp_path, capsys):
@@ -221,31 +215,20 @@ def test_missing_folders_are_made_before_the_work(tmp_path, capsys, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    'arguments',
-    [
-        ('--dipoles', '3x4'),
-        ('--dipoles', '0x0'),
-        ('--dipoles', 'many'),
-        ('--estimate', 'colour'),
-        ('--damping', 'x'),
-    ],
+    'argument',
+    ['--dipoles=3x4', '--dipoles=0x0', '--dipoles=many', '--estimate=colour', '--damping=x'],
 )
-def test_bad_usage(tmp_path, arguments, capsys):
-    assert calibrate(FACTORY, '--out', tmp_path / 'm.yaml', *arguments) == 2
+def test_bad_usage(tmp_path, argument, capsys):
+    assert calibrate(FACTORY, '--out', tmp_path / 'm.yaml', argument) == 2
     assert 'usage' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    'arguments',
-    [
-        ('--set', 'flux_noise_t=0'),
-        ('--set', 'optical_position_m=-1'),
-        ('--damping', '-1'),
-        ('--damping', 'nan'),
-    ],
+    'argument',
+    ['--set=flux_noise_t=0', '--set=optical_position_m=-1', '--damping=-1', '--damping=nan'],
 )
-def test_parameters_out_of_range(tmp_path, arguments, capsys):
-    text = refusal(capsys, FACTORY, '--out', tmp_path / 'm.yaml', *arguments)
+def test_parameters_out_of_range(tmp_path, argument, capsys):
+    text = refusal(capsys, FACTORY, '--out', tmp_path / 'm.yaml', argument)
     assert 'must be in' in text or 'must not be negative' in text
 
 

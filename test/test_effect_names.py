@@ -25,7 +25,7 @@ ALLOWED = {
     'apps/lab/measured/': 'recipes count the effects that the commands named',
     'apps/poses/effects/': 'the room of effects of trackers that give poses alone',
     'calibration/sensor_parameters.py': 'parameters of a fit below the effects, as they are named',
-    'calibration/sensor_records.py': 'writes records as `docs/interfaces.md` names them, from '
+    'calibration/result.py': 'writes records as `docs/interfaces.md` names them, from '
     'below the effects: a scan finds what is wrong with itself by its own fit',
     'apps/lab/one_place.py': 'the same, of a body of many sensors at one place',
     'apps/lab/calibration_engines.py': 'the same, of the sizes of magnets',

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from anser_ros.calibration.disturbances import at_strength, emitter_strength
-from anser_ros.calibration.sensor_records import drift_records
+from anser_ros.calibration.result import drift_records
 from anser_ros.sessions.session import load_session
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'

@@ -36,11 +36,8 @@ def written(path, measured, names, tones, places, stated):
         for name, place, tone in zip(names, places, tones, strict=True)
     )
     setup = Setup('fg', 1.0, Emitter('unknown', {}, coils), specs, VOLUME, stated)
-    stamps = [1_000_000_000 * (1 + frame) for frame in range(len(measured.time))]
-    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (len(stamps), 1))
-    write_frames(
-        path, setup, stamps, measured.flux, {measured.body: (measured.position, quaternion)}
-    )
+    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (len(measured.time), 1))
+    write_frames(path, setup, measured.flux, {measured.body: (measured.position, quaternion)})
     return path
 
 

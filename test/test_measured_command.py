@@ -32,7 +32,7 @@ def test_a_recipe_is_commands_that_anybody_can_type(capsys, tmp_path, monkeypatc
             'set', lambda folder, into: [into / f'{folder.name}.mcap'],
             lambda bags, out: [[verb, str(bags[0])]],
             lambda folder, bags, out: [
-                ReportRow('set', 'figure', 2.0, 1.0, 'mm', 1.1, True, 'nothing', 0.9)
+                ReportRow('set', 'figure', 2.0, 1.0, 'mm', 'nothing', 1.1, True, 0.9)
             ],
         )  # fmt: skip
 
@@ -48,7 +48,7 @@ def test_a_recipe_is_commands_that_anybody_can_type(capsys, tmp_path, monkeypatc
 
 
 def test_numbers_that_are_missing_are_null():
-    row = ReportRow('set', 'figure', np.nan, np.float64(1.5), 'mm', None, None, 'nothing')
+    row = ReportRow('set', 'figure', np.nan, np.float64(1.5), 'mm', 'nothing')
     document = measured.to_document([row])
     assert document['rows'][0]['before'] is None
     assert json.loads(json.dumps(document))['rows'][0]['after'] == 1.5

@@ -33,7 +33,7 @@ class TestFrames:
         flux = 1e-6 * (rng.normal(size=(2, 2, 3)) + 1j * rng.normal(size=(2, 2, 3)))
         place, turn = np.array([[0, 0, 0.1], [0, 0, 0.2]]), np.tile([0, 0, 0, 1.0], (2, 1))
         path = tmp_path / 'frames.mcap'
-        write_frames(path, setup, [10, 20], flux, {'tool': (place, turn)})
+        write_frames(path, setup, flux, {'tool': (place, turn)}, [10, 20])
         session = load_session(path)
         (tool,) = session.tools
         np.testing.assert_allclose(tool.flux[:, 0], flux[:, 1], rtol=1e-6)
@@ -41,7 +41,7 @@ class TestFrames:
         np.testing.assert_allclose(tool.position, place)
         assert session.setup.sensors[0] == sensors[0]
         with pytest.raises(BagError, match='already exists'):
-            write_frames(path, setup, [10], flux)
+            write_frames(path, setup, flux)
 
 
 def write_plate(folder, rng, signs):
@@ -53,9 +53,7 @@ def write_plate(folder, rng, signs):
             for state, sign in enumerate((*signs, (0, 0, 0))):
                 reading = np.array(sign) @ field[plane, :, sensor] + [0.1, 0.2, 0.3]
                 numbers = (x, y, z, *(35.0 * np.array(sign)), *reading)
-                lines.append(
-                    f'{plane},{sensor},{state},' + ','.join(map(repr, map(float, numbers)))
-                )
+                lines.append(','.join(map(str, (plane, sensor, state, *map(float, numbers)))))
     folder.mkdir()
     (folder / 'navion_steady.csv').write_text('\n'.join(lines))
     return 1e-3 * field
@@ -164,14 +162,12 @@ class TestHpi:
             (tmp_path / kind).mkdir()
             effects = [{'name': 'sensor_polarity', 'parameters': {'channels': channels}}]
             sources = [{'position_m': place.tolist()} for place in PLACES]
-            document = {
-                'effects': effects, 'sources': sources, 'heldout_flux_rmse_t': 1e-12
-            }  # fmt: skip
+            document = {'effects': effects, 'sources': sources, 'heldout_flux_rmse_t': 1e-12}
             (tmp_path / kind / 'calibration.json').write_text(json.dumps(document))
-        vendor, _, named, foretold, falsely = hpi_coils.rows(tmp_path, [], tmp_path)
+        vendor, _, named, predicted, falsely = hpi_coils.rows(tmp_path, [], tmp_path)
         assert vendor.after < 1e-6 and vendor.met
         assert (named.before, named.after, named.target, named.met) == (0.0, 1.0, 2.0, False)
-        assert foretold.after == pytest.approx(1.0)
+        assert predicted.after == pytest.approx(1.0)
         assert (falsely.after, falsely.met) == (1.0, False)
 
     def test_a_file_that_is_missing_or_another_is_refused(self, tmp_path):

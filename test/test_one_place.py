@@ -11,7 +11,7 @@ from anser_ros.apps.lab.measured.recipe import vector, write_frames
 from anser_ros.apps.lab.one_place import calibrate_at_one_place, is_at_one_place
 from anser_ros.apps.lab.source_calibration import KINDS
 from anser_ros.calibration.layouts import Generator
-from anser_ros.calibration.requirements import check_single_coils
+from anser_ros.calibration.readings import check_single_coils
 from anser_ros.cli.main import main
 from anser_ros.diagnosis.prepare import build_problem
 from anser_ros.diagnosis.problem import Spread
@@ -249,7 +249,7 @@ class TestOnePlace:
         setup = Setup('fg', 1.0, Emitter('coil', {}, middle), specs, None, stated)
         pose = {'h': (np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))}
         path = tmp_path / 'rest.mcap'
-        write_frames(path, setup, [10**9, 2 * 10**9], measured.flux, pose)
+        write_frames(path, setup, measured.flux, pose)
         (tool,) = load_session(path).tools
         assert not tool.sensors.is_single.any()
         out = ['--out', str(tmp_path / 'model.yaml'), '--report', str(tmp_path / 'report')]

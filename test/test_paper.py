@@ -6,19 +6,20 @@ import numpy as np
 import pytest
 
 from anser_ros.apps.lab.experiments import recordings as article
-from anser_ros.apps.lab.experiments.error_maps import board_folder, board_runs
 from anser_ros.apps.lab.experiments.recordings import (
     HEAD_DISTANCES_CM,
     NAMES,
+    Raster,
     checkerboard,
     given_recordings,
     missing,
+    simulate_recordings,
 )
 from anser_ros.apps.lab.experiments.report import draw_all, write_report
-from anser_ros.apps.lab.experiments.simulated import Raster, simulate_recordings
 from anser_ros.apps.lab.experiments.study import (
     Study,
     article_model,
+    board_runs,
     centres_extension,
     drawn_model,
     field_errors,
@@ -39,17 +40,25 @@ def recordings(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def study(recordings, tmp_path_factory):
-    """All experiments, with one of the measured runs; two more are judged further down."""
-    if not board_folder().is_dir():
-        pytest.skip(f'no folder {board_folder()}')
-    folder = tmp_path_factory.mktemp('board')
-    run = min(board_folder().glob('*.fcsv'))
-    (folder / run.name).symlink_to(run)
+    """All experiments, with a run over a board that is made here."""
+    shared = tmp_path_factory.mktemp('shared')
+    write_run(anser_board.RECIPE.data(shared))
     study = Study(recordings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('anser_ros.apps.lab.experiments.study.board_folder', lambda: folder)
+        patch.setenv('ANSER_SHARED', str(shared))
         study.run()
     return study
+
+
+def write_run(folder):
+    """A run over the board with bent positions, in a frame of its own; its lines."""
+    places = anser_board.places()
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    tracked = 1e3 * (places + 0.02 * places * np.abs(places)[:, ::-1] / 0.06) @ turn.T + 150.0
+    lines = [f'id{i},{x:.4f},{y:.4f},{z:.4f},0' for i, (x, y, z) in enumerate(tracked)]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / 'run.fcsv').write_text('# markups\n' + '\n'.join(lines) + '\n')
+    return lines
 
 
 def test_every_recording_is_made_and_named(recordings):
@@ -170,16 +179,11 @@ def test_corrected_errors_keep_what_was_not_tracked(recordings):
 
 
 def test_fiducials_are_read_aligned_and_mapped(tmp_path):
-    places = anser_board.places()
-    assert places.shape == (41, 3)
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    tracked = 1e3 * (places + 0.02 * places * np.abs(places)[:, ::-1] / 0.06) @ turn.T + 150.0
-    lines = [f'id{i},{x:.4f},{y:.4f},{z:.4f},0' for i, (x, y, z) in enumerate(tracked)]
-    (tmp_path / 'run.fcsv').write_text('# markups\n' + '\n'.join(lines) + '\n')
+    lines = write_run(tmp_path)
     (run,) = board_runs(tmp_path)
-    assert run.points == 41
-    assert run.after_m < 0.8 * run.before_m and run.confirmed
-    assert run.across_m < 1e-5
+    assert run['points'] == 41
+    assert run['after_m'] < 0.8 * run['before_m'] and run['confirmed']
+    assert run['across_m'] < 1e-5
     assert board_runs(tmp_path / 'nowhere') == []
     (tmp_path / 'run.fcsv').write_text('a,b,c,d\n')
     with pytest.raises(BagError, match='no table of fiducials'):

@@ -7,9 +7,9 @@ import pytest
 from calibration_world import CENTRES, Errors, moved_scan, scene, tool_of
 
 from anser_ros.calibration.population import Likelihood, Population
+from anser_ros.calibration.result import contradiction_words, undetermined_words
 from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import KINDS, SURVEYED_M
-from anser_ros.calibration.sensor_records import contradiction_words, undetermined_words
 from anser_ros.settings import Accuracy
 
 pytestmark = pytest.mark.long

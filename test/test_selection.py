@@ -34,13 +34,15 @@ from anser_ros.settings import Accuracy
 SEED = 21
 EMITTERS = ('a', 'b', 'c')
 TONES = (1000.0, 1100.0, 1200.0)
+LAYER = Options(layout=Layout('layer', 10, 1.25, 0.0))
 GENERATOR = Generator(np.zeros((1, 3)), np.zeros(1), 0.07)
 
 
-def calibrate(measurements, names, generator, emitters, tones, options=None, nominal=None):
+def calibrate(world, *measurements, options=None, nominal=None):
     """Correct measurements and fit a model to them, as a session's calibration does."""
     options = options or Options()
-    generator = replace(generator, emitters=emitters, frequencies_hz=tones, nominal=nominal)
+    names = ('one', 'two')[: len(measurements)]
+    generator = replace(world.generator, emitters=EMITTERS, frequencies_hz=TONES, nominal=nominal)
     scan = correct_scan(measurements, generator, options)
     return fit_scan(scan, names, generator, options)
 
@@ -50,13 +52,17 @@ def world():
     return scene(np.random.default_rng(3), side=9)
 
 
+def inside():
+    """Sensors at a hundred places inside the volume: points and axes."""
+    rng = np.random.default_rng(9)
+    points = rng.uniform([-0.07, -0.07, 0.125], [0.07, 0.07, 0.155], (100, 3))
+    return points, np.tile([0.0, 0.6, 0.8], (100, 1))
+
+
 def drawn(world, gain=1.0):
     return FieldModel(
         world.dipoles.positions, world.dipoles.directions, gain * world.moments, EMITTERS, TONES
     )
-
-
-# Blocks of space.
 
 
 def test_a_fold_holds_whole_cells_and_every_frame(rng):
@@ -85,9 +91,6 @@ def test_frames_at_one_place_can_not_be_held_out():
         fold_of_frames([np.zeros((30, 3))])
 
 
-# Layouts.
-
-
 def test_layouts_lie_where_they_say():
     generator = Generator(
         np.array([[-0.1, 0, 0.001], [0.1, 0, 0.001]]), np.array([0.0, 45.0]), 0.07
@@ -107,9 +110,6 @@ def test_layouts_lie_where_they_say():
     assert len(words) == 3
 
 
-# The drawn board.
-
-
 def test_the_drawn_board_is_expressed_by_any_layer(world):
     board = ScaledNominal(drawn(world), [world.measurements])
     layer = place(Layout('layer', 14, 1.6, 0.0), world.generator)
@@ -126,19 +126,13 @@ def test_gains_of_the_drawn_board_are_found(world):
     assert np.allclose(gains * (0.5 + 0.1j), 1.0, atol=2e-3)
 
 
-# Selection.
-
-
 def test_the_choice_is_neither_too_coarse_nor_undamped(world):
     thin = thin_frames([world.measurements])
     folds = fold_of_frames([m.position for m in thin])
     rich = place(Layout('layer', 10, 1.25, 0.0), world.generator)
     placer = LayoutPlacer(world.generator, thin)
     scorer = LayoutScorer(thin, folds, rich, Accuracy(), placer)
-    scores = {}
-    for count in (3, 9):
-        layout = Layout('layer', count, 1.25, 0.0)
-        scores[count] = scorer.score(layout)
+    scores = {n: scorer.score(Layout('layer', n, 1.25, 0.0)) for n in (3, 9)}
     assert scores[9].score < 0.5 * scores[3].score
     curve = dict(scores[9].curve)
     assert scores[9].score == min(curve.values())
@@ -164,14 +158,9 @@ def test_thinning_is_even_and_bounded(world, monkeypatch):
     assert (np.diff(thin[0].time) == thin[0].time[1]).all()
 
 
-# Calibration.
-
-
 @pytest.fixture(scope='module')
 def calibrated(world):
-    return calibrate(
-        [world.measurements], ['one'], world.generator, EMITTERS, TONES, nominal=drawn(world, 1.02)
-    )
+    return calibrate(world, world.measurements, nominal=drawn(world, 1.02))
 
 
 @pytest.mark.long
@@ -180,9 +169,7 @@ def test_calibration_reaches_the_noise_and_says_so(world, calibrated):
     assert calibrated.model.flux_error_t == calibrated.held_out.flux_error_t < 3 * NOISE_T
     assert calibrated.better_than_nominal
     assert calibrated.model.provenance['sessions'] == ['one']
-    rng = np.random.default_rng(9)
-    points = rng.uniform([-0.07, -0.07, 0.125], [0.07, 0.07, 0.155], (100, 3))
-    axes = np.tile([0.0, 0.6, 0.8], (100, 1))
+    points, axes = inside()
     true_error = rms(calibrated.model.flux(points, axes) - world.flux(points, axes))
     assert true_error < 1e-3 * rms(world.flux(points, axes))
 
@@ -203,46 +190,40 @@ def test_held_out_error_is_no_smaller_than_the_fit(calibrated):
 def test_refusals_name_what_is_needed_and_found(world, change, message):
     bad = replace(world.measurements, **change)
     with pytest.raises(FitError, match=message):
-        calibrate([bad], ['one'], world.generator, EMITTERS, TONES)
+        calibrate(world, bad)
 
 
 def test_a_plane_is_refused(world):
-    table = world.measurements.sensors
     flat = replace(
         world.measurements.sensors_only(np.arange(3)),
         position=world.measurements.position * [1, 1, 0] + [0, 0, 0.14],
         rotation=np.tile(np.eye(3), (81, 1, 1)),
     )
-    assert len(table) == 6
     with pytest.raises(FitError, match=r'one plane: .* at least 0\.\d+ mm rms, got 0\.00 mm'):
-        calibrate([flat], ['one'], world.generator, EMITTERS, TONES)
+        calibrate(world, flat)
 
 
 def test_more_dipoles_than_readings_are_refused(world):
     few = world.measurements.frames(np.arange(0, 81, 7))
     options = Options(layout=Layout('layer', 12, 1.0, 0.0))
     with pytest.raises(FitError, match=r'144 dipoles need at least 144 readings .* got 72'):
-        calibrate([few], ['one'], world.generator, EMITTERS, TONES, options)
+        calibrate(world, few, options=options)
     one = world.measurements.frames(np.arange(0, 81, 7)).sensors_only(np.arange(2))
     with pytest.raises(FitError, match=r'36 dipoles need at least 36 readings .* got 24'):
-        calibrate([one], ['one'], world.generator, EMITTERS, TONES)
+        calibrate(world, one)
     with pytest.raises(FitError, match='got 0: no session has tool fluxes'):
-        calibrate([], [], world.generator, EMITTERS, TONES)
+        calibrate(world)
 
 
 def test_two_boards_are_told_apart(world):
     other = scene(np.random.default_rng(4), side=9)
     with pytest.raises(FitError, match='different boards'):
-        calibrate(
-            [world.measurements, other.measurements], ['one', 'two'], world.generator, EMITTERS,
-            TONES, Options(layout=Layout('layer', 10, 1.25, 0.0)),
-        )  # fmt: skip
+        calibrate(world, world.measurements, other.measurements, options=LAYER)
 
 
 def test_two_sessions_of_one_board_agree(world):
     halves = [world.measurements.frames(np.arange(start, 81, 2)) for start in (0, 1)]
-    options = Options(layout=Layout('layer', 10, 1.25, 0.0))
-    found = calibrate(halves, ['one', 'two'], world.generator, EMITTERS, TONES, options)
+    found = calibrate(world, *halves, options=LAYER)
     assert found.n_measurements == 81 * 6
     assert found.model.provenance['sessions'] == ['one', 'two']
 
@@ -252,16 +233,12 @@ def test_estimated_sensors_travel_with_the_model(world):
     table = world.measurements.sensors
     gain = np.array([1.01, 0.99, 1.0, 1.02, 0.98, 1.0])
     told = replace(world.measurements, flux=world.measurements.flux * gain[:, None])
-    options = Options(layout=Layout('layer', 10, 1.25, 0.0), estimate=('gains',))
-    found = calibrate([told], ['one'], world.generator, EMITTERS, TONES, options)
+    found = calibrate(world, told, options=replace(LAYER, estimate=('gains',)))
     (effect,) = found.model.effects
     assert effect.name == 'sensor_gain_spread'
     assert effect.parameters['channels'] == table.channel.tolist()
     values = np.array(effect.parameters['values'])
     assert np.allclose(values, np.stack([gain, 0 * gain], axis=1), atol=2e-3)
-
-
-# Error maps.
 
 
 def bent(places):
@@ -273,10 +250,10 @@ def test_an_error_map_undoes_a_smooth_error(rng):
     tracked = bent(true) + 1e-4 * rng.normal(size=true.shape)
     found = learn_error_map(tracked, true)
     assert found.helps
-    assert found.after_m < 0.3 * found.before_m
+    assert found.after.judged < 0.3 * found.before.judged
     fresh = rng.uniform(-0.08, 0.08, (50, 3))
     left = found.apply(bent(fresh)) - fresh
-    assert np.sqrt((left**2).sum(axis=1).mean()) < 0.3 * found.before_m
+    assert np.sqrt((left**2).sum(axis=1).mean()) < 0.3 * found.before.judged
 
 
 def test_a_map_of_mere_noise_is_not_used(rng):
@@ -285,7 +262,7 @@ def test_a_map_of_mere_noise_is_not_used(rng):
     assert not found.helps
     assert found.shape == IDENTITY
     assert np.array_equal(found.apply(true), true)
-    assert found.after_m == found.before_m
+    assert found.after.judged == found.before.judged
 
 
 @pytest.mark.long
@@ -298,7 +275,7 @@ def test_the_error_reported_of_a_map_is_the_error_at_new_places(rng):
         found = learn_error_map(true - 0.01 * true + noise, true)
         there = rng.uniform(-0.1, 0.1, (400, 3))
         said = there - 0.01 * there + 1e-3 * rng.normal(size=there.shape)
-        reported.append(found.after_m**2)
+        reported.append(found.after.judged**2)
         fresh.append(((found.apply(said) - there) ** 2).sum(axis=1).mean())
     assert np.mean(reported) > 0.97 * np.mean(fresh)
 
@@ -307,7 +284,7 @@ def test_a_map_of_points_in_a_plane_is_learnt_in_it(rng):
     true = rng.uniform(-0.1, 0.1, (80, 3)) * [1.0, 1.0, 0.0]
     tracked = true + 0.003 * np.sin(true / 0.05)
     found = learn_error_map(tracked, true)
-    assert found.after_m < 0.3 * found.before_m
+    assert found.after.judged < 0.3 * found.before.judged
     lifted = tracked + [0.0, 0.0, 0.01]
     assert np.allclose(found.correction(lifted), found.correction(tracked), atol=1e-12)
 
@@ -317,9 +294,6 @@ def test_error_map_refusals():
         learn_error_map(np.zeros((9, 3)), np.zeros((8, 3)))
     with pytest.raises(FitError, match=f'at least {FEWEST_POINTS} points .* got 7'):
         learn_error_map(np.zeros((7, 3)), np.zeros((7, 3)))
-
-
-# Local models.
 
 
 def test_shares_of_regions_add_up_to_one(rng):
@@ -337,8 +311,7 @@ def test_joined_regions_make_the_common_field_where_one_model_does(world):
     plain = replace(layout, local=False)
     fitter = LayoutFitter([world.measurements], world.generator, Accuracy())
     local, whole = (fitter.fit(one, 1e-3, 3, exact=False) for one in (layout, plain))
-    points = rng_points()
-    axes = np.tile([0.0, 0.6, 0.8], (len(points), 1))
+    points, axes = inside()
     fluxes = [
         FieldModel(
             part.dipoles.positions, part.dipoles.directions, part.fit.moments, EMITTERS, TONES
@@ -347,10 +320,6 @@ def test_joined_regions_make_the_common_field_where_one_model_does(world):
     ]
     assert rms(fluxes[0] - fluxes[1]) < 0.02 * rms(fluxes[1])
     assert 'regions' in layout.describe()
-
-
-def rng_points():
-    return np.random.default_rng(9).uniform([-0.07, -0.07, 0.125], [0.07, 0.07, 0.155], (100, 3))
 
 
 @pytest.mark.parametrize('start', range(len(DAMPINGS)))

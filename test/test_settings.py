@@ -11,7 +11,7 @@ import yaml
 from refit_world import anser_world
 from test_setup import document
 
-from anser_ros.calibration.pose_correction import pose_precision
+from anser_ros.calibration.moments import pose_precision
 from anser_ros.cli import calibrate, diagnose, evaluate
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.field_model import FieldModelParameters

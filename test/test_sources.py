@@ -12,11 +12,10 @@ from scipy.spatial.transform import Rotation
 from anser_ros.apps.lab.source_track import Sources, seen_from
 from anser_ros.calibration import sensor_fit
 from anser_ros.calibration.layouts import Generator, Layout, coaxial, fit_coaxial, place
-from anser_ros.calibration.readings import DipoleSites, basis_rows
-from anser_ros.calibration.requirements import check_kept, check_measurements
+from anser_ros.calibration.readings import DipoleSites, basis_rows, check_kept, check_measurements
+from anser_ros.calibration.result import corrections, reported_effects
 from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.calibration.sensor_records import corrections, reported_effects
 from anser_ros.diagnosis import decisions, screening
 from anser_ros.effects.correction import Correction
 from anser_ros.effects.registry import effect_named

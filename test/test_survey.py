@@ -4,29 +4,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, hand, scene
-from scipy.spatial.transform import Rotation
+from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, Errors, moved_scan, scene
 
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
 from anser_ros.calibration.population import Likelihood, Population, solve
-from anser_ros.calibration.sensor_fit import SensorFitter
-from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters
-from anser_ros.calibration.sensor_records import (
+from anser_ros.calibration.result import (
     contradiction_words,
     corrections,
     reported_effects,
     undetermined_words,
 )
+from anser_ros.calibration.sensor_fit import SensorFitter
+from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.physics.pose_track import PoseTrack
-from anser_ros.physics.rotations import tangents, tilted
+from anser_ros.physics.rotations import tangents
 from anser_ros.settings import Accuracy
 
 pytestmark = pytest.mark.long
 
-FRAMES, RATE_HZ, OPTICAL_HZ = 500, 25.0, 60.0
+FRAMES, RATE_HZ = 500, 25.0
 OFFSET_S, LEVER_M = 0.018, np.array([0.3e-3, -0.4e-3, 0.2e-3])
 GLITCHES = (100, 400, 777)
 
@@ -36,43 +34,24 @@ def dirty():
     """A moved scan in which everything is a little wrong, and what."""
     rng = np.random.default_rng(5)
     world = scene(rng, side=4)
-    table = world.measurements.sensors
-    gain = 1 + 0.004 * rng.normal(size=6) + 0.005j * rng.normal(size=6)
-    gain *= 1 / gain.mean()
-    gain /= np.abs(gain).mean()
-    axis = tilted(table.axis, 0.008 * rng.normal(size=(6, 2)))
-    place = 0.12e-3 * rng.normal(size=(6, 3))
-    place -= place.mean(axis=0)
-    time = np.arange(FRAMES) / RATE_HZ
-    position, turn = hand(time)
-    true = table.with_geometry(table.position + place + LEVER_M, axis)
-    points, axes = true.placed(position, turn.as_matrix())
-    flux = world.flux(points.reshape(-1, 3), axes.reshape(-1, 3)).reshape(FRAMES, 6, -1)
-    flux = flux * gain[:, None]
-    flux = flux + NOISE_T * (rng.normal(size=flux.shape) + 1j * rng.normal(size=flux.shape))
-    seen = np.arange(-0.3, time[-1] + 0.3, 1 / OPTICAL_HZ)
-    there, turned = hand(seen)
-    there += JITTER_M * rng.normal(size=there.shape)
-    turned = Rotation.from_rotvec(JITTER_RAD * rng.normal(size=there.shape)) * turned
+    errors = Errors(lever_m=tuple(LEVER_M), offset_s=OFFSET_S, reflected=0.0)
+    told, truth = moved_scan(world, world.measurements.sensors, rng, FRAMES / RATE_HZ, errors)
+    there = told.track.position.copy()
     there[list(GLITCHES)] += [0.02, -0.01, 0.015]
-    track = PoseTrack(seen - OFFSET_S, there, turned.as_quat())
-    at, rotation, has_pose = track.at(time)
-    told = replace(
-        world.measurements, sensors=table, time=time, flux=flux, position=at, rotation=rotation,
-        has_pose=has_pose, track=track, valid=np.ones((FRAMES, 6), dtype=bool),
-        flags=np.zeros((FRAMES, 6), dtype=np.int64),
-    )  # fmt: skip
+    track = replace(told.track, position=there)
+    at, rotation, has_pose = track.at(told.time)
+    told = replace(told, track=track, position=at, rotation=rotation, has_pose=has_pose)
     found = SensorFitter([told], KINDS, world.generator, Accuracy()).fit()
-    return told, found, {'gain': gain, 'axis': axis, 'place': place}
+    return told, found, truth
 
 
 def test_all_that_is_wrong_is_found(dirty):
     _, found, truth = dirty
     own = found.errors_of('tool')
-    assert np.abs(own.gain - truth['gain']).max() < 3e-4
+    assert np.abs(own.gain - truth.gain).max() < 3e-4
     assert np.abs(own.gain).mean() == pytest.approx(1.0, abs=1e-12)
-    assert np.linalg.norm(own.axis - truth['axis'], axis=1).max() < 5e-4
-    assert np.abs(own.place - truth['place']).max() < 2e-5
+    assert np.linalg.norm(own.axis - truth.axis, axis=1).max() < 5e-4
+    assert np.abs(own.place - truth.place).max() < 2e-5
     assert np.abs(own.lever_arm - LEVER_M).max() < 5e-5
     assert abs(own.offset_s - OFFSET_S) < 1e-4
     assert found.left_out == ('clock_rate',)
@@ -84,7 +63,7 @@ def test_uncertainties_hold(dirty):
     rows = found.parameters.rows('gains')
     own = found.errors_of('tool')
     error = np.stack([own.gain.real, own.gain.imag], axis=1)
-    error -= np.stack([truth['gain'].real, truth['gain'].imag], axis=1)
+    error -= np.stack([truth.gain.real, truth.gain.imag], axis=1)
     assert np.sqrt(np.mean((error.ravel() / sigma[rows]) ** 2)) < 2.0
     assert sigma[rows].max() < 1e-3
 
@@ -199,11 +178,8 @@ def test_references_say_when_metal_moved():
     steady = scene(rng, side=20)
     time = np.arange(400) / 25.0
     change = 5e-10 * np.exp(-(((time - 8.0) / 1.0) ** 2))
-    flux = (
-        1e-6
-        + change[:, None, None]
-        + NOISE_T * (rng.normal(size=(400, 6, 3)) + 1j * rng.normal(size=(400, 6, 3)))
-    )
+    noise = rng.normal(size=(400, 6, 3)) + 1j * rng.normal(size=(400, 6, 3))
+    flux = 1e-6 + change[:, None, None] + NOISE_T * noise
     reference = replace(
         steady.measurements, time=time, flux=flux, valid=np.ones((400, 6), dtype=bool)
     )

@@ -15,9 +15,22 @@ from anser_ros.calibration.held_out import HeldOut, gaps_of, predict_held_out
 from anser_ros.calibration.layout_fit import LayoutFit, LayoutFitter
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.moments import Progress
-from anser_ros.calibration.readings import fold_of_frames, with_pose
-from anser_ros.calibration.requirements import check_agreement, check_kept, check_measurements
-from anser_ros.calibration.result import Calibration, Scan, residuals, with_provenance
+from anser_ros.calibration.readings import (
+    check_agreement,
+    check_kept,
+    check_measurements,
+    fold_of_frames,
+    with_pose,
+)
+from anser_ros.calibration.result import (
+    Calibration,
+    Scan,
+    contradiction_words,
+    corrections,
+    reported_effects,
+    residuals,
+    with_provenance,
+)
 from anser_ros.calibration.selection import (
     COUNTS,
     DAMPINGS,
@@ -28,7 +41,6 @@ from anser_ros.calibration.selection import (
     thin_frames,
 )
 from anser_ros.calibration.sensor_fit import SensorFitter
-from anser_ros.calibration.sensor_records import contradiction_words, corrections, reported_effects
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
@@ -105,11 +117,11 @@ def fit_scan(
     chosen, held_out = _winner(selection, thin, folds, generator, accuracy, options.damping)
     layout, damping = chosen.layout, chosen.damping
     whole = LayoutFitter(posed, generator, accuracy).fit(layout, damping, progress=progress)
+
+    def alone(part: list[Measurements]) -> float:
+        return _fitted(LayoutFitter(part, generator, accuracy), chosen).fit.noise_t
+
     if not _is_explained(scan):
-
-        def alone(part: list[Measurements]) -> float:
-            return _fitted(LayoutFitter(part, generator, accuracy), chosen).fit.noise_t
-
         check_agreement(posed, names, whole.fit.noise_t, alone)
     sensors = scan.sensor_fit
     model = FieldModel(

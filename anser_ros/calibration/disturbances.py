@@ -20,29 +20,26 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BIN_S = 0.5
-"""Length of the stretches, s, in which changes are looked for: metal on a hand's way comes and
-goes in seconds, and the mean of a stretch has a few times less noise than a frame."""
+"""Length of the stretches, s, in which changes are looked for: metal comes and goes in seconds."""
 BIN_FRAMES = 4
 """Frames of a stretch at least: their mean has half the noise of one."""
 GLITCH = 6.0
-"""Deviation of a pose from where the fluxes put it, in robust standard deviations, from which on
-it is left out: a Gaussian jitter is that far off once in a billion."""
+"""Robust standard deviations of a pose from where the fluxes put it, from which on it is left out:
+a Gaussian is that far off once in a billion."""
 LEFT_OVER = 25.0
 """Power that no pose explains, in a stretch against the median stretch and against where the tool
 was near the same place, from which on something moved; what a model misses at the edge of a scan
 is a few times the noise."""
 SHORTEST_S = 2.0
-"""Time, s, for which a tool must see that something moves: four stretches, as a path needs a
-beginning, an end and a way between."""
+"""Time, s, for which a tool must see that something moves: four stretches."""
 SEEN = 8.0
-"""Power of the references' deviation in a stretch, in standard deviations beyond the noise's, from
-which on something moved; noise reaches it once in 1e15 stretches."""
+"""Power of the references' deviation, in standard deviations beyond the noise's, from which on
+something moved; noise reaches it once in 1e15 stretches."""
 EDGE = 3.0
 """The same, beside a stretch that something moved in: it comes and goes gradually, and noise alone
 reaches it in one stretch of 700."""
 QUIET_ROUNDS = 6
-"""Rounds in which the quiet stretches are distinguished from the others. Fewer may end before the
-stretches have settled; more cost a fit each."""
+"""Rounds in which the quiet stretches are distinguished from the others."""
 
 
 @dataclass(frozen=True)
@@ -176,8 +173,7 @@ LEAST_DRIFT = 2e-4
 """Change of a strength (rms, relative) from which on it is one; it moves a pose by a hundredth of
 a millimetre."""
 CERTAIN = 5.0
-"""The same in standard deviations of what noise makes of it: of a mean over the session, noise
-alone hardly ever makes five times what it usually does."""
+"""The same in standard deviations of what noise makes of it."""
 COMMON = 0.995
 """Share of the power of an emitter's changes that one factor must explain: all of a drift, but of
 a large metal body that comes up from below up to 97 %."""
@@ -203,21 +199,18 @@ def emitter_strength(reference: Measurements) -> ComplexArray:
     means = np.array([flux[bins == b].mean(axis=0) for b in seen])
     middle = np.array([reference.time[bins == b].mean() for b in seen])
     for k in range(emitters):
-        steady = np.median(means[:, :, k].real, axis=0) + 1j * np.median(
-            means[:, :, k].imag, axis=0
-        )
+        own = means[:, :, k]
+        steady = np.median(own.real, axis=0) + 1j * np.median(own.imag, axis=0)
         weight = 1.0 / np.maximum(noise[:, k], 1e-30)
         total = float((weight * np.abs(steady) ** 2).sum())
-        gain = (means[:, :, k] * (weight * steady.conj())).sum(axis=1) / max(total, 1e-300)
-        change = means[:, :, k] - steady
+        gain = (own * (weight * steady.conj())).sum(axis=1) / max(total, 1e-300)
+        change = own - steady
         power = float((weight * np.abs(change) ** 2 * size[seen, None]).sum())
-        chance = float(change.size)
         common = float((total * np.abs(gain - 1.0) ** 2 * size[seen]).sum())
         drift = float(np.sqrt(np.mean(np.abs(gain - 1.0) ** 2)))
         by_noise = np.sqrt(1.0 / max(total * float(np.mean(size[seen])), 1e-300))
-        if drift < max(LEAST_DRIFT, CERTAIN * by_noise):
-            continue
-        if common > COMMON * (power - chance):
+        is_drift = drift >= max(LEAST_DRIFT, CERTAIN * by_noise)
+        if is_drift and common > COMMON * (power - float(change.size)):
             out[:, k] = CubicSpline(middle, gain)(reference.time)
     return out
 

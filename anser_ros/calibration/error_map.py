@@ -1,5 +1,10 @@
-"""(keep that of error_map.py)"""
+"""Learns corrections of tracked positions from places that are known: a trend and what is smooth.
 
+Shapes of maps are compared by nested cross-validation over blocks of space (`_HeldOut`), so that
+neither the choice of a shape nor the decision to correct at all has seen what judges it.
+"""
+
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,8 +19,7 @@ from anser_ros.errors import FitError
 Array = NDArray[np.float64]
 
 FLAT = 1e-6
-"""A direction in which the points extend less than this part of the largest extent carries no
-trend and no distance: what differs there is the rounding of the numbers."""
+"""Part of the largest extent below which a direction carries no trend: only rounding differs."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +87,9 @@ def _trend_columns(places: Array, degree: int) -> Array:
 
 
 FEWEST_POINTS = 8
-"""Points with both positions below which no map is learnt: an affine trend has four parameters a
-component, and as many points again have to judge it."""
+"""Points needed: an affine trend has four parameters a component, and as many judge it."""
 MOST_POINTS = 500
-"""Points that a map is learnt from at most; more are thinned evenly, because the map is smooth and
-the time grows with the third power of the points."""
+"""Points at most, thinned evenly: the time grows with their third power."""
 LENGTHS = (0.15, 0.3, 0.6, 1.2, 2.5)
 """Covariance lengths that are tried, as a fraction of the points' largest extent: from the
 distance between neighbouring blocks to nearly a quadratic trend."""
@@ -140,21 +142,6 @@ class ErrorMap:
     clearness: float
     # every shape with its held-out error (m), by which the shape was chosen
     tried: tuple[tuple[Shape, float], ...]
-
-    @property
-    def n_points(self) -> int:
-        """Return the number of points that the map was learnt from."""
-        return len(self.places)
-
-    @property
-    def before_m(self) -> float:
-        """Return the error without a map that counts, m."""
-        return self.before.judged
-
-    @property
-    def after_m(self) -> float:
-        """Return the error with what the other blocks decide that counts, m."""
-        return self.after.judged
 
     @property
     def shape(self) -> Shape:
@@ -245,15 +232,13 @@ class _Pairs:
         normal = rotation @ self.normal
         return np.asarray(lacking - np.outer(lacking @ normal, normal))
 
-    def left(
-        self, train: NDArray[np.bool_], test: NDArray[np.bool_], shapes: Sequence[Shape]
-    ) -> list[Array]:
-        """Errors (P, 3), m, of test points by maps of each shape; frame of the true ones."""
+    def left(self, known: frozenset[int], fold: int, shapes: Sequence[Shape]) -> list[Array]:
+        """Errors (P, 3), m, in a fold by maps learnt of known folds; frame of the true ones."""
+        train, test = np.isin(self.folds, list(known)), self.folds == fold
         rotation, translation = self.registration(train)
-        known = self.errors(train, rotation, translation)
-        found = []
+        errors, found = self.errors(train, rotation, translation), []
         for shape in shapes:
-            corrected = PositionMap(self.tracked[train], known, shape)(self.tracked[test])
+            corrected = PositionMap(self.tracked[train], errors, shape)(self.tracked[test])
             place = (self.tracked[test] + corrected - translation) @ rotation
             found.append(np.asarray(place - self.true[test]))
         return found
@@ -266,14 +251,11 @@ class _Pairs:
 
 def _shapes(places: Array) -> list[Shape]:
     extent = float(np.ptp(places, axis=0).max())
-    shapes = [IDENTITY] + [Shape(trend, 0.0, 0.0) for trend in TRENDS]
-    shapes += [
+    smooth = [
         Shape(trend, length * extent, noise)
-        for trend in TRENDS
-        for length in LENGTHS
-        for noise in NOISES
+        for trend, length, noise in itertools.product(TRENDS, LENGTHS, NOISES)
     ]
-    return shapes
+    return [IDENTITY, *(Shape(trend, 0.0, 0.0) for trend in TRENDS), *smooth]
 
 
 class _HeldOut:
@@ -288,23 +270,17 @@ class _HeldOut:
         self._points = points
         self._squares: dict[tuple[frozenset[int], int], Array] = {}
 
-    def _left(self, known: frozenset[int], fold: int, shapes: Sequence[Shape]) -> list[Array]:
-        folds = self._points.folds
-        return self._points.left(np.isin(folds, list(known)), folds == fold, shapes)
-
     def squares(self, known: frozenset[int], fold: int) -> Array:
         """Return the sum of squares (m^2) in a fold, by shape, of maps fitted to known folds."""
         key = known, fold
         if key not in self._squares:
-            left = self._left(known, fold, self.shapes)
+            left = self._points.left(known, fold, self.shapes)
             self._squares[key] = np.array([self._points.judged(errors) for errors in left])
         return self._squares[key]
 
     def choose(self, known: frozenset[int]) -> int:
         """Return the shape with the smallest held-out error; none of one fold alone."""
-        if len(known) < 2:
-            return 0
-        return int(np.argmin(self._crossed(known)))
+        return 0 if len(known) < 2 else int(np.argmin(self._crossed(known)))
 
     def decide(self, known: frozenset[int]) -> int:
         """Return the chosen shape, or the identity where choosing so has not helped."""
@@ -321,7 +297,7 @@ class _HeldOut:
         for fold in sorted(self.everything):
             rest = self.everything - {fold}
             shape = self.shapes[self.decide(rest) if decided else 0]
-            parts += self._left(rest, fold, [shape])
+            parts += self._points.left(rest, fold, [shape])
         return parts
 
     def clearness(self, before: Sequence[Array], after: Sequence[Array]) -> float:

@@ -1,7 +1,7 @@
 """Says how well a model predicts a block of space it was not fitted to, and where a scan has
 gaps. There are two figures for every block: the residual at the measured pose, as in the
 article, whose largest part is the jitter of the pose times the gradient of the field, and the
-residual with the pose marginalised (`pose_correction`). The covariance of damped moments is
+residual with the pose marginalised (`PoseWhitener`). The covariance of damped moments is
 largest where no reading was: it tells gaps from places that were scanned (`gaps_of`), but is
 too small, for what a layout cannot represent is not random. The held-out blocks say by which
 factor.
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.layout_fit import LayoutFit
 from anser_ros.calibration.least_squares import ComplexArray, as_complex
-from anser_ros.calibration.moments import MomentFit
-from anser_ros.calibration.pose_correction import (
+from anser_ros.calibration.moments import (
+    MomentFit,
     PoseTerms,
     PoseWhitener,
     pose_precision,
@@ -43,12 +43,11 @@ GRID = (7, 7, 4)
 MARGIN_M = 0.01
 """Way beyond that box, m: a session goes about as far as its scan, not exactly."""
 MOST_MODES = 24
-"""Combinations of moments that are kept at most; each costs the model's file a number a dipole."""
+"""Combinations of moments at most; each costs the model's file a number a dipole."""
 LEAST_MODE_FLUX = 0.1
 """Largest flux of a mode at any place, relative to the flux noise, below which it is left out."""
 DIGITS = 5
-"""Digits after the first of the largest moment: an uncertainty needs no more, and the model's file
-is shorter."""
+"""Digits after the first of the largest moment: an uncertainty needs no more."""
 FEWEST_HELD_OUT_FRAMES = 20
 """Held-out frames at least from which a factor is taken."""
 

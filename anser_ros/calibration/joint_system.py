@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.least_squares import NormalFactor, as_complex, as_real, subtract_gram
-from anser_ros.calibration.pose_correction import PoseTerms, pose_slopes
+from anser_ros.calibration.moments import PoseTerms, PoseWhitener, pose_slopes
 from anser_ros.calibration.readings import DipoleSites, basis_rows, flux_slopes, frame_blocks
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
 from anser_ros.field.measurements import Measurements
@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 LEAST_MOST_MODES, MOST_MODES = 160, 240
-"""Modes of the field at most, for a scan of minutes and for a short one. What fewer miss of a
-wide board's field passes for an error of the lever arm: 0.1 mm with 160, for a poor camera."""
+"""Modes of the field at most, for a scan of minutes and for a short one. What 160 miss of a wide
+board's field passes for 0.1 mm of lever arm, with a poor camera."""
 MODES_WORK = 6e7
 """Frames times the square of the modes, to which the time of a step is proportional."""
 POSES_A_MODE = 2.0
@@ -40,14 +40,12 @@ LEAST_MODE = 1e-8
 SYSTEM_ROWS = 1200
 """Readings in memory at a time: each has a row for every parameter."""
 POSE_ROWS = 1800
-"""Rows of the open poses, six a frame, that are subtracted together at least: with fewer, moving
-the large matrix takes as long as the products; more only take memory."""
+"""Rows of the open poses, six a frame, that are subtracted together at least."""
 LEAST_OPEN = 1e-4
 """Variance that open poses add to a part's readings on average, relative to the noise's, up to
 which they have nothing to do with it: 1e-9 without metal, 4e-5 to 1e-4 near large pieces."""
 STRETCHES = 20
-"""Stretches of a body's frames at least, whose scores' scatter tells the weight of the fluxes.
-Many more are shorter than the way over which errors of the field's model are alike."""
+"""Stretches of a body's frames at least, whose scores' scatter tells the weight of the fluxes."""
 
 
 @dataclass(frozen=True)
@@ -120,13 +118,11 @@ def open_directions(
 
     ``linear``: F frames. ``share`` (F,): share of its variance that is left after interpolation.
     """
-    slope = linear.slope * (np.sqrt(weights) / noise_t)[:, :, None, None]
-    flat = slope.reshape(len(slope), -1, 6)
     prior = 1.0 / (np.maximum(jitter, 1e-9) ** 2 * share[:, None])
-    precision = flat.transpose(0, 2, 1) @ flat + prior[:, :, None] * np.eye(6)
+    white = PoseWhitener(linear.slope, weights, noise_t, prior)
     # The inverse of the transposed factor is a root of the pose's covariance.
-    along = np.linalg.solve(np.linalg.cholesky(precision), flat.transpose(0, 2, 1))
-    return np.asarray(along.reshape(len(slope), 6, *slope.shape[1:3]))
+    along = np.linalg.solve(np.linalg.cholesky(white.precision), white.slope.transpose(0, 2, 1))
+    return np.asarray(along.reshape(len(along), 6, *linear.slope.shape[1:3]))
 
 
 def tied_parts(along: Sequence[Array]) -> NDArray[np.bool_]:
@@ -257,11 +253,10 @@ class Eliminated:
 
     @property
     def inflation(self) -> float:
-        """Return by how much more the scores of whole stretches scatter than those of independent
-        readings would.
+        """Return by how much more scores of stretches scatter than independent readings' would.
 
-        It is the median over the parameters, for a sensor that changes on the way scatters its own
-        alone; one without parameters.
+        The median over the parameters, for a sensor that changes scatters its own alone; one
+        without parameters.
         """
         count = len(self.scores)
         power = (self.scores**2).sum(axis=0) * count / max(count - 1, 1)

@@ -28,20 +28,20 @@ from anser_ros.settings import Accuracy
 Array = NDArray[np.float64]
 
 POINTS_ALONG = 11
-"""Lattice points along x and y of the volume in which dipoles are to make the nominal field (every
-second one along z): some 2000 equations for at most a few hundred dipoles."""
+"""Points along x and y (half along z) where dipoles are to make the nominal field: 2000 equations
+for at most a few hundred dipoles."""
 MARGIN = 0.3
-"""How far beyond the measured volume the nominal field is followed, as a fraction of its half
-size: a scan as wide as the board then covers the default tracked volume (`volume.REACH`)."""
+"""How far beyond the measured volume the nominal field is followed, relative to its half size: a
+scan as wide as the board then covers the default tracked volume (`volume.REACH`)."""
 LEAST_HALF_SIZE_M = 0.02
-"""Half size of that volume at least, m, for measurements along a line or in a plane: over 2 cm a
-field 10 cm from its coils changes by half, which shows how it falls."""
+"""Half size of that volume at least, m, for measurements in a plane: over 2 cm a field 10 cm from
+its coils changes by half."""
 LEAST_HEIGHT = 0.8
 """Lowest point of that volume as a fraction of the lowest reading's height: there the field is at
 most twice as strong, and farther down it changes too fast for a layer of dipoles."""
 PROJECTION_DAMPING = 1e-6
-"""Damping when a known field without noise is expressed by dipoles, as a fraction of the largest
-singular value. It only keeps nearly parallel columns from making huge moments."""
+"""Damping when a known field is expressed by dipoles: it keeps parallel columns from making huge
+moments."""
 
 
 class ScaledNominal:
@@ -55,10 +55,7 @@ class ScaledNominal:
 
     def moments(self, dipoles: DipoleSites) -> ComplexArray:
         """Return the moments (N, K), A m^2, with which N dipoles make the drawn field best."""
-        basis = flux_basis(self.points, self.axes, None, dipoles.positions, dipoles.directions)
-        factor = GramFactor(len(dipoles), 2 * self.flux.shape[1])
-        factor.add(basis, as_real(self.flux))
-        return as_complex(factor.spectrum().solve(PROJECTION_DAMPING))
+        return _moments_of_field(self.points, self.axes, as_real(self.flux), dipoles)
 
 
 def volume_lattice(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
@@ -89,11 +86,9 @@ def emitter_gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> 
 
 
 OVERLAP = 0.5
-"""Width of the blend between two regions, as a fraction of the volume's extent. With less overlap
-the field changes more abruptly between regions; with more the regions differ less."""
+"""Width of the blend between two regions, as a fraction of the volume's extent."""
 LONG_SIDE = 0.5
-"""A side shorter than this fraction of the longest one is not divided: its regions would be flat
-and would not determine the field's change across them."""
+"""Fraction of the longest side below which one is not divided: its regions would be flat."""
 
 
 class Regions:
@@ -151,31 +146,31 @@ def join_regions(
     basis = flux_basis(points, axes, None, dipoles.positions, dipoles.directions)
     shares = regions.shares(points)
     blended = sum(share[:, None] * (basis @ m) for share, m in zip(shares.T, moments, strict=True))
-    whole = GramFactor(len(layer), common.shape[1])
-    whole.add(
-        flux_basis(points, axes, None, layer.positions, layer.directions), np.asarray(blended)
-    )
-    return as_complex(whole.spectrum().solve(PROJECTION_DAMPING))
+    return _moments_of_field(points, axes, np.asarray(blended), layer)
+
+
+def _moments_of_field(
+    points: Array, axes: Array, flux: Array, dipoles: DipoleSites
+) -> ComplexArray:
+    """Moments (N, K), A m^2, that make given real fluxes (P, 2K), T, best."""
+    factor = GramFactor(len(dipoles), flux.shape[1])
+    factor.add(flux_basis(points, axes, None, dipoles.positions, dipoles.directions), flux)
+    return as_complex(factor.spectrum().solve(PROJECTION_DAMPING))
 
 
 RICH = Layout('layer', 16, 1.8, 0.0)
-"""The layer that corrects poses for sensors that stay well above the coils. It should represent
-any field of the board better than the candidates that are compared at these poses."""
+"""The layer that corrects poses, well above the coils: better than any layout that is compared."""
 RICH_MOST = 22
-"""Dipoles along a side of that layer at most, however low the sensors come; the time of a fit
-grows with the fourth power of it or faster."""
+"""Dipoles along its side at most; the time of a fit grows with the fourth power or faster."""
 RICH_SPACING = 0.4
-"""Spacing of that layer's dipoles as a fraction of the lowest sensor's height. A layer whose
-spacing is larger than the height has the field of single dipoles there."""
+"""Spacing of its dipoles as a fraction of the lowest sensor's height: at a larger one than the
+height the field is that of single dipoles."""
 RICH_DAMPING = 1e-5
-"""Damping of that layer's moments, a fraction of the largest singular value: small, so that the
-field is not biased, and large enough for a fit by inner products."""
+"""Damping of its moments: small, so as not to bias the field, and enough for a Gram matrix."""
 MOVING_DAMPING = 1e-4
-"""Damping of the moments while dipoles are moved, a fraction of the largest singular value. It
-keeps two dipoles that come close together from growing huge moments of opposite sign."""
+"""Damping while dipoles are moved: it keeps two that come close from growing huge moments."""
 MOST_MOVING_ROWS = 6000
-"""Readings by which dipoles are moved at most; the final fit of the moments takes all. Some
-hundred positions need no more, and the time grows in proportion."""
+"""Readings by which dipoles are moved at most: some hundred positions need no more."""
 LEAST_HEIGHT_M = 0.01
 """Height of the lowest reading at least, m, for recordings in which a sensor touches the board."""
 LEAST_EXTENSION = 1.1
@@ -208,10 +203,7 @@ def rich_layout(measurements: Sequence[Measurements], generator: Generator) -> L
 
 
 class LayoutPlacer:
-    """Places dipoles over a generator, pulled to what it is drawn like if their layout says so.
-
-    Dipoles and the moments (N, K) that their damping pulls to go together; None for zero.
-    """
+    """Places dipoles over a generator, with moments (N, K) that damping pulls to, None for 0."""
 
     def __init__(self, generator: Generator, measurements: Sequence[Measurements]) -> None:
         self.generator, self.measurements = generator, measurements

@@ -19,8 +19,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 RIGHT_SCALE = 1e9
-"""Factor of the right-hand sides in a Gram matrix. Fluxes are then in nT, of a size with the
-columns (some 1e-7 / (0.1 m)^3 T / (A m^2)); it only avoids numbers of very different size."""
+"""Factor of the right-hand sides in a Gram matrix: fluxes are then of a size with the columns."""
 
 
 class TriangularFactor:
@@ -28,14 +27,11 @@ class TriangularFactor:
 
     def __init__(self, unknowns: int, right_sides: int) -> None:
         self.unknowns = unknowns
-        self.rows = 0
         self.triangle = np.zeros((0, unknowns + right_sides))
 
     def add(self, matrix: Array, right: Array) -> None:
         """Take in rows (P, N) with their right-hand sides (P, M)."""
-        self.rows += matrix.shape[0]
-        block = np.concatenate([matrix, right], axis=1)
-        stack = np.concatenate([self.triangle, block])
+        stack = np.concatenate([self.triangle, np.concatenate([matrix, right], axis=1)])
         self.triangle = np.asarray(np.linalg.qr(stack, mode='r'))
 
     def spectrum(self) -> 'Spectrum':
@@ -51,19 +47,16 @@ class TriangularFactor:
 class GramFactor:
     """Keeps the same problem as the inner products of its columns.
 
-    It is several times faster than `TriangularFactor` and has half the digits. That is enough for
-    rounds that only prepare the next one, and for fits whose damping is far above the rounding;
-    the moments of a final fit come from `TriangularFactor`. The parameters are the same.
+    It is several times faster and has half the digits of a `TriangularFactor`: enough for rounds
+    that only prepare the next one, and for dampings far above the rounding.
     """
 
     def __init__(self, unknowns: int, right_sides: int) -> None:
         self.unknowns = unknowns
-        self.rows = 0
         self.gram = np.zeros((unknowns + right_sides, unknowns + right_sides))
 
     def add(self, matrix: Array, right: Array) -> None:
         """Take in rows (P, N) with their right-hand sides (P, M)."""
-        self.rows += matrix.shape[0]
         block = np.concatenate([matrix, right * RIGHT_SCALE], axis=1)
         self.gram += block.T @ block
 
@@ -129,8 +122,7 @@ def as_complex(values: Array) -> ComplexArray:
 
 
 STRIP = 256
-"""Columns of a strip: fewer make products that are slow for their size, more leave threads without
-work at the end of a matrix of some thousand columns."""
+"""Columns of a strip: fewer make slow products, more leave threads without work at the end."""
 
 
 def subtract_gram(out: Array, rows: Array) -> None:
@@ -165,7 +157,7 @@ class NormalFactor:
             in_order(reduce, self._strips[at:])
             corner = left[own, own]
             corner[:] = np.linalg.cholesky(corner.T).T  # which reads the lower triangle only
-            inverse = _inverse_of_upper(corner).T
+            inverse = np.asarray(scipy.linalg.solve_triangular(corner, np.eye(len(corner)))).T
 
             def divide(other: slice, own: slice = own, inverse: Array = inverse) -> None:
                 left[own, other] = inverse @ left[own, other]
@@ -199,7 +191,3 @@ class NormalFactor:
             return np.asarray(np.einsum('ij,ij->j', columns, columns))
 
         return np.concatenate(in_order(work, range(len(strips))))
-
-
-def _inverse_of_upper(factor: Array) -> Array:
-    return np.asarray(scipy.linalg.solve_triangular(factor, np.eye(len(factor))))

@@ -24,13 +24,11 @@ from anser_ros.physics.dipole import GAUSS_OFFSET, dipole_rows, fill_fields, flu
 Array = NDArray[np.float64]
 
 SHIFT_M = 2e-3
-"""Prior width of a coil's shift along each axis, m: some times what boards differ from their
-drawing by, so that it only holds what the readings do not determine."""
+"""Prior width of a coil's shift along each axis, m: some times what boards differ by."""
 TURN_RAD = 0.03
 """Prior width of a coil's turn about each axis, rad, for the same reason."""
 DIFFERENCE = 1e-2
-"""Step by which derivatives are taken, as a fraction of these widths: small compared with any
-curvature of the field, and far above rounding."""
+"""Step by which derivatives are taken, as a fraction of these widths."""
 COIL_STEPS = 5
 """Gauss-Newton steps of a coil at most; two are enough for shifts of a millimetre."""
 COIL_AT_REST = 1e-3
@@ -113,12 +111,11 @@ def _coil_fit(field: Callable[[Array], ComplexArray], flux: ComplexArray) -> tup
 
 
 MOST_STEPS = 15
-"""Largest number of Levenberg-Marquardt steps; it bounds the time of a fit that creeps."""
+"""Levenberg-Marquardt steps at most."""
 MOST_TRIALS = 6
-"""Trials of a step, each with five times the damping of the one before, before the search ends."""
+"""Trials of a step, each with five times the damping of the one before."""
 LONGEST_MOVE_M = 0.01
-"""Longest step of a dipole, m: small beside the distance of sensors from the dipoles, so that the
-linearisation holds. Smaller takes more steps; larger, and a step may raise the residual."""
+"""Longest step of a dipole, m: small beside its distance from the sensors."""
 CONVERGED = 1e-3
 """Relative fall of the sum of squares below which another step is not worth its time."""
 

@@ -30,15 +30,15 @@ Index = NDArray[np.int64]
 WIDTH_STEPS = 40
 """Fixed-point steps of the widths; they settle within some ten."""
 NARROWEST = {'gains': 1e-6, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9}
-"""Least width of a population, in its own unit (relative, rad, m, relative): no spread at all."""
+"""Least width of a population, in its own unit: no spread at all."""
 LEAST_EVIDENCE = 5.0
 """Gain of the log probability for which a kind of error is kept: odds of 150 to 1."""
 LEAST_POWER = 0.01
 """Power of what a population does to the fluxes, relative to their noise, from which on it is one:
-smaller errors change no pose, and a field's model is not exact to so little."""
+smaller errors change no pose."""
 FAR = 6.0
-"""Size of a channel's value, in widths of the others' population, from which on it stands alone. A
-value of a Gaussian population of ten is that far out once in ten million."""
+"""Size of a channel's value, in widths of the others' population, from which on it stands alone:
+once in ten million values of a Gaussian one."""
 FEWEST_PLACES = 4
 """Places with several sensors from which on it can be said what these have in common."""
 FEWEST_POPULATION = 4
@@ -103,15 +103,11 @@ class Population:
         self.groups = parameters.groups()
         self.alone: dict[str, Index] = {kind: np.zeros(0, dtype=np.int64) for kind in POPULATIONS}
 
-    def _start(self, fixed: Sequence[str]) -> Array:
-        width = np.zeros(len(self.parameters))
-        for kind, rows in self.groups:
-            width[rows] = 1e-12 if kind in fixed else PRIOR[kind]
-        return width
-
     def fit(self, likelihood: Likelihood, fixed: Sequence[str] = ()) -> Posterior:
         """Return the parameters with the most probable widths; ``fixed`` kinds stay at zero."""
-        width = self._start(fixed)
+        width = self.parameters.prior_width()
+        for kind in fixed:
+            width[self.parameters.rows(kind)] = 1e-12
         shared = [
             (kind, np.setdiff1d(rows, self.alone[kind]))
             for kind, rows in self.groups
@@ -162,10 +158,7 @@ class Population:
         """Take channels far outside their population out of it; return whether there are any."""
         changed, each = False, self.parameters.each
         for kind in POPULATIONS:
-            rows = self.parameters.rows(kind)
-            if kind not in self.parameters.kinds or rows.size < FEWEST_POPULATION * each[kind]:
-                continue
-            rows = rows.reshape(-1, each[kind])
+            rows = self.parameters.rows(kind).reshape(-1, each[kind])
             inside = ~np.isin(rows[:, 0], self.alone[kind])
             size = np.sqrt((found.values[rows] ** 2).mean(axis=1))
             if inside.sum() < FEWEST_POPULATION:
@@ -191,7 +184,7 @@ class Population:
         The other populations are as wide as the data make them: places that are free by
         millimetres would leave gains open that places of a few micrometres determine.
         """
-        found, start, out = self.fit(likelihood).width, self._start(()), {}
+        found, start, out = self.fit(likelihood).width, self.parameters.prior_width(), {}
         for kind in self.parameters.kinds:
             width, rows = found.copy(), self.parameters.rows(kind)
             width[rows] = start[rows]

@@ -9,7 +9,7 @@ varies their size, their depth and the kind of the dipoles. Its result, dipoles 
 and overlapping regions are the finalists, among which a complete fit decides (`fit_scan`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,9 +19,15 @@ from numpy.typing import NDArray
 from anser_ros.calibration.layout_fit import LayoutPlacer, lowest_height, rich_layout
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.least_squares import ComplexArray, as_real
-from anser_ros.calibration.moments import MomentFit, MomentFitter
+from anser_ros.calibration.moments import (
+    MomentFit,
+    MomentFitter,
+    PoseWhitener,
+    Progress,
+    pose_precision,
+    pose_terms,
+)
 from anser_ros.calibration.placement import CoilPlacer
-from anser_ros.calibration.pose_correction import PoseWhitener, pose_precision, pose_terms
 from anser_ros.calibration.readings import DipoleSites, basis_rows, with_pose
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -31,20 +37,18 @@ from anser_ros.settings import Accuracy
 Array = NDArray[np.float64]
 
 DAMPINGS = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
-"""Dampings that are tried: from far above the rounding of a Gram matrix (1e-8) to where only the
-prior would be left."""
+"""Dampings: from far above a Gram matrix's rounding (1e-8) to where only the prior is left."""
 REFERENCE_DAMPING = DAMPINGS[1]
-"""Damping of the fit by which poses are corrected before layouts are compared: small, so that the
-field is not biased, and enough to hold a rich layer."""
+"""Damping of the fit by which poses are corrected before layouts are compared."""
 
 
 @dataclass(frozen=True)
 class LayoutCandidate:
     """Holds a layout with its best damping and its score on held-out blocks."""
 
-    layout: Layout  # the layout that was scored
+    layout: Layout
     dipoles: DipoleSites  # its dipoles as placed, before any of them are moved
-    damping: float  # the damping with the best score
+    damping: float  # the one with the best score
     # square root of the mean predictive chi-square a phasor component, times the noise, T
     score: float
     # damping and score (T) for every damping that was tried
@@ -185,61 +189,54 @@ def _ridge(gram: Array, unknowns: int, prior: Array | None) -> Array:
     return np.asarray(out if prior is None else out + prior)
 
 
-Progress = Callable[[str, float], None]
-
 COUNTS = (6, 8, 10, 12, 14, 16, 18)
-"""Dipoles along a side of a layer that are tried. 6 x 6 are less than five for each of eight
-coils; 18 x 18 bound the time of tracking, which grows in proportion to the dipoles."""
+"""Dipoles along a side of a layer: from less than five for each of eight coils to what bounds the
+time of tracking, which grows in proportion to the dipoles."""
 EXTENSIONS = (1.0, 1.25, 1.5, 1.8, 2.2)
-"""Sizes of a layer that are tried, as a multiple of the coils' extent. Larger ones also represent
-what returns outside the coils; with the same count their dipoles stand farther apart."""
+"""Sizes of a layer as a multiple of the coils' extent; larger ones have the returning field
+too."""
 DEPTHS = (-0.15, 0.15, 0.3)
-"""Depths of a layer below the coils that are tried, as a fraction of the lowest sensor's height
-over the coils (negative: above the coils). Deeper layers are smoother and closer to singular."""
+"""Depths of a layer below the coils, as a fraction of the lowest sensor's height over them. Deeper
+layers are smoother and closer to singular."""
 SMALLEST_TRIPLE = 4
 """Points along a side of a layer of three-component dipoles at least."""
 MOST_DIPOLES = 1.2 * COUNTS[-1] ** 2
-"""Layouts of other kinds with more dipoles than this are not tried, since tracking takes time in
-proportion to the dipoles; it is a fifth more than the largest layer has."""
+"""Dipoles of layouts of other kinds at most: a fifth more than the largest layer has."""
 DIPOLES_PER_READING = 4
-"""Most dipoles of a layer for each reading. Damping makes more dipoles than readings harmless,
-and with the drawn board as prior even useful."""
+"""Most dipoles of a layer for each reading: damping makes more than one harmless."""
 ALWAYS_AFFORDABLE = COUNTS[3] ** 2
 """Dipoles that a layer may have however few readings there are: the 12 x 12 of the article."""
 MOST_ROWS = 12_000
-"""Readings that the choice looks at; the final fit takes all. More make the choice slower in
-proportion, fewer make held-out errors less certain than the differences between layouts."""
+"""Readings that the choice looks at; fewer make held-out errors less certain than differences."""
 MOVING = (
     Layout('coils', 2, 1.0, 0.0),
     Layout('coils', 3, 1.0, 0.0),
     Layout('layer', 8, 1.25, 0.01),
 )
-"""Layouts from which dipoles are moved to better places; a moved dipole does the work of several
-fixed ones, so that these are small."""
+"""Layouts from which dipoles are moved; one does the work of several fixed ones."""
 COAXIAL = tuple(Layout('coaxial', n, 1.0, 0.0, moved=True) for n in (1, 3, 5))
 """Layouts for emitters without a drawing: see `coaxial`."""
 LOCAL_COUNT = 10
 """Dipoles along a side of the layer that every region of a local model has."""
 LOCAL_READINGS = 24
-"""Readings a dipole that local models need: four regions that overlap by half have about six
-readings per dipole each then."""
+"""Readings a dipole that local models need: about six in each of four overlapping regions."""
 MOVING_READINGS = 12
 """Fewest readings for each moved dipole: three times its three coordinates and its moment."""
 LEAST_GAIN = 0.08
 """Fraction by which more dipoles must lower the predictive error to be chosen: below the noise it
 changes no pose, while tracking takes time in proportion to the dipoles."""
 LOSS_FOR_A_THIRD = 1.15
-"""Factor by which a finalist's predictive error may be larger if it has a third of the dipoles, as
-moved ones have. Where a scan has gaps, some percent of the error of blocks, most of it noise, are
-half of what the field is wrong by in the gaps."""
+"""Factor by which a finalist's predictive error may be larger if it has a third of the dipoles.
+Where a scan has gaps, some percent of the error of blocks, most of it noise, are half of what the
+field is wrong by in the gaps."""
 
 
 class Selection(NamedTuple):
     """Holds the result of a search through layouts."""
 
-    finalists: tuple[LayoutCandidate, ...]  # the layouts among which a fit from the start decides
-    candidates: tuple[LayoutCandidate, ...]  # every layout that was scored
-    reference: MomentFit  # the fit of a rich layer that corrected the poses
+    finalists: tuple[LayoutCandidate, ...]  # among which a fit from the start decides
+    candidates: tuple[LayoutCandidate, ...]  # all that were scored
+    reference: MomentFit  # of the rich layer that corrected the poses
 
 
 def thin_frames(measurements: Sequence[Measurements]) -> list[Measurements]:

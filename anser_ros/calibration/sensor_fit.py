@@ -14,7 +14,7 @@ fixes.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,15 @@ from anser_ros.calibration.joint_system import (
 from anser_ros.calibration.layout_fit import RICH_DAMPING, ScaledNominal, rich_layout
 from anser_ros.calibration.layouts import Generator, place
 from anser_ros.calibration.least_squares import ComplexArray, as_real
-from anser_ros.calibration.moments import MomentFitter, Progress
+from anser_ros.calibration.moments import (
+    SMALLEST_NOISE_T,
+    MomentFitter,
+    PoseWhitener,
+    Progress,
+    most_probable_step,
+    moved,
+    outlier_weights,
+)
 from anser_ros.calibration.population import (
     Likelihood,
     OpticalNoise,
@@ -46,12 +54,6 @@ from anser_ros.calibration.population import (
     interpolation_share,
     solve,
     width_by_evidence,
-)
-from anser_ros.calibration.pose_correction import (
-    SMALLEST_NOISE_T,
-    most_probable_step,
-    moved,
-    outlier_weights,
 )
 from anser_ros.calibration.readings import basis_rows, frame_blocks, usable_weights, with_pose
 from anser_ros.calibration.sensor_parameters import (
@@ -68,11 +70,9 @@ from anser_ros.settings import Accuracy
 Array = NDArray[np.float64]
 
 CERTAIN = 6.0
-"""Standard deviations between two sessions from which on they contradict each other: a value of a
-normal variable is that far out once in a billion."""
+"""Standard deviations between two sessions from which on they contradict each other."""
 NOTICEABLE = 0.5
-"""Share of the useful size of a parameter (`USEFUL`) below which a difference is not reported: it
-moves poses by less than a tenth of a millimetre."""
+"""Share of the useful size of a parameter (`USEFUL`) below which a difference is not reported."""
 
 
 @dataclass(frozen=True)
@@ -101,30 +101,26 @@ def contradictions(
     apart = [replace(part, body=str(i)) for i, part in enumerate(parts)]
     parameters = SensorParameters(apart, [kind for kind in kinds if kind not in CLOCKS])
     rest = sums(parameters, apart)
-    width = np.empty(len(parameters))
-    for kind in parameters.kinds:
-        width[parameters.rows(kind)] = PRIOR[kind]
     inflation = max(1.0, rest.inflation)
     information = rest.information / inflation + parameters.rule()
+    width = parameters.prior_width()
     posterior = solve(Likelihood(information, rest.gradient / inflation), width)
     change, covariance = posterior.values, posterior.covariance
     worst: dict[tuple[str, str], Contradiction] = {}
-    for i, j in combinations(range(len(bodies)), 2):
-        if bodies[i] != bodies[j]:
-            continue
-        for kind in parameters.kinds:
-            for name, one, other in _pairs(parameters, kind, i, j):
-                difference = change[one] - change[other]
-                variance = covariance[one, one] + covariance[other, other]
-                variance = variance - 2.0 * covariance[one, other]
-                sigma = float(np.sqrt(variance[int(np.argmax(np.abs(difference)))]))
-                size = float(np.linalg.norm(difference))
-                found = Contradiction(kind, name or bodies[i], size, sigma, (i, j))
-                known = worst.get((kind, found.place))
-                if size < max(NOTICEABLE * USEFUL[kind], CERTAIN * sigma):
-                    continue
-                if known is None or size / sigma > known.size / known.sigma:
-                    worst[kind, found.place] = found
+    same = [(i, j) for i, j in combinations(range(len(bodies)), 2) if bodies[i] == bodies[j]]
+    for (i, j), kind in product(same, parameters.kinds):
+        for name, one, other in _pairs(parameters, kind, i, j):
+            difference = change[one] - change[other]
+            variance = covariance[one, one] + covariance[other, other]
+            variance = variance - 2.0 * covariance[one, other]
+            sigma = float(np.sqrt(variance[int(np.argmax(np.abs(difference)))]))
+            size = float(np.linalg.norm(difference))
+            found = Contradiction(kind, name or bodies[i], size, sigma, (i, j))
+            known = worst.get((kind, found.place))
+            if size < max(NOTICEABLE * USEFUL[kind], CERTAIN * sigma):
+                continue
+            if known is None or size / sigma > known.size / known.sigma:
+                worst[kind, found.place] = found
     return tuple(worst.values())
 
 
@@ -178,8 +174,8 @@ COARSE_ROWS = 5000
 MOST_ROWS = 22_000
 """Readings of the last steps; more are thinned. Their time grows in proportion."""
 COARSE_MODES = 120
-"""Modes of the field, the strongest, that the first steps solve for; the time of a step grows with
-the third power, and the last steps undo what it leaves in the parameters."""
+"""Modes of the field, the strongest, that the first steps solve for; their time grows with the
+third power of it."""
 COARSE_STEPS = 6
 """First steps at most, with `COARSE_ROWS`; `SMALL_STEP` ends them earlier."""
 FINE_STEPS = 6
@@ -188,11 +184,9 @@ SMALL_STEP = 0.1
 """Step, in standard deviations, below which another one is not worth its time; and the relative
 change of the fluxes' weight (as a standard deviation) below which the weight has settled."""
 LOOSE = OpticalNoise(1e-3, 1e-2)
-"""Jitter of the first step, m and rad: poses are off by that much while the clock's offset and the
-lever arm are unknown."""
+"""Jitter of the first step: poses are off by that much before clock and lever arm are known."""
 FREE_POSE = np.repeat([1.0 / 0.02**2, 1.0 / 0.1**2], 3)
-"""Precision of a pose that is to follow the fluxes, 1/m^2 and 1/rad^2: a prior of 2 cm and 0.1 rad
-holds only what they do not determine."""
+"""Precision of a pose that is to follow the fluxes, 1/m^2 and 1/rad^2."""
 FIELD_WIDTH = 0.3
 """Prior width of the field's deviation from the drawing, relative to the flux, to begin with.
 Smaller holds the first steps to a poor drawing; larger lets it take up what is the sensors'."""
@@ -252,28 +246,18 @@ class SensorFitter:
 
     def fit(self) -> SensorFit:
         """Find field and parameters, first with few frames and then with all."""
-        total = COARSE_STEPS + 3 * FINE_STEPS
         tools = self._tools(COARSE_ROWS)
         self._start(tools)
-        # With too few to distinguish noise from modes of the field, errors of any size seem
-        # certain.
-        poses = sum(len(tool.weights) for tool in tools)
-        modes = int((self.modes.size > CLEAR_MODE).sum())
-        readings = sum(int(m.usable.sum()) for m in self.measured)
-        path = any(m.is_followed for m in self.measured)  # its neighbouring poses are alike
-        if path and poses < modes and readings < FEWEST_READINGS * modes:
-            self.parameters = self.parameters.fixed()
-            self.population = Population(self.parameters)
-            self.values = np.zeros(0)
+        self._fix_if_too_few(tools)
         self.solved = min(COARSE_MODES, self.modes.size.size)
         for step in range(COARSE_STEPS):
-            self._report(step / total)
+            self._report(step)
             size = self._step(tools, inspect=step > 0)
             if step > 2 and size < 10.0 * SMALL_STEP:
                 break
         tools, self.solved = self._tools(MOST_ROWS), self.modes.size.size
         for step in range(FINE_STEPS):
-            self._report((COARSE_STEPS + 3 * step) / total)
+            self._report(COARSE_STEPS + 3 * step)
             # Metal is looked for once field and sensors fit: where neither is known yet, both look
             # as if something moved, and what is left out is not learnt.
             before = self.inflation
@@ -283,6 +267,21 @@ class SensorFitter:
             settled = abs(self.inflation / before - 1.0) < 2.0 * SMALL_STEP
             if size < SMALL_STEP and settled:
                 break
+        return self._result(tools)
+
+    def _fix_if_too_few(self, tools: Sequence[_Tool]) -> None:
+        """Estimate nothing where too few readings make errors of any size seem certain."""
+        poses = sum(len(tool.weights) for tool in tools)
+        modes = int((self.modes.size > CLEAR_MODE).sum())
+        readings = sum(int(m.usable.sum()) for m in self.measured)
+        path = any(m.is_followed for m in self.measured)  # its neighbouring poses are alike
+        if path and poses < modes and readings < FEWEST_READINGS * modes:
+            self.parameters = self.parameters.fixed()
+            self.population = Population(self.parameters)
+            self.values = np.zeros(0)
+
+    def _result(self, tools: Sequence[_Tool]) -> SensorFit:
+        """Choose the kinds of errors that the readings speak for, and judge all frames."""
         whole = self.posterior
         posterior, left_out, evidence = self.population.chosen(self.likelihood)
         if 'gains' in evidence:
@@ -332,13 +331,13 @@ class SensorFitter:
 
     def _undetermined(self) -> dict[str, float]:
         """Kinds that the scan does not determine, those among them that were not even tried."""
-        not_tried = set(self.parameters.asked) - set(self.parameters.kinds)
-        wide = {kind: PRIOR[kind] for kind in self.parameters.asked if kind in not_tried}
+        asked, tried = self.parameters.asked, self.parameters.kinds
+        wide = {kind: PRIOR[kind] for kind in asked if kind not in tried}
         return {**self.population.undetermined(self.likelihood), **wide}
 
-    def _report(self, share: float) -> None:
+    def _report(self, done: int) -> None:
         if self.progress is not None:
-            self.progress('sensors and clock', share)
+            self.progress('sensors and clock', done / (COARSE_STEPS + 3 * FINE_STEPS))
 
     def _tools(self, most_rows: int) -> list[_Tool]:
         """The frames of a stage, thinned evenly; those without a pose or a reading are left."""
@@ -363,12 +362,12 @@ class SensorFitter:
         most = int(np.clip(most, LEAST_MOST_MODES, MOST_MODES))
         self.modes = FieldModes.of(measured, sites, most)
         moments, _ = MomentFitter(measured, sites, RICH_DAMPING, self.accuracy).solve(exact=False)
-        self.middle = np.zeros((self.modes.size.size, 2 * moments.shape[1]))
-        drawn = None
-        if self.nominal is not None:
+        if self.nominal is None:
+            self.field = self._amplitudes(measured, moments)
+            self.middle = np.zeros_like(self.field)
+        else:
             drawn = ScaledNominal(self.nominal, measured).moments(sites)
-            self.middle = self._amplitudes(measured, drawn)
-        self.field = self._amplitudes(measured, moments if drawn is None else drawn)
+            self.field = self.middle = self._amplitudes(measured, drawn)
 
     def _amplitudes(self, measured: Sequence[Measurements], moments: ComplexArray) -> Array:
         """Amplitudes (M, 2K) of the modes that make the flux of moments best."""
@@ -425,11 +424,9 @@ class SensorFitter:
         return float(np.abs(step / sigma).max(initial=0.0))
 
     def _about_probable_poses(self, at: Linear, tool: _Tool) -> Linear:
-        """Return the readings linearised where the fluxes put the poses, in steps from the
-        measured ones.
+        """Return readings linearised where the fluxes put the poses, in steps from measured ones.
 
-        A camera that jitters by 0.3 mm measures poses at which the field differs in its second
-        order by as much as the fluxes' noise.
+        At 0.3 mm of jitter the field's second order is as large as the fluxes' noise.
         """
         step, _ = self._pose_steps(at, tool.weights)
         near = linearise(moved(at.part, step), self.modes, self.field)
@@ -482,22 +479,15 @@ class SensorFitter:
         self, at: Linear, weights: Array, judged: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], Array]:
         """Frames whose poses are far from where the fluxes put them, and what no pose explains."""
-        zero = np.zeros((len(weights), 6))
-        step, left = most_probable_step(at, weights, self.noise_t, FREE_POSE, zero)
+        step, left = most_probable_step(at, weights, self.noise_t, FREE_POSE)
         scaled = step / np.sqrt(interpolation_share(at.part))[:, None]
         return glitches(scaled, judged, self.accuracy.pose_jitter), left
 
     def _pose_steps(self, at: Linear, weights: Array) -> tuple[Array, Array]:
         """Most probable steps (F, 6) of the poses and their variances."""
         prior = 1.0 / (self.optical.jitter**2 * interpolation_share(at.part)[:, None])
-        count = len(at.slope)
-        root = np.sqrt(weights) / self.noise_t
-        slope = (at.slope * root[:, :, None, None]).reshape(count, -1, 6)
-        residual = (at.residual * root[:, :, None]).reshape(count, -1)
-        precision = slope.transpose(0, 2, 1) @ slope + prior[:, :, None] * np.eye(6)
-        inverse = np.linalg.inv(precision)
-        step = (inverse @ np.einsum('fri,fr->fi', slope, residual)[:, :, None])[:, :, 0]
-        return step, np.diagonal(inverse, axis1=1, axis2=2)
+        white = PoseWhitener(at.slope, weights, self.noise_t, prior)
+        return white.step(at.residual), np.diagonal(white.inverse, axis1=1, axis2=2)
 
     def _all_frames(
         self, steady: Sequence[NDArray[np.bool_]]

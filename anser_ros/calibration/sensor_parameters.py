@@ -24,8 +24,8 @@ ComplexArray = NDArray[np.complex128]
 
 KINDS = ('gains', 'axes', 'places', 'lever_arm', 'time_offset', 'clock_rate')
 EXTRA_KINDS = ('offsets',)
-"""Kinds that are estimated only when they are asked for: constant phasors of every channel, such
-as the field of the surroundings in magnetometers, which coils at tones of their own do not see."""
+"""Kinds that are estimated only when asked for: constant phasors of every channel, such as the
+field of the surroundings in magnetometers."""
 POPULATIONS = ('gains', 'axes', 'places', 'offsets')
 """Kinds that every sensor has a value of: one population with one spread."""
 CLOCKS = ('time_offset', 'clock_rate')
@@ -45,7 +45,7 @@ USEFUL = {
 """Standard deviation, in the parameters' own units, beyond which a scan does not determine them:
 that much makes errors of some tenths of a millimetre, as a tool that was not calibrated has."""
 SHARED_SHIFT = 'lever_arm'
-"""The kind that shifts all sensors of a body, and so the field, where nothing else distinguishes
+"""The kind that shifts all sensors of a body, and so the field, if nothing else distinguishes
 them."""
 SURVEYED_M = 1e-3
 """Standard deviation of a setup's lever arm, m along each axis, where no scan determines it: that
@@ -98,11 +98,7 @@ class BodyErrors:
 
 
 def has_turned(measurements: Measurements) -> bool:
-    """Return whether a body turned about two axes at least by enough to determine its lever arm.
-
-    If a body does not turn, a shift of all its sensors cannot be distinguished from a shift of the
-    field.
-    """
+    """Return whether a body turned about two axes, without which a lever arm shifts the field."""
     rotation = measurements.rotation[measurements.has_pose]
     if len(rotation) < 2:
         return False
@@ -112,14 +108,9 @@ def has_turned(measurements: Measurements) -> bool:
 
 
 def velocity_of(measurements: Measurements) -> Array:
-    """Return a body's velocity (m/s) and angular velocity (rad/s), frame fg, shape (F, 6).
-
-    It is zero without a track, from which it is taken.
-    """
-    track = measurements.track
-    if track is None:
-        return np.zeros((len(measurements.time), 6))
-    return track.velocity(measurements.time)
+    """Return velocities of a body, m/s and rad/s, frame fg, (F, 6); zero without a track."""
+    track, time = measurements.track, measurements.time
+    return np.zeros((len(time), 6)) if track is None else track.velocity(time)
 
 
 class SensorParameters:
@@ -146,12 +137,10 @@ class SensorParameters:
         self.slices: dict[tuple[str, str], slice] = {}
         self._size = 0
         for body, table in zip(self.bodies, self.tables, strict=True):
-            for kind in self.kinds:
-                if kind not in CLOCKS:
-                    self._add(kind, body, self.each[kind] * len(table) if kind in self.each else 3)
-        for kind in self.kinds:
-            if kind in CLOCKS:
-                self._add(kind, '', 1)
+            for kind in (kind for kind in self.kinds if kind not in CLOCKS):
+                self._add(kind, body, self.each[kind] * len(table) if kind in self.each else 3)
+        for kind in (kind for kind in self.kinds if kind in CLOCKS):
+            self._add(kind, '', 1)
 
     def fixed(self) -> 'SensorParameters':
         """Return the same, none of which is estimated."""
@@ -178,6 +167,13 @@ class SensorParameters:
             rows = self.rows(kind)
             out += [(kind, rows[0::2]), (kind, rows[1::2])] if kind == 'gains' else [(kind, rows)]
         return out
+
+    def prior_width(self) -> Array:
+        """Return the prior standard deviation of each parameter, (Q,)."""
+        width = np.zeros(len(self))
+        for kind, rows in self.groups():
+            width[rows] = PRIOR[kind]
+        return width
 
     def gains_at_one_place(self) -> list[NDArray[np.int64]]:
         """Return indices of the gains (real parts) of the sensors at each place with several."""
@@ -217,9 +213,7 @@ class SensorParameters:
         return out, common
 
     def of(self, kind: str, body: str, values: Array) -> Array | None:
-        """Return a kind's parameters of a body, a row per sensor for a population; None where
-        fixed.
-        """
+        """Return a kind's parameters of a body, for a population a row a sensor; None if fixed."""
         if (kind, body) not in self.slices:
             return None
         part = values[self.slices[kind, body]]

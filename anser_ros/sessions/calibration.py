@@ -20,10 +20,9 @@ from anser_ros.calibration.disturbances import (
 )
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.moments import Progress
-from anser_ros.calibration.requirements import check_single_coils
-from anser_ros.calibration.result import Calibration
+from anser_ros.calibration.readings import check_single_coils
+from anser_ros.calibration.result import Calibration, drift_records
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS
-from anser_ros.calibration.sensor_records import drift_records
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord

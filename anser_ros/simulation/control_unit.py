@@ -24,7 +24,6 @@ from anser_ros.wire.frames import (
     DeviceStatus,
     Hello,
     Identify,
-    Payload,
     Record,
     Reply,
     ReplyCode,
@@ -211,10 +210,7 @@ class ControlUnit:
     ) -> None:
         front = front_end or FrontEnd()
         nominal_a = float(world.setup.emitter.geometry.get('current_a', 0.25))
-        self._effects = tuple(effects)
-        self._sampler = Sampler(
-            world, calibration, front, nominal_a, effects=self._effects, seed=seed
-        )
+        self._sampler = Sampler(world, calibration, front, nominal_a, effects=effects, seed=seed)
         self._hello = _hello(world, front, block_samples, nominal_a)
         self._reader = FrameReader()
         self._sample = 0
@@ -242,10 +238,7 @@ class ControlUnit:
 
     def receive(self, data: bytes) -> list[Piece]:
         """Take bytes from the host and return the records that answer."""
-        answers: list[Piece] = []
-        for record in self._reader.feed(data):
-            answers += self._obey(record)
-        return answers
+        return [piece for record in self._reader.feed(data) for piece in self._obey(record)]
 
     def drop(self) -> None:
         """Count a block that was lost because the line was full."""
@@ -275,7 +268,7 @@ class ControlUnit:
         pieces: list[Piece] = []
         if self._sample >= self._next_hello:
             self._next_hello = self._sample + int(self.sample_rate_hz)
-            pieces += [self._piece(self._hello), self._piece(self._status())]
+            pieces += [Piece(encode(self._hello)), Piece(encode(self._status()))]
         if self.streaming:
             pieces += self._blocks(samples)
         self._sample += samples
@@ -314,10 +307,10 @@ class ControlUnit:
         elif isinstance(command, Stop):
             self._state = DeviceState.IDLE
         elif isinstance(command, Identify):
-            more = [self._piece(self._hello)]
+            more = [Piece(encode(self._hello))]
         else:
             code, text = self._set_frequencies(command)
-            more = [self._piece(self._hello)] if code is ReplyCode.OK else []
+            more = [Piece(encode(self._hello))] if code is ReplyCode.OK else []
         reply = encode(Reply(TYPE_OF[type(command)], code, text), record.tag)
         return [Piece(reply), *more]
 
@@ -345,9 +338,6 @@ class ControlUnit:
 
     def _ticks(self, sample: int) -> int:
         return round(sample / self.sample_rate_hz * TICK_HZ)
-
-    def _piece(self, payload: Payload) -> Piece:
-        return Piece(encode(payload))
 
 
 def _hello(world: World, front: FrontEnd, block_samples: int, nominal_a: float) -> Hello:

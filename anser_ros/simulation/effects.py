@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import ParameterError
-from anser_ros.simulation.world import MetalBody
+from anser_ros.simulation.world import MetalBody, at_rest
 from anser_ros.wire.channel_calibration import ChannelCalibration
-from anser_ros.wire.setup import Setup
+from anser_ros.wire.setup import SensorSpec, Setup
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -194,9 +194,8 @@ class Drawn:
 
     def document(self) -> dict[str, Any]:
         """Return the effect as plain data for a file of the truth."""
-        return {
-            'name': self.name, 'parameters': self.parameters, 'answers': list(self.answers)
-        }  # fmt: skip
+        answers = list(self.answers)
+        return {'name': self.name, 'parameters': self.parameters, 'answers': answers}
 
 
 @dataclass(frozen=True)
@@ -212,6 +211,12 @@ def _tool_columns(setup: Setup) -> list[int]:
     return [column for column, s in enumerate(setup.sensors) if s.name in moving]
 
 
+def _tool_sensor(unit: Unit, rng: np.random.Generator) -> tuple[int, SensorSpec]:
+    """Draw a tool sensor: its column, and what the setup says of it."""
+    column = int(rng.choice(_tool_columns(unit.setup)))
+    return column, unit.setup.sensors[column]
+
+
 def _clusters(setup: Setup) -> list[list[int]]:
     """Return the columns of tool sensors of which three or more are at the same place."""
     places: dict[tuple[str, tuple[float, ...]], list[int]] = {}
@@ -224,13 +229,9 @@ def _clusters(setup: Setup) -> list[list[int]]:
 def _static_metal(unit: Unit, rng: np.random.Generator) -> Drawn:
     place = np.array([*rng.uniform(-0.08, 0.08, 2), rng.uniform(-0.12, -0.07)])
     radius = float(rng.uniform(0.03, 0.045))
-    body = MetalBody(np.zeros((1, 3)), radius, 5e6, 200.0, _resting(place))
+    body = MetalBody(np.zeros((1, 3)), radius, 5e6, 200.0, at_rest(place))
     parameters = {'position_m': place.tolist(), 'radius_m': radius}
     return _known('static_metal', parameters, metal=(body,))
-
-
-def _resting(place: NDArray[np.float64]) -> Callable[[float], Any]:
-    return lambda time_s: (place, np.eye(3))
 
 
 def _known(name: str, parameters: dict[str, Any], *effects: RawEffect, **rest: Any) -> Drawn:
@@ -261,8 +262,7 @@ def _clock_rate(unit: Unit, rng: np.random.Generator) -> Drawn:
 
 
 def _sensor_axis(unit: Unit, rng: np.random.Generator) -> Drawn:
-    column = int(rng.choice(_tool_columns(unit.setup)))
-    sensor = unit.setup.sensors[column]
+    column, sensor = _tool_sensor(unit, rng)
     across = np.cross(sensor.axis, rng.standard_normal(3))
     tilt_deg = float(rng.uniform(3.0, 8.0))
     turn = Rotation.from_rotvec(np.radians(tilt_deg) * across / np.linalg.norm(across))
@@ -272,21 +272,20 @@ def _sensor_axis(unit: Unit, rng: np.random.Generator) -> Drawn:
 
 
 def _sensor_gain(unit: Unit, rng: np.random.Generator) -> Drawn:
-    column = int(rng.choice(_tool_columns(unit.setup)))
+    column, sensor = _tool_sensor(unit, rng)
     gain = float(1 + rng.choice([-1, 1]) * rng.uniform(0.01, 0.04))
-    parameters = {'channel': unit.setup.sensors[column].channel, 'gain': gain, 'phase_deg': 0.0}
+    parameters = {'channel': sensor.channel, 'gain': gain, 'phase_deg': 0.0}
     return _known('sensor_gain', parameters, ChannelGain(column, gain))
 
 
 def _saturation(unit: Unit, rng: np.random.Generator) -> Drawn:
-    column = int(rng.choice(_tool_columns(unit.setup)))
+    column, sensor = _tool_sensor(unit, rng)
     limit_v = float(rng.uniform(2.0, 4.0))
-    channel = unit.setup.sensors[column].channel
     # The amplifier's limit is a voltage, which grows with the frequency: the mean tone stands for
     # all of them.
-    volts_per_tesla = unit.channels.areas_m2([channel])[0] * np.mean(unit.setup.frequencies_hz)
-    full_scale_t = float(limit_v / (2 * np.pi * volts_per_tesla))
-    parameters = {'channel': channel, 'full_scale_t': full_scale_t, 'limit_v': limit_v}
+    area_m2 = unit.channels.areas_m2([sensor.channel])[0]
+    full_scale_t = float(limit_v / (2 * np.pi * area_m2 * np.mean(unit.setup.frequencies_hz)))
+    parameters = {'channel': sensor.channel, 'full_scale_t': full_scale_t, 'limit_v': limit_v}
     return _known('saturation', parameters, CompressingAmplifier(column, limit_v))
 
 
@@ -299,32 +298,25 @@ def _coil_drift(unit: Unit, rng: np.random.Generator) -> Drawn:
 
 
 def _loose_contact(unit: Unit, rng: np.random.Generator) -> Drawn:
-    column = int(rng.choice(_tool_columns(unit.setup)))
+    column, sensor = _tool_sensor(unit, rng)
     share, period_s = float(rng.uniform(0.04, 0.1)), float(rng.uniform(0.6, 1.2))
-    parameters = {
-        'channels': [unit.setup.sensors[column].channel], 'share': share, 'period_s': period_s
-    }  # fmt: skip
-    effect = LooseSensor(column, share, period_s=period_s)
-    answers = ('loose_contact', 'outliers')
-    return Drawn('loose_contact', parameters, (effect,), answers=answers)
+    parameters = {'channels': [sensor.channel], 'share': share, 'period_s': period_s}
+    effects = (LooseSensor(column, share, period_s=period_s),)
+    return Drawn('loose_contact', parameters, effects, answers=('loose_contact', 'outliers'))
 
 
 def _gain_ripple(unit: Unit, rng: np.random.Generator) -> Drawn:
     depth, period_s = float(rng.uniform(0.005, 0.02)), float(rng.uniform(1.0, 4.0))
     parameters = {'depth': depth, 'period_s': period_s}
     # The diagnosis has no oscillating gain, but one that varies over time.
-    return Drawn(
-        'gain_ripple',
-        parameters,
-        (GainRipple(depth, period_s),),
-        answers=('tool_gain_drift', 'sensor_gain_drift'),
-    )
+    answers = ('tool_gain_drift', 'sensor_gain_drift')
+    return Drawn('gain_ripple', parameters, (GainRipple(depth, period_s),), answers=answers)
 
 
 def _crossover(unit: Unit, rng: np.random.Generator) -> Drawn:
-    column = int(rng.choice(_tool_columns(unit.setup)))
+    column, sensor = _tool_sensor(unit, rng)
     dead_v = float(rng.uniform(0.01, 0.03))
-    parameters = {'channel': unit.setup.sensors[column].channel, 'dead_v': dead_v}
+    parameters = {'channel': sensor.channel, 'dead_v': dead_v}
     return Drawn('crossover', parameters, (CrossoverAmplifier(column, dead_v),))
 
 

@@ -1,6 +1,4 @@
-"""Simulates the line between control unit and host: a pseudo-terminal behind a link, and its
-faults.
-"""
+"""Simulates the line between control unit and host: a pseudo-terminal, and its faults."""
 
 from __future__ import annotations
 
@@ -26,11 +24,9 @@ FAULTS = (
     NONE, 'bad_crc', 'gap', 'garbage', 'wrong_baud', 'silence', UNPLUG, OVERRUN, SATURATION,
 )  # fmt: skip
 _BURST_BYTES = 700
-"""Length of a burst of garbage: about as long as a block of samples, so that it may hold bytes
-that look like the begin of a record."""
+"""Length of a burst of garbage: about that of a block of samples."""
 _LASTS_S = {'wrong_baud': 2.5, 'silence': 2.5, UNPLUG: 1.0, OVERRUN: 0.1, SATURATION: 1.0}
-"""Duration of each lasting fault, s. The first two outlast the host's patience, so that it notices
-them; the others last long enough for several blocks."""
+"""Duration of each lasting fault, s. The first two outlast the host's patience."""
 
 
 class FaultInjector:
@@ -59,37 +55,31 @@ class FaultInjector:
         if self.kind == 'silence' and self.lasts(time_s, 'silence'):
             return []
         if self.kind == 'wrong_baud' and self.lasts(time_s, 'wrong_baud'):
-            return [Piece(self._garble(p.data), p.is_block) for p in pieces]
+            # A receiver at another baud rate gets fewer bytes, all of them wrong.
+            return [Piece(self._noise(max(1, len(p.data) // 3)), p.is_block) for p in pieces]
         return list(pieces)
 
     def _damage_one(self, pieces: Sequence[Piece], period: int) -> list[Piece]:
-        arrived = []
-        for piece in pieces:
-            if piece.is_block and period != self._done:
-                self._done = period
-                if self.kind == 'gap':
-                    continue
-                if self.kind == 'garbage':
-                    arrived.append(Piece(self._noise(_BURST_BYTES)))
-                else:
-                    damaged = bytearray(piece.data)
-                    damaged[len(damaged) // 2] ^= 0x10
-                    arrived.append(Piece(bytes(damaged), is_block=True))
-                    continue
-            arrived.append(piece)
-        return arrived
-
-    def _garble(self, data: bytes) -> bytes:
-        """Return what a receiver at another baud rate gets: fewer bytes, all of them wrong."""
-        return self._noise(max(1, len(data) // 3))
+        first = next((rank for rank, piece in enumerate(pieces) if piece.is_block), None)
+        if first is None or period == self._done:
+            return list(pieces)
+        self._done = period
+        if self.kind == 'gap':
+            arrived = []
+        elif self.kind == 'garbage':
+            arrived = [Piece(self._noise(_BURST_BYTES)), pieces[first]]
+        else:
+            damaged = bytearray(pieces[first].data)
+            damaged[len(damaged) // 2] ^= 0x10
+            arrived = [Piece(bytes(damaged), is_block=True)]
+        return [*pieces[:first], *arrived, *pieces[first + 1 :]]
 
     def _noise(self, count: int) -> bytes:
         return bytes(self._rng.integers(0, 256, count, dtype=np.uint8))
 
 
 _PENDING_LIMIT_BYTES = 1 << 20
-"""Bytes that wait for the host at most, about half a second of samples. A host that is slower
-loses blocks instead of falling behind more and more."""
+"""Bytes that wait for the host at most, half a second of samples: a slower host loses blocks."""
 
 
 class PseudoPort:
@@ -165,14 +155,6 @@ class PseudoPort:
         self._pending = b''.join(parts)
         self._flush()
         return dropped
-
-    def write_all(self, data: bytes) -> None:
-        """Send bytes and wait until the line has taken all of them."""
-        self._pending += data
-        self._flush()
-        while self._pending and self._fds is not None:
-            select.select([], [self._fds[0]], [], 0.1)
-            self._flush()
 
     def wait(self, timeout_s: float) -> None:
         """Wait until the host sends something or the time is over, and send what is pending.

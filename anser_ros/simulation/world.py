@@ -118,6 +118,11 @@ class MetalBody:
         )
 
 
+def at_rest(place: Array) -> Path:
+    """Return the path of a body that rests, unturned, at a place, m."""
+    return lambda time_s: (place, np.eye(3))
+
+
 def steel_disc(path: Path | None = None, *, radius_m: float = 0.06, rings: int = 3) -> MetalBody:
     """Return a disc of touching steel balls, like the foot of a stand or the head of a C-arm.
 

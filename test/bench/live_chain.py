@@ -20,7 +20,7 @@ import numpy as np
 
 from anser_ros.cli.demo import BOARD_SEED, node_command
 from anser_ros.cli.processes import Child, Supervisor
-from anser_ros.simulation.control_unit import ControlUnit
+from anser_ros.simulation.control_unit import ControlUnit, Piece
 from anser_ros.simulation.line import PseudoPort
 from anser_ros.simulation.world import Approach, World, board_source, manufactured, steel_disc
 from anser_ros.wire.channel_calibration import parse_channels
@@ -174,7 +174,9 @@ class Feeder(threading.Thread):
                 time.sleep(left / 1e9)
             if self.stopping.is_set():
                 return
-            self._port.write_all(data)
+            self._port.write([Piece(data)])
+            while self._port._pending:
+                self._port.wait(0.001)
             self.taken_ns.append(time.monotonic_ns())
 
 

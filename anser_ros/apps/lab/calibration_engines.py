@@ -8,6 +8,7 @@ which the part that poses explain counts as little as the jitter is large (`with
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +18,15 @@ from anser_ros.apps.lab.one_place import calibrate_at_one_place, is_at_one_place
 from anser_ros.apps.lab.still import STILL_ONLY, calibrate_still, is_still
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.least_squares import as_real
-from anser_ros.calibration.moments import Progress
-from anser_ros.calibration.pose_correction import PoseWhitener, pose_precision, pose_terms
-from anser_ros.calibration.readings import DipoleSites, fold_of_frames, frame_blocks
-from anser_ros.calibration.requirements import (
+from anser_ros.calibration.moments import PoseWhitener, Progress, pose_precision, pose_terms
+from anser_ros.calibration.readings import (
     FEWEST_FRAMES_OF_MANY,
     FEWEST_SCAN_FRAMES,
     MANY_SENSORS,
+    DipoleSites,
     check_single_coils,
+    fold_of_frames,
+    frame_blocks,
 )
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN
@@ -43,11 +45,10 @@ ComplexArray = NDArray[np.complex128]
 POINT, SIZED = COAXIAL[:2]
 """Layouts of emitters without a size, and of those that have no more than a size."""
 LEAST_SIGMAS = 5.0
-"""Standard deviations from zero at which a size is reported. They come from five blocks, so that
-chance alone reaches so many in one of 130 emitters without a size."""
+"""Standard deviations, of five blocks, at which a size is reported: chance in one emitter of
+130."""
 STEPS = 4
-"""Steps of the fit, which starts where the dipoles were fitted: each leaves a small part of the
-error before it."""
+"""Steps of the fit, each of which leaves a small part of the error before it."""
 WAYS = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-4, 1e-7])
 """Steps of the differences by centre (m), tilt of the axis (rad), real and imaginary part of the
 moment (relative) and second moment (m^2): small beside any distance, far above rounding."""
@@ -195,7 +196,7 @@ def _fitted(
     calibrate: Callable[..., Calibration],
     sessions: Sequence[Session],
     options: Options,
-    progress: Progress | None,
+    progress: Progress | None = None,
 ) -> Calibration:
     sessions, _ = at_constant_strength(sessions, options)
     (tool,) = _tools(sessions)
@@ -204,12 +205,6 @@ def _fitted(
         tool, Path(session.path).name, generator_of(sessions[0].setup), options.estimate,
         options.accuracy, progress,
     )  # fmt: skip
-
-
-def _fit_one_place(
-    sessions: Sequence[Session], options: Options, progress: Progress | None = None
-) -> Calibration:
-    return _fitted(calibrate_at_one_place, sessions, options, progress)
 
 
 def _fit_still(
@@ -224,14 +219,8 @@ def _fit_still(
     return _fitted(calibrate_still, sessions, options, progress)
 
 
-def _fit_with_sizes(
-    sessions: Sequence[Session], options: Options, progress: Progress | None = None
-) -> Calibration:
-    return with_source_sizes(SCAN.fit(sessions, options, progress))
-
-
 ENGINES = (
-    Engine(_accepts_one_place, _fit_one_place, is_joint=True),
+    Engine(_accepts_one_place, partial(_fitted, calibrate_at_one_place), is_joint=True),
     Engine(
         _accepts_still,
         _fit_still,
@@ -241,7 +230,7 @@ ENGINES = (
         f'{MANY_SENSORS} sensors, over emitters without a drawing, and with no layout of dipoles '
         'stated',
     ),
-    Engine(SCAN.accepts, _fit_with_sizes),
+    Engine(SCAN.accepts, lambda *scan: with_source_sizes(SCAN.fit(*scan))),
 )
 """In their order: a body of many sensors at one place, at a few poses, and any scan, with the
 sizes of emitters without a drawing."""

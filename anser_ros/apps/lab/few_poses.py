@@ -18,9 +18,8 @@ from scipy.stats import f_oneway
 from anser_ros.apps.lab.still import AS_STATED, BEND, PLACEMENT, STILL_ONLY
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.held_out import rms
-from anser_ros.calibration.result import Calibration
+from anser_ros.calibration.result import SPREADS, Calibration
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.calibration.sensor_records import SPREADS
 from anser_ros.diagnosis.decisions import UNSTRUCTURED
 from anser_ros.effects.registry import all_effects
 from anser_ros.field.model import EffectRecord, FieldModel
@@ -39,18 +38,13 @@ CHANCE = 1e-3
 
 @dataclass(frozen=True)
 class FewPosesDiagnosis:
-    """Holds what is wrong with the sensors of a session of few poses.
+    """Holds what is wrong with the sensors of a session of few poses."""
 
-    Before is with sensors as the given model has them, after with the effects that were found, of
-    which each has the held-out residual without it, T. The model is the field as it was estimated,
-    and the effects that were known and found.
-    """
-
-    before: Calibration
-    after: Calibration
+    before: Calibration  # with sensors as the given model has them
+    after: Calibration  # with the effects that were found
     effects: tuple[EffectRecord, ...]
-    without_t: tuple[float, ...]
-    model: FieldModel
+    without_t: tuple[float, ...]  # the held-out residual without each effect
+    model: FieldModel  # the field as it was estimated, and the effects that were known and found
 
     @property
     def floor_t(self) -> float:
@@ -70,11 +64,8 @@ class FewPosesDiagnosis:
     def depends_on(self) -> tuple[str, ...]:
         """Return the variables, of position, channel and emitter, that what remains follows."""
         power = residual_power(self.after)
-        return tuple(
-            name
-            for name, axis in (('position', 0), ('channel', 1), ('emitter', 2))
-            if _differs(power, axis)
-        )
+        axes = ('position', 'channel', 'emitter')
+        return tuple(name for axis, name in enumerate(axes) if _differs(power, axis))
 
 
 accepts = is_estimated_jointly
@@ -87,14 +78,9 @@ def diagnose(
 ) -> FewPosesDiagnosis:
     """Find what is wrong with the sensors of a session that it `accepts`.
 
-    The effects that the model has are corrected first.
-
-    Raises
-    ------
-    ModelFileError
-        When the model's emitters are not the session's, or an effect of it is unknown.
-    FitError
-        When the readings don't determine the field.
+    The effects that the model has are corrected first. Raises `ModelFileError` when its emitters
+    are not the session's, or an effect of it is unknown, and `FitError` when the readings don't
+    determine the field.
     """
     say = progress or (lambda text: None)
     known = correct(prepare(session, model)).session

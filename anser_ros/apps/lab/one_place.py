@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from anser_ros.apps.lab.source_calibration import KINDS, SourceReadings, SourcesFit, SourcesFitter
@@ -20,8 +21,7 @@ from anser_ros.calibration.layouts import Generator, Layout
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.population import LEAST_EVIDENCE
-from anser_ros.calibration.readings import FOLDS, with_pose
-from anser_ros.calibration.requirements import MANY_SENSORS
+from anser_ros.calibration.readings import FOLDS, MANY_SENSORS, with_pose
 from anser_ros.calibration.result import Calibration, Residuals, Scan, with_provenance
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -35,15 +35,14 @@ Mask = NDArray[np.bool_]
 STILL = 5.0
 """Standard deviations of the optical jitter within which all poses are one place."""
 NOISY = 5.0
-"""Times the median noise from which on a sensor is called noisy; its scatter has eight degrees of
-freedom with two frames of four emitters, which make such a ratio in no sensor of a thousand."""
+"""Times the median noise from which on a sensor is called noisy: two frames of four emitters make
+such a ratio by chance in no sensor of a thousand."""
 FEWEST_SCATTERS = 4
 """Degrees of freedom of a sensor's scatter from which on it is called noisy."""
 WORDS = 'a three-component dipole for every emitter, place free, and {} of their stray fields'
 """The layout in words, with the number of dipoles of stray fields."""
 REACH = 0.1
-"""How far beyond the box around the sensors sources are looked for, as a fraction of its longest
-side."""
+"""How far beyond the sensors' box sources are looked for, as a fraction of its longest side."""
 
 
 def is_at_one_place(measurements: Sequence[Measurements], accuracy: Accuracy) -> bool:
@@ -183,23 +182,16 @@ def _fitted(readings: SourceReadings, kinds: Sequence[str]) -> SourcesFit:
 def _dipoles(fit: SourcesFit) -> tuple[Array, Array, NDArray[np.complex128]]:
     """Positions, directions and moments (N, K): each source's own dipoles drive it alone."""
     sites = [one.sites for one in fit.sources]
-    moments = np.zeros((sum(map(len, sites)), len(sites)), dtype=complex)
-    first = 0
-    for k, one in enumerate(fit.sources):
-        own = slice(first, first + len(one.moments))
-        moments[own, k] = one.moments[:, 0]
-        if one.moments.shape[1] == 2:
-            moments[own, k] += 1j * one.moments[:, 1]
-        first = own.stop
+    moments = scipy.linalg.block_diag(*(_phasors(one.moments)[:, None] for one in fit.sources))
     positions, directions = (
         np.concatenate([getattr(one, part) for one in sites])
         for part in ('positions', 'directions')
     )
-    return positions, directions, moments
+    return positions, directions, moments.astype(complex)
 
 
 def _phasors(parts: Array) -> NDArray[np.complex128]:
-    """Fluxes (S, K) of their parts (S, K, C)."""
+    """Complex numbers (...) of their parts (..., C)."""
     return np.asarray(parts[..., 0] + (1j * parts[..., 1] if parts.shape[-1] == 2 else 0.0))
 
 
@@ -229,10 +221,8 @@ def _reversed(
     """A record of the channels that are the wrong way round, with the least evidence of one."""
     if not channels.size:
         return ()
-    found = {
-        'log_probability': float(evidence.min()),
-        'held_out_log_probability': float(held_out.min()),
-    }
+    least, other = float(evidence.min()), float(held_out.min())
+    found = {'log_probability': least, 'held_out_log_probability': other}
     return (EffectRecord('sensor_polarity', {'channels': channels.tolist()}, {}, found),)
 
 

@@ -9,7 +9,7 @@ together.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 KINDS = ('places', 'axes', 'gains')
-"""Kinds of sensors' errors whose widths are found where they are asked for: m, rad, relative.
-Whenever any is, which way round each sensor is, is found as well."""
+"""Kinds of sensors' errors whose widths are found where they are asked for: m, rad, relative."""
 START = {'places': 1e-3, 'axes': 0.03, 'gains': 0.03}
 """Their widths at the start; far too wide ones cost a few trials."""
 WIDTH_STEP = 2.0
@@ -134,6 +133,10 @@ class _OneEmitter:
         """How far readings may be off, (S, C), T."""
         if self.widths is not None:
             return source.sigma(self.points, self.noise_t, self.widths)
+        return self.rough()
+
+    def rough(self) -> Array:
+        """The same before there is a field."""
         rough = np.hypot(self.noise_t[:, None], FIRST_GAIN * np.abs(self.flux))
         return np.maximum(rough, 1e-300)
 
@@ -163,7 +166,7 @@ class _OneEmitter:
         """One step, and the covariance of the places (3D, 3D) that it has."""
         basis, count, parts = source.basis(self.points), len(source.places), self.flux.shape[1]
         is_known = bool(source.moments.any())
-        sigma = (self if is_known else replace(self, widths=None)).spread(source)
+        sigma = self.spread(source) if is_known else self.rough()
         left = self.flux - basis @ source.moments if is_known else np.zeros_like(self.flux)
         root = self.root(left, sigma)
         matrix = np.zeros((len(self.flux), parts, 3 * count * (1 + parts)))
@@ -176,12 +179,8 @@ class _OneEmitter:
         target = (self.flux * root).ravel()
         strength = float(np.linalg.norm(source.moments[:3]))
         stray = 0.0 if strength == 0.0 else (STRAY * strength) ** -2.0
-        prior = np.concatenate(
-            [
-                np.full(3 * count, HELD_M**-2.0),
-                np.tile(np.repeat([0.0, stray], [3, 3 * count - 3]), parts),
-            ]
-        )
+        of_moments = np.tile(np.repeat([0.0, stray], [3, 3 * count - 3]), parts)
+        prior = np.concatenate([np.full(3 * count, HELD_M**-2.0), of_moments])
         normal = white.T @ white + np.diag(prior)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
         inverse = np.linalg.pinv(normal * np.outer(scale, scale), hermitian=True)
@@ -267,8 +266,7 @@ class SourcesFitter:
         """Where on the grid one dipole explains an emitter's readings best, refined."""
         one = self._one(k, None)
         flux, rows = one.flux, self.grid_rows
-        rough = np.hypot(one.noise_t[:, None], FIRST_GAIN * np.abs(flux))
-        rough = np.where(self.used[:, None], np.maximum(rough, 1e-300), np.inf)
+        rough = np.where(self.used[:, None], one.rough(), np.inf)
         weight, left = np.ones((len(self.grid), len(flux))), np.zeros(0)
         for _ in range(SOURCE_STEPS):
             sums = [_solved(rows, weight, flux[:, c], rough[:, c]) for c in range(flux.shape[1])]
@@ -277,9 +275,8 @@ class SourcesFitter:
         losses, found = np.log1p((left**2).sum(axis=2) / FREEDOM).sum(axis=1), []
         for best in np.argsort(losses)[:STARTS]:
             start = LocatedSource(self.grid[best][None], np.zeros((3, flux.shape[1])))
-            source = one.stepped(start)
-            found.append((one.loss(source), source))
-        return min(found, key=lambda pair: pair[0])[1]
+            found.append(one.stepped(start))
+        return min(found, key=one.loss)
 
     def _learn_signs(self, sources: Sequence[LocatedSource]) -> None:
         """Find which way round each sensor is; those that do not tell clearly take no part."""

@@ -44,11 +44,7 @@ FEWEST_SENSORS = UNKNOWNS + 1
 class SourceScan:
     """Holds places around a body where a source may be, with what turns fluxes into a moment.
 
-    Parameters
-    ----------
-    coils : BodyCoils
-    near, far : float
-        Least and largest distance of the source from the body's middle, m.
+    ``near``, ``far``: least and largest distance of the source from the body's middle, m.
     """
 
     def __init__(self, coils: BodyCoils, near: float, far: float) -> None:
@@ -57,7 +53,7 @@ class SourceScan:
         places = middle + (shells[:, None, None] * _directions()).reshape(-1, 3)
         gap = np.linalg.norm(places[:, None] - coils.offsets[None], axis=2).min(axis=1)
         self.places = places[gap > NEAREST * near]
-        basis = np.stack([_vector_basis(coils, self.places, axis) for axis in np.eye(3)], axis=2)
+        basis = _vector_basis(coils, self.places)
         self._span = np.linalg.qr(basis / np.linalg.norm(basis, axis=(1, 2))[:, None, None])[0]
         self._coils = coils
 
@@ -71,11 +67,8 @@ class SourceScan:
             if len(chosen) < STARTS and all(d > 0.3 * reach for d in apart):
                 chosen.append(index)
         out = []
-        for index in chosen:
-            place = self.places[index]
-            basis = np.stack(
-                [_vector_basis(self._coils, place[None], axis)[0] for axis in np.eye(3)], axis=1
-            )
+        for place in self.places[chosen]:
+            basis = _vector_basis(self._coils, place[None])[0]
             moment = np.linalg.lstsq(basis, flux, rcond=1e-12)[0]
             out.append((place, moment / max(float(np.linalg.norm(moment)), 1e-300)))
         return out
@@ -89,10 +82,12 @@ def _directions() -> Array:
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
 
 
-def _vector_basis(coils: BodyCoils, places: Array, axis: Array) -> Array:
-    """Flux in every coil of unit dipoles along an axis at places (G, 3): (G, S)."""
-    field = field_basis(coils.offsets, places, np.broadcast_to(axis, places.shape))
-    return np.asarray(np.einsum('sgi,si->gs', field, coils.axes))
+def _vector_basis(coils: BodyCoils, places: Array) -> Array:
+    """Flux in every coil of unit dipoles along x, y and z at places (G, 3): (G, S, 3)."""
+    fields = [
+        field_basis(coils.offsets, places, np.tile(axis, (len(places), 1))) for axis in np.eye(3)
+    ]
+    return np.stack([np.einsum('sgi,si->gs', field, coils.axes) for field in fields], axis=2)
 
 
 @dataclass
@@ -106,11 +101,8 @@ class SourceTrack(Track[BodySolution]):
 class Sources:
     """Follows the source that each body sees, as an observer of the tracker.
 
-    Attributes
-    ----------
-    found : dict of str to PoseEstimate
-        Of each body in the last frame, where the field is the same all around an axis: place (m)
-        and axis of the source in the body's frame.
+    ``found``: of each body in the last frame, where the field is the same all around an axis:
+    place (m) and axis of the source in the body's frame.
     """
 
     def __init__(self) -> None:
@@ -174,8 +166,7 @@ class _SourceFrame(SolveFrame):
         return out
 
     def rolled(self, position: Array, rotation: Array) -> Start:
-        """Return the pose turned about the axis to where its coils are nearest to the volume's
-        middle.
+        """Return the pose turned about the axis to where it is nearest to the volume's middle.
 
         This rule fixes the rotation that cannot be observed.
         """

@@ -17,28 +17,28 @@ from anser_ros.apps.lab.still_fit import STILL_STEPS, StillFit, StillFitter, fig
 from anser_ros.apps.lab.still_model import POSE
 from anser_ros.calibration.held_out import HeldOut, HeldOutTally, rms
 from anser_ros.calibration.layouts import Generator, Layout
-from anser_ros.calibration.least_squares import as_complex
-from anser_ros.calibration.moments import Progress
-from anser_ros.calibration.population import LEAST_EVIDENCE, OpticalNoise, Posterior
-from anser_ros.calibration.pose_correction import (
+from anser_ros.calibration.moments import (
     PoseTerms,
+    Progress,
     most_probable_step,
     moved,
     pose_precision,
     pose_terms,
 )
-from anser_ros.calibration.readings import basis_rows, usable_weights, with_pose
-from anser_ros.calibration.requirements import (
+from anser_ros.calibration.population import LEAST_EVIDENCE, OpticalNoise, Posterior
+from anser_ros.calibration.readings import (
     FEWEST_FRAMES_OF_MANY,
     FEWEST_SCAN_FRAMES,
     MANY_SENSORS,
+    basis_rows,
     check_measurements,
     usable_frames,
+    usable_weights,
+    with_pose,
 )
-from anser_ros.calibration.result import Calibration, Scan, residuals, with_provenance
+from anser_ros.calibration.result import Calibration, Scan, corrections, residuals, with_provenance
 from anser_ros.calibration.sensor_fit import SensorFit
 from anser_ros.calibration.sensor_parameters import SensorParameters
-from anser_ros.calibration.sensor_records import corrections
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import clusters_of
@@ -62,8 +62,8 @@ WORDS = (
 POPULATIONS = ('gains', 'axes')
 """Those of them that every sensor has a value of."""
 FEWEST_PLACED = 4
-"""Poses from which on their errors are reported. With three, each that is left out leaves two to
-fit to, and what was found on simulated plates was as often further from the truth as nearer."""
+"""Poses from which on their errors are reported: what was found with three on simulated plates was
+as often further from the truth as nearer."""
 POSE_STEPS = 4
 """Gauss-Newton steps of a held-out pose from where it is stated: errors are millimetres."""
 
@@ -91,20 +91,17 @@ def calibrate_still(
     looked_for = tuple(kind for kind in STILL_KINDS if kind in kinds)
     chosen = tuple(kind for kind in looked_for if kind != 'poses')  # those are in every fit
 
-    def fitter(part: Measurements, kinds: Sequence[str]) -> StillFitter:
-        return StillFitter(part, generator.centres, kinds, accuracy)
-
-    frames = np.arange(len(posed.time))
-    folds = []
+    frames, folds = np.arange(len(posed.time)), []
     for frame in frames:
         if progress is not None:
             progress('each pose from the others', frame / (len(frames) + 1.0))
-        folds.append(fitter(posed.frames(frames != frame), chosen).fit())
+        others = posed.frames(frames != frame)
+        folds.append(StillFitter(others, generator.centres, chosen, accuracy).fit())
     # What most folds do not find has no part in what is predicted, so nothing speaks for it.
     kept = [
         kind for kind in chosen if 2 * sum(kind in fold.evidence for fold in folds) > len(folds)
     ]
-    whole = fitter(posed, kept)
+    whole = StillFitter(posed, generator.centres, kept, accuracy)
     fit = whole.fit()
     held_out = _held_out(posed, folds, accuracy, _as_stated)
     misplaced = []
@@ -118,7 +115,7 @@ def calibrate_still(
     model = FieldModel(
         positions=fit.sites.positions,
         directions=fit.sites.directions,
-        moments=_moments(fit),
+        moments=fit.moments,
         emitters=generator.emitters,
         frequencies_hz=generator.frequencies_hz,
         flux_error_t=held_out.flux_error_t,
@@ -149,11 +146,6 @@ def _not_determined(kinds: Sequence[str], poses: int) -> tuple[str, ...]:
     if 'poses' in kinds and poses < FEWEST_PLACED:
         lines.append(f'poses: determined from {FEWEST_PLACED} poses on; there are {poses}')
     return tuple(lines)
-
-
-def _moments(fit: StillFit) -> NDArray[np.complex128]:
-    found = fit.unknowns.moments
-    return as_complex(found) if fit.model.is_complex else found.astype(complex)
 
 
 def _parameters(
@@ -189,7 +181,7 @@ def _held_out(
 
 def _as_stated(sound: Measurements, fit: StillFit, accuracy: Accuracy) -> PoseTerms:
     """A frame's readings less those at its stated pose; how good that is plays no part."""
-    return pose_terms(sound, fit.sites, _moments(fit))
+    return pose_terms(sound, fit.sites, fit.moments)
 
 
 def _where_the_other_half_finds_it(
@@ -203,7 +195,7 @@ def _where_the_other_half_finds_it(
     for sensor, channels in enumerate(clusters_of(sound.sensors)):
         halves[channels] = sensor % 2 == 1
     one, other = (
-        pose_terms(_at_best_pose(sound, fit, accuracy, half), fit.sites, _moments(fit))
+        pose_terms(_at_best_pose(sound, fit, accuracy, half), fit.sites, fit.moments)
         for half in (halves, ~halves)
     )
     residual = np.where(halves[:, None], other.residual, one.residual)
@@ -217,7 +209,7 @@ def _at_best_pose(
     weights, precision = usable_weights(sound) * seen, pose_precision(accuracy)
     offset = np.zeros((len(sound.time), POSE))
     for _ in range(POSE_STEPS):
-        terms = pose_terms(moved(sound, offset), fit.sites, _moments(fit))
+        terms = pose_terms(moved(sound, offset), fit.sites, fit.moments)
         offset += most_probable_step(terms, weights, fit.widths.noise_t, precision, offset)[0]
     return moved(sound, offset)
 

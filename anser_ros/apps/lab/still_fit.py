@@ -32,8 +32,8 @@ FREEDOM = 4.0
 """Degrees of freedom of Student's t, the distribution of a channel's readings in a frame: a few
 wild ones lose weight, and the others hardly any."""
 SHARED = 100.0
-"""How many times tighter the sum of an error over all frames is held than the error: what all
-frames share moves the field or turns the sensors, and is no frame's."""
+"""How many times tighter an error's sum over all frames is held than the error: what all frames
+share moves the field or turns the sensors."""
 AT_ONCE = 64
 """Places of a dipole that are judged at a time; each takes three columns for each part."""
 
@@ -69,21 +69,15 @@ class StillWidths:
 
 
 class StillSystem:
-    """One linear system about an estimate, with its solution.
+    """One linear system about an estimate ``now``, with its solution.
 
-    ``now``: about which it is linear. ``widths``: before any data. ``place_width`` (J,): how far
-    the last J dipoles of free direction may be from where they are, m. ``moving``: whether places
-    and the frames' errors are solved for; at first there is no field to tell them by.
+    ``place_width`` (J,): how far the last J dipoles of free direction may be from where they are,
+    m. ``moving``: whether places and the frames' errors are solved for; at first there is no field
+    to tell them by.
 
-    Attributes
-    ----------
-    solution : StillUnknowns
-    steps : ndarray, shape (J, 3)
-        Of the places of free dipoles, m.
-    sensor_variance : ndarray, shape (S, G + 2)
-    moment_variance, frame_variance : ndarray, shape (N, C), (F, 6 + B)
-    residual : ndarray, shape (F, S, C)
-        Of the linear model, T.
+    Found are the ``solution``, ``steps`` (J, 3), m, of the free dipoles, ``sensor_variance``
+    (S, G + 2), ``moment_variance`` (N, C), ``frame_variance`` (F, 6 + B), and the ``residual``
+    (F, S, C), T, of the linear model.
     """
 
     def __init__(
@@ -194,7 +188,6 @@ class StillSystem:
 
         ``basis`` (S, F, 3P): flux of its three components in each channel, T/(A m^2). ``widths``
         (W, P): expected sizes of its moment to try, A m^2.
-
         """
         parts, places = self.model.parts, basis.shape[2] // 3
         flat = np.empty((places, parts * 3, self.sensors * self.root.shape[1]))
@@ -256,6 +249,11 @@ class StillFit:
     freedom: float  # how many of the moments of each part the readings determine
     log_evidence: float
     evidence: dict[str, float]  # log evidence that each kind of error added to those before it
+
+    @property
+    def moments(self) -> NDArray[np.complex128]:
+        """Return the moments (N, K), A m^2."""
+        return self.model.phasors(self.unknowns.moments)
 
 
 class StillFitter:
@@ -412,24 +410,20 @@ class StillFitter:
                 break
         return fit
 
-    def _system(self, fit: StillFit) -> StillSystem:
-        fixed = np.zeros(0)
-        return StillSystem(self.model, fit.unknowns, fit.sites, fit.widths, fit.weights, fixed)
-
     def _place_beside(self, fit: StillFit) -> tuple[Array, float] | None:
-        """Where one more dipole makes the readings most probable, and its expected moment."""
+        """Where one more dipole makes the readings most probable, and its expected moment.
+
+        The best place of a grid is refined among ever nearer ones; None where none is clear.
+        """
         step, margin = GRID * self.extent, REACH * self.extent
         axes = [
             np.arange(low - margin, high + margin + step / 2.0, step)
             for low, high in zip(self.points.min(axis=0), self.points.max(axis=0), strict=True)
         ]
         places = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
-        return self._refined(self._system(fit), fit, places, step)
-
-    def _refined(
-        self, system: StillSystem, fit: StillFit, places: Array, step: float
-    ) -> tuple[Array, float] | None:
-        """The best of some places, then of ever nearer ones about it; None where none is clear."""
+        system = StillSystem(
+            self.model, fit.unknowns, fit.sites, fit.widths, fit.weights, np.zeros(0)
+        )
         best, found = -np.inf, None
         around = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing='ij'), -1).reshape(-1, 3)
         for _ in range(1 + HALVINGS):

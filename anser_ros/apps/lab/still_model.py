@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.least_squares import as_complex, as_real
-from anser_ros.calibration.pose_correction import pose_slopes
+from anser_ros.calibration.moments import pose_slopes
 from anser_ros.calibration.readings import DipoleSites
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis, flux_jacobian
@@ -126,6 +126,10 @@ class StillModel:
         """Return whether any usable reading has an imaginary part."""
         return bool((measurements.flux[measurements.usable].imag != 0.0).any())
 
+    def phasors(self, parts: Array) -> NDArray[np.complex128]:
+        """Return the phasors (..., K) of their parts (..., C)."""
+        return as_complex(parts) if self.is_complex else parts.astype(complex)
+
     def _parts(self, flux: NDArray[np.complex128]) -> Array:
         """Real parts (..., K) of phasors, or real and imaginary ones by turns (..., 2K)."""
         return as_real(flux) if self.is_complex else np.ascontiguousarray(flux.real)
@@ -190,7 +194,7 @@ class StillModel:
         dipoles' columns, so that these serve every part. The next step's residual has it whole.
         """
         points, axes, rotation, position = self.placed(now)
-        moments = as_complex(now.moments) if self.is_complex else now.moments.astype(complex)
+        moments = self.phasors(now.moments)
         flat = (*self._flat(points, axes), sites.positions, sites.directions)
         flux, by_place, by_axis = flux_jacobian(*flat, moments)
         frames, sensors = points.shape[:2]
@@ -250,5 +254,4 @@ class StillModel:
         flat = now.frames.copy()
         flat[:, POSE:] = 0.0
         bent = self.flux(now, sites) - self.flux(replace(now, frames=flat), sites)
-        taken = as_complex(bent) if self.is_complex else bent.astype(complex)
-        return replace(self.measured, flux=self.measured.flux - taken)
+        return replace(self.measured, flux=self.measured.flux - self.phasors(bent))

@@ -79,7 +79,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
 
 def verdict(error_map: ErrorMap) -> str:
     """State in a line what places that took no part say of the map."""
-    before, after = 1e3 * error_map.before_m, 1e3 * error_map.after_m
+    before, after = 1e3 * error_map.before.judged, 1e3 * error_map.after.judged
     along = 'in the plane of the places, ' if error_map.before.in_plane is not None else ''
     figures = f'held out, {along}{before:.3f} mm rms without a map, {after:.3f} mm with'
     if error_map.is_confirmed:
@@ -116,11 +116,11 @@ def to_document(error_map: ErrorMap) -> dict[str, Any]:
         'map': error_map.shape.describe(),
         'confirmed': error_map.is_confirmed,
         'clearness': error_map.clearness,
-        'heldout_rmse_before_m': error_map.before_m,
-        'heldout_rmse_after_m': error_map.after_m,
+        'heldout_rmse_before_m': error_map.before.judged,
+        'heldout_rmse_after_m': error_map.after.judged,
         'before': _plain(error_map.before),
         'after': _plain(error_map.after),
-        'n_points': error_map.n_points,
+        'n_points': len(error_map.places),
         'tried': [
             {'map': shape.describe(), 'noise_share': shape.noise, 'heldout_rmse_m': error}
             for shape, error in error_map.tried

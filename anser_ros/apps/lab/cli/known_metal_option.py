@@ -24,10 +24,7 @@ def models(
 ) -> Callable[[PreparedSession], FrameModels] | None:
     """Return what gives the model of each frame, None where the option is not given.
 
-    Raises
-    ------
-    ParameterError
-        When it is given beside other options that say where the model comes from.
+    Raises `ParameterError` when it is given beside other options that give a model.
     """
     if args.known_metal is None:
         return None

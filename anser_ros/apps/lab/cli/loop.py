@@ -1,35 +1,33 @@
-"""Runs the loop: an effect in simulated samples is found blind, corrected and measured again."""
+"""Runs the loop: an effect in simulated samples is found blind, corrected and measured again. A
+run (`record`) starts a simulated control unit, acquisition, trackers and a recorder.
+"""
 
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.apps.lab.cli.loop_run import (
-    AFTER,
-    BEFORE,
-    UNGATED,
-    LoopFiles,
-    Run,
-    make_world,
-    record,
-)
 from anser_ros.cli import missing
+from anser_ros.cli.demo import FROZEN_TRACKER, PATIENCE_S, in_namespace, simulated_unit
+from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.output import add_json, add_out, make_new_folder, say_written, write_files
-from anser_ros.cli.processes import LAST_DOMAIN, own_domain
+from anser_ros.cli.processes import LAST_DOMAIN, Supervisor, own_domain, tail
 from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.effects.correction import Correction
-from anser_ros.errors import DiagnosisError, ParameterError
+from anser_ros.errors import AnserError, DiagnosisError, ParameterError, SetupError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.prepared import prepare
@@ -42,11 +40,163 @@ from anser_ros.sessions.recorded_health import (
 )
 from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session, load_session
-from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.sessions.tracked_session import error_statistics
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.effects import CATALOGUE, NONE, RANDOM
 from anser_ros.stamps import NANO
+from anser_ros.wire.bag import read_bag
+from anser_ros.wire.setup import dump_setup, parse_setup
+from anser_ros.wire.text_files import config_path, read_config
+
+POLL_S = 0.2
+"""Time from one look at the processes to the next, s; a run takes tens of seconds."""
+RATE_HZ = 25.0
+"""Rate of the fluxes, Hz; low enough for all processes together on two cores."""
+AFTER, BEFORE, UNGATED = '/anser', '/anser/before', '/anser/ungated'
+"""Namespaces of the trackers: with the corrected model, with the model as it was, and with the
+latter without residual gate, whose error shows what the gate withholds."""
+
+TONES_HZ = tuple(5025.0 + 100.0 * mark for mark in (0, 1, 4, 9, 15, 22, 32, 34))
+"""Drive tones, Hz, at the marks of a Golomb ruler (no two pairs are equally far apart) in steps of
+100 Hz. Where a channel compresses, the third-order products of the tones, also those that the
+converter's rate of 20 kHz folds back, then fall between the tones, whole cycles of a 20 ms window
+away."""
+
+
+class LoopFiles(NamedTuple):
+    """The files of setup and uncorrected model, which all runs of a loop share."""
+
+    setup: Path
+    model: Path
+
+
+def make_world(folder: Path) -> LoopFiles:
+    """Write the demo's setup and model with the loop's tones.
+
+    The field without metal does not depend on the tones, so that the model stays right.
+
+    Raises `SetupError` when the demo's setup has another number of coils than there are tones.
+    """
+    setup = parse_setup(read_config('demo_setup.yaml'))
+    if len(setup.emitter.coils) != len(TONES_HZ):
+        raise SetupError(f'the loop has {len(TONES_HZ)} tones, the setup another number of coils')
+    coils = tuple(
+        replace(coil, frequency_hz=tone)
+        for coil, tone in zip(setup.emitter.coils, TONES_HZ, strict=True)
+    )
+    world = LoopFiles(folder / 'setup.yaml', folder / 'model.yaml')
+    changed = replace(setup, emitter=replace(setup.emitter, coils=coils))
+    world.setup.write_text(dump_setup(changed), encoding='utf-8')
+    model = load_model(config_path('demo_model.yaml'))
+    save_model(world.model, replace(model, frequencies_hz=TONES_HZ))
+    return world
+
+
+@dataclass(frozen=True)
+class Run:
+    """Holds the settings of one run: what is simulated, and which nodes track it."""
+
+    folder: Path  # for the bag and the logs
+    setup: Path  # of the unit and of all nodes
+    duration_s: float  # from the first flux on
+    unit: Mapping[str, object] = field(default_factory=dict)  # parameters of the simulated unit
+    served: Path | None = None  # model whose poses are judged; no tracker in its chain without it
+    baseline: Path | None = None  # clean recording; with it the model follows the references
+    known: Path | None = None  # uncorrected model of the trackers beside; none without it
+    watched: Mapping[str, object] | None = None  # parameters of a watcher; none without them
+
+
+def record(run: Run) -> Path:
+    """Record a run and return the folder of its bag.
+
+    The unit is started once all nodes are ready: drifts begin with its first start, which is then
+    the first frame of the recording and of every tracker.
+
+    Raises `DiagnosisError` when a process ends, or no flux arrives in time.
+    """
+    ports = Path(tempfile.mkdtemp(prefix='anser_loop_'))
+    bag = run.folder / 'bag'
+    try:
+        with Supervisor(run.folder / 'logs') as supervisor:
+            for name, command in _commands(run, ports / 'cu').items():
+                supervisor.start(name, command)
+            listeners = [f'{AFTER}/acquisition', f'{AFTER}/recorder']
+            listeners += [f'{AFTER}/tracker'] if run.served is not None else []
+            listeners += [f'{AFTER}/watcher'] if run.watched is not None else []
+            listeners += [f'{apart}/tracker' for apart in _beside(run)]
+            _wait(supervisor, run, lambda: _unready(bag, listeners))
+            unit = simulated_unit(ports / 'cu', setup_file=run.setup, metal=False, **run.unit)
+            supervisor.start('cu_simulator', unit)
+            _wait(supervisor, run, lambda: _without_flux(bag))
+            end = time.monotonic() + run.duration_s
+            while time.monotonic() < end:
+                _check(supervisor)
+                time.sleep(POLL_S)
+    finally:
+        shutil.rmtree(ports, ignore_errors=True)
+    return bag
+
+
+def _commands(run: Run, port: Path) -> dict[str, list[str]]:
+    commands = {
+        'acquisition': node('acquisition', device=port, setup_file=run.setup, rate_hz=RATE_HZ),
+        'recorder': node('recorder', directory=run.folder, name='bag'),
+    }
+    if run.served is not None:
+        follows: dict[str, object] = {'refit': False}
+        if run.baseline is not None:
+            follows = {'refit': True, 'baseline_file': run.baseline}
+        commands['field_model'] = node('field_model', model_file=run.served, **follows)
+        commands['tracker'] = node('tracker', model_file=run.served)
+    if run.watched is not None:
+        commands['watcher'] = node('watcher', **run.watched)
+    for namespace, settings in _beside(run).items():
+        name = f'tracker_{namespace.rsplit("/", 1)[-1]}'
+        beside = in_namespace(namespace)
+        commands[name] = node('tracker', *beside, model_file=run.known, **settings)
+    return commands
+
+
+def _beside(run: Run) -> dict[str, dict[str, object]]:
+    """Return the namespaces and settings of the trackers with the uncorrected model."""
+    return {} if run.known is None else {BEFORE: {}, UNGATED: dict(FROZEN_TRACKER)}
+
+
+def _wait(supervisor: Supervisor, run: Run, missing: Callable[[], str]) -> None:
+    """Wait until nothing is missing any more."""
+    end = time.monotonic() + PATIENCE_S
+    while what := missing():
+        _check(supervisor)
+        if time.monotonic() > end:
+            raise DiagnosisError(f'{what} after {PATIENCE_S:g} s; logs: {run.folder / "logs"}')
+        time.sleep(POLL_S)
+
+
+def _check(supervisor: Supervisor) -> None:
+    ended = supervisor.ended()
+    if ended is not None:
+        raise DiagnosisError(f'{ended.name} ended with {ended.process.returncode}: {tail(ended)}')
+
+
+def _unready(bag: Path, names: Sequence[str]) -> str:
+    """Return a message with the nodes that have not reported, or that lack a model."""
+    reported = last_words(bag)
+    missing = [
+        name.strip('/')
+        for name in names
+        if name.strip('/') not in reported
+        or ('tracker' in name and 'dipoles' not in reported[name.strip('/')])
+    ]
+    return f'{", ".join(missing)} not ready' if missing else ''
+
+
+def _without_flux(bag: Path) -> str:
+    try:
+        return '' if read_bag(bag).tool is not None else 'no tool flux was recorded'
+    except AnserError as error:
+        return f'nothing was recorded: {error}'
+
 
 NAMED, PARTLY, UNEXPLAINED = 'named', 'named in part', 'said unexplained'
 MISSED, WRONG = 'missed', 'wrong name'
@@ -154,10 +304,8 @@ def table(rounds: list[dict[str, Any]], console: Console) -> None:
     console.print(out)
     for number, one in enumerate(rounds, 1):
         for name, after_s in one['watcher_said_after_s'].items():
-            text = (
-                f'round {number}: the watcher reported {name} {after_s:.0f} s after the first flux'
-            )
-            console.print(text, highlight=False)
+            words = f'the watcher reported {name} {after_s:.0f} s after the first flux'
+            console.print(f'round {number}: {words}', highlight=False)
     for number, one in enumerate(rounds, 1):
         for name, signs in one['machine'].items():
             text = '; '.join(signs)
@@ -224,7 +372,7 @@ def run(args: argparse.Namespace) -> int:
     """
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
-    _check(args, seed)
+    _check_arguments(args, seed)
     missing.check('recorder')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     # A ROS system that runs already must neither receive nor be received by what is simulated
@@ -246,10 +394,10 @@ def _run(args: argparse.Namespace, effects: list[str], seed: int) -> int:
     rounds: list[dict[str, Any]] = []
     document = {'schema': SCHEMA, 'data': 'simulated', 'folder': str(folder), 'rounds': rounds}
     for count, effect in enumerate(effects):
-        say_of = partial(_say_of, say, f'round {count + 1} of {len(effects)}: ')
+        where = f'round {count + 1} of {len(effects)}:'
         found = _round(
-            folder / f'{count + 1:02d}', world, clean, effect, seed + count, args.duration,
-            args.watch, say_of,
+            folder / f'{count + 1:02d}', world, clean, effect, seed + count, args,
+            partial(say.print, where),
         )  # fmt: skip
         rounds.append(found)
         write_files(folder, {'loop.json': document})
@@ -261,11 +409,7 @@ def _run(args: argparse.Namespace, effects: list[str], seed: int) -> int:
     return 0
 
 
-def _say_of(console: Console, where: str, text: str) -> None:
-    console.print(where + text)
-
-
-def _check(args: argparse.Namespace, seed: int) -> None:
+def _check_arguments(args: argparse.Namespace, seed: int) -> None:
     if not 10.0 <= args.duration <= 600.0:
         raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
     if args.clean and not 2.0 <= args.clean <= 600.0:
@@ -280,22 +424,22 @@ def _round(
     clean: Path | None,
     effect: str,
     seed: int,
-    duration_s: float,
-    is_watched: bool,
+    args: argparse.Namespace,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Run the loop for one effect, from the raw samples to the error of the second run."""
-    model, truth_file = world.model, folder / 'truth.json'
+    model, truth_file, duration_s = world.model, folder / 'truth.json', args.duration
     folder.mkdir()
     unit = {'effect': effect, 'effect_seed': seed, 'effect_file': truth_file}
     say(f'{duration_s:g} s with an effect that only truth.json knows')
     noisy = {'optical_noise_m': Accuracy.optical_position_m, 'seed': 2}
-    watched = None
-    if is_watched:
-        watched = {'model_file': model} | ({'baseline_file': clean} if clean else {})
+    watched = {'model_file': model} | ({'baseline_file': clean} if clean else {})
     first = record(
-        Run(folder / 'first', world.setup, duration_s, {**unit, **noisy}, watched=watched)
-    )
+        Run(
+            folder / 'first', world.setup, duration_s, unit | noisy,
+            watched=watched if args.watch else None,
+        )
+    )  # fmt: skip
     say('diagnosis')
     began_s = time.monotonic()
     diagnosis = _diagnose(first, clean, model, folder / 'diagnosis')
@@ -304,9 +448,8 @@ def _round(
     second_s = SECOND_SHARE * duration_s
     follows = clean is not None and _drifts(corrected, first)
     say(f'the corrected model is served, {second_s:g} s on another path')
-    other = {'path_phase_rad': OTHER_PATH_RAD, 'seed': 3}
+    unit |= {'path_phase_rad': OTHER_PATH_RAD, 'seed': 3}
     baseline = clean if follows else None
-    unit |= other
     second = record(
         Run(folder / 'second', world.setup, second_s, unit, corrected, baseline, model)
     )

@@ -22,7 +22,8 @@ from anser_ros.apps.lab.measured import (
     navion,
     transformer,
 )
-from anser_ros.apps.lab.measured.recipe import Recipe, ReportRow
+from anser_ros.apps.lab.measured import recipe as shared_data
+from anser_ros.apps.lab.measured.recipe import SHARED, Recipe, ReportRow
 from anser_ros.cli import main
 from anser_ros.cli.output import Result, add_json, add_out, make_folder, say, write_files
 from anser_ros.errors import ParameterError
@@ -35,7 +36,6 @@ RECIPES: dict[str, Recipe] = {
     )
 }  # fmt: skip
 """Data sets that the shipped commands are run on."""
-SHARED = 'ANSER_SHARED'
 SCHEMA = 'anser_measured/1'
 
 
@@ -112,12 +112,8 @@ def _cook(
 
 
 def shared_folder(given: Path | None) -> Path:
-    """Return the folder that contains ``measured/``.
-
-    Raises `ParameterError` when there is no such folder.
-    """
-    source = main.PACKAGE_FOLDER.parents[1] / 'shared'
-    folder = given or Path(os.environ.get(SHARED, source))
+    """Return the folder that contains ``measured/``; raises `ParameterError` without one."""
+    folder = given or shared_data.shared_folder()
     if not (folder / 'measured').is_dir():
         raise ParameterError(f'no measured data: {folder} has no folder measured; use --shared')
     return folder
@@ -148,8 +144,7 @@ def table(rows: list[ReportRow]) -> Table:
     out = Table(title='Measured data: before and after, on held-out data')
     figures = ('before', 'after', 'special', 'target')
     for heading in ('data set', 'figure', *figures, 'met', 'chosen on'):
-        number = heading in figures
-        out.add_column(heading, justify='right' if number else 'left', overflow='fold')
+        out.add_column(heading, justify='right' if heading in figures else 'left', overflow='fold')
     for row in rows:
         met = {None: '', True: 'yes', False: 'no'}[row.met]
         values = [_number(value) for value in (row.before, row.after, row.special, row.target)]

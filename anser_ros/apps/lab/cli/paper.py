@@ -9,9 +9,9 @@ from anser_ros.apps.lab.experiments.recordings import (
     default_folder,
     given_recordings,
     missing,
+    simulate_recordings,
 )
 from anser_ros.apps.lab.experiments.report import draw_all, write_report
-from anser_ros.apps.lab.experiments.simulated import simulate_recordings
 from anser_ros.apps.lab.experiments.study import Study
 from anser_ros.cli.output import (
     Result,

@@ -1,16 +1,35 @@
-"""Finds the recordings of the article's experiments, and holds what the article reports of
-each.
+"""Finds or simulates the recordings of the article's experiments, and holds what it reports. In
+simulated ones the board differs slightly from its drawing. Plates and the X-ray head are
+lattices of metal balls that the board magnetises and that do not magnetise each other: rougher
+than real ones, which distort the field by about as much.
 """
 
-import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.lab.measured.recipe import shared_folder
 from anser_ros.errors import BagError
+from anser_ros.physics.dipole import field_basis
 from anser_ros.sessions.session import Session, load_session
+from anser_ros.settings import Accuracy
+from anser_ros.simulation.recording import STATIC_NOISE_T, record
+from anser_ros.simulation.world import (
+    FieldSource,
+    MetalBody,
+    Pose,
+    World,
+    at_rest,
+    board_source,
+    manufactured,
+    steel_disc,
+)
+from anser_ros.wire.setup import SensorSpec, Setup, parse_setup
+from anser_ros.wire.text_files import config_path
 
 STATISTICS = ('RMSE', 'ME', 'PRC50', 'PRC95')
 SENSORS = ('Y', 'Z')
@@ -20,10 +39,7 @@ Column = Mapping[str, Mapping[str, float]]
 
 
 def _column(y: tuple[float, ...], z: tuple[float, ...]) -> Column:
-    return {
-        'Y': dict(zip(STATISTICS, y, strict=True)),
-        'Z': dict(zip(STATISTICS, z, strict=True)),
-    }
+    return {s: dict(zip(STATISTICS, v, strict=True)) for s, v in zip(SENSORS, (y, z), strict=True)}
 
 
 # Position errors of the article's new model without metal, mm.
@@ -85,7 +101,7 @@ NAMES = (
 class Recordings:
     """Opens a folder with one bag for each of `NAMES`."""
 
-    folder: Path  # the folder
+    folder: Path
     origin: str  # who simulated the recordings, for the report
 
     def load(self, name: str) -> Session:
@@ -104,19 +120,12 @@ def missing(folder: Path) -> list[str]:
 
 
 def default_folder() -> Path:
-    """Return the shared recordings' folder, in ``$ANSER_SHARED`` or beside the repository."""
-    beside = Path(__file__).resolve().parents[2].parent / 'shared'
-    return Path(os.environ.get('ANSER_SHARED', beside)) / 'sessions' / 'paper'
+    """Return the shared recordings' folder."""
+    return shared_folder() / 'sessions' / 'paper'
 
 
 def given_recordings(folder: Path) -> Recordings:
-    """Return the recordings of a folder that the user has named.
-
-    Raises
-    ------
-    BagError
-        When a recording is missing.
-    """
+    """Return the recordings of a folder; raises `BagError` when one is missing."""
     lacking = missing(folder)
     if lacking:
         raise BagError(
@@ -124,11 +133,6 @@ def given_recordings(folder: Path) -> Recordings:
             f'the first is {lacking[0]}.mcap'
         )
     return Recordings(folder, 'simulated by an independent field world')
-
-
-def with_frames(session: Session, rows: np.ndarray) -> Session:
-    """Return the session with some frames of its only tool."""
-    return replace(session, tools=(session.tools[0].frames(rows),), reference=None)
 
 
 def with_sensors(session: Session, names: list[str]) -> Session:
@@ -146,4 +150,142 @@ def checkerboard(session: Session) -> tuple[Session, Session]:
     low, high = np.nanmin(where, axis=0), np.nanmax(where, axis=0)
     cell = np.rint((where - low) / np.maximum(high - low, 1e-9) * side)
     black = np.nansum(cell, axis=1).astype(np.int64) % 2 == 0
-    return with_frames(session, black), with_frames(session, ~black)
+    training, test = (
+        replace(session, tools=(tool.frames(rows),), reference=None) for rows in (black, ~black)
+    )
+    return training, test
+
+
+Array = NDArray[np.float64]
+
+STATIC = Accuracy(flux_noise_t=STATIC_NOISE_T)
+"""Errors of a tool at rest; the noise is half of a single window's."""
+PLATE_EDGE_M = 0.25
+"""Edge of the square plate, m, about as large as the board."""
+PLATE_BALLS = 12
+"""Balls along an edge of the plate; more make it smoother and the simulation slower."""
+PLATE_DEPTH_M = 0.02
+"""Depth of the balls' centres below the board, m."""
+COLLIMATOR_DEPTH_M = 0.03
+"""Depth of the X-ray head below the board in the last experiment, m."""
+METALS = {'aluminium': (35e6, 1.0), 'mu-metal': (1.8e6, 1e4)}
+"""Conductivity, S/m, and relative permeability (article, Table I)."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Moves a body so that it rests at the points of a lattice, one a second, held by hand."""
+
+    side: int  # points along x and along y
+    span_m: float  # edge of the square, m
+    # height of the lattice, m; each point is off by up to 4 mm and turned by up to 20 mrad
+    height_m: float
+
+    def __call__(self, time_s: float) -> Pose:
+        """Return the pose at a time, s."""
+        index = int(np.clip(round(time_s), 0, self.side**2 - 1))
+        row, column = divmod(index, self.side)
+        line = np.linspace(-self.span_m / 2, self.span_m / 2, self.side)
+        # Multiples of irrational numbers are evenly spread and the same in every run.
+        unsteady = np.mod(np.outer([0.6180340, 0.7548777, 0.5698403], [1, 2]) * (index + 1), 1.0)
+        offset = 0.004 * (2.0 * unsteady[:, 0] - 1.0)
+        turn = 0.02 * (2.0 * unsteady[:, 1] - 1.0)
+        place = np.array([line[column], line[row], self.height_m]) + offset
+        return place, np.asarray(Rotation.from_rotvec(turn).as_matrix())
+
+
+def _tool_a() -> tuple[SensorSpec, ...]:
+    axes = {'x': (1.0, 0.0, 0.0), 'y': (0.0, 1.0, 0.0), 'z': (0.0, 0.0, 1.0)}
+    places = [(0.0, 0.0, 0.03 * (cluster - 1)) for cluster in range(3)]
+    return tuple(
+        SensorSpec(3 * cluster + row, f'tool_a/{cluster}/{letter}', 'tool_a', place, axis, 0.0)
+        for cluster, place in enumerate(places)
+        for row, (letter, axis) in enumerate(axes.items())
+    )
+
+
+def _tool_b() -> tuple[SensorSpec, ...]:
+    return (
+        SensorSpec(0, 'tool_b/y', 'tool_b', (-0.006, 0.0, 0.0), (0.0, 1.0, 0.0), 0.0082),
+        SensorSpec(1, 'tool_b/z', 'tool_b', (0.006, 0.0, 0.0), (0.0, 0.0, 1.0), 0.0082),
+    )
+
+
+def plate(material: str) -> MetalBody:
+    """Return a square plate of a material below the board."""
+    ball = PLATE_EDGE_M / (2 * PLATE_BALLS)
+    line = np.linspace(-PLATE_EDGE_M / 2 + ball, PLATE_EDGE_M / 2 - ball, PLATE_BALLS)
+    x, y = np.meshgrid(line, line)
+    offsets = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    conductivity, permeability = METALS[material]
+    place = np.array([0.0, 0.0, -PLATE_DEPTH_M])
+    return MetalBody(offsets, ball, conductivity, permeability, at_rest(place))
+
+
+def head(depth_m: float) -> MetalBody:
+    """Return the X-ray head at a depth below the board, m."""
+    place = np.array([0.01, -0.01, -depth_m])
+    return steel_disc(at_rest(place), radius_m=0.1, rings=4)
+
+
+def with_metal(source: FieldSource, metal: Sequence[MetalBody], setup: Setup) -> FieldSource:
+    """Return the field of a board together with that of the metal at rest that it magnetises."""
+    tones = np.array(setup.frequencies_hz)
+    if not metal:
+        return source
+    where = np.concatenate([body.centres(0.0) for body in metal])
+    induced = np.concatenate(
+        [source(body.centres(0.0)) * body.polarisability(tones) for body in metal]
+    )
+
+    def field(points: Array) -> NDArray[np.complex128]:
+        out = np.array(source(points), dtype=complex)
+        for component, unit in enumerate(np.eye(3)):
+            basis = field_basis(points, where, np.broadcast_to(unit, where.shape))
+            out += np.einsum('pni,nk->pik', basis, induced[:, component])
+        return out
+
+    return field
+
+
+def simulate_recordings(folder: Path, seed: int, share: float = 1.0) -> Recordings:
+    """Write a bag for every experiment into a folder.
+
+    ``seed``: of the board's errors and of the noise. ``share``: points along a lattice's side as a
+    fraction of the article's; at least six are left.
+    """
+    rng = np.random.default_rng(seed)
+    text = config_path('demo_setup.yaml').read_text(encoding='utf-8')
+    drawn = replace(parse_setup(text), flux_rate_hz=1.0)
+    board = board_source(manufactured(drawn, rng))
+    setups = {
+        'tool_a': replace(drawn, sensors=_tool_a()),
+        'tool_b': replace(drawn, sensors=_tool_b()),
+    }
+    small = Raster(8, 0.2, 0.15)
+    jobs: list[tuple[str, Raster, list[MetalBody]]] = [
+        ('factory_tool_a', Raster(31, 0.30, 0.15), []),
+        ('midplane_tool_b', Raster(26, 0.25, 0.15), []),
+    ]
+    for material in MATERIALS:
+        stem = f'shield_{material.replace("-", "_")}'
+        jobs.append((f'{stem}_tool_b', Raster(25, 0.25, 0.15), [plate(material)]))
+        jobs.append((f'{stem}_c_arm_tool_b', small, [plate(material), head(0.05)]))
+    for distance in HEAD_DISTANCES_CM:
+        jobs.append((f'c_arm_{distance:02d}cm_tool_b', small, [head(0.03 + distance / 100)]))
+    collimator = [head(COLLIMATOR_DEPTH_M)]
+    jobs += [
+        ('collimator_tool_a', Raster(13, 0.24, 0.15), collimator),
+        ('collimator_bottom_tool_b', Raster(8, 0.2, 0.12), collimator),
+        ('collimator_midplane_tool_b', small, collimator),
+    ]
+    for name, full, metal in jobs:
+        raster = replace(full, side=max(round(full.side * share), 6))
+        body = 'tool_a' if name.endswith('tool_a') else 'tool_b'
+        setup = setups[body]
+        world = World(setup, with_metal(board, metal, setup), paths={body: raster})
+        record(
+            str(folder / f'{name}.mcap'), world, frames=raster.side**2, rate_hz=1.0,
+            optical_rate_hz=None, errors=STATIC, rng=rng,
+        )  # fmt: skip
+    return Recordings(folder, "simulated by this package's own world")

@@ -69,17 +69,8 @@ def ablate(
 ) -> list[AblationRow]:
     """Track a session by every method with every number of references.
 
-    Parameters
-    ----------
-    session : Session
-        With references, and one tool with an optical pose.
-    name : str
-    model : FieldModel
-    baseline : Session
-    counts : sequence of int
-    every : int
-        Only every so many frames are tracked; best no common divisor of the rates, or all of them
-        meet an optical pose whose jitter no interpolation has smoothed.
+    ``every``: only so many frames are tracked; best no common divisor of the rates, or all of them
+    meet an optical pose whose jitter no interpolation has smoothed.
     """
     if session.reference is None or not session.tools:
         return []

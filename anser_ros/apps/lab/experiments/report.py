@@ -1,6 +1,6 @@
 """Writes the study of the article's experiments as tables and figures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -190,6 +190,8 @@ WORDS = {
     'article, layer over the centres': "article's method, layer no larger than the coils' centres",
     'ours': 'ours',
 }
+CLEAN, CLEAN_WORDS = ('unshielded', 'uncompensated'), 'our model of the clean board'
+"""Cases in which our model is that of the board without metal, and its words there."""
 CAPTIONS = {
     'Fig. 2': 'Training and test points of Table III.',
     'Fig. 5': 'Empirical distribution of the position error of Table II.',
@@ -234,24 +236,29 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return '\n'.join(lines)
 
 
-def _statistics_rows(
-    name: str, millimetres: Mapping[str, Mapping[str, float]], digits: int
-) -> list[list[str]]:
-    rows = []
-    for sensor in recordings.SENSORS:
-        values = [f'{millimetres[sensor][s]:.{digits}f}' for s in recordings.STATISTICS]
-        rows.append([name, sensor, *values])
-    return rows
+def _sensor_rows(name: str, cell: Callable[[str, str], str]) -> list[list[str]]:
+    """Return a row for each sensor, with a cell for each of its statistics."""
+    return [
+        [name, sensor, *(cell(sensor, statistic) for statistic in recordings.STATISTICS)]
+        for sensor in recordings.SENSORS
+    ]
 
 
-def _both(name: str, errors: Document) -> list[list[str]]:
-    rows = []
-    for sensor in recordings.SENSORS:
-        mm, deg = errors[sensor]['position_mm'], errors[sensor]['orientation_deg']
-        rows.append(
-            [name, sensor, *(f'{mm[s]:.3f} / {deg[s]:.3f}' for s in recordings.STATISTICS)]
-        )
-    return rows
+def _printed_rows(millimetres: recordings.Column) -> list[list[str]]:
+    return _sensor_rows(PRINTED, lambda sensor, s: f'{millimetres[sensor][s]:.2f}')
+
+
+def _position_rows(name: str, errors: Document) -> list[list[str]]:
+    return _sensor_rows(name, lambda sensor, s: f'{errors[sensor]["position_mm"][s]:.3f}')
+
+
+def _tracked(results: Document, experiment: str, printed: recordings.Column) -> str:
+    """Return the table of an experiment's position errors below what the article printed."""
+    rows = _printed_rows(printed)
+    for method, errors in results['tracking'][experiment].items():
+        is_clean = method == 'ours' and experiment.split()[1] in CLEAN
+        rows += _position_rows(CLEAN_WORDS if is_clean else WORDS[method], errors)
+    return _table(['model', 'sensor', *recordings.STATISTICS], rows)
 
 
 def _bound_line(results: Document, experiment: str) -> str:
@@ -261,14 +268,19 @@ def _bound_line(results: Document, experiment: str) -> str:
 
 
 def _table_2(results: Document) -> str:
-    rows = []
-    for model in ('Biot-Savart', 'data-driven'):
+    def printed(model: str) -> Callable[[str, str], str]:
         mm, deg = recordings.TABLE_2_MM[model], recordings.TABLE_2_DEG[model]
-        for sensor in recordings.SENSORS:
-            values = [f'{mm[sensor][s]:.2f} / {deg[sensor][s]:.2f}' for s in recordings.STATISTICS]
-            rows.append([f'{PRINTED}: {model}', sensor, *values])
+        return lambda sensor, s: f'{mm[sensor][s]:.2f} / {deg[sensor][s]:.2f}'
+
+    def measured(of: Document) -> Callable[[str, str], str]:
+        mm, deg = 'position_mm', 'orientation_deg'
+        return lambda sensor, s: f'{of[sensor][mm][s]:.3f} / {of[sensor][deg][s]:.3f}'
+
+    rows = []
+    for model in recordings.TABLE_2_MM:
+        rows += _sensor_rows(f'{PRINTED}: {model}', printed(model))
     for method, errors in results['tracking']['table_2'].items():
-        rows += _both(f'{WORDS[method]}', errors)
+        rows += _sensor_rows(WORDS[method], measured(errors))
     head = ['model', 'sensor', *(f'{s}, mm / deg' for s in recordings.STATISTICS)]
     return (
         '## Table II: a new model of the board (simulated)\n\nTrained with tool A, tested with '
@@ -286,25 +298,15 @@ def _table_3(results: Document) -> str:
     for material in MATERIALS:
         rows = []
         printed = recordings.TABLE_3_FIELD[material]
-        for which in ('training', 'test'):
-            rows.append([PRINTED, which, *(f'{printed[which][n]:.4f}' for n in names)])
-        for method, sets in results['fields'][material].items():
-            for which, found in sets.items():
-                rows.append([WORDS[method], which, *(f'{found[n]:.4f}' for n in names)])
+        found = results['fields'][material].items()
+        for words, sets in ((PRINTED, printed), *((WORDS[m], s) for m, s in found)):
+            for which, figures in sets.items():
+                rows.append([words, which, *(f'{figures[n]:.4f}' for n in names)])
         parts.append(f'### {material}\n\n' + _table(['model', 'set', *names], rows))
-        rows = _statistics_rows(PRINTED, recordings.TABLE_3_MM[material], 2)
-        for method, errors in results['tracking'][f'table_3 {material}'].items():
-            rows += _position_rows(WORDS[method], errors)
-        parts.append(
-            'Tracking on the test points, mm:\n\n'
-            + _table(['model', 'sensor', *recordings.STATISTICS], rows)
-        )
+        tracked = _tracked(results, f'table_3 {material}', recordings.TABLE_3_MM[material])
+        parts.append(f'Tracking on the test points, mm:\n\n{tracked}')
         parts.append(_bound_line(results, f'table_3 {material}'))
     return '\n\n'.join(parts)
-
-
-def _position_rows(name: str, errors: Document) -> list[list[str]]:
-    return _statistics_rows(name, {s: e['position_mm'] for s, e in errors.items()}, 3)
 
 
 def _table_4(results: Document) -> str:
@@ -313,25 +315,13 @@ def _table_4(results: Document) -> str:
         'Models trained with the plate and without the head, tested with both; the head is 2 cm '
         'below. Position errors in mm.',
     ]
-    for case in ('unshielded', *MATERIALS):
-        rows = _statistics_rows(PRINTED, recordings.TABLE_4_MM[case], 2)
-        for method, errors in results['tracking'][f'table_4 {case}'].items():
-            name = 'our model of the clean board' if case == 'unshielded' else WORDS['ours']
-            rows += _position_rows(name if method == 'ours' else WORDS[method], errors)
-        parts.append(f'### {case}\n\n' + _table(['model', 'sensor', *recordings.STATISTICS], rows))
+    for case, printed in recordings.TABLE_4_MM.items():
+        parts.append(f'### {case}\n\n{_tracked(results, f"table_4 {case}", printed)}')
     rows = []
     for distance in HEAD_DISTANCES_CM:
         methods = results['tracking'][f'fig_7 {distance} cm']
-        rows.append(
-            [
-                f'{distance} cm',
-                *(
-                    f'{methods[method][sensor]["position_mm"]["RMSE"]:.3f}'
-                    for method in ('drawing', 'ours')
-                    for sensor in recordings.SENSORS
-                ),
-            ]
-        )
+        errors = [methods[m][s] for m in ('drawing', 'ours') for s in recordings.SENSORS]
+        rows.append([f'{distance} cm', *(f'{e["position_mm"]["RMSE"]:.3f}' for e in errors)])
     head = ['head below', 'drawing, Y', 'drawing, Z', 'our clean model, Y', 'our clean model, Z']
     parts.append('### Unshielded and uncompensated (Fig. 7), RMSE in mm\n\n' + _table(head, rows))
     return '\n\n'.join(parts)
@@ -346,13 +336,7 @@ def _table_5(results: Document) -> str:
         'in mm.',
     ]
     for case, printed in recordings.TABLE_5_MM.items():
-        rows = _statistics_rows(PRINTED, printed, 2)
-        for method, errors in results['tracking'][f'table_5 {case}'].items():
-            name = WORDS[method]
-            if case == 'uncompensated' and method == 'ours':
-                name = 'our model of the clean board'
-            rows += _position_rows(name, errors)
-        parts.append(f'### {case}\n\n' + _table(['model', 'sensor', *recordings.STATISTICS], rows))
+        parts.append(f'### {case}\n\n{_tracked(results, f"table_5 {case}", printed)}')
     for method, words in results['corrections'].items():
         lines = '; '.join(f'{sensor}: {text}' for sensor, text in words.items())
         parts.append(f'Correction, {WORDS[method]}: {lines}.')
@@ -361,27 +345,18 @@ def _table_5(results: Document) -> str:
 
 
 def _models(results: Document) -> str:
-    rows = [[name, text] for name, text in results['models'].items()]
-    return '## Our models, as held-out error chose them\n\n' + _table(
-        ['trained on', 'model'], rows
-    )
+    table = _table(['trained on', 'model'], list(results['models'].items()))
+    return f'## Our models, as held-out error chose them\n\n{table}'
 
 
 def _board(results: Document) -> str:
     if not results['measured_board']:
         return ''
-    rows = [
-        [
-            run['name'],
-            f'{run["points"]}',
-            f'{1e3 * run["before_m"]:.2f}',
-            f'{1e3 * run["after_m"]:.2f}',
-            f'{1e3 * run["across_m"]:.2f}',
-            'yes' if run['confirmed'] else 'no',
-            run['shape'],
-        ]
-        for run in results['measured_board']
-    ]
+    rows = []
+    for run in results['measured_board']:
+        errors = [f'{1e3 * run[key]:.2f}' for key in ('before_m', 'after_m', 'across_m')]
+        gain = 'yes' if run['confirmed'] else 'no'
+        rows.append([run['name'], f'{run["points"]}', *errors, gain, run['shape']])
     head = ['run', 'points', 'before, mm rms', 'after, mm rms', 'across, mm rms', 'gain', 'map']
     return (
         '## Error maps on measured positions\n\n'

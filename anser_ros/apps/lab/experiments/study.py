@@ -1,16 +1,14 @@
-"""Redoes the article's experiments: the methods that are compared, the errors of each, their
-bound, and the study of all.
-"""
+"""Redoes the article's experiments: the compared methods, the errors of each, and their bound."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.apps.lab.experiments.error_maps import BoardRun, board_folder, board_runs
 from anser_ros.apps.lab.experiments.recordings import (
     HEAD_DISTANCES_CM,
     MATERIALS,
@@ -19,18 +17,26 @@ from anser_ros.apps.lab.experiments.recordings import (
     checkerboard,
     with_sensors,
 )
+from anser_ros.apps.lab.measured import anser_board
+from anser_ros.apps.lab.measured.recipe import shared_folder
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.error_map import learn_error_map
 from anser_ros.calibration.layout_fit import emitter_gains
 from anser_ros.calibration.layouts import Layout, place
 from anser_ros.calibration.least_squares import TriangularFactor, as_complex, as_real
-from anser_ros.calibration.readings import basis_rows, with_pose
+from anser_ros.calibration.moments import Progress
+from anser_ros.calibration.readings import (
+    DipoleSites,
+    basis_rows,
+    flux_slopes,
+    usable_readings,
+    with_pose,
+)
 from anser_ros.calibration.result import Calibration
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import MU_0
-from anser_ros.physics.dipole import flux_jacobian
-from anser_ros.physics.rotations import axis_angles
+from anser_ros.physics.rotations import axis_angles, tangents
 from anser_ros.sessions.calibration import calibrate_sessions, generator_of
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import NOMINAL, model_for
@@ -41,38 +47,19 @@ Array = NDArray[np.float64]
 
 
 def position_bound(measurements: Measurements, model: FieldModel, noise_t: float) -> Array:
-    """Return the least root mean square position error of unbiased estimates.
+    """Return the least position error of unbiased estimates of each sensor, rms, (S,), m.
 
     The Fisher information of position and axis is ``J^T J / sigma^2`` (Kay, Estimation Theory,
     1993, section 3.7); the axis, a unit vector, counts in its tangent plane.
 
-    Parameters
-    ----------
-    measurements : Measurements
-        The poses at which the bound is wanted.
-    model : FieldModel
-        The field.
-    noise_t : float
-        Flux noise of a phasor component, T.
-
-    Returns
-    -------
-    ndarray, shape (S,)
-        Error of each sensor over the frames, m.
+    ``measurements``: the poses at which it is wanted. ``noise_t``: of a phasor component, T.
     """
-    posed = with_pose(measurements)
-    points, axes = posed.placed()
-    frames, sensors = points.shape[:2]
-    lengths = np.tile(posed.sensors.length, frames)
-    _, by_place, by_axis = flux_jacobian(
-        points.reshape(-1, 3), axes.reshape(-1, 3), lengths,
-        model.positions, model.directions, model.moments,
-    )  # fmt: skip
-    across = np.linalg.svd(axes.reshape(-1, 1, 3))[2][:, 1:]
-    tilt = np.einsum('pti,pik->ptk', across, by_axis)
-    slope = as_real(np.concatenate([by_place, tilt], axis=1)) / noise_t
-    covariance = np.linalg.inv(slope @ slope.transpose(0, 2, 1))
-    variance = np.trace(covariance[:, :3, :3], axis1=1, axis2=2).reshape(frames, sensors)
+    posed, sites = with_pose(measurements), DipoleSites(model.positions, model.directions)
+    _, by_place, by_axis = flux_slopes(posed, sites, model.moments)
+    across = tangents(posed.placed()[1].reshape(-1, 3)).reshape(*by_axis.shape[:2], 2, 3)
+    slope = as_real(np.concatenate([by_place, across @ by_axis], axis=2)) / noise_t
+    covariance = np.linalg.inv(slope @ slope.transpose(0, 1, 3, 2))
+    variance = np.trace(covariance[:, :, :3, :3], axis1=2, axis2=3)
     return np.asarray(np.sqrt(variance.mean(axis=0)))
 
 
@@ -100,7 +87,8 @@ def drawn_model(session: Session, training: Sequence[Session]) -> FieldModel:
     gains = emitter_gains(nominal, tools).real
     # The drawing's own tolerances are what the gains and the data now replace.
     model = replace(nominal, moments=nominal.moments * gains, modes=None)
-    return expecting(model, _residual_rms(model, tools))
+    errors, _ = in_phase_errors(model, tools)
+    return expecting(model, float(np.sqrt(np.mean(errors**2))))
 
 
 def expecting(model: FieldModel, flux_error_t: float) -> FieldModel:
@@ -108,15 +96,14 @@ def expecting(model: FieldModel, flux_error_t: float) -> FieldModel:
     return replace(model, flux_error_t=max(flux_error_t, model.flux_error_t))
 
 
-def _residual_rms(model: FieldModel, tools: Sequence[Measurements]) -> float:
-    """Return the root mean square of the in-phase residuals at the measured poses, T."""
-    errors = []
-    for tool in tools:
-        points, axes = tool.placed()
-        lengths = np.broadcast_to(tool.sensors.length, tool.usable.shape)
-        flux = model.flux(points[tool.usable], axes[tool.usable], lengths[tool.usable])
-        errors.append((tool.flux[tool.usable] - flux).real.ravel())
-    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+def in_phase_errors(model: FieldModel, tools: Sequence[Measurements]) -> tuple[Array, Array]:
+    """Return in-phase residuals at the measured poses, and what was measured there, (P, K), T."""
+    pairs = [
+        ((flux - model.flux(points, axes, lengths)).real, flux.real)
+        for points, axes, lengths, flux in usable_readings(tools)
+    ]
+    errors, measured = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    return errors, measured
 
 
 def article_model(session: Session, extension: float = OUTLINE) -> FieldModel:
@@ -133,11 +120,6 @@ def article_model(session: Session, extension: float = OUTLINE) -> FieldModel:
         dipoles.positions, dipoles.directions, moments,
         session.setup.emitter_names, session.setup.frequencies_hz,
     )  # fmt: skip
-
-
-def our_model(sessions: Sequence[Session]) -> Calibration:
-    """Return this package's calibration, with everything chosen by held-out error."""
-    return calibrate_sessions(list(sessions), Options())
 
 
 @dataclass(frozen=True)
@@ -223,8 +205,8 @@ class Results:
     models: dict[str, str] = field(default_factory=dict)
     # the error map of Table V in words, by method and sensor
     corrections: dict[str, dict[str, str]] = field(default_factory=dict)
-    # error maps of a real tracker's positions; the only measured data here
-    board_runs: list[BoardRun] = field(default_factory=list)
+    # `board_runs` of a real tracker's positions; the only measured data here
+    board_runs: list[dict[str, Any]] = field(default_factory=list)
 
     def document(self) -> dict[str, Any]:
         """Return the figures as plain data."""
@@ -249,22 +231,12 @@ class Results:
             'bounds_m': self.bounds,
             'models': self.models,
             'corrections': self.corrections,
-            'measured_board': [asdict(run) for run in self.board_runs],
+            'measured_board': self.board_runs,
         }
 
 
-Progress = Callable[[str, float], None]
-
-
 class Study:
-    """Runs the experiments one by one, and keeps what several of them need.
-
-    Parameters
-    ----------
-    recordings : Recordings
-    progress : callable, optional
-        Called with the experiment's name and the finished share.
-    """
+    """Runs the experiments one by one, and keeps what several of them need."""
 
     def __init__(self, recordings: Recordings, progress: Progress | None = None) -> None:
         self.recordings, self.progress = recordings, progress
@@ -301,8 +273,8 @@ class Study:
             step()
         return self.results
 
-    def _ours(self, name: str, *sessions: Session) -> Calibration:
-        calibration = our_model(sessions)
+    def _ours(self, name: str, session: Session) -> Calibration:
+        calibration = calibrate_sessions([session], Options())
         self.results.models[name] = (
             f'{calibration.layout.describe()}, damping {calibration.damping:g}, '
             f'{calibration.n_measurements} readings per emitter, held out '
@@ -322,17 +294,27 @@ class Study:
             for name, limit in zip(tool.sensors.name, limits, strict=True)
         }
 
+    def _compare(
+        self, experiment: str, test: Session, ours: FieldModel, **others: FieldModel
+    ) -> dict[str, Errors]:
+        """Track a recording by models of other methods, in phase as theirs are, and by ours."""
+        errors = {name: track(test, model, in_phase=True) for name, model in others.items()}
+        errors['ours'] = track(test, ours)
+        self.results.tracking[experiment] = errors
+        return errors
+
     def new_model(self) -> None:
         """Run Table II and Fig. 5: the model without metal, tested with tool B."""
         test = self.recordings.load('midplane_tool_b')
         ours = self.factory_calibration.model
-        small = article_model(self.factory, centres_extension(self.factory))
-        self.results.tracking['table_2'] = {
-            'drawing': track(test, self.drawing, in_phase=True),
-            'article': track(test, article_model(self.factory), in_phase=True),
-            'article, layer over the centres': track(test, small, in_phase=True),
-            'ours': track(test, ours),
+        others = {
+            'drawing': self.drawing,
+            'article': article_model(self.factory),
+            'article, layer over the centres': article_model(
+                self.factory, centres_extension(self.factory)
+            ),
         }
+        self._compare('table_2', test, ours, **others)
         self._bound('table_2', test, ours)
 
     def shields(self) -> None:
@@ -350,10 +332,7 @@ class Study:
                 }
                 for method, model in (('article', article), ('ours', ours))
             }
-            self.results.tracking[f'table_3 {material}'] = {
-                'article': track(test, article, in_phase=True),
-                'ours': track(test, ours),
-            }
+            self._compare(f'table_3 {material}', test, ours, article=article)
             self._bound(f'table_3 {material}', test, ours)
 
     def head(self) -> None:
@@ -362,10 +341,7 @@ class Study:
         ours = self._bent(self.factory_calibration.model)
         for distance in HEAD_DISTANCES_CM:
             test = self.recordings.load(f'c_arm_{distance:02d}cm_tool_b')
-            self.results.tracking[f'fig_7 {distance} cm'] = {
-                'drawing': track(test, self.drawing, in_phase=True),
-                'ours': track(test, ours),
-            }
+            self._compare(f'fig_7 {distance} cm', test, ours, drawing=self.drawing)
 
     @cached_property
     def shield_models(self) -> dict[str, tuple[FieldModel, FieldModel]]:
@@ -381,10 +357,7 @@ class Study:
         for material in MATERIALS:
             test = self.recordings.shield(material, head=True)
             article, ours = (self._bent(model) for model in self.shield_models[material])
-            self.results.tracking[f'table_4 {material}'] = {
-                'article': track(test, article, in_phase=True),
-                'ours': track(test, ours),
-            }
+            self._compare(f'table_4 {material}', test, ours, article=article)
         nearest = f'fig_7 {HEAD_DISTANCES_CM[-1]} cm'
         self.results.tracking['table_4 unshielded'] = self.results.tracking[nearest]
 
@@ -395,15 +368,9 @@ class Study:
         article, ours = article_model(training), self._ours('collimator', training).model
         bottom = self.recordings.load('collimator_bottom_tool_b')
         test = self.recordings.load('collimator_midplane_tool_b')
-        compensated = {
-            'article': track(test, article, in_phase=True),
-            'ours': track(test, ours),
-        }
-        self.results.tracking['table_5 uncompensated'] = {
-            'drawing': track(test, self.drawing, in_phase=True),
-            'ours': track(test, self._bent(self.factory_calibration.model)),
-        }
-        self.results.tracking['table_5 compensated'] = compensated
+        clean = self._bent(self.factory_calibration.model)
+        self._compare('table_5 uncompensated', test, clean, drawing=self.drawing)
+        compensated = self._compare('table_5 compensated', test, ours, article=article)
         known = {
             'article': track(bottom, article, in_phase=True),
             'ours': track(bottom, ours),
@@ -416,7 +383,7 @@ class Study:
 
     def error_maps(self) -> None:
         """Run the error map of a tracker that gives positions only."""
-        self.results.board_runs = board_runs(board_folder())
+        self.results.board_runs = board_runs(anser_board.RECIPE.data(shared_folder()))
 
     def _corrected(self, method: str, known: Errors, errors: Errors) -> Errors:
         """Return errors after an error map learnt in the bottom plane, if it helps there."""
@@ -425,8 +392,8 @@ class Study:
             error_map = learn_error_map(known[sensor].tracked, known[sensor].true)
             words[sensor] = (
                 f'{error_map.shape.describe()} (bottom plane, held out: '
-                f'{1e3 * error_map.before_m:.3f} mm without a map, '
-                f'{1e3 * error_map.after_m:.3f} mm with)'
+                f'{1e3 * error_map.before.judged:.3f} mm without a map, '
+                f'{1e3 * error_map.after.judged:.3f} mm with)'
             )
             out[sensor] = found.corrected(error_map.apply(found.tracked))
         self.results.corrections[method] = words
@@ -449,12 +416,7 @@ def field_errors(session: Session, model: FieldModel) -> dict[str, float]:
     They are those of the article's equation (8): MAE and RMSE in mA/m, N-MAE and N-RMSE in percent
     of the range of the measured values.
     """
-    tool = session.tools[0]
-    points, axes = tool.placed()
-    used = tool.usable
-    lengths = np.broadcast_to(tool.sensors.length, used.shape)[used]
-    measured = tool.flux[used].real
-    error = measured - model.flux(points[used], axes[used], lengths).real
+    error, measured = in_phase_errors(model, session.tools[:1])
     span = float(np.ptp(measured))
     mean, square = float(np.abs(error).mean()), float(np.sqrt((error**2).mean()))
     return {
@@ -463,3 +425,28 @@ def field_errors(session: Session, model: FieldModel) -> dict[str, float]:
         'RMSE': 1e3 * square / MU_0,
         'N-RMSE': 100.0 * square / span,
     }
+
+
+def board_runs(folder: Path) -> list[dict[str, Any]]:
+    """Return errors of a tracker over a board in held-out blocks, run by run; none without data.
+
+    ``before_m`` and ``after_m`` are rms along the board, of blocks predicted from the others; the
+    latter may be the larger, where a map that helped among the others does not in the block.
+    Raises `BagError` or `FitError` as `anser_board.load` does.
+    """
+    runs = anser_board.load(folder) if folder.is_dir() else {}
+    found = []
+    for name, points in runs.items():
+        error_map = learn_error_map(points, anser_board.places(), registers=True)
+        found.append(
+            {
+                'name': name,
+                'points': len(error_map.places),
+                'before_m': error_map.before.judged,
+                'after_m': error_map.after.judged,
+                'across_m': error_map.before.out_of_plane or 0.0,
+                'confirmed': error_map.is_confirmed,
+                'shape': error_map.shape.describe(),
+            }
+        )
+    return found

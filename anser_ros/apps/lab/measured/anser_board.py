@@ -22,9 +22,7 @@ PITCH_M = 31.75e-3
 
 
 def places() -> Array:
-    """Return the places of the board, shape (41, 3), m: 5 x 5 row by row, then 4 x 4
-    between them.
-    """
+    """Return the places of the board, (41, 3), m: 5 x 5 row by row, then 4 x 4 between them."""
     outer, inner = np.arange(-2.0, 3.0), np.arange(4) - 1.5
     grid = [(x, y, 0.0) for line in (outer, inner) for y in line for x in line]
     return np.asarray(PITCH_M * np.array(grid))
@@ -33,12 +31,8 @@ def places() -> Array:
 def load(folder: Path) -> dict[str, Array]:
     """Return the reported points (m) of every run, by the names of the files.
 
-    Raises
-    ------
-    FitError
-        When no run is there, or one has another number of points than the board has places.
-    BagError
-        When a file is no list of fiducials.
+    Raises `FitError` when no run is there, or one has another number of points than the board has
+    places, and `BagError` when a file is no list of fiducials.
     """
     runs = {path.stem: read_fiducials(path) for path in sorted(folder.glob('*.fcsv'))}
     if not runs:
@@ -89,8 +83,8 @@ def rows(folder: Path, files: list[Path], out: Path) -> list[ReportRow]:
         clear = figure(document, 'clearness')
         what_clear = f'{run.stem}: gain in standard errors'
         found += [
-            ReportRow(NAME, what, before, after, 'mm', None, None, seen),
-            ReportRow(NAME, what_clear, float('nan'), clear, '', None, None, 'of the blocks'),
+            ReportRow(NAME, what, before, after, 'mm', seen),
+            ReportRow(NAME, what_clear, float('nan'), clear, '', 'of the blocks'),
         ]
     return found
 

@@ -20,13 +20,13 @@ from anser_ros.apps.lab.measured.recipe import (
     Recipe,
     ReportRow,
     calibrations,
+    existing,
     figure,
     ran,
     vector,
     write_frames,
 )
 from anser_ros.errors import FitError
-from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 Array = NDArray[np.float64]
@@ -76,9 +76,7 @@ class Epoch:
 
 def load(folder: Path) -> Epoch:
     """Read the file ``hpi_coils.npz``; raises `FitError` when it, or an array, is missing."""
-    path = folder / 'hpi_coils.npz'
-    if not path.is_file():
-        raise FitError(f'no such file: {path}')
+    path = existing(folder / 'hpi_coils.npz')
     with np.load(path) as part:
         try:
             return Epoch(
@@ -147,11 +145,9 @@ def setup_of(epoch: Epoch) -> Setup:
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write the epoch as a session; return its file. Raises `BagError` when it exists."""
-    into.mkdir(parents=True, exist_ok=True)
     epoch, path = load(folder), into / f'{NAME}.mcap'
     pose = np.tile([0.0, 0.0, HEIGHT_M], (FRAMES, 1)), np.tile([0.0, 0.0, 0.0, 1.0], (FRAMES, 1))
-    stamps = [SECOND_NS * (1 + frame) for frame in range(FRAMES)]
-    write_frames(path, setup_of(epoch), stamps, fluxes(epoch), {BODY: pose})
+    write_frames(path, setup_of(epoch), fluxes(epoch), {BODY: pose})
     return [path]
 
 
@@ -205,26 +201,25 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     distance = 'coils to digitised places, rms after rigid alignment'
     chosen = 'the signals alone'
     return [
-        ReportRow(
-            NAME, f"{distance} (before: vendor's fit)", vendor, places[1], 'mm', TARGET_MM,
-            met, chosen, SPECIAL_MM,
-        ),
-        ReportRow(
-            NAME, f'{distance} (before: sensors as stated)', places[0], places[1], 'mm',
-            TARGET_MM, met, chosen, SPECIAL_MM,
+        *(
+            ReportRow(
+                NAME, f'{distance} (before: {words})', before, places[1], 'mm', chosen,
+                TARGET_MM, met, SPECIAL_MM,
+            )
+            for words, before in (("vendor's fit", vendor), ('sensors as stated', places[0]))
         ),
         ReportRow(
             NAME, f'of {truth.sum()} inverted channels, named', float((truth & named[0]).sum()),
-            float((truth & named[1]).sum()), '', float(truth.sum()),
-            bool((named[1] | ~truth).all()), chosen, SPECIAL_INVERTED,
+            float((truth & named[1]).sum()), '', chosen, float(truth.sum()),
+            bool((named[1] | ~truth).all()), SPECIAL_INVERTED,
         ),
         ReportRow(
             NAME, 'a fifth of the channels predicted by the others, RMSE', errors[0], errors[1],
-            'pT', None, None, 'field and signs on the others',
+            'pT', 'field and signs on the others',
         ),
         ReportRow(
             NAME, 'channels falsely named inverted', float((named[0] & ~truth).sum()),
-            float((named[1] & ~truth).sum()), '', 0.0, bool((truth | ~named[1]).all()), chosen,
+            float((named[1] & ~truth).sum()), '', chosen, 0.0, bool((truth | ~named[1]).all()),
         ),
     ]  # fmt: skip
 

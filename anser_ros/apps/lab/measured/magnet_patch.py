@@ -20,7 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.lab.measured.recipe import Recipe, ReportRow, figure, ran, vector, write_frames
+from anser_ros.apps.lab.measured.recipe import (
+    Recipe,
+    ReportRow,
+    existing,
+    figure,
+    ran,
+    vector,
+    write_frames,
+)
 from anser_ros.errors import FitError
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
@@ -67,14 +75,9 @@ class Recording:
 def read_table(path: Path) -> tuple[list[str], Array]:
     """Return the header and numbers of a CSV file; text columns become nan.
 
-    Raises
-    ------
-    FitError
-        When the file is missing or has no rows.
+    Raises `FitError` when the file is missing or has no rows.
     """
-    if not path.is_file():
-        raise FitError(f'no such file: {path}')
-    with path.open(newline='') as stream:
+    with existing(path).open(newline='') as stream:
         header, *rows = list(csv.reader(stream))
     if not rows:
         raise FitError(f'{path.name} has no rows')
@@ -88,14 +91,10 @@ def read_table(path: Path) -> tuple[list[str], Array]:
     return header, np.array([[number(text) for text in row] for row in rows])
 
 
-def read_poses(path: Path, magnet: str) -> tuple[dict[str, Array], int]:
-    """Return columns of a file of 16 sensors a pose, as (F, 16, 3) arrays; `magnet` is their
-    prefix.
+def read_poses(path: Path, magnet: str) -> dict[str, Array]:
+    """Return columns of a file of 16 sensors a pose, (F, 16, 3), the magnet's by their prefix.
 
-    Raises
-    ------
-    FitError
-        When a column is missing, or the rows are not whole poses.
+    Raises `FitError` when a column is missing, or the rows are not whole poses.
     """
     header, table = read_table(path)
     if len(table) % SENSORS:
@@ -116,13 +115,11 @@ def read_poses(path: Path, magnet: str) -> tuple[dict[str, Array], int]:
         out[key] = table[:, [column[name] for name in names]].reshape(-1, SENSORS, 3)
     if 'timestamp' in column:
         out |= {'stamp': table[:, column['timestamp']].reshape(-1, SENSORS)}
-    return out, len(table) // SENSORS
+    return out
 
 
 def as_recording(name: str, parts: dict[str, Array], background_t: Array) -> Recording:
-    """Return a table as a recording: SI units, matrices for rotation vectors, ambient field
-    removed.
-    """
+    """Return a table in SI units, with matrices for rotations, and the ambient field removed."""
     turn = Rotation.from_rotvec(parts['turn'].reshape(-1, 3)).as_matrix()
     frames = len(parts['field'])
     stamp = parts['stamp'].mean(axis=1) if 'stamp' in parts else np.arange(frames, dtype=float)
@@ -139,7 +136,7 @@ def as_recording(name: str, parts: dict[str, Array], background_t: Array) -> Rec
 
 def load(folder: Path, name: str) -> Recording:
     """Read one file of poses, its own background subtracted."""
-    parts, _ = read_poses(folder / f'{name}.csv', 'm')
+    parts = read_poses(folder / f'{name}.csv', 'm')
     background = read_table(folder / f'{name}_background_uT.csv')[1] * 1e-6
     if background.shape != (SENSORS, 3):
         raise FitError(f'{name}: background of shape {background.shape}, expected (16, 3)')
@@ -170,9 +167,7 @@ def setup_of(
     stated: Mapping[str, float] = STATED,
     geometry: Mapping[str, float] = GEOMETRY,
 ) -> Setup:
-    """Return a setup of one emitter, and three channels a sensor, as the first frame states
-    them.
-    """
+    """Return a setup of one emitter, and three channels a sensor as the first frame has them."""
     place = recording.sensor_m[0] - recording.sensor_m[0].mean(axis=0)
     turn = recording.sensor_rotation[0]
     sensors = tuple(
@@ -193,23 +188,17 @@ def setup_of(
 
 
 def write_session(recording: Recording, path: Path, setup: Setup | None = None) -> None:
-    """Write one recording as an MCAP session, by default with the setup that `setup_of` makes.
-
-    Raises
-    ------
-    BagError
-        When the file exists already.
-    """
+    """Write one recording as a session, by default with the setup of `setup_of`."""
     turn, place = patch_in_fg(recording)
     stamps = np.round(recording.stamp_s * SECOND_NS).astype(np.int64).tolist()
     flux = recording.field_t.reshape(len(stamps), -1, 1).astype(np.complex128)
     quaternion = Rotation.from_matrix(turn).as_quat()
-    write_frames(path, setup or setup_of(recording), stamps, flux, {BODY: (place, quaternion)})
+    poses = {BODY: (place, quaternion)}
+    write_frames(path, setup or setup_of(recording), flux, poses, stamps)
 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write every file of poses as a session; return the files written."""
-    into.mkdir(parents=True, exist_ok=True)
     out = []
     for name in file_names(folder):
         path = into / f'magnet_{name}.mcap'
@@ -261,7 +250,7 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
             made.append(
                 ReportRow(
                     NAME, f'learnt on {learnt}, {tracked} tracked: {kind} RMSE', scale * before,
-                    scale * after, unit, goal, bool(scale * after <= goal), chosen,
+                    scale * after, unit, chosen, goal, bool(scale * after <= goal),
                     SPECIAL.get((learnt, tracked), (None, None))[k],
                 )
             )  # fmt: skip

@@ -22,9 +22,8 @@ the size of the source, together (docs/results/README.md)."""
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write the file as a session; return its file. Raises `BagError` when it exists."""
-    into.mkdir(parents=True, exist_ok=True)
     table = folder / f'{FILE}.csv'
-    parts, _ = magnet_patch.read_poses(table, 'M')
+    parts = magnet_patch.read_poses(table, 'M')
     recording = magnet_patch.as_recording(FILE, parts, np.zeros(3))
     path = into / f'magnet_{FILE}.mcap'
     setup = magnet_patch.setup_of(recording, None, STATED, {})
@@ -46,8 +45,8 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     chosen = 'everything on the other blocks of poses; scored on the block left out'
     return [
         ReportRow(
-            NAME, 'field at poses left out, RMSE', before, after, 'uT', None, None, chosen,
-            SPECIAL_UT,
+            NAME, 'field at poses left out, RMSE', before, after, 'uT', chosen,
+            special=SPECIAL_UT,
         )
     ]  # fmt: skip
 

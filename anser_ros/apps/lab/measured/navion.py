@@ -20,13 +20,13 @@ from anser_ros.apps.lab.measured.recipe import (
     Recipe,
     ReportRow,
     calibrations,
+    existing,
     figure,
     ran,
     vector,
     write_frames,
 )
 from anser_ros.errors import FitError
-from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 Array = NDArray[np.float64]
@@ -59,14 +59,10 @@ CHOSEN = 'everything on the other heights; scored on the height left out, at its
 def read(folder: Path) -> tuple[Array, Array]:
     """Return places (P, S, 3), m, and fields (P, S, 3, K), T, of one coil at its full current.
 
-    Raises
-    ------
-    FitError
-        When the file is missing, lacks a state of a sensor, or has other combinations of currents.
+    Raises `FitError` when the file is missing, lacks a state of a sensor, or has other
+    combinations of currents.
     """
-    path = folder / 'navion_steady.csv'
-    if not path.is_file():
-        raise FitError(f'no such file: {path}')
+    path = existing(folder / 'navion_steady.csv')
     with path.open(newline='') as stream:
         rows = list(csv.DictReader(stream))
 
@@ -91,7 +87,6 @@ def read(folder: Path) -> tuple[Array, Array]:
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write the data set as a session; return its file. Raises `BagError` when it exists."""
-    into.mkdir(parents=True, exist_ok=True)
     place, field = read(folder)
     middle = place.mean(axis=1) * np.array([0.0, 0.0, 1.0])
     sensors = tuple(
@@ -112,8 +107,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
     upright = np.tile(Rotation.from_matrix(TURN).as_quat(), (len(place), 1))
     position = middle @ TURN.T + [0.0, 0.0, PLANE_M]
     path = into / f'{NAME}_{PLATE}.mcap'
-    stamps = [SECOND_NS * (1 + frame) for frame in range(len(place))]
-    write_frames(path, setup, stamps, flux, {PLATE: (position, upright)})
+    write_frames(path, setup, flux, {PLATE: (position, upright)})
     return [path]
 
 
@@ -128,17 +122,14 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     before, after = map(_errors_mt, documents)
     spreads = {e['name']: e['parameters'].get('spread') for e in documents[1]['effects']}
     found = [
-        ReportRow(
-            NAME, what, float('nan'), scale * figure(spreads, name), unit, None, None,
-            'all heights',
-        )
+        ReportRow(NAME, what, float('nan'), scale * figure(spreads, name), unit, 'all heights')
         for what, name, scale, unit in SPREADS
-    ]  # fmt: skip
+    ]
     return [
         ReportRow(
             NAME, f'field of one coil at 35 A, component RMSE, {which}', before[which],
-            after[which], 'mT', goal, None if goal is None else bool(after[which] <= goal),
-            CHOSEN, SPECIAL_MT.get(which),
+            after[which], 'mT', CHOSEN, goal,
+            None if goal is None else bool(after[which] <= goal), SPECIAL_MT.get(which),
         )
         for which in before
         for goal in [TARGETS_MT.get(which)]

@@ -1,8 +1,7 @@
-"""Describes how somebody else's data are tried: the sessions made of them, the commands run on
-them, and the figures.
-"""
+"""Describes how somebody else's data are tried: sessions made of them, commands, and figures."""
 
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +10,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.errors import FitError
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import Setup, dump_setup
 from anser_ros.wire.setup_values import Vector
 
 Array = NDArray[np.float64]
+
+SHARED = 'ANSER_SHARED'
+"""Environment variable with the folder of other people's data and shared recordings."""
+
+
+def shared_folder() -> Path:
+    """Return the folder of shared data: as the environment says, or beside the repository."""
+    beside = Path(__file__).resolve().parents[5] / 'shared'
+    return Path(os.environ.get(SHARED, beside))
+
+
+def existing(path: Path) -> Path:
+    """Return a path; raises `FitError` when there is no such file."""
+    if not path.is_file():
+        raise FitError(f'no such file: {path}')
+    return path
 
 
 def vector(values: Array) -> Vector:
@@ -27,39 +44,24 @@ def vector(values: Array) -> Vector:
 def write_frames(
     path: Path,
     setup: Setup,
-    stamp_ns: Sequence[int],
     flux: NDArray[np.complex128],
     poses: Mapping[str, tuple[Array, Array]] | None = None,
+    stamp_ns: Sequence[int] | None = None,
 ) -> None:
-    """Write one flux message of tools, one of references and the poses of the bodies a frame.
+    """Write a session of F frames: fluxes (F, S, K), T, in the setup's order, and poses of bodies.
 
-    Parameters
-    ----------
-    path : Path
-        The ``.mcap`` file; it must not exist yet.
-    setup : Setup
-    stamp_ns : sequence of int, length F
-    flux : ndarray, shape (F, S, K), complex
-        T, sensors in the order of the setup.
-    poses : mapping, optional
-        Body to its positions (F, 3), m, and quaternions (F, 4), x y z w, frame fg.
-
-    Raises
-    ------
-    BagError
-        When the file exists already.
+    ``poses``: positions (F, 3), m, and quaternions (F, 4), x y z w, frame fg. ``stamp_ns`` (F,):
+    one a second by default. Raises `BagError` when the file exists already.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stamps = [SECOND_NS * (1 + k) for k in range(len(flux))] if stamp_ns is None else stamp_ns
     with SessionWriter(path) as writer:
-        writer.write_setup(dump_setup(setup), int(stamp_ns[0]))
-        for frame, stamp in enumerate(stamp_ns):
-            writer.write_readings(setup.sensors, int(stamp), flux[frame])
+        writer.write_setup(dump_setup(setup), stamps[0])
+        for frame, stamp in enumerate(stamps):
+            writer.write_readings(setup.sensors, stamp, flux[frame])
             for body, (position, quaternion) in (poses or {}).items():
-                writer.write_pose(
-                    optical_topic(body),
-                    int(stamp),
-                    position[frame].tolist(),
-                    quaternion[frame].tolist(),
-                )
+                place, turn = position[frame].tolist(), quaternion[frame].tolist()
+                writer.write_pose(optical_topic(body), stamp, place, turn)
 
 
 @dataclass(frozen=True)
@@ -71,9 +73,9 @@ class ReportRow:
     before: float  # the figure without the effects that were found; nan where there is none
     after: float  # the figure with them
     unit: str  # of `before`, `after` and `target`
-    target: float | None  # what `after` should not exceed (a correlation: not fall below)
-    met: bool | None  # whether it does; None without a target
     chosen_on: str  # what the effects were chosen and fitted on, and the figure was scored on
+    target: float | None = None  # what `after` should not exceed
+    met: bool | None = None  # whether it does; None without a target
     # `after` of code for this data set alone, where a recipe has taken its place: docs/results
     special: float | None = None
 

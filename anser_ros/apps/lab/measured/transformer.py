@@ -13,11 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
-from anser_ros.apps.lab.measured.recipe import Recipe, ReportRow, ran, vector, write_frames
+from anser_ros.apps.lab.measured.recipe import (
+    Recipe,
+    ReportRow,
+    existing,
+    ran,
+    vector,
+    write_frames,
+)
 from anser_ros.errors import FitError
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
-from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 Array = NDArray[np.float64]
@@ -43,14 +49,9 @@ STATED = {'flux_noise_t': 2e-7, 'optical_position_m': 3e-3, 'optical_rotation_ra
 def read(folder: Path) -> tuple[Array, NDArray[np.complex128]]:
     """Return places (P, 3), m, fg, and fields (P, 3), T, complex, along the axes of fg.
 
-    Raises
-    ------
-    FitError
-        When the file is missing, or is no table of nine columns.
+    Raises `FitError` when the file is missing, or is no table of nine columns.
     """
-    path = folder / 'data_set.txt'
-    if not path.is_file():
-        raise FitError(f'no such file: {path}')
+    path = existing(folder / 'data_set.txt')
     try:
         table = np.loadtxt(path, comments='%', ndmin=2)
     except ValueError as error:
@@ -68,7 +69,6 @@ def read(folder: Path) -> tuple[Array, NDArray[np.complex128]]:
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write the planes to calibrate with and the one that judges; return the two files."""
-    into.mkdir(parents=True, exist_ok=True)
     place, field = read(folder)
     sensors = tuple(
         SensorSpec(k, f'{PROBE}/{axis}', PROBE, (0.0, 0.0, 0.0), vector(unit), 0.0)
@@ -81,9 +81,8 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
     for name, chosen in (('planes', ~kept), ('kept', kept)):
         count = int(chosen.sum())
         path = into / f'{NAME}_{name}.mcap'
-        stamps = [SECOND_NS * (1 + frame) for frame in range(count)]
         pose = (place[chosen], np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
-        write_frames(path, setup, stamps, field[chosen][:, :, None], {PROBE: pose})
+        write_frames(path, setup, field[chosen][:, :, None], {PROBE: pose})
         paths.append(path)
     return paths
 
@@ -117,7 +116,7 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
          rmse_ut(predicted), 'uT'),
         ('effects named on the plane left out', float('nan'), float(len(named)), ''),
     )  # fmt: skip
-    return [ReportRow(NAME, *values, None, None, chosen) for values in figures]
+    return [ReportRow(NAME, *values, chosen) for values in figures]
 
 
 RECIPE = Recipe(NAME, write_sessions, commands, rows)
