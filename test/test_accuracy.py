@@ -8,8 +8,16 @@ import pytest
 from pose_world import World
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.poses.assessment.dynamic import assess_motion
-from anser_ros.apps.poses.assessment.f2554 import point_to_point, single_point, standing_alone
+from anser_ros.apps.poses.assessment.distances import (
+    Grid,
+    distance_errors,
+    grid_points,
+    have_common_errors,
+    point_to_point,
+    rotation_errors,
+    single_point,
+    standing_alone,
+)
 from anser_ros.apps.poses.assessment.history import (
     ALERT,
     FAIL,
@@ -19,18 +27,10 @@ from anser_ros.apps.poses.assessment.history import (
     SessionVerdict,
     judged,
 )
-from anser_ros.apps.poses.assessment.hummel import (
-    Grid,
-    distance_errors,
-    grid_points,
-    have_common_errors,
-    rotation_errors,
-)
 from anser_ros.apps.poses.assessment.intervals import IntervalEstimate
-from anser_ros.apps.poses.assessment.protocols import Assessment
-from anser_ros.apps.poses.assessment.stability import metal_shifts
-from anser_ros.apps.poses.assessment.stillness import StillPoint, still_points
-from anser_ros.apps.poses.cli.accuracy_report import control_chart
+from anser_ros.apps.poses.assessment.protocols import Assessment, assess_motion
+from anser_ros.apps.poses.assessment.rest import StillPoint, metal_shifts, still_points
+from anser_ros.apps.poses.cli.accuracy import control_chart
 from anser_ros.apps.poses.hand_eye import fit_hand_eye
 from anser_ros.apps.poses.importing import write_pose_session
 from anser_ros.apps.poses.sequence import sequence_of
@@ -212,7 +212,7 @@ class TestHummel:
             place = np.array([shift, 0.0, 0.2]) + 2e-4 * rng.normal(size=(time.size, 3))
             return sequence_of('pen', time, place, np.tile(STILL, (time.size, 1)))
 
-        found = metal_shifts(rest(0.0), [('1', rest(1e-3)), ('2', rest(0.0))])
+        found = metal_shifts(rest(0.0), [rest(1e-3), rest(0.0)])
         assert found['position_shift_1_m'].low < 1e-3 < found['position_shift_1_m'].high
         assert found['position_shift_2_m'].low < 2e-5 < found['position_shift_1_m'].low
 
@@ -252,14 +252,14 @@ def test_latency_and_error_by_speed():
     world = World(4300, sensors=1, duration=25.0)
     world.offset = 0.04
     found = fit_hand_eye(world.session())
-    motion = assess_motion(found, 'sensor_0', rng_of(1))
-    latency = motion.estimates['latency_s']
+    estimates, groups = assess_motion(found, 'sensor_0', rng_of(1))
+    latency = estimates['latency_s']
     assert latency.low < 0.04 < latency.high and latency.high - latency.low < 4e-3
-    slow, fast = motion.groups[0], motion.groups[-1]
+    slow, fast = groups[0], groups[-1]
     assert fast.latency_s.low < 0.04 < fast.latency_s.high
     # What is late by 40 ms is off by as much of its way.
-    assert fast.error_live_m.value > 0.03 * fast.low_m_s
-    assert slow.error_m.value < 1e-3 < fast.error_live_m.value
+    assert fast.error_live_rms_m.value > 0.03 * fast.speed_low_m_s
+    assert slow.error_rms_m.value < 1e-3 < fast.error_live_rms_m.value
 
 
 class TestControl:

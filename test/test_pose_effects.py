@@ -17,9 +17,9 @@ from anser_ros.apps.poses.effects.numbers import PoseClockRate
 from anser_ros.apps.poses.effects.stream import ReceiptJitter, stamp_step
 from anser_ros.apps.poses.fit import is_lever_determined
 from anser_ros.apps.poses.hand_eye import one_clock
-from anser_ros.apps.poses.path import OpticalPath
+from anser_ros.apps.poses.problem import PoseNoise
 from anser_ros.apps.poses.search import doubt, with_noise
-from anser_ros.apps.poses.sequence import PoseSession, sequence_of
+from anser_ros.apps.poses.sequence import OpticalPath, PoseSession, sequence_of
 from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, started
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
@@ -96,8 +96,7 @@ def test_jitter_of_stamps_is_known_as_well_as_that_of_so_many_poses_can_be(share
         velocity = np.tile([0.0, 0.2, 0.0, 0.0, 0.0, 0.0], (300, 1))  # 2 mm in 10 ms
         sensors.append(SimpleNamespace(
             view=SimpleNamespace(sensor=f'sensor_{k}', time=time, velocity=velocity),
-            used=np.ones(300, dtype=bool), position_m=1e-5, orientation_rad=1e-3, stamp_s=0.01,
-            stamp_gain=3000.0,
+            used=np.ones(300, dtype=bool), noise=PoseNoise(1e-5, 1e-3, 0.01), stamp_gain=3000.0,
         ))  # fmt: skip
     streams = {s.view.sensor: s.view for s in sensors}
     residuals = SimpleNamespace(sensors=sensors, session=SimpleNamespace(sensors=streams))

@@ -194,12 +194,13 @@ def metrics(series: PoseSeries) -> dict[str, Any]:
         ('position', 'm', series.position_error),
         ('orientation', 'rad', series.orientation_error),
     ):
-        for statistic, value in _statistics(errors[np.isfinite(errors)]).items():
+        for statistic, value in statistics(errors[np.isfinite(errors)]).items():
             result[f'{key}_{statistic}_{unit}'] = value
     return result
 
 
-def _statistics(errors: Array) -> dict[str, float | None]:
+def statistics(errors: Array) -> dict[str, float | None]:
+    """Return root mean square, mean and percentiles of errors (n,) by their names in reports."""
     if not errors.size:
         return dict.fromkeys(('rmse', 'me', 'prc50', 'prc95'))
     return {

@@ -20,7 +20,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 
-from anser_ros.apps.poses.assessment.hummel import (
+from anser_ros.apps.poses.assessment.distances import (
     VOLUMES,
     Grid,
     distance_errors,

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -36,16 +36,14 @@ SMALLEST_SHARE = 0.02
 to be alike do not make limits that the next one must break."""
 
 
-@dataclass(frozen=True)
-class ControlLimits:
+class ControlLimits(NamedTuple):
     """Holds the limits of one figure."""
 
     n: int  # earlier sessions they are made from
     mean: float
     sigma: float
-    # distance from the mean, in the figure's unit, from which on a session is a note, and an alert
-    note: float
-    alert: float
+    note: float  # distance from the mean from which on a session is a note
+    alert: float  # and an alert
 
 
 @cache
@@ -69,11 +67,7 @@ class Verdict:
 def limits_of(earlier: Sequence[float], figures: int = 1) -> ControlLimits | None:
     """Return limits from the figures of earlier sessions, in their order.
 
-    Parameters
-    ----------
-    earlier : sequence of float
-    figures : int
-        How many figures are watched at once, this one with them.
+    ``figures``: how many are watched at once, this one with them.
     """
     values = np.asarray(earlier, dtype=np.float64)
     values = values[np.isfinite(values)]
@@ -91,15 +85,8 @@ def judged(
 ) -> Verdict:
     """Return what a figure is worth.
 
-    Parameters
-    ----------
-    value : float
-    earlier : sequence of float
-        The same figure of sessions that were in order, the oldest first.
-    tolerance : float, optional
-        Largest size that it may have.
-    figures : int
-        How many figures are watched with it.
+    ``earlier``: the same figure of sessions that were in order, the oldest first; ``tolerance``:
+    largest size that it may have; ``figures``: how many are watched with it.
     """
     limits = limits_of(earlier, figures)
     if not np.isfinite(value):
@@ -172,23 +159,13 @@ def _is_watched(name: str, protocol: str) -> bool:
 def judge(
     found: Assessment, folder: Path | None, tolerances: Mapping[str, float]
 ) -> SessionVerdict:
-    """Return the verdict on a session.
+    """Return the verdict on a session by the history in a folder, or by tolerances alone.
 
     Sessions of the same protocol and body count, but no later ones, and no figure that was an
-    alert or failed in its session.
+    alert or failed in its session. ``tolerances``: largest size by figure.
 
-    Parameters
-    ----------
-    found : Assessment
-    folder : Path or None
-        Of the history; None: tolerances alone.
-    tolerances : mapping of str to float
-        Largest size by figure.
-
-    Raises
-    ------
-    ParameterError
-        When a tolerance is for an unknown figure, or a file is not of a history.
+    Raises `ParameterError` when a tolerance is for an unknown figure, or a file is not of a
+    history.
     """
     figures = figures_of(found)
     unknown = sorted(set(tolerances) - set(figures))

@@ -59,14 +59,9 @@ def read_poses(
 ) -> AssessedPoses:
     """Read or track the poses of one body.
 
-    Raises
-    ------
-    BagError
-        When a recording has no such poses, or several and none is named.
-    PlausibilityError
-        When the positions cannot be in metres, and as `import_poses` and `track_session`.
-    ParameterError
-        As `import_poses` and `track_session`.
+    Raises `BagError` when a recording has no such poses, or several and none is named,
+    `PlausibilityError` when the positions cannot be in metres, and as `import_poses` and
+    `track_session`.
     """
     source = Path(path)
     if wanted.model:

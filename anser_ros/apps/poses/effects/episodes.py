@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from anser_ros.apps.poses.effect import PoseEffect, PoseResiduals, Sensing
+from anser_ros.apps.poses.effect import PoseEffect
+from anser_ros.apps.poses.problem import PoseResiduals, Sensing
 from anser_ros.field.model import EffectRecord
 
 Array = NDArray[np.float64]

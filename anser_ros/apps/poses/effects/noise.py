@@ -1,15 +1,14 @@
 """A sensor's noise is larger than the others', or grows with the distance."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from anser_ros.apps.poses.effect import PoseEffect, PoseResiduals, Sensing
+from anser_ros.apps.poses.effect import PoseEffect
 from anser_ros.apps.poses.effects.episodes import in_episode
-from anser_ros.apps.poses.jitter import jitter
+from anser_ros.apps.poses.problem import PoseResiduals, Sensing, jitter
 from anser_ros.field.model import EffectRecord
 
 Array = NDArray[np.float64]
@@ -99,14 +98,14 @@ def _likeliest(square: Array, place: Array) -> Array:
     return np.asarray(min(tries, key=lambda result: float(result.fun)).x)
 
 
-def _in_motion(sensing: Sensing, chosen: Mask) -> Mask:
-    """Which of some poses (n,) the body moves in; all of them where it hardly ever does.
+def _jitter(sensing: Sensing, chosen: Mask) -> tuple[Array, Array]:
+    """`jitter` of those of some poses (n,) in which the body moves; of all where it hardly does.
 
     A body that rests at one place and moves at others jitters less at the one.
     """
     moving = chosen & (np.linalg.norm(sensing.view.velocity[:, :3], axis=1) > AT_REST_M_S)
     hardly = np.count_nonzero(moving) < HARDLY_EVER * np.count_nonzero(chosen)
-    return chosen if hardly else moving
+    return jitter(sensing, chosen if hardly else moving, sensing.noise.stamp_s > 0)
 
 
 class PoseExcessNoise(PoseEffect):
@@ -131,7 +130,7 @@ class PoseExcessNoise(PoseEffect):
         exponent = float(law[0].parameters['exponent']) if law else 0.0
         for sensing in residuals.sensors:
             quiet = sensing.used & ~in_episode(sensing, residuals)
-            square, distance = jitter(replace(sensing, used=_in_motion(sensing, quiet)))
+            square, distance = _jitter(sensing, quiet)
             square = square / distance[:, 1] ** (2 * exponent)
             if square.size >= FEWEST_DIFFERENCES:
                 noise[sensing.view.sensor] = float(np.sqrt(np.median(square)))
@@ -160,10 +159,10 @@ class RangeNoise(PoseEffect):
         # Poses far away stand out from a noise that is taken as one; the law judges them too.
         # Those of an episode are off by something else.
         every = [
-            replace(one, used=_in_motion(one, (one.used | one.out) & ~in_episode(one, residuals)))
+            _jitter(one, (one.used | one.out) & ~in_episode(one, residuals))
             for one in residuals.sensors
         ]
-        pairs = [pair for pair in map(jitter, every) if pair[0].size >= FEWEST_DIFFERENCES]
+        pairs = [pair for pair in every if pair[0].size >= FEWEST_DIFFERENCES]
         if not pairs:
             return []
         places = np.concatenate([distance for _, distance in pairs])

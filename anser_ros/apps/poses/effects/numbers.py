@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.apps.poses.effect import NumberEffect, PoseSetting, PoseTerm, PoseView, Role
-from anser_ros.apps.poses.path import OpticalPath
+from anser_ros.apps.poses.sequence import OpticalPath
 from anser_ros.effects.base import Remedy
 
 Array = NDArray[np.float64]
