@@ -94,4 +94,6 @@ def test_a_ramp_is_a_drift():
     assert jitter.low < jitter.value < jitter.high < 1.05 * jitter.value
     curve = allan['x']
     at = curve.tau_s > 30
-    np.testing.assert_allclose(curve.deviation_m[at], 2e-6 * curve.tau_s[at] / np.sqrt(2), rtol=0.15)
+    np.testing.assert_allclose(
+        curve.deviation_m[at], 2e-6 * curve.tau_s[at] / np.sqrt(2), rtol=0.15
+    )
