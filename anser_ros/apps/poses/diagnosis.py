@@ -299,17 +299,13 @@ def diagnose_poses(
     floor = floor_of(after)
     residuals = _residuals(session, problem, whole)
     records = records_of(whole, search.evidence, session)
-    is_known = search.knows_levers and knows_levers(whole, most_poses(session))
+    most = most_poses(session)
+    is_known = search.knows_levers and knows_levers(whole, most)
     for effect in pose_effects().values():
-        if effect.needs_levers and not is_known:
-            continue
         words = {'summary': effect.summary, 'advice': effect.advice}
-        records += [
-            replace(r, evidence={**words, **r.evidence}) for r in effect.observed(residuals)
-        ]
-    records += [*exchanged, *swapped]
-    if convention is not None:
-        records.append(convention)
+        seen = effect.observed(residuals) if is_known or not effect.needs_levers else ()
+        records += [replace(r, evidence={**words, **r.evidence}) for r in seen]
+    records += [*exchanged, *swapped, *([] if convention is None else [convention])]
     errors = errors_of(after)
     excess = max(errors.position_m**2 - floor**2, 0.0)
     possible = max(errors_of(before).position_m ** 2 - floor**2, excess, 1e-18)
@@ -327,7 +323,7 @@ def diagnose_poses(
         left_out=tuple(
             name
             for name, poses in session.sensors.items()
-            if poses is not most_poses(session) and name not in problem.setting.sensors
+            if poses is not most and name not in problem.setting.sensors
         ),
         knows_levers=search.knows_levers,
     )

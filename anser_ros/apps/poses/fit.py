@@ -259,8 +259,7 @@ def _turn_information(part: PosePart) -> Array:
 
 
 def turn_jitter(reference: PoseSequence) -> float:
-    """Return the jitter of a reference's orientation, rad a coordinate, from its quietest
-    stretches.
+    """Return a reference's jitter of orientation, rad a coordinate, from its quietest stretches.
 
     The squared second difference of noise has six times its variance per coordinate; the lowest
     quarter of that with three coordinates is at 1.21.

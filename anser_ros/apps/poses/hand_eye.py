@@ -72,10 +72,8 @@ def one_clock(records: Sequence[EffectRecord], duration: float) -> list[EffectRe
     Clocks that agree about the start or the middle of a session of ``duration`` s have a rate and
     no offset besides.
     """
-    offset = next(
-        (r for r in records if _is(r, Role.OFFSET) and 'sensor' not in r.parameters),
-        None,
-    )
+    shared = [r for r in records if _is(r, Role.OFFSET) and 'sensor' not in r.parameters]
+    offset = shared[0] if shared else None
     rate = next((r for r in records if _is(r, Role.RATE)), None)
     if rate is None:
         return list(records)
@@ -116,10 +114,7 @@ def records_of(
             'advice': term.effect.advice,
             'remedy': term.effect.remedy.value,
             'parameters_spent': int(term.theta.size),
-            'held_out_gain': one.gain,
-            'held_out_share': one.share,
-            'position_rmse_without_m': one.position_rmse_without_m,
-            'position_rmse_with_m': one.position_rmse_with_m,
+            **one._asdict(),
         }
         records.append(replace(record, evidence=words))
     return one_clock(records, fit.state.problem.setting.duration)
@@ -212,8 +207,7 @@ class HandEye:
 
 
 def as_pairs(session: PoseSession) -> PoseSession:
-    """Return the n-th pose of every sensor beside the n-th of the reference, whatever their
-    stamps.
+    """Return the n-th poses of sensors beside the n-th of the reference, whatever their stamps.
 
     Raises `DiagnosisError` when numbers differ, or there is no reference.
     """

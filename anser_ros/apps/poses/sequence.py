@@ -109,8 +109,7 @@ class PoseSession:
 
 
 def jumping_poses(poses: PoseSequence) -> Mask:
-    """Return the mask (n,) of single poses, or a few, that leap away from those before and after
-    them.
+    """Return the mask (n,) of poses, at most a few in a row, that leap away from their neighbours.
 
     A marker found in its second solution does this: it is far away between two poses that agree.
     """
@@ -318,13 +317,6 @@ class OpticalPath:
         size = off[whole] / np.sqrt(1 + np.sum(weight**2, axis=0))[whole, None]
         return float(np.sqrt(np.mean(size**2))) if size.size else 0.0
 
-    def filtered(self, tau: float, two_sided: bool = False) -> 'OpticalPath':
-        """Return the path behind a first-order low pass with a time constant, s.
-
-        Two-sided, it looks as far ahead as back, with the same width and no delay.
-        """
-        return _behind(self, tau, two_sided)
-
 
 def _share_at_zero(nodes: Array, k: int) -> Array:
     """Lagrange's weight of node k of nodes (4, n) at zero."""
@@ -332,9 +324,12 @@ def _share_at_zero(nodes: Array, k: int) -> Array:
     return np.asarray(np.prod([-nodes[j] / (nodes[k] - nodes[j]) for j in others], axis=0))
 
 
-@lru_cache(maxsize=8)
-def _behind(path: OpticalPath, tau: float, two_sided: bool) -> OpticalPath:
-    """Return what `OpticalPath.filtered` does; a fit asks again and again for the same filter."""
+@lru_cache(maxsize=8)  # a fit asks again and again for the same filter
+def filtered(path: OpticalPath, tau: float, two_sided: bool = False) -> OpticalPath:
+    """Return a path behind a first-order low pass with a time constant, s.
+
+    Two-sided, it looks as far ahead as back, with the same width and no delay.
+    """
     tau = tau / np.sqrt(2) if two_sided else tau
     step = max(SMALLEST_STEP_S, tau / STEPS_A_TAU)
     grid = np.arange(path.knots[0], path.knots[-1] + step, step)

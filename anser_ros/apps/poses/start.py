@@ -1,6 +1,4 @@
-"""Starts a fit from a session: blocks, a coarse time offset, two frames, exchanged sensors put
-back.
-"""
+"""Starts a fit from a session: blocks, a coarse time offset, two frames, swapped sensors."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -370,8 +368,7 @@ def swapped_spans(
 
 
 def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
-    """Return the session with sensors put back that were exchanged for about half of it, and the
-    records of it; as it is if there are none.
+    """Return the session with sensors put back that were swapped for half of it, and the records.
 
     Nothing fits all of such a session. Its first part says whose poses are whose.
     """
@@ -385,8 +382,7 @@ def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
 
 
 def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Mask, Mask]:
-    """Masks of the poses of sensor i that fit where sensor j should be, and that rather fit there
-    than where i should be."""
+    """Masks of the poses of sensor i that fit where j should be, and that rather fit there."""
     own = replace(problem, noise=fit.state.problem.noise).state(fit.terms).parts[i]
     renamed = replace(problem.sensors[i], name=problem.sensors[j].name)
     _, as_other, _ = predicted(problem.path, renamed, fit.terms)

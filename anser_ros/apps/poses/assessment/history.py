@@ -111,11 +111,6 @@ def judged(
     return Verdict(PASS, '', limits, tolerance)
 
 
-def worst(verdicts: Mapping[str, Verdict]) -> str:
-    """Return the worst state of the verdicts, which is the session's."""
-    return max((v.state for v in verdicts.values()), key=STATES.index, default=PASS)
-
-
 SCHEMA = 'anser_accuracy_history/1'
 
 
@@ -152,10 +147,6 @@ def figures_of(found: Assessment) -> dict[str, float]:
     return figures
 
 
-def _is_watched(name: str, protocol: str) -> bool:
-    return any(name.startswith(w) or name.endswith(w) for w in WATCHED[protocol])
-
-
 def judge(
     found: Assessment, folder: Path | None, tolerances: Mapping[str, float]
 ) -> SessionVerdict:
@@ -173,7 +164,8 @@ def judge(
         raise ParameterError(f'no figure {unknown[0]!r}; there are: {", ".join(figures)}')
     entries = [] if folder is None else _entries(folder, found)
     earlier = [entry for entry in entries if entry['start_ns'] < found.start_ns]
-    watched = [n for n in figures if _is_watched(n, found.protocol)]
+    words = WATCHED[found.protocol]
+    watched = [n for n in figures if n.startswith(words) or n.endswith(words)]
     past = {
         name: tuple(
             EarlierFigure(
@@ -188,7 +180,8 @@ def judge(
     for name in [*watched, *(n for n in tolerances if n not in watched)]:
         values = [one.value for one in past.get(name, ()) if one.is_in_order]
         verdicts[name] = judged(figures[name], values, tolerances.get(name), len(watched))
-    return SessionVerdict(worst(verdicts), verdicts, len(earlier), past)
+    state = max((v.state for v in verdicts.values()), key=STATES.index, default=PASS)
+    return SessionVerdict(state, verdicts, len(earlier), past)
 
 
 def keep(found: Assessment, folder: Path, verdicts: Mapping[str, Verdict]) -> Path:

@@ -158,9 +158,7 @@ def _independent(values: Array, power: int) -> float:
 
 
 def deviation_interval(value: float, freedoms: float) -> IntervalEstimate:
-    """Return a standard deviation with the interval of chi-square with so many degrees of
-    freedom.
-    """
+    """Return a standard deviation with its chi-square interval by degrees of freedom."""
     low, high = np.sqrt(freedoms / stats.chi2.ppf([0.5 + LEVEL / 2, 0.5 - LEVEL / 2], freedoms))
     return IntervalEstimate(value, value * low, value * high)
 

@@ -1,6 +1,4 @@
-"""Finds where a tool rested, and assesses a tool left alone: jitter, drift, Allan deviation,
-shifts.
-"""
+"""Finds where a tool rested, and assesses a tool left alone: jitter, drift, Allan deviation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -162,9 +160,7 @@ def _runs(
 
 
 def _without_ends(first: int, last: int, count: int) -> tuple[int, int]:
-    """A run without its first and last window, in which the tool came and went; one of all windows
-    is a recording in which it did not, and is kept whole.
-    """
+    """A run without its ends, in which the tool came and went; one of all windows stays whole."""
     is_all = last - first == count - 1
     return (first, last) if is_all or last - first < 3 else (first + 1, last - 1)
 
@@ -298,9 +294,7 @@ def _longest_even(time: Array) -> tuple[int, int]:
 
 
 def allan_deviation(values: Array, rate_hz: float) -> AllanCurve:
-    """Return the overlapping Allan deviation of evenly spaced values, m, at octaves of averaging
-    time.
-    """
+    """Return the overlapping Allan deviation of evenly spaced values, m, at octaves of time."""
     import allantools  # no other assessment needs it
 
     tau, deviation, _, terms = allantools.oadev(

@@ -134,25 +134,21 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     is_judged = args.history is not None or bool(tolerances)
     verdict = judge(found, args.history, tolerances) if is_judged else None
     document = to_document(found, verdict)
-    written: tuple[Path, ...] = ()
-    if args.out is not None:
-        page = render(found, document, verdict)
-        written = write_files(args.out, {'accuracy.json': document, 'report.html': page})
+    report = render(found, document, verdict) if args.out else None
+    written = write_files(args.out, {'accuracy.json': document, 'report.html': report})
     if verdict is not None and args.history is not None:
         written = (*written, keep(found, args.history, verdict.figures))
     return Result(document, (), _shown(found, document), written)
 
 
 def _shown(found: Assessment, document: dict[str, Any]) -> tuple[Any, ...]:
-    def coloured(state: str) -> str:
-        return f'[{COLORS.get(state, "white")}]{state}[/]'
-
     qa = document.get('qa')
-    head = ['figure', 'value', '95 % interval', *(['state'] if qa else [])]
-    rows = [
-        [*cells, *([coloured(state)] if qa else [])]
-        for *cells, state in figure_rows(found, document)
-    ]
+    rows = figure_rows(found, document)
+    head = ['figure', 'value', '95 % interval', 'state']
+    for row in rows:
+        row[-1] = f'[{COLORS.get(row[-1], "white")}]{row[-1]}[/]'
+    if not qa:
+        head, rows = head[:-1], [row[:-1] for row in rows]
     points = [f'{len(found.points)} points'] if found.points else []
     return (terminal_table(head, rows), *points, *found.notes, *([qa_words(qa)] if qa else []))
 
@@ -276,14 +272,14 @@ def qa_words(qa: Mapping[str, Any]) -> str:
     return ': '.join([compared, *filter(None, ['; '.join(words)])])
 
 
-def figure_rows(found: Assessment, document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+def figure_rows(found: Assessment, document: Mapping[str, Any]) -> list[list[str]]:
     """Return name, value with unit, interval, and state of every figure."""
     judged = document.get('qa', {}).get('figures', {})
     figures = dict(found.estimates)
     for name, group in found.groups.items():
         figures |= {f'{name}/{key}': estimate for key, estimate in group.summary.items()}
     return [
-        (name, *_texts(one, *shown_unit(found, name)), judged.get(name, {}).get('state', ''))
+        [name, *_texts(one, *shown_unit(found, name)), judged.get(name, {}).get('state', '')]
         for name, one in figures.items()
     ]
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.poses.assessment.source import PoseSource, read_poses
+from anser_ros.apps.poses.assessment.source import PoseSource, is_bag, read_poses
 from anser_ros.apps.poses.cli.import_poses import add_form_options
 from anser_ros.apps.poses.cli.pose_session import add_topic_options, load_poses
 from anser_ros.apps.poses.convention import reading_words
@@ -36,7 +36,6 @@ from anser_ros.pictures import legend_beside
 
 SCHEMA = 'anser_handeye/1'
 Array = NDArray[np.float64]
-BAGS = ('.mcap', '.db3', '.bag')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,9 +78,10 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     document = to_document(found)
     written: tuple[Path, ...] = ()
     if args.out is not None:
-        plain_yaml = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
-        report = render(found, document)
-        files = {'handeye.yaml': plain_yaml, 'handeye.json': document, 'report.html': report}
+        files = {
+            'handeye.yaml': yaml.safe_dump(document, sort_keys=False, default_flow_style=None),
+            'handeye.json': document, 'report.html': render(found, document),
+        }  # fmt: skip
         written = write_files(args.out, files)
     notes = [session.lost] if session.lost else []
     if found.convention is not None:
@@ -98,7 +98,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
 
 def _session(args: argparse.Namespace) -> PoseSession:
     first = args.tracked[0]
-    if first.is_dir() or first.suffix in BAGS:
+    if is_bag(first):
         if len(args.tracked) > 1 or args.reference:
             raise ParameterError('one bag has both streams; --reference is for files of poses')
         if args.model:

@@ -182,10 +182,8 @@ class PoseMovingMetal(PoseEffect):
                 ends = min(other[0], group[0]), max(other[1], group[1])
                 group = *ends, other[2] + group[2]
             groups.append(group)
-        start, length = (
-            residuals.setting.start,
-            residuals.setting.duration / window_count(residuals),
-        )
+        start = residuals.setting.start
+        length = residuals.setting.duration / window_count(residuals)
         return [
             EffectRecord(
                 self.name,

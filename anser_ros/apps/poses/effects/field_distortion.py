@@ -46,9 +46,7 @@ def _smooth_map(record: EffectRecord) -> PositionMap:
 
 
 def monomials(position: Array, centre: Array, size: float, degree: int, lowest: int = 1) -> Array:
-    """Return products of coordinates of positions (n, 3) about a centre, degrees ``lowest`` and
-    up.
-    """
+    """Return products of coordinates of positions (n, 3) about a centre, from ``lowest`` on."""
     scaled = (position - centre) / size
     columns = [np.prod(scaled[:, _factors(order)], axis=2) for order in range(lowest, degree + 1)]
     return np.concatenate(columns, axis=1)

@@ -43,8 +43,7 @@ FEWEST_DIFFERENCES = 60  # differences of neighbours that a power law is fitted 
 
 
 def power_law(square: Array, distance: Array) -> tuple[float, float, float]:
-    """Return the exponent of the noise by distance above a floor, its sigma, and the likelihood's
-    gain.
+    """Return the exponent of the noise by distance, its sigma, and the likelihood's gain.
 
     Square (n,) and distances (n, 3) are as of `jitter`. A squared deviation across the velocity
     has two degrees of freedom, so it is distributed exponentially about the variance, which is
@@ -168,17 +167,14 @@ class RangeNoise(PoseEffect):
         places = np.concatenate([distance for _, distance in pairs])
         square = np.concatenate([one / np.median(one) for one, _ in pairs])
         distance = np.concatenate([one / np.median(one) for _, one in pairs])
-        low, high = (
-            np.percentile(distance, [5, 95]) if square.size >= FEWEST_DIFFERENCES else (1.0, 1.0)
-        )
+        low, high = np.percentile(distance, [5, 95])
         if high < WIDEST * low:
             return []
         exponent, spread, gain = power_law(square, distance)
         is_clear = gain > LEAST_LAW_SIGMAS**2 and exponent > LEAST_LAW_SIGMAS * spread
         if not (is_clear and EXPONENTS[0] <= exponent <= EXPONENTS[1]):
             return []
-        middle = float(np.median(places))
-        values = {'exponent': exponent, 'reference_m': middle}
+        values = {'exponent': exponent, 'reference_m': float(np.median(places))}
         return [EffectRecord(self.name, values, {'exponent': spread})]
 
 

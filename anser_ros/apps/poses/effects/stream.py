@@ -1,6 +1,4 @@
-"""What is wrong with a stream: poses repeated, missing or outlying, stamps of receipt or of a
-poll.
-"""
+"""What is wrong with a stream: poses repeated, missing or outlying, stamps of receipt or poll."""
 
 from collections.abc import Sequence
 
@@ -21,6 +19,7 @@ Array = NDArray[np.float64]
 FEWEST_STALE = 0.02
 """Share (0 to 1) of poses of a moving body from which repeats are named: one in 60 comes again
 where a tracker of 60 Hz is polled a hertz too fast, which harms nothing."""
+FEWEST_MOVING = 20  # poses of a moving body by which repeats are judged
 MOVING_M = 5e-4
 """Way between two poses, m, from which a body moves: trackers resolve a tenth of it."""
 FROZEN_WAY_M = 0.01
@@ -53,12 +52,9 @@ class StalePoses(PoseEffect):
         found = []
         for poses in residuals.session.streams.values():
             moving = _moving(poses)
-            count = int(np.count_nonzero(moving))
-            if count < 20:
-                continue
-            again = poses.repeated & moving
-            share = float(np.count_nonzero(again)) / count
-            if share < FEWEST_STALE:
+            count, again = int(np.count_nonzero(moving)), poses.repeated & moving
+            share = np.count_nonzero(again) / max(count, 1)
+            if count < FEWEST_MOVING or share < FEWEST_STALE:
                 continue
             runs = int(np.count_nonzero(np.diff(again.astype(int), prepend=0) == 1))
             values = {'stream': poses.name, 'fraction': share, 'runs': runs}
