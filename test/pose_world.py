@@ -79,3 +79,10 @@ class World:
         }
         reference = made.pop('optical', None)
         return PoseSession('simulated', 10**9, made, reference)
+
+
+def write_tum(path, poses, start=100.0, scale=1.0):
+    """Write poses as a file in TUM's form, their stamps from a time (s) on."""
+    rows = np.c_[poses.time + start, scale * poses.position, poses.quaternion]
+    np.savetxt(path, rows, fmt='%.9f')
+    return str(path)

@@ -26,6 +26,9 @@ from anser_ros.cli.main import main
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 
+PLAIN = np.array([0.0, 0.0, 0.0, 1.0])  # no turn
+MIDDLE = np.array([0.05, 0.02, -0.3])
+
 
 @pytest.fixture(scope='module')
 def bent():
@@ -34,7 +37,7 @@ def bent():
     world.offset = 0.03
 
     def bend(sensor, place):
-        away = (place - [0.05, 0.02, -0.3]) / 0.06
+        away = (place - MIDDLE) / 0.06
         return place + 1.5e-3 * away[:, [0]] * away
 
     world.bend = bend
@@ -73,10 +76,8 @@ def test_clocks_that_run_apart_are_corrected_where_their_rate_was_learnt():
     rate = EffectRecord('clock_rate', {'rate_ppm': 1000.0, 'middle_s': 20.0, 'offset_s': 0.05}, {})
     own = EffectRecord('time_offset', {'sensor': 'tip', 'offset_s': 0.01}, {})
     second = 10**9
-    support = {
-        'low_m': [-1.0] * 3, 'high_m': [1.0] * 3,
-        'first_ns': 100 * second, 'last_ns': 140 * second,
-    }  # fmt: skip
+    support = {'low_m': [-1.0] * 3, 'high_m': [1.0] * 3}
+    support |= {'first_ns': 100 * second, 'last_ns': 140 * second}
     document = {
         'schema': MODEL_SCHEMA, 'held_out_position_rmse_m': 1e-3,
         'held_out_orientation_rmse_rad': 1e-2, 'support': support,
@@ -88,8 +89,7 @@ def test_clocks_that_run_apart_are_corrected_where_their_rate_was_learnt():
 
     def late(at):
         stamp = round(at * second)
-        place, turn = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
-        return stamp - PoseCorrector(document).correct('tip', stamp, place, turn).stamp_ns
+        return stamp - PoseCorrector(document).correct('tip', stamp, np.zeros(3), PLAIN).stamp_ns
 
     assert late(120) == round(0.06 * second)  # the offset at the middle
     # The reference's time of a stamp t is middle + (t - middle) / 1.001.
@@ -102,46 +102,46 @@ def test_clocks_that_run_apart_are_corrected_where_their_rate_was_learnt():
 
 def test_outside_the_covariance_grows_and_the_state_says_so(bent):
     corrector = PoseCorrector(bent[1])
-    q = np.array([0, 0, 0, 1.0])
-    near = corrector.correct('sensor_0', 10**9, np.array([0.05, 0.02, -0.3]), q)
-    far = corrector.correct('sensor_0', 10**9, np.array([0.6, 0.02, -0.3]), q)
+    near = corrector.correct('sensor_0', 10**9, MIDDLE, PLAIN)
+    far = corrector.correct('sensor_0', 10**9, np.array([0.6, 0.02, -0.3]), PLAIN)
     assert (near.state, far.state) == (OK, OUTSIDE)
     assert np.sqrt(far.covariance[0, 0]) > 0.02 > 10 * np.sqrt(near.covariance[0, 0])
 
 
 def test_no_pose_stays_none_and_an_unknown_sensor_is_said(bent):
     corrector = PoseCorrector(bent[1])
-    q, place = np.array([0, 0, 0, 1.0]), np.array([0.05, 0.02, -0.3])
-    assert corrector.correct('sensor_0', 1, place * np.nan, q).state == NO_POSE
-    assert corrector.correct('sensor_0', 1, np.full(3, -3.7e28), q).state == NO_POSE
-    assert corrector.correct('sensor_0', 1, place, 0 * q).state == NO_POSE
-    assert corrector.correct('other', 1, place, q).state == UNKNOWN
+    for place, turn in (
+        (MIDDLE * np.nan, PLAIN),
+        (np.full(3, -3.7e28), PLAIN),
+        (MIDDLE, 0 * PLAIN),
+    ):
+        assert corrector.correct('sensor_0', 1, place, turn).state == NO_POSE
+    assert corrector.correct('other', 1, MIDDLE, PLAIN).state == UNKNOWN
+
+
+def map_record(degree, kind, coefficients, **uncertainty):
+    parameters = {
+        'degree': degree, 'kind': kind, 'sensor': 'sensor_0', 'centre_m': MIDDLE.tolist(),
+        'size_m': 0.05, 'coefficients_mm': coefficients,
+    }  # fmt: skip
+    return {'name': 'field_distortion', 'parameters': parameters, 'uncertainty': uncertainty}
 
 
 def test_a_map_whose_coefficients_are_not_those_of_its_degree_is_refused(bent):
-    parameters = {
-        'degree': 2, 'kind': 'quadratic', 'sensor': 'sensor_0', 'centre_m': [0.05, 0.02, -0.3],
-        'size_m': 0.05, 'coefficients_mm': [0.1] * 27,
-    }  # fmt: skip
-    record = {'name': 'field_distortion', 'parameters': parameters, 'uncertainty': {}}
+    record = map_record(2, 'quadratic', [0.1] * 27)
     with pytest.raises(ModelFileError, match='27 coefficients_mm, such a map has 30'):
         PoseCorrector({**bent[1], 'effects': [record]})
 
 
 def test_a_shrunk_space_is_stretched_about_its_own_point_with_its_variance(bent):
-    parameters = {
-        'degree': 0, 'kind': 'scale', 'sensor': 'sensor_0', 'centre_m': [0.05, 0.02, -0.3],
-        'size_m': 0.05, 'coefficients_mm': [1.5, 0.1, -0.2, 0.3],
-    }  # fmt: skip
-    sigma = {'coefficients_mm': [0.3, 0.1, 0.1, 0.1]}
-    record = {'name': 'field_distortion', 'parameters': parameters, 'uncertainty': sigma}
+    record = map_record(0, 'scale', [1.5, 0.1, -0.2, 0.3], coefficients_mm=[0.3, 0.1, 0.1, 0.1])
     effects = [e for e in bent[1]['effects'] if e['name'] == 'hand_eye']
     plain, full = (
         PoseCorrector({**bent[1], 'effects': [*effects, *more]}) for more in ([], [record])
     )
-    q, place = np.array([0, 0, 0, 1.0]), np.array([0.08, 0.0, -0.28])
-    before, after = (one.correct('sensor_0', 1, place, q) for one in (plain, full))
-    away = place - parameters['centre_m']
+    place = np.array([0.08, 0.0, -0.28])
+    before, after = (one.correct('sensor_0', 1, place, PLAIN) for one in (plain, full))
+    away = place - MIDDLE
     moved = 1.5e-3 * away / 0.05 + [1e-4, -2e-4, 3e-4]
     np.testing.assert_allclose(after.position - before.position, moved, atol=1e-12)
     variance = np.mean((0.3e-3 * away / 0.05) ** 2) + 1e-8
@@ -200,8 +200,9 @@ def test_a_map_of_points_is_applied_where_it_is_confirmed(tmp_path, capsys):
     for name, bend in (('bent', 0.03), ('noisy', 0.0)):
         tracked = turn.apply(true * [1.0 + bend, 1.0, 1.0] + 2e-4 * rng.normal(size=true.shape))
         tracked += shift
-        for file, points, head in (('em', tracked, 'x_m,y_m,z_m'), ('true', true, 'x_m,y_m,z_m')):
-            np.savetxt(tmp_path / f'{file}.csv', points, delimiter=',', header=head, comments='')
+        for file, points in (('em', tracked), ('true', true)):
+            np.savetxt(tmp_path / f'{file}.csv', points, delimiter=',', header='x_m,y_m,z_m',
+                       comments='')  # fmt: skip
         out = tmp_path / name
         command = ['error_map', str(tmp_path / 'em.csv'), '--true', str(tmp_path / 'true.csv')]
         assert main([*command, '--register', '--sensor', 'tip', '--out', str(out)]) == 0
@@ -211,12 +212,10 @@ def test_a_map_of_points_is_applied_where_it_is_confirmed(tmp_path, capsys):
         assert document['confirmed'] == (name == 'bent')
         assert document['before']['out_of_plane_rmse_m'] == pytest.approx(2e-4, rel=0.3)
         corrector = PoseCorrector(yaml.safe_load((out / 'model.yaml').read_text()))
-        fixed = np.array(
-            [corrector.correct('tip', 1, p, np.array([0, 0, 0, 1.0])).position for p in tracked]
-        )
+        fixed = np.array([corrector.correct('tip', 1, p, PLAIN).position for p in tracked])
         left = (fixed - shift) @ turn.as_matrix() - true
         rms = np.sqrt(np.mean(np.sum(left[:, :2] ** 2, axis=1)))
         assert rms < 4e-4
         np.testing.assert_array_equal(fixed, tracked) if name == 'noisy' else None
-    away = corrector.correct('tip', 1, tracked[0] + 1.0, np.array([0, 0, 0, 1.0]))
+    away = corrector.correct('tip', 1, tracked[0] + 1.0, PLAIN)
     assert away.state == 'outside_support'

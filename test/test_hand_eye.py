@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from conftest import REPO
-from pose_world import FRAME, SHIFT, World
+from pose_world import FRAME, SHIFT, World, write_tum
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.hand_eye import fit_hand_eye
@@ -41,15 +41,10 @@ def shah(session):
     """Frames of ``A X = Z B`` by Shah's Kronecker product (J. Mechanisms Robotics 5, 2013)."""
     one, two = session.sensors['s'], session.reference
     products = sum(np.kron(b, a) for a, b in zip(one.rotation, two.rotation, strict=True))
-    u, _, vt = np.linalg.svd(products)
     # tracked = frame optical mount, so vec(tracked mount^T) = (optical x 1) vec(frame)
-    mount, frame = vt[0].reshape(3, 3).T, u[:, 0].reshape(3, 3).T
-    found = []
-    for matrix in (mount, frame):
-        matrix = matrix * np.sign(np.linalg.det(matrix))
-        left, _, right = np.linalg.svd(matrix)
-        found.append(left @ right)
-    frame = found[1]
+    frame = np.linalg.svd(products)[0][:, 0].reshape(3, 3).T
+    left, _, right = np.linalg.svd(frame * np.sign(np.linalg.det(frame)))
+    frame = left @ right
     count = one.size
     rows = np.zeros((3 * count, 6))
     rows[:, :3] = (frame @ two.rotation).reshape(-1, 3)
@@ -145,8 +140,7 @@ def test_the_command_takes_a_bag_or_files(tmp_path, capsys):
     assert abs(document['clock']['offset_s']) < 1e-3
     assert '<img' in (tmp_path / 'o' / 'report.html').read_text(encoding='utf-8')
     for name, poses in (('em', session.sensors['sensor_1']), ('optical', session.reference)):
-        rows = np.c_[poses.time + 5.0, poses.position, poses.quaternion]
-        np.savetxt(tmp_path / f'{name}.tum', rows, fmt='%.9f')
+        write_tum(tmp_path / f'{name}.tum', poses)
     files = [str(tmp_path / 'em.tum'), '--reference', str(tmp_path / 'optical.tum')]
     assert run_verb('handeye', [*files, '--json']) == 0
     (one,) = json.loads(capsys.readouterr().out)['sensors'].values()
@@ -171,8 +165,7 @@ def test_millimetres_under_heads_of_metres_are_said_or_refused(tmp_path, capsys)
     streams = {'em': session.sensors['sensor_0'], 'optical': session.reference}
     for name, poses in streams.items():
         for ending, scale in (('m', 1.0), ('mm', 1e3)):
-            rows = np.c_[poses.time + 5.0, scale * poses.position, poses.quaternion]
-            np.savetxt(tmp_path / f'{name}_{ending}.tum', rows, fmt='%.9f')
+            write_tum(tmp_path / f'{name}_{ending}.tum', poses, scale=scale)
 
     def told(em, optical):
         files = [str(tmp_path / f'em_{em}.tum'), '--reference']

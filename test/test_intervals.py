@@ -10,7 +10,7 @@ from anser_ros.apps.poses.assessment.intervals import (
     mitk_statistics,
     summarised,
 )
-from anser_ros.apps.poses.assessment.stability import allan_deviation, assess_rest
+from anser_ros.apps.poses.assessment.rest import allan_deviation, assess_rest
 from anser_ros.apps.poses.sequence import sequence_of
 
 pytestmark = pytest.mark.long
@@ -73,7 +73,7 @@ def test_allan_deviations_follow_their_laws(make, law):
     for seed in range(5300, 5312):
         curve = allan_deviation(make(np.random.default_rng(seed), 4000), 50.0)
         long = curve.tau_s > 0.3  # the discrete walk has reached its law
-        low, high, true = curve.low[long], curve.high[long], law(curve.tau_s[long])
+        low, high, true = curve.low_m[long], curve.high_m[long], law(curve.tau_s[long])
         hits += list((low < true) & (true < high))
     assert 0.88 < np.mean(hits) <= 1.0
 
@@ -83,14 +83,17 @@ def test_a_ramp_is_a_drift():
     place = np.outer(time, [2e-6, 0, 0]) + 1e-4 * np.random.default_rng(1).normal(
         size=(time.size, 3)
     )
-    found = assess_rest(sequence_of('pen', time, place, np.tile(STILL, (time.size, 1))))
-    drift = found.estimates['position_drift_x_m_per_h']
+    poses = sequence_of('pen', time, place, np.tile(STILL, (time.size, 1)))
+    estimates, allan, _ = assess_rest(poses)
+    drift = estimates['position_drift_x_m_per_h']
     assert drift.low < 2e-6 * 3600 < drift.high and drift.low > 6e-3
-    other = found.estimates['position_drift_y_m_per_h']
+    other = estimates['position_drift_y_m_per_h']
     assert other.low < 0 < other.high
-    jitter = found.estimates['position_jitter_y_m']
+    jitter = estimates['position_jitter_y_m']
     assert jitter.value == pytest.approx(1e-4, rel=0.03)
     assert jitter.low < jitter.value < jitter.high < 1.05 * jitter.value
-    curve = found.allan['x']
+    curve = allan['x']
     at = curve.tau_s > 30
-    np.testing.assert_allclose(curve.deviation[at], 2e-6 * curve.tau_s[at] / np.sqrt(2), rtol=0.15)
+    np.testing.assert_allclose(
+        curve.deviation_m[at], 2e-6 * curve.tau_s[at] / np.sqrt(2), rtol=0.15
+    )

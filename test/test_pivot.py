@@ -10,6 +10,7 @@ import pytest
 import yaml
 from conftest import REPO
 from geometry_msgs.msg import PoseStamped
+from pose_world import write_tum
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -179,8 +180,7 @@ class TestDocument:
         text = DEMO.replace('name: tool_a/0/x', 'name: tool_a/tip')
         assert text != DEMO
         with pytest.raises(SetupError, match='tool_a/tip'):
-            with_tip = with_tips(text, {'tool_a': self.SPEC})
-            parse_setup(with_tip)
+            parse_setup(with_tips(text, {'tool_a': self.SPEC}))
 
 
 def test_slicer_gets_the_tip_as_a_body():
@@ -189,11 +189,6 @@ def test_slicer_gets_the_tip_as_a_body():
     setup = parse_setup(DEMO).with_tips({'tool_a': TestDocument.SPEC})
     table = igtl.OpenIGTLinkParameters(coils=False)
     assert set(igtl.devices_of(setup, table)) == {'tool_a', 'tool_a/tip'}
-
-
-def write_tum(path, poses):
-    np.savetxt(path, np.c_[poses.time + 100, poses.position, poses.quaternion], fmt='%.9f')
-    return str(path)
 
 
 def test_the_command_writes_the_tip_and_refuses_in_a_line(tmp_path, capsys):
@@ -267,9 +262,8 @@ def test_the_command_takes_poses_from_the_graph(ros, tmp_path, capsys):
     thread = threading.Thread(target=publish)
     thread.start()
     try:
-        assert (
-            run_verb('pivot', ['--live', '--topic', '/pen/pose', '--seconds', '2', '--json']) == 0
-        )
+        command = ['--live', '--topic', '/pen/pose', '--seconds', '2', '--json']
+        assert run_verb('pivot', command) == 0
         document = json.loads(capsys.readouterr().out)
         assert np.linalg.norm(np.array(document['tip_m']) - tip) < 1e-3
     finally:

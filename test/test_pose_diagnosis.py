@@ -45,45 +45,16 @@ def test_a_clean_session_has_hand_eye_alone_and_knows_how_well():
         )
 
 
-def late(world):
-    world.offset = 0.04
+MIDDLE = np.array([0.05, 0.02, -0.3])
 
 
-def fast(world):
-    world.offset, world.rate_ppm = 0.02, 900.0
+def bent(sensor, place):
+    away = (place - MIDDLE) / 0.06
+    return place + 1.5e-3 * away[:, [0]] * away if sensor == 1 else place
 
 
-def large(world):
-    world.scale = 1.012
-
-
-def jittery(world):
-    world.jitter = 0.01
-
-
-def filtered(world):
-    world.tau = 0.08
-
-
-def bent(world):
-    def bend(sensor, place):
-        away = (place - [0.05, 0.02, -0.3]) / 0.06
-        return place + 1.5e-3 * away[:, [0]] * away if sensor == 1 else place
-
-    world.bend = bend
-
-
-def shrunk(world):
-    middle = np.array([0.05, 0.02, -0.3])
-    world.bend = lambda sensor, place: middle + 0.97 * (place - middle) if sensor == 1 else place
-
-
-def far_noise(world):
-    world.spread = lambda s, p: (np.linalg.norm(p, axis=1) / 0.3) ** 4
-
-
-def noisy(world):
-    world.spread = lambda s, p: np.full(len(p), 3.0 if s == 1 else 1.0)
+def shrunk(sensor, place):
+    return MIDDLE + 0.97 * (place - MIDDLE) if sensor == 1 else place
 
 
 def twice(streams):
@@ -92,69 +63,82 @@ def twice(streams):
     return streams
 
 
-def stale(world):
-    world.after = twice
+def lossy(streams):
+    streams['sensor_0'][1][100:118] = -3.697314e28
+    return streams
 
 
-def lossy(world):
-    def lose(streams):
-        streams['sensor_0'][1][100:118] = -3.697314e28
-        return streams
-
-    world.after = lose
-
-
-def mirrored(world):
-    def flip(streams):
-        rows = streams['optical']
-        rows[1][::50] += [0.057, 0, 0]
-        flipped = Rotation.from_quat(rows[2][::50]) * Rotation.from_rotvec([1.5, 0, 0])
-        rows[2][::50] = flipped.as_quat()
-        return streams
-
-    world.after = flip
+def mirrored(streams):
+    rows = streams['optical']
+    rows[1][::50] += [0.057, 0, 0]
+    flipped = Rotation.from_quat(rows[2][::50]) * Rotation.from_rotvec([1.5, 0, 0])
+    rows[2][::50] = flipped.as_quat()
+    return streams
 
 
-def swapped(world):
+def swapped(first, last):
     def swap(streams):
         for one, other in zip(streams['sensor_0'], streams['sensor_1'], strict=True):
-            one[200:260], other[200:260] = other[200:260].copy(), one[200:260].copy()
+            one[first:last], other[first:last] = other[first:last].copy(), one[first:last].copy()
         return streams
 
-    world.after = swap
+    return swap
 
 
-def swapped_half(world):
-    def swap(streams):
-        for one, other in zip(streams['sensor_0'], streams['sensor_1'], strict=True):
-            one[300:], other[300:] = other[300:].copy(), one[300:].copy()
+def polled(step, rounded=np.ceil):
+    def poll(streams):
+        streams['sensor_0'][0] = rounded(streams['sensor_0'][0] / step) * step
         return streams
 
-    world.after = swap
+    return poll
 
 
-CASES = [
-    (late, {'time_offset': ('offset_s', 0.04, 5e-4)}),
-    (fast, {'time_offset': ('offset_s', 0.02, 1e-3), 'clock_rate': ('rate_ppm', 900.0, 100.0)}),
-    (large, {'optical_scale': ('scale', 1.012, 1.5e-3)}),
-    (jittery, {'stamp_jitter': ('rms_s', 0.01, 0.0015)}),
-    (filtered, {'tracker_lag': ('tau_s', 0.08, 0.02)}),
-    (far_noise, {'range_noise': ('exponent', 4.0, 1.2)}),
-    (noisy, {'excess_noise': ('factor', 3.0, 0.8)}),
-    (stale, {'stale_poses': ('fraction', 0.25, 0.05)}),
-    (lossy, {'missing_poses': ('fraction', 0.03, 0.005)}),
-    (bent, {'field_distortion': ('degree', 2, 0.1)}),
-    (shrunk, {'field_distortion': ('degree', 0, 0.1)}),
-    (mirrored, {'outliers': ('fraction', 0.02, 0.005)}),
-    (swapped, {'swapped_sensors': ('fraction', 0.1, 0.01)}),
-    (swapped_half, {'swapped_sensors': ('fraction', 0.5, 0.01)}),
-]
+def late(seconds, sensor='sensor_0'):
+    def shift(streams):
+        streams[sensor][0] = streams[sensor][0] + seconds
+        return streams
+
+    return shift
 
 
-@pytest.mark.parametrize(('change', 'expected'), CASES, ids=[c[0].__name__ for c in CASES])
-def test_one_thing_wrong_is_named_with_its_size(change, expected):
+def carried(world, share):
+    """The world with only a share of its turns."""
+    turn = world._turn
+    world._turn = lambda time: share * turn(time)
+    return world
+
+
+CASES = {
+    'late': ({'offset': 0.04}, {'time_offset': ('offset_s', 0.04, 5e-4)}),
+    'fast': (
+        {'offset': 0.02, 'rate_ppm': 900.0},
+        {'time_offset': ('offset_s', 0.02, 1e-3), 'clock_rate': ('rate_ppm', 900.0, 100.0)},
+    ),
+    'large': ({'scale': 1.012}, {'optical_scale': ('scale', 1.012, 1.5e-3)}),
+    'jittery': ({'jitter': 0.01}, {'stamp_jitter': ('rms_s', 0.01, 0.0015)}),
+    'filtered': ({'tau': 0.08}, {'tracker_lag': ('tau_s', 0.08, 0.02)}),
+    'far_noise': (
+        {'spread': lambda s, p: (np.linalg.norm(p, axis=1) / 0.3) ** 4},
+        {'range_noise': ('exponent', 4.0, 1.2)},
+    ),
+    'noisy': (
+        {'spread': lambda s, p: np.full(len(p), 3.0 if s == 1 else 1.0)},
+        {'excess_noise': ('factor', 3.0, 0.8)},
+    ),
+    'stale': ({'after': twice}, {'stale_poses': ('fraction', 0.25, 0.05)}),
+    'lossy': ({'after': lossy}, {'missing_poses': ('fraction', 0.03, 0.005)}),
+    'bent': ({'bend': bent}, {'field_distortion': ('degree', 2, 0.1)}),
+    'shrunk': ({'bend': shrunk}, {'field_distortion': ('degree', 0, 0.1)}),
+    'mirrored': ({'after': mirrored}, {'outliers': ('fraction', 0.02, 0.005)}),
+    'swapped': ({'after': swapped(200, 260)}, {'swapped_sensors': ('fraction', 0.1, 0.01)}),
+    'swapped_half': ({'after': swapped(300, None)}, {'swapped_sensors': ('fraction', 0.5, 0.01)}),
+}
+
+
+@pytest.mark.parametrize(('wrong', 'expected'), CASES.values(), ids=CASES)
+def test_one_thing_wrong_is_named_with_its_size(wrong, expected):
     world = World(2)
-    change(world)
+    vars(world).update(wrong)
     found = named(diagnose_poses(world.session()))
     assert set(found) == set(expected)
     for name, (key, value, tolerance) in expected.items():
@@ -166,8 +150,10 @@ def test_noise_of_the_reference_is_not_the_filter_of_a_precise_tracker():
     world = World(2, duration=20.0, sensors=1, rate=25.0, optical_rate=60.0)
     world.noise_m, world.noise_rad = 2e-5, 1e-4
     knots = np.arange(-2.0, 23.0, 2.5)
-    world._place = CubicSpline(knots, world.rng.normal(0, 0.06, (knots.size, 3)))
-    world._turn = CubicSpline(knots, world.rng.normal(0, 0.25, (knots.size, 3)))
+    place, turn = (
+        CubicSpline(knots, world.rng.normal(0, s, (knots.size, 3))) for s in (0.06, 0.25)
+    )
+    world.follow(place, turn)
     assert not named(diagnose_poses(world.session()))
 
 
@@ -200,9 +186,7 @@ def test_another_order_or_sense_of_quaternions_is_named_and_undone(change, conve
 
 
 def test_another_sense_is_named_of_a_body_that_turns_too_little_for_places_to_tell():
-    world = World(2, sensors=1)
-    turn = world._turn
-    world._turn = lambda time: 0.25 * turn(time)
+    world = carried(World(2, sensors=1), 0.25)
     world.after = read_as([3, 0, 1, 2])
     found = diagnose_poses(world.session())
     assert named(found)['frame_convention'].parameters['quaternion'] == 'wxyz'
@@ -210,12 +194,7 @@ def test_another_sense_is_named_of_a_body_that_turns_too_little_for_places_to_te
 
 def test_a_sensor_that_shares_no_time_with_the_reference_is_told():
     world = World(2, sensors=2)
-
-    def shift(streams):
-        streams['sensor_0'][0] += 1000.0
-        return streams
-
-    world.after = shift
+    world.after = late(1000.0)
     found = diagnose_poses(world.session())
     assert found.left_out == ('sensor_0',)
     assert 'Left out' in pose_verdict(to_document(found))
@@ -242,12 +221,8 @@ def test_files_that_do_not_belong_together_are_refused():
 def test_two_sensors_without_a_reference_are_compared_by_rigidity():
     world = World(6, duration=20.0)
 
-    def delay(streams):
-        streams.pop('optical')
-        streams['sensor_1'][0] = streams['sensor_1'][0] + 0.03
-        return streams
-
-    world.after = delay
+    shift = late(0.03, 'sensor_1')
+    world.after = lambda streams: shift({k: v for k, v in streams.items() if k != 'optical'})
     session = world.session()
     found = diagnose_poses(session)
     assert set(named(found)) == {'time_offset'}
@@ -259,9 +234,7 @@ def test_two_sensors_without_a_reference_are_compared_by_rigidity():
 
 
 def test_a_lever_arm_that_the_motion_does_not_tell_is_not_given():
-    world = World(7, duration=20.0, sensors=1)
-    turn = world._turn
-    world._turn = lambda time: 0.001 * turn(time)
+    world = carried(World(7, duration=20.0, sensors=1), 0.001)
     (record,) = hand_eyes(diagnose_poses(world.session()))
     assert None in record.parameters['lever_arm_m']
     assert not record.evidence['observable']
@@ -290,12 +263,7 @@ def test_the_command_writes_the_documents_that_are_promised(tmp_path, capsys):
 
 def test_stamps_of_a_poll_are_told_from_those_that_jitter():
     world = World(12, duration=25.0, sensors=1)
-
-    def poll(streams):
-        streams['sensor_0'][0] = np.round(streams['sensor_0'][0] / 0.0312) * 0.0312
-        return streams
-
-    world.after = poll
+    world.after = polled(0.0312, np.round)
     found = named(diagnose_poses(world.session()))
     assert set(found) == {'quantised_stamps'}
     assert found['quantised_stamps'].parameters['step_s'] == pytest.approx(0.0312, rel=0.01)
@@ -319,10 +287,9 @@ def test_a_body_at_rest_tells_no_lever_arm_and_breaks_nothing():
 
 @pytest.mark.parametrize(('strain', 'expected'), [(0.0, {'time_offset'}), (0.02, set())])
 def test_a_body_that_is_only_carried_tells_the_clock_where_that_leaves_nothing(strain, expected):
-    world = World(5, duration=30.0)
-    turn, world.offset = world._turn, 0.03
-    world._turn = lambda time: 0.01 * turn(time)
-    world.bend = lambda sensor, place: place + sensor * strain * (place - [0.05, 0.02, -0.3])
+    world = carried(World(5, duration=30.0), 0.01)
+    world.offset = 0.03
+    world.bend = lambda sensor, place: place + sensor * strain * (place - MIDDLE)
     found = diagnose_poses(world.session())
     assert set(named(found)) == expected
     assert (found.unexplained > 0.5) == (not expected)
@@ -345,23 +312,13 @@ def test_a_scale_that_gains_much_less_than_a_bend_is_part_of_it_unless_sensors_a
 
 def test_the_slow_beat_of_a_poll_is_no_rate_of_the_clock():
     world = World(206, duration=32.0, sensors=1, rate=1 / (2.0016 * 0.03))
-
-    def poll(streams):
-        streams['sensor_0'][0] = np.ceil(streams['sensor_0'][0] / 0.03) * 0.03
-        return streams
-
-    world.after = poll
+    world.after = polled(0.03)
     assert 'clock_rate' not in named(diagnose_poses(world.session()))
 
 
 def test_errors_of_a_poll_are_not_as_uncertain_as_random_ones():
     world = World(13, duration=40.0, sensors=1, rate=17.0)
-
-    def poll(streams):
-        streams['sensor_0'][0] = np.ceil(streams['sensor_0'][0] / 0.03) * 0.03
-        return streams
-
-    world.after = poll
+    world.after = polled(0.03)
     offset = named(diagnose_poses(world.session()))['time_offset']
     sigma = offset.uncertainty['offset_s']
     assert sigma < 0.7 * 0.03 / np.sqrt(12 * 17 * 40)

@@ -17,9 +17,9 @@ from anser_ros.apps.poses.effects.numbers import PoseClockRate
 from anser_ros.apps.poses.effects.stream import ReceiptJitter, stamp_step
 from anser_ros.apps.poses.fit import is_lever_determined
 from anser_ros.apps.poses.hand_eye import one_clock
-from anser_ros.apps.poses.path import OpticalPath
+from anser_ros.apps.poses.problem import PoseNoise
 from anser_ros.apps.poses.search import doubt, with_noise
-from anser_ros.apps.poses.sequence import PoseSession, sequence_of
+from anser_ros.apps.poses.sequence import OpticalPath, PoseSession, sequence_of
 from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, started
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
@@ -34,20 +34,15 @@ def test_the_clock_undoes_a_rate_exactly():
     np.testing.assert_allclose(PoseClockRate().clock(term, 'sensor_0', stamps), true, atol=1e-12)
 
 
+# Clocks agree at the middle, or at the start: 20 s at 1000 ppm.
 @pytest.mark.parametrize(
-    ('offset_s', 'names'),
-    [
-        (0.0, ['clock_rate']),  # agree at the middle
-        (0.02, ['clock_rate']),  # agree at the start: 20 s at 1000 ppm
-        (0.008, ['time_offset', 'clock_rate']),
-        (-0.02, ['time_offset', 'clock_rate']),
-    ],
+    ('offset_s', 'is_alike'), [(0.0, True), (0.02, True), (0.008, False), (-0.02, False)]
 )
-def test_clocks_that_were_set_alike_have_no_offset_beside_their_rate(offset_s, names):
+def test_clocks_that_were_set_alike_have_no_offset_beside_their_rate(offset_s, is_alike):
     rate = EffectRecord('clock_rate', {'rate_ppm': 1000.0, 'middle_s': 20.0}, {})
     offset = EffectRecord('time_offset', {'offset_s': offset_s}, {})
     found = one_clock([offset, rate], 40.0)
-    assert [r.name for r in found] == names
+    assert [r.name for r in found] == ['time_offset', 'clock_rate'][is_alike:]
     assert found[-1].parameters['offset_s'] == offset_s
 
 
@@ -96,8 +91,7 @@ def test_jitter_of_stamps_is_known_as_well_as_that_of_so_many_poses_can_be(share
         velocity = np.tile([0.0, 0.2, 0.0, 0.0, 0.0, 0.0], (300, 1))  # 2 mm in 10 ms
         sensors.append(SimpleNamespace(
             view=SimpleNamespace(sensor=f'sensor_{k}', time=time, velocity=velocity),
-            used=np.ones(300, dtype=bool), position_m=1e-5, orientation_rad=1e-3, stamp_s=0.01,
-            stamp_gain=3000.0,
+            used=np.ones(300, dtype=bool), noise=PoseNoise(1e-5, 1e-3, 0.01), stamp_gain=3000.0,
         ))  # fmt: skip
     streams = {s.view.sensor: s.view for s in sensors}
     residuals = SimpleNamespace(sensors=sensors, session=SimpleNamespace(sensors=streams))
@@ -155,13 +149,10 @@ def test_metal_is_told_by_the_body_where_stamps_jitter_more_than_it_pulls():
 
 def test_metal_at_one_sensor_leaves_the_episodes_of_others_at_other_times():
     away, near = (30, 40, (0.0, 0.0, 4e-3)), (4, 8, (4e-3, 0.0, 0.0))
-    first, second = episodes_of((near, away), returns=True)
-    assert (first.parameters['sensors'], second.parameters['sensors']) == (
-        ['sensor_0'], ['sensor_2'],
-    )  # fmt: skip
-    assert first.parameters['t_start_s'] == pytest.approx(4.0, abs=1.0)
-    assert first.parameters['t_end_s'] == pytest.approx(8.0, abs=1.0)
-    assert second.parameters['t_start_s'] == pytest.approx(30.0, abs=1.0)
+    first, second = (r.parameters for r in episodes_of((near, away), returns=True))
+    assert (first['sensors'], second['sensors']) == (['sensor_0'], ['sensor_2'])
+    times = [first['t_start_s'], first['t_end_s'], second['t_start_s']]
+    assert times == pytest.approx([4.0, 8.0, 30.0], abs=1.0)
 
 
 def episodes_of(spans, *, returns=False, shared_m=0.0):
@@ -231,15 +222,13 @@ def test_recordings_at_rest_one_after_the_other_are_compared_whole():
     # The reference is recorded for a second, and the tracker after it: they share no time.
     world, rng = World(5, duration=200.0, sensors=1), np.random.default_rng(5)
     streams = {'sensor_0': [], 'optical': []}
-    for k in range(12):
-        place, turn = world.sensor(0, np.full(30, 10.0 * k))
+    for start in 10.0 * np.arange(12):
+        place, turn = world.sensor(0, np.full(30, start))
         place = place + 2e-4 * rng.normal(size=place.shape)
-        streams['sensor_0'].append((10.0 * k + 2.0 + 0.05 * np.arange(30), place, turn.as_quat()))
-        place, turn = world.body(np.full(20, 10.0 * k))
-        place = FRAME.inv().apply(place - SHIFT)
-        streams['optical'].append(
-            (10.0 * k + 0.05 * np.arange(20), place, (FRAME.inv() * turn).as_quat())
-        )
+        streams['sensor_0'].append((start + 2.0 + 0.05 * np.arange(30), place, turn.as_quat()))
+        place, turn = world.body(np.full(20, start))
+        rows = FRAME.inv().apply(place - SHIFT), (FRAME.inv() * turn).as_quat()
+        streams['optical'].append((start + 0.05 * np.arange(20), *rows))
     made = {
         name: sequence_of(name, *(np.concatenate(v) for v in zip(*rows, strict=True)))
         for name, rows in streams.items()

@@ -39,6 +39,17 @@ def line(sensor, x, q, stamp):
     )
 
 
+def device_line(stamp_s, frame):
+    q = ' '.join(map(str, TURN.as_quat()))
+    host = round(1e9 * stamp_s)
+    return f'Position: {stamp_s} 2 3 Orientation: {q} AuroraFrame: {frame} NetworkTime: {host}'
+
+
+def one_of(session):
+    (poses,) = session.sensors.values()
+    return poses
+
+
 def test_tool_tracker_counts_field_periods_and_says_what_is_missing(tmp_path):
     gone = cell(3208, 'Too Few Markers', [MISSING] * 7)
     path = tool_tracker(tmp_path / 'a.tsv', [
@@ -90,14 +101,10 @@ def test_ascension_writes_the_scalar_first_and_the_inverse(tmp_path):
 
 
 def test_device_stamps_lie_on_the_hosts_axis_by_the_smallest_delay(tmp_path):
-    q = TURN.as_quat()
-    rows = []
-    for k, late in enumerate((0.012, 0.003, 0.009)):
-        row = line(0, 1, q, round(1e9 * (100 + k / 40 + late)))
-        rows.append(row.replace('Time', f'AuroraFrame: {8 * k} Time'))
+    late = (0.012, 0.003, 0.009)
+    rows = [device_line(100 + k / 40 + s, 8 * k) for k, s in enumerate(late)]
     path = write(tmp_path / 'a.txt', *rows)
-    host = import_poses([path]).sensors['sensor_0'].time
-    device = import_poses([path], stamps='device').sensors['sensor_0'].time
+    host, device = (one_of(import_poses([path], stamps=s)).time for s in ('host', 'device'))
     np.testing.assert_allclose(np.diff(device), 0.025, atol=1e-9)
     assert np.ptp(np.diff(host)) > 0.01
 
@@ -105,7 +112,7 @@ def test_device_stamps_lie_on_the_hosts_axis_by_the_smallest_delay(tmp_path):
 def test_tum_csv_and_static_files_one_after_the_other(tmp_path):
     q = ' '.join(map(str, TURN.as_quat()))
     tum = write(tmp_path / 'a.tum', '# t x y z', f'1.5 0.1 0.2 0.3 {q}', f'1.6 0.1 0.2 0.4 {q}')
-    (poses,) = import_poses([tum]).sensors.values()
+    poses = one_of(import_poses([tum]))
     np.testing.assert_allclose(poses.position[:, 2], [0.3, 0.4])
     table = write(tmp_path / 'a.csv', 'stamp_ns,sensor,x_mm,y_mm,z_mm,qx,qy,qz,qw',
                   '1000000000,tip,1,2,3,0,0,0,1', '1100000000,tip,,,,,,,')  # fmt: skip
@@ -199,27 +206,19 @@ def test_sensors_have_the_names_that_they_are_given(tmp_path, capsys):
 
 
 def test_axes_in_different_units_are_refused(tmp_path):
-    table = write(
-        tmp_path / 'a.csv', 'stamp_ns,x_m,y_mm,z_m,qx,qy,qz,qw', '1000000000,1,2,3,0,0,0,1'
-    )
+    head = 'stamp_ns,x_m,y_mm,z_m,qx,qy,qz,qw'
+    table = write(tmp_path / 'a.csv', head, '1000000000,1,2,3,0,0,0,1')
     with pytest.raises(ParameterError, match='columns'):
         import_poses([table])
-
-
-def device_line(stamp_s, frame):
-    q = ' '.join(map(str, TURN.as_quat()))
-    host = round(1e9 * stamp_s)
-    return f'Position: {stamp_s} 2 3 Orientation: {q} AuroraFrame: {frame} NetworkTime: {host}'
 
 
 def test_rows_in_any_order_have_the_device_stamps_of_their_own(tmp_path):
     lines = [device_line(100 + 0.05 * k, 1000 + 16 * k) for k in range(60)]
     mixed = [lines[k] for k in np.random.default_rng(1).permutation(60)]
-    sessions = [
-        import_poses([write(tmp_path / f'{n}.txt', *rows)], stamps='device')
+    ordered, found = (
+        one_of(import_poses([write(tmp_path / f'{n}.txt', *rows)], stamps='device'))
         for n, rows in (('a', lines), ('b', mixed))
-    ]
-    ordered, found = (next(iter(s.sensors.values())) for s in sessions)
+    )
     np.testing.assert_allclose(found.time, ordered.time, atol=1e-9)
     np.testing.assert_array_equal(found.position, ordered.position)
 
@@ -227,8 +226,8 @@ def test_rows_in_any_order_have_the_device_stamps_of_their_own(tmp_path):
 def test_a_device_that_restarts_after_a_pause_is_put_on_the_hosts_axis_again(tmp_path):
     before = [device_line(100 + 0.05 * k, 5000 + 16 * k) for k in range(40)]
     after = [device_line(110 + 0.05 * k, 16 * k) for k in range(40)]
-    session = import_poses([write(tmp_path / 'a.txt', *before, *after)], stamps='device')
-    time = next(iter(session.sensors.values())).time
+    path = write(tmp_path / 'a.txt', *before, *after)
+    time = one_of(import_poses([path], stamps='device')).time
     np.testing.assert_allclose(time[40:] - time[:40], 10.0, atol=1e-6)
 
 

@@ -41,22 +41,18 @@ def filled(session, *, start=0.0, end=1e9):
 
 def moved(session, change):
     """The reference's frame, or a sensor's mount, is another from the middle on."""
-    kind, middle = change, 16.0
-    if kind == 'camera':
-        poses = session.reference
-        after = poses.time > middle
-        turn = Rotation.from_euler('xyz', [3, -2, 5], degrees=True)
-        place, q = poses.position.copy(), poses.quaternion.copy()
-        place[after] = turn.apply(place[after]) + [0.02, 0.0, -0.01]
-        q[after] = (turn * Rotation.from_quat(q[after])).as_quat()
-        return replace(session, reference=replace(poses, position=place, quaternion=q))
-    poses = session.sensors['sensor_0']
-    after = poses.time > middle
+    name = REFERENCE if change == 'camera' else 'sensor_0'
+    poses = session.streams[name]
+    after = poses.time > 16.0
     place, turn = poses.position.copy(), Rotation.from_quat(poses.quaternion)
-    place[after] += turn[after].apply([0.0, 0.008, 0.0])
-    return replace(
-        session, sensors={**session.sensors, 'sensor_0': replace(poses, position=place)}
-    )
+    if change == 'mount':
+        place[after] += turn[after].apply([0.0, 0.008, 0.0])
+        moved = replace(poses, position=place)
+        return replace(session, sensors={**session.sensors, name: moved})
+    pushed, quaternion = Rotation.from_euler('xyz', [3, -2, 5], degrees=True), turn.as_quat()
+    place[after] = pushed.apply(place[after]) + [0.02, 0.0, -0.01]
+    quaternion[after] = (pushed * turn[after]).as_quat()
+    return replace(session, reference=replace(poses, position=place, quaternion=quaternion))
 
 
 def test_the_window_keeps_so_many_seconds_and_begins_anew_when_time_runs_back():

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,19 +29,24 @@ class LiveErrors:
     orientation: Array
 
 
-def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict[str, PoseStream]:
-    """Return what each PoseStamped topic of a bag carries."""
+def published_poses(
+    path: str | os.PathLike[str], topics: Sequence[str] | None = None, salvage: Any = None
+) -> dict[str, PoseStream]:
+    """Return what each PoseStamped topic of a bag carries, of some topics or of all.
+
+    ``salvage``: a `wire.bag.Salvage`, which takes what could not be read.
+    """
     # Nodes that read no bag run where the packages that read bags are not installed.
     from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
 
-    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics}
-    stamps: dict[str, list[int]] = {topic: [] for topic in topics}
+    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics or ()}
+    stamps: dict[str, list[int]] = {topic: [] for topic in topics or ()}
     decoder = MessageDecoder()
-    for raw in iter_messages(path, Salvage()):
-        if raw.topic in rows and raw.type_name == POSE_TYPE:
+    for raw in iter_messages(path, salvage or Salvage()):
+        if raw.type_name == POSE_TYPE and (topics is None or raw.topic in rows):
             message = decoder.decode(raw)
-            stamps[raw.topic].append(stamp_of(message))
-            rows[raw.topic].append(pose_numbers(message.pose))
+            stamps.setdefault(raw.topic, []).append(stamp_of(message))
+            rows.setdefault(raw.topic, []).append(pose_numbers(message.pose))
     found = {}
     for topic, values in rows.items():
         table = np.array(values, dtype=np.float64).reshape(-1, 7)

@@ -18,7 +18,7 @@ from pathlib import Path
 import harness
 import numpy as np
 
-from anser_ros.apps.poses.assessment.hummel import (
+from anser_ros.apps.poses.assessment.distances import (
     VOLUMES,
     Grid,
     distance_errors,

@@ -1,7 +1,6 @@
 """States what this application adds to the core; `anser_ros.extensions` describes the tables."""
 
 OFFLINE = {
-    'error_map': 'learn an error map from tracked and true positions, and apply it to others',
     'known_metal': 'learn a piece of metal from a session, for evaluate --known-metal',
     'loop': 'put an effect into simulated samples, find it blind, correct it, measure again',
     'measured': "other people's measurements: what they contain, and the error before and after",

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,16 +68,9 @@ class PoseReading:
         positions over that of the optical ones, as both are written.
         """
         effect = effect_with(Role.READING)
-        return EffectRecord(
-            effect.name,
-            {
-                'stream': self.stream, 'quaternion': self.quaternion,
-                'handedness': self.handedness, 'unit': self.unit,
-            },
-            {},
-            {'misfit_as_written_m': before, 'misfit_so_read_m': after, 'extent_ratio': ratio,
-             'summary': effect.summary},
-        )  # fmt: skip
+        evidence = {'misfit_as_written_m': before, 'misfit_so_read_m': after,
+                    'extent_ratio': ratio, 'summary': effect.summary}  # fmt: skip
+        return EffectRecord(effect.name, dict(vars(self)), {}, evidence)
 
     def applied(self, session: PoseSession) -> PoseSession:
         """Return the session with its numbers read in this convention."""
@@ -114,11 +108,12 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     ratio = _extent_ratio(session)
     unit = _unit(ratio)
     plain = PoseReading(unit=unit)
-    cost = _cost(plain.applied(session))
-    is_turned = cost < POOR_M and _is_turned(plain.applied(session))
+    as_written = plain.applied(session)
+    cost = _cost(as_written)
+    record = None if plain.is_plain else plain.record(np.inf, cost, ratio)
+    is_turned = cost < POOR_M and _is_turned(as_written)
     if cost < POOR_M and not is_turned:
-        record = None if plain.is_plain else plain.record(np.inf, cost, ratio)
-        return plain.applied(session), record
+        return as_written, record
     trials = [(_cost(reading.applied(session)), reading) for reading in _readings(unit)]
     best, reading = min(trials, key=lambda pair: pair[0])
     if best < (TURNED_SHARE if is_turned else RIGHT_MISFIT_SHARE) * cost:
@@ -129,7 +124,7 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
             f'by {1e3 * cost:.0f} mm in the median, and by {1e3 * best:.0f} mm when quaternions '
             f'are read in another order or sense'
         )
-    return plain.applied(session), None if plain.is_plain else plain.record(np.inf, cost, ratio)
+    return as_written, record
 
 
 def reading_words(record: EffectRecord) -> str:
@@ -156,13 +151,12 @@ def reading_words(record: EffectRecord) -> str:
 
 
 def _readings(unit: str) -> Iterator[PoseReading]:
-    for stream in ('tracked', REFERENCE):
-        for quaternion in ('xyzw', 'wxyz', 'conjugate', 'wxyz_conjugate'):
-            for handedness in ('right', 'left'):
-                found = PoseReading(stream, quaternion, handedness, unit)
-                is_as_written = (quaternion, handedness) == ('xyzw', 'right')
-                if not is_as_written and (stream == 'tracked' or unit == 'm'):
-                    yield found
+    orders = ('xyzw', 'wxyz', 'conjugate', 'wxyz_conjugate')
+    every = product(('tracked', REFERENCE), orders, ('right', 'left'))
+    for stream, quaternion, handedness in every:
+        is_as_written = (quaternion, handedness) == ('xyzw', 'right')
+        if not is_as_written and (stream == 'tracked' or unit == 'm'):
+            yield PoseReading(stream, quaternion, handedness, unit)
 
 
 def _cost(session: PoseSession) -> float:

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.convention import PoseReading
 from anser_ros.apps.poses.diagnosis import PoseDiagnosis
-from anser_ros.apps.poses.effect import SMOOTH, PoseMap, Role, effect_of_record, effect_with
+from anser_ros.apps.poses.effect import PoseMap, Role, effect_of_record, effect_with
+from anser_ros.apps.poses.effects.field_distortion import SMOOTH
 from anser_ros.apps.poses.hand_eye import PoseClock
 from anser_ros.apps.poses.sequence import FARTHEST, NO_TURN, PoseSequence
 from anser_ros.calibration.error_map import ErrorMap
@@ -24,44 +25,38 @@ MODEL_SCHEMA = 'anser_pose_model/1'
 
 def to_document(found: PoseDiagnosis) -> dict[str, Any]:
     """Return the diagnosis as plain data; figures of fluxes are null."""
-    before, after = found.before, found.after
-    document: dict[str, Any] = {
+    registered, before, after = found.registered, found.before, found.after
+    return as_document({
         'schema': SCHEMA,
         'held_out': {
             'flux_rms_before_t': None, 'flux_rms_after_t': None, 'flux_rms_floor_t': None,
-            'position_rmse_before_m': before.position_m,
-            'position_rmse_after_m': after.position_m,
-            'orientation_rmse_before_rad': before.orientation_rad,
-            'orientation_rmse_after_rad': after.orientation_rad,
-            'position_rmse_registration_only_m': found.registered.position_m,
+            **_rms(before.position_m, before.orientation_rad, after.position_m,
+                   after.orientation_rad),
+            'position_rmse_registration_only_m': registered.position_m,
             'position_floor_m': found.floor_m,
         },
         'sensors': {
             name: {
-                'position_rmse_registration_only_m': found.registered.by_sensor[name][0],
-                'position_rmse_before_m': before.by_sensor[name][0],
-                'position_rmse_after_m': after.by_sensor[name][0],
-                'orientation_rmse_before_rad': before.by_sensor[name][1],
-                'orientation_rmse_after_rad': after.by_sensor[name][1],
+                'position_rmse_registration_only_m': registered.by_sensor[name][0],
+                **_rms(*before.by_sensor[name], *after.by_sensor[name]),
             }
             for name in after.by_sensor
         },
-        'effects': [
-            {
-                'name': record.name, 'parameters': plain(record.parameters),
-                'uncertainty': plain(record.uncertainty), 'evidence': plain(record.evidence),
-                'flux_rms_without_t': None,
-            }
-            for record in found.records
-        ],
-        'unexplained': {
-            'fraction': found.unexplained, 'depends_on': list(found.depends_on),
-        },
-        'left_out': list(found.left_out),
+        'effects': [{**vars(record), 'flux_rms_without_t': None} for record in found.records],
+        'unexplained': {'fraction': found.unexplained, 'depends_on': found.depends_on},
+        'left_out': found.left_out,
         'knows_levers': found.knows_levers,
         'refused': [{'candidate': label, 'why': why} for label, why in found.refused],
-    }  # fmt: skip
-    return dict(finite(document))
+    })  # fmt: skip
+
+
+def _rms(m_before: float, rad_before: float, m_after: float, rad_after: float) -> dict[str, float]:
+    return {
+        'position_rmse_before_m': m_before,
+        'position_rmse_after_m': m_after,
+        'orientation_rmse_before_rad': rad_before,
+        'orientation_rmse_after_rad': rad_after,
+    }
 
 
 def to_model(found: PoseDiagnosis) -> dict[str, Any]:
@@ -92,15 +87,17 @@ def to_model(found: PoseDiagnosis) -> dict[str, Any]:
     }
 
 
-def finite(value: Any) -> Any:
+def as_document(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return plain data with None where a number is not finite, which JSON has no word for."""
+    return dict(_finite(plain(dict(values))))
+
+
+def _finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:

@@ -5,6 +5,7 @@ of time, judge on the fifth that took no part; then the parameters are fitted to
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.convention import read_rightly
 from anser_ros.apps.poses.effect import (
-    PoseResiduals,
     PoseTerm,
     PoseView,
     Role,
-    Sensing,
     pose_effects,
 )
 from anser_ros.apps.poses.fit import (
@@ -30,8 +29,14 @@ from anser_ros.apps.poses.fit import (
     with_time_constants,
 )
 from anser_ros.apps.poses.hand_eye import records_of
-from anser_ros.apps.poses.jitter import floor_of
-from anser_ros.apps.poses.problem import PosePart, PoseProblem, PoseState
+from anser_ros.apps.poses.problem import (
+    PosePart,
+    PoseProblem,
+    PoseResiduals,
+    PoseState,
+    Sensing,
+    floor_of,
+)
 from anser_ros.apps.poses.search import LEAST_MAP_M, PoseSearch, frame_terms, search_effects
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.apps.poses.start import (
@@ -123,21 +128,14 @@ def _joined(states: list[PoseState]) -> PoseState:
     for same in zip(*(state.parts for state in states), strict=True):
         order = np.argsort(np.concatenate([p.view.time for p in same]), kind='stable')
 
-        def put(values: Sequence[NDArray[Any]], order: NDArray[np.int64] = order) -> NDArray[Any]:
-            return np.concatenate(values)[order]
+        def put(rows: Sequence[Any], keys: Sequence[str], order: Any = order) -> dict[str, Any]:
+            return {k: np.concatenate([getattr(row, k) for row in rows])[order] for k in keys}
 
-        poses = {
-            field.name: put([getattr(p.view, field.name) for p in same])
-            for field in fields(PoseView)
-            if field.name not in ('sensor', 'frame', 'lever')
-        }
-        parts.append(
-            PosePart(
-                replace(same[0].view, **poses), put([p.residual for p in same]),
-                put([p.weight for p in same]), same[0].noise, put([p.blocks for p in same]),
-                put([p.places for p in same]),
-            )
-        )  # fmt: skip
+        one_each = ('sensor', 'frame', 'lever')
+        keys = [field.name for field in fields(PoseView) if field.name not in one_each]
+        view = replace(same[0].view, **put([p.view for p in same], keys))
+        values = put(same, ('residual', 'weight', 'blocks', 'places'))
+        parts.append(replace(same[0], view=view, **values))
     return replace(states[0], parts=tuple(parts))
 
 
@@ -196,13 +194,12 @@ def _share(part: PosePart, name: str) -> float:
         low, high = float(size[~upper].mean()), float(size[upper].mean())
         return max((high - low) / max(high + low, 1e-18), 0.0)
     groups = _groups(part, used, name)
-    explained, count = 0.0, 0
-    for group in np.unique(groups):
+    numbers, explained = np.unique(groups), 0.0
+    for group in numbers:
         rows = residual[groups == group]
         explained += len(rows) * float(np.sum(rows.mean(axis=0) ** 2))
-        count += 1
     total = float(np.sum(residual**2))
-    return explained / max(total, 1e-18) - count / max(len(residual), 1)
+    return explained / max(total, 1e-18) - len(numbers) / max(len(residual), 1)
 
 
 def _groups(part: PosePart, used: NDArray[np.bool_], name: str) -> NDArray[np.int64]:
@@ -237,18 +234,24 @@ class PoseDiagnosis:
     session: PoseSession  # as it is meant (units, order of quaternions)
     fit: PoseFit  # the two frames and all effects, on all poses
     records: tuple[EffectRecord, ...]  # the effects that are named
-    # Held out: with the registration alone, with hand-eye, with the effects.
-    registered: HeldOutErrors
-    before: HeldOutErrors
-    after: HeldOutErrors
+    registered: HeldOutErrors  # held out, with the registration alone
     floor_m: float  # what jitter alone would leave, m
     unexplained: float  # share of the squared error above the jitter that stays
     depends_on: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]
-    states: tuple[PoseState, PoseState]  # the held-out poses before and after
+    states: tuple[PoseState, PoseState]  # the held-out poses with hand-eye, and with the effects
     left_out: tuple[str, ...]  # sensors that have too few poses at times with a reference
-    # Whether the motion determines enough of a lever arm to look for effects of place.
-    knows_levers: bool
+    knows_levers: bool  # whether the motion determines enough to look for effects of place
+
+    @cached_property
+    def before(self) -> HeldOutErrors:
+        """Return the held-out errors with hand-eye alone."""
+        return errors_of(self.states[0])
+
+    @cached_property
+    def after(self) -> HeldOutErrors:
+        """Return the held-out errors with the effects."""
+        return errors_of(self.states[1])
 
 
 def diagnose_poses(
@@ -296,17 +299,13 @@ def diagnose_poses(
     floor = floor_of(after)
     residuals = _residuals(session, problem, whole)
     records = records_of(whole, search.evidence, session)
-    is_known = search.knows_levers and knows_levers(whole, most_poses(session))
+    most = most_poses(session)
+    is_known = search.knows_levers and knows_levers(whole, most)
     for effect in pose_effects().values():
-        if effect.needs_levers and not is_known:
-            continue
         words = {'summary': effect.summary, 'advice': effect.advice}
-        records += [
-            replace(r, evidence={**words, **r.evidence}) for r in effect.observed(residuals)
-        ]
-    records += [*exchanged, *swapped]
-    if convention is not None:
-        records.append(convention)
+        seen = effect.observed(residuals) if is_known or not effect.needs_levers else ()
+        records += [replace(r, evidence={**words, **r.evidence}) for r in seen]
+    records += [*exchanged, *swapped, *([] if convention is None else [convention])]
     errors = errors_of(after)
     excess = max(errors.position_m**2 - floor**2, 0.0)
     possible = max(errors_of(before).position_m ** 2 - floor**2, excess, 1e-18)
@@ -316,8 +315,6 @@ def diagnose_poses(
         fit=whole,
         records=tuple(records),
         registered=registered,
-        before=errors_of(before),
-        after=errors,
         floor_m=floor,
         unexplained=excess / possible if significant else 0.0,
         depends_on=(depends_on(after) or depends_on(whole.state)) if significant else (),
@@ -326,7 +323,7 @@ def diagnose_poses(
         left_out=tuple(
             name
             for name, poses in session.sensors.items()
-            if poses is not most_poses(session) and name not in problem.setting.sensors
+            if poses is not most and name not in problem.setting.sensors
         ),
         knows_levers=search.knows_levers,
     )
@@ -379,9 +376,7 @@ def _residuals(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> Po
         noise, cost = noise_of(part)
         gain = noise_of(part, with_stamps=False)[1] - cost
         sensings.append(
-            Sensing(
-                part.view, part.residual, part.used, weight == 0.0, noise.position_m,
-                noise.orientation_rad, noise.stamp_s, gain,
-            )
+            Sensing(part.view, part.residual, part.weight, noise, part.blocks, part.places,
+                    weight == 0.0, gain)
         )  # fmt: skip
     return PoseResiduals(session, problem.setting, tuple(sensings))

@@ -1,45 +1,27 @@
-"""Defines what an effect of a tracker of poses looks like: one interface, one file for each
-effect. A tracked pose is predicted from the optical one in this order::     clock -> optical
-track -> optical pose -> hand-eye -> tracked pose and what the tracker's own map of space does
-(a distortion) is undone on the measured side. Prior, cost and record of an effect are those of
-`anser_ros.effects.base`, as for effects on fluxes.
+"""Defines what an effect of a tracker of poses looks like: one interface, one file for each.
+
+A tracked pose is predicted from the optical one: clock, optical path, optical pose, hand-eye. What
+the tracker's own map of space does (a distortion) is undone on the measured side.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cache
-from typing import Literal, TypedDict
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 import anser_ros.apps.poses.effects as package
-from anser_ros.apps.poses.path import OpticalPath
-from anser_ros.apps.poses.sequence import PoseSession
-from anser_ros.calibration.error_map import PositionMap, Shape
+from anser_ros.apps.poses.sequence import OpticalPath, PoseSession
 from anser_ros.effects.base import BaseEffect, BaseTerm
-from anser_ros.effects.effect import needed, sigmas
+from anser_ros.effects.effect import sigmas
 from anser_ros.effects.registry import effects_in
 from anser_ros.field.model import EffectRecord
 
-SMOOTH = 'smooth'
-"""The kind of such a map: it is determined by the points that it was learnt from."""
-
-
-def smooth_map(record: EffectRecord) -> PositionMap:
-    """Return the map of a record: what is added to tracked positions.
-
-    Raises `EffectError` when a parameter is missing.
-    """
-    places, errors = (
-        np.asarray(needed(record, key), dtype=np.float64).reshape(-1, 3)
-        for key in ('places_m', 'errors_m')
-    )
-    values = [needed(record, key) for key in ('trend', 'length_m', 'noise')]
-    shape = Shape(int(values[0]), float(values[1]), float(values[2]))
-    return PositionMap(places, errors, shape)
-
+if TYPE_CHECKING:
+    from anser_ros.apps.poses.problem import PoseResiduals
 
 Array = NDArray[np.float64]
 
@@ -88,25 +70,15 @@ class Role(Enum):
     """Names what an effect is to the others, who ask for this and for no effect by its name."""
 
     PLAIN = 'plain'
-    REGISTRATION = 'frame of the reference'
-    """Where the reference's frame lies in the tracker's; in every fit, and no error."""
-    MOUNT = 'frame of a sensor'
-    """Where and how a sensor sits on the body; in every fit, and no error. Records
-    both frames."""
-    OFFSET = 'offset'
-    """Moves the times of poses by a constant; every fit starts with it."""
-    RATE = 'rate'
-    """Moves the times of poses by a share of the time."""
-    READING = 'reading'
-    """Another convention than a stream states, by which it is read before anything is fitted."""
-    SWAP = 'swap'
-    """Sensors under each other's names, which are put back before anything is searched for."""
-    FILTER = 'filter'
-    """A low pass with a time constant: no slopes, tried at some of them when the rest is found."""
-    SCALE = 'scale'
-    """One scale of all positions, which is a part of a map."""
-    MAP = 'map'
-    """A map of the places, that a map of a higher degree contains."""
+    REGISTRATION = 'frame of the reference'  # in the tracker's; in every fit, and no error
+    MOUNT = 'frame of a sensor'  # on the body; in every fit, and no error; records both frames
+    OFFSET = 'offset'  # moves the times of poses by a constant; every fit starts with it
+    RATE = 'rate'  # moves the times of poses by a share of the time
+    READING = 'reading'  # another convention than stated, undone before anything is fitted
+    SWAP = 'swap'  # sensors under each other's names, undone before anything is searched for
+    FILTER = 'filter'  # a low pass: has no slopes, and is tried when the rest is found
+    SCALE = 'scale'  # one scale of all positions, which is a part of a map
+    MAP = 'map'  # of the places; a map of a higher degree contains it
 
     @property
     def is_frame(self) -> bool:
@@ -115,10 +87,7 @@ class Role(Enum):
 
     @property
     def is_clock(self) -> bool:
-        """Return whether it moves times.
-
-        Such an effect is found before a filter is judged, whose first order is a delay.
-        """
+        """Return whether it moves times: found before a filter, whose first order is a delay."""
         return self in (Role.OFFSET, Role.RATE)
 
 
@@ -178,10 +147,9 @@ class PoseEffect(BaseEffect[PoseTerm]):
         return ()
 
     def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
-        """Return the derivative of predicted less measured pose by the parameters, shape (n, 6,
-        q).
+        """Return slopes (n, 6, q) of predicted less measured pose; None where it does nothing.
 
-        Rows are m and rad along the axes of the tracker's frame; None where it does nothing.
+        Rows are m and rad along the axes of the tracker's frame.
         """
         return None
 
@@ -198,9 +166,7 @@ class PoseEffect(BaseEffect[PoseTerm]):
         return frames
 
     def moved(self, before: PoseTerm, after: PoseTerm, middle: Array) -> EffectRecord:
-        """Return the record of a frame that has changed; ``middle`` (3,) is where the body is, m,
-        optical frame.
-        """
+        """Return the record of a changed frame; ``middle`` (3,), m: the body's optical place."""
         raise NotImplementedError
 
     def filter(self, term: PoseTerm, path: OpticalPath) -> OpticalPath:
@@ -242,9 +208,7 @@ class PoseEffect(BaseEffect[PoseTerm]):
         return term
 
     def whole(self, term: PoseTerm) -> PoseTerm | None:
-        """Return a map with what it lacks beside a scale, with parameters of zero; None for a
-        term that lacks nothing.
-        """
+        """Return a map with what it lacks beside a scale, of zeros; None where nothing lacks."""
         return None
 
     def is_scale(self, term: PoseTerm) -> bool:
@@ -273,29 +237,6 @@ class NumberEffect(PoseEffect):
         sigma = self.factor * float(sigmas(covariance)[0])
         value = self.base + self.factor * float(term.theta[0])
         return EffectRecord(self.name, {**term.site, self.key: value}, {self.key: sigma})
-
-
-@dataclass(frozen=True)
-class Sensing:
-    """Holds what one sensor shows once the frames and effects are fitted."""
-
-    view: PoseView
-    residual: Array  # (n, 6), measured less predicted, m and rad, tracker's frame
-    used: NDArray[np.bool_]  # (n,), poses that have a reference and do not stand out
-    out: NDArray[np.bool_]  # (n,), poses that have a reference and stand out
-    position_m: float = 0.0  # the noise that is left, a coordinate
-    orientation_rad: float = 0.0
-    stamp_s: float = 0.0  # and of the stamps
-    stamp_gain: float = 0.0  # minus twice the log likelihood that an error of the stamps takes off
-
-
-@dataclass(frozen=True)
-class PoseResiduals:
-    """Holds a session and what its fit leaves, by which some effects are seen without a fit."""
-
-    session: PoseSession
-    setting: PoseSetting
-    sensors: tuple[Sensing, ...]
 
 
 def frames_of(terms: Sequence[PoseTerm], sensor: str) -> Frames:

@@ -5,6 +5,7 @@ NODES = {
 }
 OFFLINE = {
     'accuracy': 'jitter, drift, distances, rotations, latency by published protocols',
+    'error_map': 'learn an error map from tracked and true positions, and apply it to others',
     'handeye': 'frames, lever arm, mount and clocks of two streams of poses, jointly',
     'import_poses': 'files of poses as trackers write them, to a bag',
     'pivot': 'the tip of a stylus, from poses while it turns about its tip',

@@ -15,8 +15,7 @@ from scipy.special import ndtri
 from scipy.stats import chi2
 
 from anser_ros.apps.poses.effect import PoseTerm, Role
-from anser_ros.apps.poses.jitter import stamp_step
-from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
+from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState, stamp_step
 from anser_ros.apps.poses.sequence import PoseSequence, PoseSession
 from anser_ros.diagnosis.engine import JointFit, descended, stepped
 from anser_ros.effects.effect import sigmas
@@ -171,13 +170,10 @@ def unexplained_poses(state: PoseState) -> tuple[NDArray[np.bool_], ...]:
     for part in state.parts:
         noise = replace(_spread(part), stamp_s=part.noise.stamp_s)
         white = noise.whitened(part.residual, part.view.velocity)
-        place = np.linalg.norm(white[:, :3], axis=1)
-        turn = np.linalg.norm(white[:, 3:], axis=1)
-        far = np.maximum(place, turn)
-        few = np.count_nonzero(part.used & (far > STANDS_OUT)) <= FEW_SHARE * np.count_nonzero(
-            part.used
-        )
-        found.append(part.used & (far > (STANDS_OUT if few else FAR_OUT)))
+        far = np.maximum(*(np.linalg.norm(half, axis=1) for half in np.hsplit(white, 2)))
+        out = part.used & (far > STANDS_OUT)
+        few = np.count_nonzero(out) <= FEW_SHARE * np.count_nonzero(part.used)
+        found.append(out if few else part.used & (far > FAR_OUT))
     return tuple(found)
 
 
@@ -209,8 +205,9 @@ def noise_of(part: PosePart, with_stamps: bool = True) -> tuple[PoseNoise, float
         plain = PoseNoise(float(start[0]), float(start[1]))
         return plain, cost(np.log(start)) * len(residual)
     tries = [np.log([start[0], start[1], stamp]) for stamp in (0.002, 0.02)]
-    best = min((minimize(cost, at, method='Nelder-Mead', options={'xatol': 1e-3, 'fatol': 1e-6,
-               'maxiter': 300}) for at in tries), key=lambda r: float(r.fun))  # fmt: skip
+    options = {'xatol': 1e-3, 'fatol': 1e-6, 'maxiter': 300}
+    found = [minimize(cost, at, method='Nelder-Mead', options=options) for at in tries]
+    best = min(found, key=lambda result: float(result.fun))
     values = np.exp(best.x)
     stamp = min(float(values[2]), LARGEST_STAMP_S)
     return PoseNoise(float(values[0]), float(values[1]), stamp), float(best.fun) * len(residual)
@@ -239,21 +236,19 @@ def is_lever_determined(
 ) -> NDArray[np.bool_]:
     """Return the mask (3,) of the components of a lever arm that the motion determines.
 
-    The tracker's errors are taken to be ``error_m`` at least.
+    Errors of the measured rotations make a lever arm too small by their share of the rotations'
+    variance, whatever its formal uncertainty: the reference's own jitter must be little of it. And
+    the lever arm that makes the median error by the turns of the body alone must be short; the
+    tracker's errors are taken to be ``error_m`` at least.
     """
     if not part.used.any():
         return np.zeros(3, dtype=np.bool_)
-    is_near = lever_reach(part, error_m) < HARDLY_DETERMINED_M
-    return (lever_blur(part, jitter_rad) < MOST_BLUR) & is_near
-
-
-def lever_reach(part: PosePart, error_m: float = 0.0) -> Array:
-    """Return the lever arm (3,), m, that makes the median error by the turns of the body alone, or
-    an error of ``error_m`` if that is larger.
-    """
+    turns, one = _turn_information(part), np.eye(3)
+    error = 2 * max(jitter_rad, LEAST_JITTER_RAD) ** 2
+    blur = error * np.diag(np.linalg.inv(turns + 1e-3 * error * one))
     far = max(float(np.median(np.linalg.norm(part.residual[part.used, :3], axis=1))), error_m)
-    information = np.linalg.inv(_turn_information(part) + LEAST_JITTER_RAD**2 * np.eye(3))
-    return np.asarray(far * np.sqrt(np.diag(information)))
+    reach = far * np.sqrt(np.diag(np.linalg.inv(turns + LEAST_JITTER_RAD**2 * one)))
+    return np.asarray((blur < MOST_BLUR) & (reach < HARDLY_DETERMINED_M))
 
 
 def _turn_information(part: PosePart) -> Array:
@@ -263,20 +258,8 @@ def _turn_information(part: PosePart) -> Array:
     return np.asarray(np.trace(tilt) * np.eye(3) - tilt)
 
 
-def lever_blur(part: PosePart, jitter_rad: float) -> Array:
-    """Return by which share (3,) the reference's own jitter of orientation shrinks a lever arm.
-
-    Errors of the measured rotations make a lever arm too small by their share of the rotations'
-    variance, whatever its formal uncertainty.
-    """
-    information = _turn_information(part)
-    error = 2 * max(jitter_rad, LEAST_JITTER_RAD) ** 2
-    return np.asarray(error * np.diag(np.linalg.inv(information + 1e-3 * error * np.eye(3))))
-
-
 def turn_jitter(reference: PoseSequence) -> float:
-    """Return the jitter of a reference's orientation, rad a coordinate, from its quietest
-    stretches.
+    """Return a reference's jitter of orientation, rad a coordinate, from its quietest stretches.
 
     The squared second difference of noise has six times its variance per coordinate; the lowest
     quarter of that with three coordinates is at 1.21.
@@ -302,10 +285,9 @@ def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
     however large the error is that these make before.
     """
     shaking = turn_jitter(reference)
-    parts = {part.view.sensor: part for part in fit.state.parts}
     for index, term in enumerate(fit.terms):
         if term.role is Role.MOUNT:
-            part = parts[str(term.sensor)]
+            part = fit.state.part(str(term.sensor))
             sigma = sigmas(fit.covariance_of(index))[:3]
             is_known = (sigma < LEAST_KNOWN_M) & is_lever_determined(part, shaking, 0.0)
             turns = _turn_information(part) if part.used.any() else np.zeros((3, 3))
@@ -327,17 +309,9 @@ def is_one_scale(fit: PoseFit) -> bool:
     if len(problem.sensors) < 2:
         return True
     for i, poses in enumerate(problem.sensors):
-        alone = replace(
-            problem,
-            **{key: getattr(problem, key)[i : i + 1]
-               for key in ('sensors', 'blocks', 'places', 'weight', 'noise')},
-        )  # fmt: skip
         # A map of its own would take up what differs.
-        terms = [
-            t for t in fit.terms
-            if t.acts_on(poses.name) and t.role is not Role.MAP
-        ]  # fmt: skip
-        one = fit_poses(alone, terms)
+        terms = [t for t in fit.terms if t.acts_on(poses.name) and t.role is not Role.MAP]
+        one = fit_poses(problem.sensor(i), terms)
         index = next(k for k, t in enumerate(one.terms) if t.role is Role.SCALE)
         scale = 1e-3 * float(one.terms[index].theta[0])
         found.append((scale, 1e-3 * float(np.sqrt(one.covariance_of(index)[0, 0]))))

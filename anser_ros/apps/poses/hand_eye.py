@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.convention import read_rightly
-from anser_ros.apps.poses.effect import PoseTerm, Role, effect_of_record, effect_with, frames_of
+from anser_ros.apps.poses.effect import Role, effect_of_record, effect_with, frames_of
 from anser_ros.apps.poses.fit import (
     LEAST_KNOWN_M,
     LEAST_KNOWN_RAD,
@@ -72,10 +72,8 @@ def one_clock(records: Sequence[EffectRecord], duration: float) -> list[EffectRe
     Clocks that agree about the start or the middle of a session of ``duration`` s have a rate and
     no offset besides.
     """
-    offset = next(
-        (r for r in records if _is(r, Role.OFFSET) and 'sensor' not in r.parameters),
-        None,
-    )
+    shared = [r for r in records if _is(r, Role.OFFSET) and 'sensor' not in r.parameters]
+    offset = shared[0] if shared else None
     rate = next((r for r in records if _is(r, Role.RATE)), None)
     if rate is None:
         return list(records)
@@ -116,10 +114,7 @@ def records_of(
             'advice': term.effect.advice,
             'remedy': term.effect.remedy.value,
             'parameters_spent': int(term.theta.size),
-            'held_out_gain': one.gain,
-            'held_out_share': one.share,
-            'position_rmse_without_m': one.position_rmse_without_m,
-            'position_rmse_with_m': one.position_rmse_with_m,
+            **one._asdict(),
         }
         records.append(replace(record, evidence=words))
     return one_clock(records, fit.state.problem.setting.duration)
@@ -133,7 +128,7 @@ def hand_eye_record(fit: PoseFit, index: int, jitter_rad: float) -> EffectRecord
     """
     name = str(fit.terms[index].sensor)
     frames, sigma = frames_of(fit.terms, name), sigmas(fit.covariance_of(index))
-    part = next(p for p in fit.state.parts if p.view.sensor == name)
+    part = fit.state.part(name)
     is_known = (sigma[:3] < LEAST_KNOWN_M) & is_lever_determined(part, jitter_rad)
     lever = [float(v) if known else None for v, known in zip(frames.lever, is_known, strict=True)]
     values: dict[str, object] = {
@@ -204,7 +199,7 @@ class HandEye:
     # recording does not determine it.
     offset_s: tuple[float, float] | None
     rate_ppm: tuple[float, float] | None
-    middle_s: float  # s since the recording's start
+    middle_s: float  # s since the recording's start; 0 without a rate
     sensors: dict[str, SensorFrames]
     # What the recording does not determine, and what it would take, in words.
     undetermined: tuple[str, ...]
@@ -212,8 +207,7 @@ class HandEye:
 
 
 def as_pairs(session: PoseSession) -> PoseSession:
-    """Return the n-th pose of every sensor beside the n-th of the reference, whatever their
-    stamps.
+    """Return the n-th poses of sensors beside the n-th of the reference, whatever their stamps.
 
     Raises `DiagnosisError` when numbers differ, or there is no reference.
     """
@@ -274,19 +268,15 @@ def _fitted(problem: PoseProblem) -> PoseFit:
         return with_noise(fit_poses(fit.state.problem, frame_terms(fit.terms)))
     rate = effect_with(Role.RATE).sites(problem.setting)[0]
     whole = with_noise(fit_poses(fit.state.problem, [*fit.terms, rate]))
-    if _sigma(whole, len(whole.terms) - 1) * 1e3 < LEAST_KNOWN_PPM:
-        return whole
-    return with_noise(fit)
-
-
-def _sigma(fit: PoseFit, index: int) -> float:
-    return float(np.sqrt(fit.covariance_of(index)[0, 0]))
+    _, sigma = _clock(whole, Role.RATE, 1e3) or (0.0, np.inf)
+    return whole if sigma < LEAST_KNOWN_PPM else with_noise(fit)
 
 
 def _clock(fit: PoseFit, role: Role, scale: float) -> tuple[float, float] | None:
     for index, term in enumerate(fit.terms):
         if term.role is role:
-            return scale * float(term.theta[0]), scale * _sigma(fit, index)
+            sigma = float(sigmas(fit.covariance_of(index))[0])
+            return scale * float(term.theta[0]), scale * sigma
     return None
 
 
@@ -309,7 +299,7 @@ def _described(
             continue
         name = str(term.sensor)
         frames = frames_of(fit.terms, name)
-        part = next(p for p in fit.state.parts if p.view.sensor == name)
+        part = fit.state.part(name)
         record = hand_eye_record(fit, index, shaking)
         lever = [np.nan if v is None else float(v) for v in record.parameters['lever_arm_m']]
         sigma = sigmas(fit.covariance_of(index))
@@ -339,18 +329,11 @@ def _described(
             f'the rate of the clocks: in {fit.state.problem.setting.duration:.0f} s it is known '
             f'to more than {LEAST_KNOWN_PPM:.0f} ppm; record longer'
         )
+    middle = next((t.site['middle_s'] for t in fit.terms if t.role is Role.RATE), 0.0)
     return HandEye(
-        session, convention, frames.rotation, sigma[3:], place, sigma[:3], offset, rate,
-        _middle(fit.terms), sensors, tuple(words), fit,
+        session, convention, frames.rotation, sigma[3:], place, sigma[:3], offset, rate, middle,
+        sensors, tuple(words), fit,
     )  # fmt: skip
-
-
-def _middle(terms: tuple[PoseTerm, ...]) -> float:
-    """When the offset is the offset: at stamp zero where no rate is known."""
-    for term in terms:
-        if term.role is Role.RATE:
-            return float(term.effect.record(term, np.zeros((1, 1))).parameters['middle_s'])
-    return 0.0
 
 
 def _open_lever(name: str, lever: Array, turn: Array) -> list[str]:
@@ -369,16 +352,3 @@ def _open_lever(name: str, lever: Array, turn: Array) -> list[str]:
         f'{tilts[1]:.1f}, {tilts[2]:.1f} deg rms); turn it about two axes by '
         f'{TILT_NEEDED_DEG:g} deg or more'
     ]
-
-
-def matrix_of(rotation: Array, translation: Array) -> Array:
-    """Return rotation and translation as one matrix (4, 4); NaN where either is unknown."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix
-
-
-def turn_of(rotation: Array) -> tuple[list[float], list[float]]:
-    """Return a rotation matrix as a rotation vector, degrees, and a quaternion x y z w."""
-    turn = Rotation.from_matrix(rotation)
-    return np.rad2deg(turn.as_rotvec()).tolist(), turn.as_quat().tolist()

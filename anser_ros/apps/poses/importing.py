@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.sessions.plausibility import LENGTH_M
-from anser_ros.stamps import NANO, stamp_of
-from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
+from anser_ros.sessions.recorded_poses import published_poses
+from anser_ros.stamps import NANO
+from anser_ros.wire.bag import Salvage
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import (
     BODY,
@@ -22,7 +23,6 @@ from anser_ros.wire.recorded import (
     OPTICAL,
     TRACKED,
     optical_topic,
-    pose_numbers,
     pose_setup,
     tracked_topic,
 )
@@ -30,20 +30,19 @@ from anser_ros.wire.recorded import (
 Array = NDArray[np.float64]
 
 ORDERS = {
-    'xyzw': ((0, 1, 2, 3), False),
-    'wxyz': ((1, 2, 3, 0), False),
-    'xyzw_inverse': ((0, 1, 2, 3), True),
-    'wxyz_inverse': ((1, 2, 3, 0), True),
+    'xyzw': ((0, 1, 2, 3), 1.0),
+    'wxyz': ((1, 2, 3, 0), 1.0),
+    'xyzw_inverse': ((0, 1, 2, 3), -1.0),
+    'wxyz_inverse': ((1, 2, 3, 0), -1.0),
 }
-"""Where x, y, z and w stand in a written quaternion, and whether it turns the other way."""
+"""Where x, y, z and w stand in a written quaternion, and the sense in which it turns."""
 AURORA_HZ, POLARIS_HZ = 320.0, 60.0
 """Counts a second of the frame counters of NDI's Aurora (field periods) and Polaris (images)."""
 COUNTERS = {'AuroraFrame': AURORA_HZ, 'PolarisFrame': POLARIS_HZ, 'DeviceTime': 1.0}
 """Keys of a device's own time, with its counts a second."""
 HOST_TIMES = ('NetworkTime', 'Time')
 """Keys of the host's counter at receipt, ns."""
-LEAST_COUNTED = 8
-"""Numbers that a line of TUM's form has: the time, a position, a quaternion."""
+TUM_NUMBERS = 8  # in a line: the time, a position, a quaternion
 TUM = re.compile(r'\s*[-+.\deE]+([\s,]+([-+.\deE]+|[-+]?nan|[-+]?inf)){7}', re.IGNORECASE)
 """A line of TUM's form; values that are no numbers stand where there was no pose."""
 TITLE_LINES = 20  # lines that a program may write before its poses
@@ -167,7 +166,7 @@ def _tum(lines: Sequence[str], path: Path) -> Found:
     one = RawRows(unit='m')
     for line in lines:
         numbers = [_number(cell) for cell in re.split(r'[\s,]+', line.strip())]
-        if len(numbers) < LEAST_COUNTED:
+        if len(numbers) < TUM_NUMBERS:
             raise ParameterError(f'{path}: a line of {len(numbers)} numbers, TUM has 8')
         one.rows.append((numbers[0], float('nan'), *numbers[1:8]))
     return {path.stem: one}, len(lines)
@@ -194,6 +193,8 @@ def _table(lines: Sequence[str], path: Path) -> Found:
     return rows, len(lines)
 
 
+Piece = tuple[str, Array, Array, Array]
+"""Name of a stream, and of one of its recordings times, s, positions, m, and quaternions."""
 BETWEEN_FILES_S = 10.0
 """Pause, s, between recordings without a host's time that are put one after the other. A pose is
 not interpolated over a tenth of it."""
@@ -236,7 +237,7 @@ def import_poses(
             f'{len(tracked)} files of tracked poses and {len(reference)} of the reference; '
             'they belong together one by one'
         )
-    pieces: list[tuple[str, Array, Array, Array]] = []
+    pieces: list[Piece] = []
     lost: list[str] = []
     free = 0.0  # where the next recording without a host's time begins, s
     for number, path in enumerate(tracked):
@@ -246,29 +247,23 @@ def import_poses(
             rows, unread = read_form(reference[number])
             groups |= _named(rows, REFERENCE, None, None)
             files.append((reference[number], unread))
-        lost += [
-            f'lines of {p} that are no poses, and are left out: {unread}'
-            for p, unread in files
-            if unread
-        ]
+        words = 'lines of {} that are no poses, and are left out: {}'
+        lost += [words.format(*one) for one in files if one[1]]
         times = {label: _times(table, stamps) for label, table in groups.items()}
         for label, (time, _) in times.items():
             if not np.isfinite(time).any():
                 raise ParameterError(f'{path}: {label}: no pose has a time')
-        own = [time for time, is_host in times.values() if not is_host]
         for label, table in groups.items():
             time, is_host = times[label]
             begin = 0.0 if is_host else _begin(label, times) - free
             pieces.append((label, time - begin, table[:, 2:5], table[:, 5:]))
-        if own:
+        if not all(is_host for _, is_host in times.values()):
             free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
     session = _session(str(tracked[0]), _renamed(pieces, names or {}))
     return replace(session, lost='; '.join(lost))
 
 
-def _renamed(
-    pieces: Sequence[tuple[str, Array, Array, Array]], names: Mapping[str, str]
-) -> list[tuple[str, Array, Array, Array]]:
+def _renamed(pieces: Sequence[Piece], names: Mapping[str, str]) -> list[Piece]:
     found = list(dict.fromkeys(piece[0] for piece in pieces if piece[0] != REFERENCE))
     unknown = sorted(set(names) - set(found))
     if unknown:
@@ -295,11 +290,10 @@ def _named(
     found = {}
     for label, one in rows.items():
         table = one.table
-        order, is_inverse = ORDERS[quaternion or one.form]
+        order, sense = ORDERS[quaternion or one.form]
         table[:, 2:5] *= LENGTH_M[unit or one.unit]
         table[:, 5:] = table[:, 5:][:, list(order)]
-        if is_inverse:
-            table[:, 5:8] *= -1.0
+        table[:, 5:8] *= sense
         found[label] = table
     return found
 
@@ -345,7 +339,7 @@ def _continued(counter: Array) -> Array:
     return out
 
 
-def _session(path: str, pieces: Sequence[tuple[str, Array, Array, Array]]) -> PoseSession:
+def _session(path: str, pieces: Sequence[Piece]) -> PoseSession:
     start = min(float(np.nanmin(time)) for _, time, _, _ in pieces)
     end = max(float(np.nanmax(time)) for _, time, _, _ in pieces)
     if start < 0.0 or end > LATEST_S:
@@ -381,42 +375,33 @@ def read_pose_session(
     Raises `BagError` when the bag can't be read, or has no tracked poses, or several references.
     Raises `PlausibilityError` when quaternions are not of unit length.
     """
-    name, salvage, decoder = os.fspath(path), Salvage(), MessageDecoder()
-    stamps: dict[str, list[int]] = {}
-    rows: dict[str, list[tuple[float, ...]]] = {}
-    for raw in iter_messages(path, salvage):
-        if raw.type_name == POSE_TYPE:
-            message = decoder.decode(raw)
-            stamps.setdefault(raw.topic, []).append(stamp_of(message))
-            rows.setdefault(raw.topic, []).append(pose_numbers(message.pose))
+    name, salvage = os.fspath(path), Salvage()
+    streams = published_poses(path, salvage=salvage)
     chosen = tracked or {
         topic[len(TRACKED) : -len(ENDING)]: topic
-        for topic in sorted(rows)
+        for topic in sorted(streams)
         if topic.startswith(TRACKED) and topic.endswith(ENDING)
     }
-    reference = optical or _only_optical(name, list(rows))
-    for topic in (*chosen.values(), *([reference] if reference else [])):
-        if topic not in rows:
-            known = ', '.join(sorted(rows)) or 'none'
+    reference = optical or _only_optical(name, list(streams))
+    topics = [*chosen.values(), *([reference] if reference else [])]
+    for topic in topics:
+        if topic not in streams:
+            known = ', '.join(sorted(streams)) or 'none'
             raise BagError(f'{name}: no poses on {topic}; topics of poses: {known}')
     if not chosen:
         raise BagError(
             f'{name}: no tracked poses, which are expected on {TRACKED}<sensor>{ENDING}'
         )
-    start = min(min(stamps[topic]) for topic in (*chosen.values(), *filter(None, [reference])))
+    start = min(int(streams[topic].stamp_ns.min()) for topic in topics)
 
     def sequence(label: str, topic: str) -> PoseSequence:
-        table = np.array(rows[topic], dtype=np.float64).reshape(-1, 7)
-        time = np.array([stamp - start for stamp in stamps[topic]]) * NANO
-        return sequence_of(label, time, table[:, :3], table[:, 3:])
+        poses = streams[topic]
+        time = np.asarray((poses.stamp_ns - start) * NANO)
+        return sequence_of(label, time, poses.position, poses.quaternion)
 
-    return PoseSession(
-        name,
-        start,
-        {label: sequence(label, topic) for label, topic in chosen.items()},
-        sequence(REFERENCE, reference) if reference else None,
-        salvage.lost,
-    )
+    sensors = {label: sequence(label, topic) for label, topic in chosen.items()}
+    found = sequence(REFERENCE, reference) if reference else None
+    return PoseSession(name, start, sensors, found, salvage.lost)
 
 
 def _only_optical(path: str, topics: list[str]) -> str | None:
@@ -436,19 +421,16 @@ def write_pose_session(path: Path, session: PoseSession) -> None:
         sequences.append((optical_topic(BODY), session.reference))
     messages: list[tuple[int, str, list[float], list[float]]] = []
     for topic, poses in sequences:
-        stamp = session.start_ns + np.round(poses.time / NANO).astype(np.int64)
-        messages += zip(
-            stamp.tolist(),
-            [topic] * poses.size,
-            poses.position.tolist(),
-            poses.quaternion.tolist(),
-            strict=True,
+        stamps, late = (
+            (session.start_ns + np.round(time / NANO).astype(np.int64)).tolist()
+            for time in (poses.time, poses.missing)
         )
-        for late in (session.start_ns + np.round(poses.missing / NANO).astype(np.int64)).tolist():
-            messages.append((late, topic, [np.nan] * 3, [np.nan] * 4))
+        rows = zip(stamps, poses.position.tolist(), poses.quaternion.tolist(), strict=True)
+        messages += [(stamp, topic, *row) for stamp, *row in rows]
+        messages += [(stamp, topic, [np.nan] * 3, [np.nan] * 4) for stamp in late]
     messages.sort(key=lambda message: message[0])
     with SessionWriter(path, frame_id='tracker') as writer:
         setup = pose_setup(session.sensors, BODY)
         writer.write_setup(setup, messages[0][0] if messages else session.start_ns)
-        for stamp_of, topic, position, quaternion in messages:
-            writer.write_pose(topic, stamp_of, position, quaternion)
+        for stamp, topic, position, quaternion in messages:
+            writer.write_pose(topic, stamp, position, quaternion)

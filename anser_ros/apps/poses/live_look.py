@@ -92,8 +92,8 @@ class PoseWatch:
             return PoseSighting((*frozen, *changed), poses, misfit_m=misfit, remark=remark)
         self.searches += 1
         found = diagnose_poses(session)
-        named = [r for r in found.records if not _is_hand_eye(r)]
-        named += self._noisier(found, named)
+        named = [r for r in found.records if effect_of_record(r).role is not Role.MOUNT]
+        named += self._more_jitter(found, named)
         if self._known is None and not frozen:
             self._known = _learnt(session, found)
         # Noise that is not quite alike among neighbours is no reason for a warning of its own.
@@ -140,7 +140,7 @@ class PoseWatch:
             )  # fmt: skip
         return worst, (_change(terms[index], moved[index], state, worst, left),), ''
 
-    def _noisier(
+    def _more_jitter(
         self, found: PoseDiagnosis, named: Sequence[EffectRecord]
     ) -> Sequence[EffectRecord]:
         """More jitter than at first, unless something that is named makes it."""
@@ -164,9 +164,8 @@ def _until(session: PoseSession, end: float) -> PoseSession:
 
 def _later_half(problem: PoseProblem) -> PoseProblem:
     """Return the later half of a window, which a change in its first half has left behind."""
-    first = min(float(p.time[0]) for p in problem.sensors)
-    last = max(float(p.time[-1]) for p in problem.sensors)
-    return problem.rows([p.time > 0.5 * (first + last) for p in problem.sensors])
+    ends = np.concatenate([p.time[[0, -1]] for p in problem.sensors])
+    return problem.rows([p.time > 0.5 * (ends.min() + ends.max()) for p in problem.sensors])
 
 
 def _misfits(state: PoseState) -> dict[str, float]:
@@ -179,13 +178,9 @@ def _misfits(state: PoseState) -> dict[str, float]:
     return found
 
 
-def _is_hand_eye(record: EffectRecord) -> bool:
-    return effect_of_record(record).role is Role.MOUNT
-
-
 def _learnt(session: PoseSession, found: PoseDiagnosis) -> _Known | None:
     """What later windows are judged by; None where the motion does not determine the frames."""
-    eyes = [record for record in found.records if _is_hand_eye(record)]
+    eyes = [r for r in found.records if effect_of_record(r).role is Role.MOUNT]
     if session.reference is None or not all(e.evidence.get('observable') for e in eyes):
         return None
     misfit = _misfits(pose_problem(session).state(found.fit.terms))

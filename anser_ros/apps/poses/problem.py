@@ -1,17 +1,19 @@
-"""Sets a session of poses up for fitting: the body's path, what is predicted, and its errors."""
+"""Sets a session of poses up for fitting: what is predicted of it, its residuals and their noise.
+
+Errors of poses and stamps themselves: jitter between neighbours, and grids of polls.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import PoseSetting, PoseTerm, PoseView, Role, frames_of
-from anser_ros.apps.poses.path import OpticalPath
-from anser_ros.apps.poses.sequence import PoseSequence
+from anser_ros.apps.poses.sequence import OpticalPath, PoseSequence, PoseSession
 from anser_ros.calibration.readings import FOLDS
 from anser_ros.diagnosis.engine import BlockSums, JointState, block_sums, joined
 
@@ -66,13 +68,18 @@ class PoseProblem:
 
     def rows(self, keep: Sequence[NDArray[np.generic]]) -> 'PoseProblem':
         """Return the poses of each sensor that are named by index or mask."""
-        return replace(
-            self,
-            sensors=tuple(s.rows(k) for s, k in zip(self.sensors, keep, strict=True)),
-            blocks=tuple(b[k] for b, k in zip(self.blocks, keep, strict=True)),
-            places=tuple(p[k] for p, k in zip(self.places, keep, strict=True)),
-            weight=tuple(w[k] for w, k in zip(self.weight, keep, strict=True)),
-        )
+        rows: dict[str, Any] = {
+            key: tuple(v[k] for v, k in zip(getattr(self, key), keep, strict=True))
+            for key in ('blocks', 'places', 'weight')
+        }
+        sensors = tuple(s.rows(k) for s, k in zip(self.sensors, keep, strict=True))
+        return replace(self, sensors=sensors, **rows)
+
+    def sensor(self, index: int) -> 'PoseProblem':
+        """Return the problem with one of its sensors alone."""
+        keys = ('sensors', 'blocks', 'places', 'weight', 'noise')
+        one: dict[str, Any] = {key: getattr(self, key)[index : index + 1] for key in keys}
+        return replace(self, **one)
 
     def in_blocks(self, wanted: Ints) -> 'PoseProblem':
         """Return the problem with only the poses in some blocks of time."""
@@ -82,17 +89,17 @@ class PoseProblem:
         """Return all poses predicted with some active effects, and what they are missed by."""
         parts = []
         for i, sensor in enumerate(self.sensors):
-            view, residual, known = _predicted(self.path, sensor, terms)
+            view, residual, known = predicted(self.path, sensor, terms)
             weight = np.where(known, self.weight[i], 0.0)
             parts.append(PosePart(view, residual, weight, self.noise[i], self.blocks[i],
                                   self.places[i]))  # fmt: skip
         return PoseState(self, tuple(terms), tuple(parts))
 
 
-def _predicted(
+def predicted(
     path: OpticalPath, sensor: PoseSequence, terms: Sequence[PoseTerm]
 ) -> tuple[PoseView, Array, Mask]:
-    """View, residual (n, 6) measured less predicted, and where the reference is known."""
+    """Return view, residual (n, 6) measured less predicted, and where the reference is known."""
     time, position, rotation = sensor.time, sensor.position, sensor.rotation
     frames = frames_of(terms, sensor.name)
     frame, lever = frames.rotation, frames.lever
@@ -150,6 +157,23 @@ class PosePart:
 
 
 @dataclass(frozen=True)
+class Sensing(PosePart):
+    """Holds what one sensor shows once the frames and effects are fitted."""
+
+    out: Mask  # (n,), poses that have a reference and stand out
+    stamp_gain: float  # minus twice the log likelihood that an error of the stamps takes off
+
+
+@dataclass(frozen=True)
+class PoseResiduals:
+    """Holds a session and what its fit leaves, by which some effects are seen without a fit."""
+
+    session: PoseSession
+    setting: PoseSetting
+    sensors: tuple[Sensing, ...]
+
+
+@dataclass(frozen=True)
 class PoseState(JointState[PoseTerm, PosePart]):
     """Holds a problem of poses with a list of active terms."""
 
@@ -165,6 +189,10 @@ class PoseState(JointState[PoseTerm, PosePart]):
     def in_space(self) -> 'PoseState':
         """Return the state with blocks of space in place of those of time."""
         return replace(self, parts=tuple(replace(p, blocks=p.places) for p in self.parts))
+
+    def part(self, sensor: str) -> PosePart:
+        """Return the part of a sensor."""
+        return next(part for part in self.parts if part.view.sensor == sensor)
 
     def moved(self, terms: Sequence[PoseTerm]) -> 'PoseState':
         """Return the state of the same problem with other terms."""
@@ -232,3 +260,111 @@ class PoseState(JointState[PoseTerm, PosePart]):
                 columns = part.noise.without_stamps(columns, part.view.velocity)
             out.append(columns * part.weight[:, None, None])
         return out
+
+
+FINEST_S = 2e-3  # finest step of a poll, s: at 0.5 m/s a finer one moves poses by 0.3 mm rms
+ON_STEP = 0.95  # share of the stamps that lie on a grid for it to be one
+RATE_SHARE = 0.9
+"""Share of the intervals that are one step from which the step may be the tracker's own rate, with
+some poses lost, and no poll's: another clock falls into step for less."""
+FEWEST_BEATS, ON_BEAT = 4, 0.7
+"""Distances between the intervals that are not one step, and the share of them that differ by one
+interval at most, from which they are two clocks' beat; poses lost at random make it once in
+1000."""
+SHARED = 0.05
+"""Share of poses under the stamp of the pose before them from which a grid is a poll's, whatever
+its intervals: a tracker gives each pose a time of its own."""
+
+
+def stamp_step(time: Array) -> float:
+    """Return the step, s, that all intervals between stamps are multiples of, or zero."""
+    every = np.diff(time)
+    steps = every[every > FINEST_S / 2]
+    if steps.size < 20:
+        return 0.0
+    is_shared = np.mean(every == 0) > SHARED
+    kinds = np.unique(np.round(steps, 5))
+    if kinds.size < 2:
+        # One interval alone is a rate and not a grid, unless it holds several poses.
+        step = float(np.median(steps))
+        return step if is_shared or _is_beat(every, step) else 0.0
+    # Intervals differ by whole steps, and are some steps themselves.
+    apart = np.diff(kinds)
+    apart = apart[apart > FINEST_S]
+    base = float(np.percentile(steps, 2))
+    trials = [*apart[:1].tolist(), *(base / divisor for divisor in range(1, 9))]
+    for trial in trials:
+        step = float(trial)
+        if step < FINEST_S:
+            continue
+        counts = np.round(steps / step)
+        step = float(np.sum(steps * counts) / np.sum(counts**2))
+        counts = np.round(steps / step)
+        off = np.abs(steps - counts * step)
+        if np.mean((off < 0.02 * step + 2e-6) & (counts > 0)) > ON_STEP:
+            is_rate = np.mean(np.round(every / step) == 1) > RATE_SHARE
+            return 0.0 if is_rate and not is_shared and not _is_beat(every, step) else step
+    return 0.0
+
+
+def _is_beat(every: Array, step: float) -> bool:
+    """Whether intervals of no step, or of two, come as regularly as those of two clocks do.
+
+    A tracker and its poll are out of step by a little more with each pose, and the next interval
+    of another length comes when that is a whole step again. Longer intervals are pauses.
+    """
+    apart = np.diff(np.flatnonzero(np.isin(np.round(every / step), (0, 2))))
+    return apart.size >= FEWEST_BEATS and bool(
+        np.mean(np.abs(apart - np.median(apart)) <= 1) > ON_BEAT
+    )
+
+
+NEAR_S, NEAR_STEPS = 0.3, 3.0
+"""Poses that are nearer in time, s or usual intervals, differ by noise and not by place."""
+
+
+def jitter(part: PosePart, used: Mask, is_stamped: bool) -> tuple[Array, Array]:
+    """Return squared noise (n,) of used poses beside near neighbours, and distances (n, 3).
+
+    Squares are m^2, a coordinate; the distances, m, are those of the pose before, of the pose and
+    of the one after it. Second differences of the residual across the velocity, so that neither a
+    slow course nor an error of the stamps, where ``is_stamped``, is in it.
+    """
+    rows = np.flatnonzero(used)
+    time, velocity = part.view.time[rows], part.view.velocity[rows, :3]
+    residual = part.residual[rows, :3]
+    if rows.size < 3:
+        return np.zeros(0), np.zeros((0, 3))
+    along = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
+    if is_stamped:
+        # Neighbours move another way, and errors of their stamps lie along theirs. What is the
+        # same everywhere would change with the direction that is taken out of it.
+        residual = _across(residual - np.median(residual, axis=0), along)
+    second = residual[1:-1] - 0.5 * (residual[:-2] + residual[2:])
+    second = _across(second, along[1:-1])
+    usual = float(np.median(np.diff(time)))
+    near = time[2:] - time[:-2] < max(NEAR_S, NEAR_STEPS * usual)
+    square = np.sum(second**2, axis=1) / (1.5 * 2)
+    distance = np.linalg.norm(part.view.measured[rows], axis=1)
+    about = np.stack([distance[:-2], distance[1:-1], distance[2:]], axis=1)
+    return square[near], about[near]
+
+
+def _across(vectors: Array, along: Array) -> Array:
+    """Vectors (n, 3) without their part along unit vectors (n, 3)."""
+    return np.asarray(vectors - np.sum(vectors * along, axis=1, keepdims=True) * along)
+
+
+def floor_of(state: PoseState) -> float:
+    """Return the distance that jitter alone makes, m, from differences between neighbours."""
+    squares = []
+    for part in state.parts:
+        is_resting = not part.view.velocity.any()  # each recording has an error of its own
+        groups = np.unique(part.blocks) if is_resting else (None,)
+        rows = [part.used if k is None else part.used & (part.blocks == k) for k in groups]
+        square = np.concatenate([jitter(part, r, False)[0] for r in rows])
+        noise = part.noise
+        along = noise.stamp_s * np.linalg.norm(part.view.velocity[part.used, :3], axis=1)
+        if square.size and along.size:
+            squares.append(3 * float(np.mean(square)) + float(np.mean(along**2)))
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0

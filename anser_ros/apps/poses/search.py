@@ -23,8 +23,7 @@ from anser_ros.apps.poses.fit import (
     unexplained_poses,
     with_time_constants,
 )
-from anser_ros.apps.poses.jitter import stamp_step
-from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseState
+from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseState, stamp_step
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.apps.poses.start import FEWEST_HAND_EYE_POSES
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN, PER_PARAMETER
@@ -98,8 +97,7 @@ def doubt(fit: PoseFit, index: int) -> str:
     record = effect.record(term, covariance)
     if not effect.possible(record):
         return 'implausible parameters'
-    views = [part.view for part in fit.state.parts]
-    seen = effect.seen_at(record, term, covariance, views)
+    seen = effect.seen_at(record, term, covariance, [part.view for part in fit.state.parts])
     if term.role is Role.MAP and float(seen.parameters['rms_m']) < LEAST_MAP_M:
         return f'moves poses by less than {1e3 * LEAST_MAP_M:g} mm'
     sigma = float(np.sqrt(covariance[0, 0]))
@@ -226,8 +224,8 @@ gains as much where there is nothing else."""
 class PoseEvidence(NamedTuple):
     """States what speaks for an active term, of the poses that were fitted."""
 
-    gain: float  # what it takes off the cross-validated sum of squares, in units of the misfit
-    share: float  # the same over the sum of squares without it
+    held_out_gain: float  # what it takes off the cross-validated squares, in units of the misfit
+    held_out_share: float  # the same over the sum of squares without it
     position_rmse_without_m: float
     position_rmse_with_m: float
 
@@ -251,7 +249,7 @@ def with_noise(fit: PoseFit, with_stamps: bool = True) -> PoseFit:
     for _ in range(NOISE_ROUNDS):
         cut = replace(problem, weight=_weights(state))
         parts = cut.state(fit.terms).parts
-        noise = tuple((likely_noise(p) if with_stamps else noise_of(p, False))[0] for p in parts)
+        noise = tuple(likely_noise(p) if with_stamps else noise_of(p, False)[0] for p in parts)
         every = tuple(np.ones(weight.size) for weight in cut.weight)
         problem = replace(problem, weight=every, noise=noise)
         state = problem.state(fit.terms)
@@ -263,13 +261,12 @@ def _weights(state: PoseState) -> tuple[Array, ...]:
     return tuple(np.where(mask, 0.0, 1.0) for mask in unexplained_poses(state))
 
 
-def likely_noise(part: PosePart) -> tuple[PoseNoise, float]:
-    """Return a sensor's noise, with a stamps' error if that is believed, and what that gains."""
+def likely_noise(part: PosePart) -> PoseNoise:
+    """Return a sensor's noise, with an error of the stamps where that is believed."""
     plain, without = noise_of(part, with_stamps=False)
     full, cost = noise_of(part, with_stamps=True)
-    gain = without - cost
-    believed = gain > STAMP_GAIN and full.stamp_s < LARGEST_STAMP_S
-    return (full, gain) if believed else (plain, 0.0)
+    believed = without - cost > STAMP_GAIN and full.stamp_s < LARGEST_STAMP_S
+    return full if believed else plain
 
 
 def search_effects(
@@ -313,11 +310,8 @@ class _PoseSelection(ForwardSelection[PoseFit]):
     def addition(self, fit: PoseFit) -> PoseFit | None:
         """Return the fit with the candidate that is worth most, or None; a lag comes last."""
         self._say(f'search besides {len(fit.terms) - len(frame_terms(fit.terms))} effects')
-        accepted: list[tuple[float, PoseFit]] = []
-        for term in _finalists(fit, self._knows_levers):
-            found = self._accepted(fit, term)
-            if found is not None:
-                accepted.append(found)
+        trials = [self._accepted(fit, term) for term in _finalists(fit, self._knows_levers)]
+        accepted = [trial for trial in trials if trial is not None]
         best = _simplest(accepted) if accepted else None
         if not self._knows_levers or (best is not None and best.terms[-1].role.is_clock):
             return best
@@ -425,14 +419,14 @@ def _simplest(accepted: list[tuple[float, PoseFit]]) -> PoseFit:
     A scale that gains much less than a map is a part of that, unless several sensors vouch for it,
     which see the same one (`is_one_scale`) at different places.
     """
-    ends = [(gain, fit.terms[-1]) for gain, fit in accepted]
-    maps = [gain for gain, t in ends if t.role is Role.MAP]
+    maps = [gain for gain, fit in accepted if fit.terms[-1].role is Role.MAP]
     is_alone = len(accepted[0][1].state.parts) == 1
     least = PART_OF_MAP * max(maps, default=0.0) if is_alone else 0.0
     plain = [
-        pair
-        for pair, (gain, term) in zip(accepted, ends, strict=True)
-        if term.role is not Role.MAP and (gain >= least or term.role is not Role.SCALE)
+        (gain, fit)
+        for gain, fit in accepted
+        if fit.terms[-1].role is not Role.MAP
+        and (gain >= least or fit.terms[-1].role is not Role.SCALE)
     ]
     return max(plain or accepted, key=lambda pair: pair[0])[1]
 

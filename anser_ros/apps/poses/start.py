@@ -1,6 +1,4 @@
-"""Starts a fit from a session: blocks, a coarse time offset, two frames, exchanged sensors put
-back.
-"""
+"""Starts a fit from a session: blocks, a coarse time offset, two frames, swapped sensors."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import PoseSetting, PoseSite, PoseTerm, Role, effect_with
 from anser_ros.apps.poses.fit import PoseFit, robust_fit
-from anser_ros.apps.poses.path import OpticalPath
-from anser_ros.apps.poses.problem import PoseNoise, PoseProblem
-from anser_ros.apps.poses.sequence import PoseSequence, PoseSession, jumping_poses
+from anser_ros.apps.poses.problem import PoseNoise, PoseProblem, predicted
+from anser_ros.apps.poses.sequence import OpticalPath, PoseSequence, PoseSession, jumping_poses
 from anser_ros.calibration.readings import fold_of_frames
 from anser_ros.diagnosis.prepare import BLOCKS, TEST_EVERY
 from anser_ros.errors import DiagnosisError, FitError
@@ -69,15 +66,11 @@ def pose_problem(session: PoseSession) -> PoseProblem:
     kept = {name: _thinned(poses) for name, poses in sensors.items()}
     starts = _pauses(list(kept.values()))
     if starts.size + 1 >= FEWEST_PARTS:
-        few = {name: _still_ones(poses) for name, poses in kept.items()}
-        rests = sum(p.size for p in few.values()) < AT_REST_SHARE * sum(
-            p.size for p in kept.values()
-        )
-        kept = few
-        if rests:
-            path = OpticalPath.through(
-                _resting(reference, list(sensors.values())), is_at_rest=True
-            )
+        every = sum(p.size for p in kept.values())
+        kept = {name: _still_ones(poses) for name, poses in kept.items()}
+        if sum(p.size for p in kept.values()) < AT_REST_SHARE * every:
+            track = _resting(reference, list(sensors.values()))
+            path = OpticalPath.through(track, is_at_rest=True)
     kept = {
         name: poses for name, poses in kept.items() if _seen(poses, path) >= FEWEST_HAND_EYE_POSES
     }
@@ -292,20 +285,16 @@ def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> 
     for poses in problem.sensors:
         place, turn, _, known = problem.path.at(poses.time - offset)
         pairs.append((poses.position[known], poses.rotation[known], place[known], turn[known]))
-    rotation = np.eye(3) if frame is None else frame
-    shift = np.zeros(3)
-    if frame is not None:
-        shift = np.median(
-            np.concatenate([p - o @ rotation.T for p, _, o, _ in pairs if len(p)]), axis=0
-        )
     terms: list[PoseTerm] = []
+    rotation = np.eye(3) if frame is None else frame
     if frame is not None:
-        terms.append(effect_with(Role.REGISTRATION).at_frame({}, shift, rotation))
+        apart = np.concatenate([p - o @ frame.T for p, _, o, _ in pairs if len(p)])
+        shift = np.median(apart, axis=0)
+        terms.append(effect_with(Role.REGISTRATION).at_frame({}, shift, frame))
     for poses, (_, turned, _, turn) in zip(problem.sensors, pairs, strict=True):
         mounts = Rotation.from_matrix(turn.transpose(0, 2, 1) @ (rotation.T @ turned))
-        middle = _middle(mounts)
         site: PoseSite = {'sensor': poses.name}
-        terms.append(effect_with(Role.MOUNT).at_frame(site, np.zeros(3), middle))
+        terms.append(effect_with(Role.MOUNT).at_frame(site, np.zeros(3), _middle(mounts)))
     return [*terms, PoseTerm(effect_with(Role.OFFSET), {}, np.array([offset]))]
 
 
@@ -379,8 +368,7 @@ def swapped_spans(
 
 
 def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
-    """Return the session with sensors put back that were exchanged for about half of it, and the
-    records of it; as it is if there are none.
+    """Return the session with sensors put back that were swapped for half of it, and the records.
 
     Nothing fits all of such a session. Its first part says whose poses are whose.
     """
@@ -394,17 +382,14 @@ def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
 
 
 def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Mask, Mask]:
-    """Masks of the poses of sensor i that fit where sensor j should be, and that rather fit there
-    than where i should be."""
-    problem = replace(problem, noise=fit.state.problem.noise)
-    own = problem.state(fit.terms).parts[i]
-    sensors = list(problem.sensors)
-    sensors[i] = replace(sensors[i], name=problem.sensors[j].name)
-    as_other = replace(problem, sensors=tuple(sensors)).state(fit.terms).parts[i]
+    """Masks of the poses of sensor i that fit where j should be, and that rather fit there."""
+    own = replace(problem, noise=fit.state.problem.noise).state(fit.terms).parts[i]
+    renamed = replace(problem.sensors[i], name=problem.sensors[j].name)
+    _, as_other, _ = predicted(problem.path, renamed, fit.terms)
     noise = replace(own.noise, stamp_s=0.0)
     here, there = (
-        np.linalg.norm(noise.whitened(part.residual, own.view.velocity), axis=1)
-        for part in (own, as_other)
+        np.linalg.norm(noise.whitened(residual, own.view.velocity), axis=1)
+        for residual in (own.residual, as_other)
     )
     return (here > FAR) & (there < FITS * here) & (own.weight > 0), there < here
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -36,16 +36,14 @@ SMALLEST_SHARE = 0.02
 to be alike do not make limits that the next one must break."""
 
 
-@dataclass(frozen=True)
-class ControlLimits:
+class ControlLimits(NamedTuple):
     """Holds the limits of one figure."""
 
     n: int  # earlier sessions they are made from
     mean: float
     sigma: float
-    # distance from the mean, in the figure's unit, from which on a session is a note, and an alert
-    note: float
-    alert: float
+    note: float  # distance from the mean from which on a session is a note
+    alert: float  # and an alert
 
 
 @cache
@@ -69,11 +67,7 @@ class Verdict:
 def limits_of(earlier: Sequence[float], figures: int = 1) -> ControlLimits | None:
     """Return limits from the figures of earlier sessions, in their order.
 
-    Parameters
-    ----------
-    earlier : sequence of float
-    figures : int
-        How many figures are watched at once, this one with them.
+    ``figures``: how many are watched at once, this one with them.
     """
     values = np.asarray(earlier, dtype=np.float64)
     values = values[np.isfinite(values)]
@@ -91,15 +85,8 @@ def judged(
 ) -> Verdict:
     """Return what a figure is worth.
 
-    Parameters
-    ----------
-    value : float
-    earlier : sequence of float
-        The same figure of sessions that were in order, the oldest first.
-    tolerance : float, optional
-        Largest size that it may have.
-    figures : int
-        How many figures are watched with it.
+    ``earlier``: the same figure of sessions that were in order, the oldest first; ``tolerance``:
+    largest size that it may have; ``figures``: how many are watched with it.
     """
     limits = limits_of(earlier, figures)
     if not np.isfinite(value):
@@ -122,11 +109,6 @@ def judged(
     if last.size == RUN and abs(last.sum()) == RUN:
         return Verdict(NOTE, f'{RUN} sessions in a row on one side of the mean', limits, tolerance)
     return Verdict(PASS, '', limits, tolerance)
-
-
-def worst(verdicts: Mapping[str, Verdict]) -> str:
-    """Return the worst state of the verdicts, which is the session's."""
-    return max((v.state for v in verdicts.values()), key=STATES.index, default=PASS)
 
 
 SCHEMA = 'anser_accuracy_history/1'
@@ -165,30 +147,16 @@ def figures_of(found: Assessment) -> dict[str, float]:
     return figures
 
 
-def _is_watched(name: str, protocol: str) -> bool:
-    return any(name.startswith(w) or name.endswith(w) for w in WATCHED[protocol])
-
-
 def judge(
     found: Assessment, folder: Path | None, tolerances: Mapping[str, float]
 ) -> SessionVerdict:
-    """Return the verdict on a session.
+    """Return the verdict on a session by the history in a folder, or by tolerances alone.
 
     Sessions of the same protocol and body count, but no later ones, and no figure that was an
-    alert or failed in its session.
+    alert or failed in its session. ``tolerances``: largest size by figure.
 
-    Parameters
-    ----------
-    found : Assessment
-    folder : Path or None
-        Of the history; None: tolerances alone.
-    tolerances : mapping of str to float
-        Largest size by figure.
-
-    Raises
-    ------
-    ParameterError
-        When a tolerance is for an unknown figure, or a file is not of a history.
+    Raises `ParameterError` when a tolerance is for an unknown figure, or a file is not of a
+    history.
     """
     figures = figures_of(found)
     unknown = sorted(set(tolerances) - set(figures))
@@ -196,7 +164,8 @@ def judge(
         raise ParameterError(f'no figure {unknown[0]!r}; there are: {", ".join(figures)}')
     entries = [] if folder is None else _entries(folder, found)
     earlier = [entry for entry in entries if entry['start_ns'] < found.start_ns]
-    watched = [n for n in figures if _is_watched(n, found.protocol)]
+    words = WATCHED[found.protocol]
+    watched = [n for n in figures if n.startswith(words) or n.endswith(words)]
     past = {
         name: tuple(
             EarlierFigure(
@@ -211,7 +180,8 @@ def judge(
     for name in [*watched, *(n for n in tolerances if n not in watched)]:
         values = [one.value for one in past.get(name, ()) if one.is_in_order]
         verdicts[name] = judged(figures[name], values, tolerances.get(name), len(watched))
-    return SessionVerdict(worst(verdicts), verdicts, len(earlier), past)
+    state = max((v.state for v in verdicts.values()), key=STATES.index, default=PASS)
+    return SessionVerdict(state, verdicts, len(earlier), past)
 
 
 def keep(found: Assessment, folder: Path, verdicts: Mapping[str, Verdict]) -> Path:

@@ -73,19 +73,12 @@ def vertex_weights(pairs: NDArray[np.int64], rng: np.random.Generator) -> Array:
 def summarised(values: Array, weights: Array, clusters: int) -> dict[str, IntervalEstimate]:
     """Return mean, root mean square, deviation, median and 95th percentile with intervals.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Errors.
-    weights : ndarray, shape (draws, n)
-        Of the resamples.
-    clusters : int
-        Independent pieces that were drawn; the fewer, the wider the interval is made (Student's t
-        for the normal, and the degree of freedom that the mean takes).
+    ``values`` (n,): errors; ``weights`` (draws, n): of the resamples; ``clusters``: independent
+    pieces that were drawn. The fewer, the wider the interval is made (Student's t for the normal,
+    and the degree of freedom that the mean takes).
     """
     order = np.argsort(values)
-    ones = np.ones((1, values.size))
-    whole = _statistics(values[order], ones)
+    whole = _statistics(values[order], np.ones((1, values.size)))
     if clusters < FEWEST_CLUSTERS or values.size < FEWEST_CLUSTERS:
         return {name: IntervalEstimate(float(v[0])) for name, v in whole.items()}
     step = max(1, CHUNK // values.size)
@@ -139,15 +132,12 @@ def _statistics(ordered: Array, weights: Array) -> Mapping[str, Array]:
 
 
 def independent_for_variance(values: Array) -> float:
-    """Return how many independent values determine a variance as well as these do.
-
-    Of a stationary series it is ``n / (1 + 2 sum rho_k^2)``.
-    """
+    """Return how many independent values determine a variance: ``n / (1 + 2 sum rho^2)``."""
     return _independent(values, 2)
 
 
 def independent_for_mean(values: Array) -> float:
-    """Return how many independent values determine a mean as well: ``n / (1 + 2 sum rho_k)``."""
+    """Return how many independent values determine a mean: ``n / (1 + 2 sum rho)``."""
     return _independent(values, 1)
 
 
@@ -168,13 +158,9 @@ def _independent(values: Array, power: int) -> float:
 
 
 def deviation_interval(value: float, freedoms: float) -> IntervalEstimate:
-    """Return a standard deviation with the interval of chi-square with so many degrees of
-    freedom.
-    """
-    low, high = stats.chi2.ppf([0.5 + LEVEL / 2, 0.5 - LEVEL / 2], freedoms)
-    return IntervalEstimate(
-        value, value * np.sqrt(freedoms / low), value * np.sqrt(freedoms / high)
-    )
+    """Return a standard deviation with its chi-square interval by degrees of freedom."""
+    low, high = np.sqrt(freedoms / stats.chi2.ppf([0.5 + LEVEL / 2, 0.5 - LEVEL / 2], freedoms))
+    return IntervalEstimate(value, value * low, value * high)
 
 
 def blocks_of_time(time: Array) -> NDArray[np.int64]:

@@ -77,21 +77,10 @@ class PivotFit:
 def fit_pivot(
     poses: PoseSequence, rng: np.random.Generator, limits: PivotLimits | None = None
 ) -> PivotFit:
-    """Find the tip from poses while it rests on a point.
+    """Find the tip from poses, in the order of time, while it rests on a point.
 
-    Parameters
-    ----------
-    poses : PoseSequence
-        Of the body, in the order of time.
-    rng : numpy.random.Generator
-        Draws the samples.
-    limits : PivotLimits, optional
-
-    Raises
-    ------
-    FitError
-        When there are too few poses, they don't turn about one point, or their motion leaves a
-        direction undetermined; it says which motion is missing.
+    Raises `FitError` when there are too few poses, they don't turn about one point, or their
+    motion leaves a direction undetermined; it says which motion is missing.
     """
     limits = limits or PivotLimits()
     fresh = poses.rows(~poses.repeated)
@@ -219,16 +208,14 @@ def _refuse_poor_motion(turn: Array, used: Mask) -> Array:
     tilts = np.rad2deg(np.sqrt(np.maximum(values, 0.0)))
     if tilts[0] < LEAST_TILT_DEG:
         around = _words(vectors[:, 0])
-        turned = np.rad2deg(
-            (Rotation.from_matrix(turn[used]).mean().inv() * Rotation.from_matrix(turn[used]))
-            .magnitude().max()
-        )  # fmt: skip
         if tilts[0] < TWO_AXES * tilts[1]:
             raise FitError(
                 f'the tool turned about one axis only, {around} in its own frame: where the tip '
                 'is along that axis is not determined; tilt the tool to both sides across it too, '
                 'by 25 deg or more'
             )
+        turns = Rotation.from_matrix(turn[used])
+        turned = np.rad2deg((turns.mean().inv() * turns).magnitude().max())
         raise FitError(
             f'the tool turned by {turned:.0f} deg at most, and {around} of the body by '
             f'{tilts[0]:.1f} deg (rms, at least {LEAST_TILT_DEG:g}): tilt it by 25 deg or more to '

@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.apps.poses.assessment.dynamic import SpeedGroup, assess_motion
-from anser_ros.apps.poses.assessment.f2554 import point_to_point, single_point, standing_alone
-from anser_ros.apps.poses.assessment.hummel import (
+from anser_ros.apps.poses.assessment.distances import (
     ORDERS,
     RING_STEP_DEG,
     ROTATION,
@@ -19,17 +18,125 @@ from anser_ros.apps.poses.assessment.hummel import (
     grid_points,
     have_common_errors,
     matching_error,
+    point_to_point,
     rotation_errors,
+    single_point,
+    standing_alone,
 )
-from anser_ros.apps.poses.assessment.intervals import IntervalEstimate
+from anser_ros.apps.poses.assessment.intervals import (
+    BLOCKS,
+    LEVEL,
+    IntervalEstimate,
+    blocks_of_time,
+    cluster_weights,
+    summarised,
+)
+from anser_ros.apps.poses.assessment.rest import (
+    AllanCurve,
+    PauseRule,
+    StillPoint,
+    assess_rest,
+    metal_shifts,
+    point_of,
+    still_points,
+)
 from anser_ros.apps.poses.assessment.source import AssessedPoses
-from anser_ros.apps.poses.assessment.stability import AllanCurve, assess_rest, metal_shifts
-from anser_ros.apps.poses.assessment.stillness import PauseRule, StillPoint, point_of, still_points
 from anser_ros.apps.poses.hand_eye import HandEye, fit_hand_eye
+from anser_ros.apps.poses.problem import predicted
 from anser_ros.apps.poses.sequence import PoseSequence
 from anser_ros.errors import FitError, ParameterError
 
 Array = NDArray[np.float64]
+
+GROUPS = 5  # groups of speeds, with equal numbers of poses: a row of the table each
+FEWEST_MOVING_POSES = 100
+"""Fewer leave a group less than 20, whose 95th percentile would be one pose."""
+SLOWEST_M_S = 0.02
+"""Median speed below which a recording is of a rest, where a jitter of 0.1 mm is 5 ms of
+latency."""
+
+
+@dataclass(frozen=True)
+class SpeedGroup:
+    """Holds poses of similar speed."""
+
+    speed_low_m_s: float
+    speed_high_m_s: float
+    speed_mean_m_s: float
+    n: int
+    error_rms_m: IntervalEstimate  # with the clocks' offset taken out
+    error_live_rms_m: IntervalEstimate  # of poses that are taken for those of their stamps
+    latency_s: IntervalEstimate  # against the reference, the common offset included
+
+
+def assess_motion(
+    found: HandEye, sensor: str, rng: np.random.Generator
+) -> tuple[dict[str, IntervalEstimate], tuple[SpeedGroup, ...]]:
+    """Return figures of a moving sensor whose frames and clocks are known, and the same by speed.
+
+    A late pose is where the tool was, back along its velocity: the error along the velocity over
+    the speed is the latency that remains beside the common offset.
+
+    Raises `FitError` when there are too few poses, or the tool hardly moved.
+    """
+    part = found.fit.state.part(sensor)
+    used = part.used
+    if np.count_nonzero(used) < FEWEST_MOVING_POSES:
+        raise FitError(
+            f'{np.count_nonzero(used)} poses with a reference; {FEWEST_MOVING_POSES} are needed'
+        )
+    rest, velocity = part.residual[used, :3], part.view.velocity[used, :3]
+    speed = np.linalg.norm(velocity, axis=1)
+    if float(np.median(speed)) < SLOWEST_M_S or found.offset_s is None:
+        raise FitError(
+            f'the median speed of the tool was {1e3 * np.median(speed):.0f} mm/s; move it at '
+            f'{1e3 * SLOWEST_M_S:.0f} mm/s or more, at several speeds'
+        )
+    offset, sigma = found.offset_s
+    error = np.linalg.norm(rest, axis=1)
+    error_live = np.linalg.norm(rest - offset * velocity, axis=1)
+    clusters = blocks_of_time(part.view.time[used])
+    edges = np.quantile(speed, np.linspace(0, 1, GROUPS + 1))
+    groups = []
+    for k in range(GROUPS):
+        inside = (speed >= edges[k]) & ((speed < edges[k + 1]) | (k == GROUPS - 1))
+        weights = cluster_weights(clusters[inside], rng)
+        count = int(np.unique(clusters[inside]).size)
+        late = _latency(rest[inside], velocity[inside], weights, offset, sigma)
+        groups.append(
+            SpeedGroup(
+                float(edges[k]), float(edges[k + 1]), float(speed[inside].mean()),
+                int(inside.sum()), summarised(error[inside], weights, count)['RMS'],
+                summarised(error_live[inside], weights, count)['RMS'], late,
+            )
+        )  # fmt: skip
+    weights = cluster_weights(clusters, rng)
+    whole = summarised(error, weights, BLOCKS)
+    estimates = {
+        'dynamic_error_rms_m': whole['RMS'],
+        'dynamic_error_prc95_m': whole['P95'],
+        'dynamic_error_live_rms_m': summarised(error_live, weights, BLOCKS)['RMS'],
+        'latency_s': _latency(rest, velocity, weights, offset, sigma),
+        'speed_prc95_m_s': IntervalEstimate(float(np.percentile(speed, 95))),
+    }
+    return estimates, tuple(groups)
+
+
+def _latency(
+    rest: Array, velocity: Array, weights: Array, offset: float, sigma: float
+) -> IntervalEstimate:
+    """The offset and what is left beside it, s, with the offset's own uncertainty."""
+    along, square = np.sum(rest * velocity, axis=1), np.sum(velocity**2, axis=1)
+    value = offset - float(along.sum() / max(square.sum(), 1e-300))
+    drawn = offset - (weights @ along) / np.maximum(weights @ square, 1e-300)
+    low, high = np.quantile(drawn, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
+    wide = 1.96 * sigma
+    return IntervalEstimate(
+        value,
+        value - float(np.hypot(value - low, wide)),
+        value + float(np.hypot(high - value, wide)),
+    )
+
 
 EVEN_ENOUGH = 0.9
 """Share of poses in the longest evenly spaced stretch below which it is said that poses lack."""
@@ -51,6 +158,19 @@ class ProtocolOptions:
     axis: Array | None = None  # (3,), or None, direction of a sensor without roll
     # (n, 3), or None, places of a phantom's points, m; None: the recording's optical reference
     truth: Array | None = None
+
+
+class _Given(NamedTuple):
+    """What a protocol is carried out on."""
+
+    recordings: Sequence[AssessedPoses]
+    options: ProtocolOptions
+    rng: np.random.Generator
+
+    @property
+    def points(self) -> list[StillPoint]:
+        """Pauses of the recording, or one of each where there are several."""
+        return points_of(self.recordings, self.options.pause)
 
 
 @dataclass(frozen=True)
@@ -103,12 +223,8 @@ def assess(
 ) -> Assessment:
     """Assess recordings by a protocol.
 
-    Raises
-    ------
-    ParameterError
-        When the protocol takes another number of recordings, or lacks an option.
-    FitError
-        When the recordings are not what the protocol takes.
+    Raises `ParameterError` when the protocol takes another number of recordings, or lacks an
+    option, `FitError` when the recordings are not what it takes.
     """
     first = recordings[0]
     if protocol in ONE and len(recordings) > 1:
@@ -123,7 +239,7 @@ def assess(
         'single-point': _single_point, 'point-to-point': _point_to_point, 'dynamic': _dynamic,
     }  # fmt: skip
     try:
-        return makers[protocol](empty, recordings, options, rng)
+        return makers[protocol](empty, _Given(recordings, options, rng))
     except FitError as error:
         raise FitError(f'{first.session.path}: {error}') from error
 
@@ -131,10 +247,7 @@ def assess(
 def points_of(recordings: Sequence[AssessedPoses], rule: PauseRule) -> list[StillPoint]:
     """Return the points of recordings: the pauses of one, or one of each where there are several.
 
-    Raises
-    ------
-    FitError
-        When no pause is found.
+    Raises `FitError` when no pause is found.
     """
     if len(recordings) > 1:
         found = []
@@ -152,33 +265,23 @@ def points_of(recordings: Sequence[AssessedPoses], rule: PauseRule) -> list[Stil
     return pauses
 
 
-def _rest(
-    empty: Assessment,
-    recordings: Sequence[AssessedPoses],
-    options: ProtocolOptions,
-    rng: np.random.Generator,
-) -> Assessment:
-    found = assess_rest(recordings[0].poses)
+def _rest(empty: Assessment, given: _Given) -> Assessment:
+    estimates, allan, even_share = assess_rest(given.recordings[0].poses)
     notes = []
-    if found.even_share < EVEN_ENOUGH:
+    if even_share < EVEN_ENOUGH:
         notes.append(
             'poses are missing: the Allan deviation is that of the longest stretch without a '
-            f'gap, {found.even_share:.0%} of the poses'
+            f'gap, {even_share:.0%} of the poses'
         )
-    if found.estimates['position_jitter_rms_m'].value < STUCK_M:
+    if estimates['position_jitter_rms_m'].value < STUCK_M:
         notes.append('the position never changes at all: is the sensor stuck?')
-    return replace(empty, estimates=found.estimates, allan=found.allan, notes=tuple(notes))
+    return replace(empty, estimates=estimates, allan=allan, notes=tuple(notes))
 
 
-def _grid(
-    empty: Assessment,
-    recordings: Sequence[AssessedPoses],
-    options: ProtocolOptions,
-    rng: np.random.Generator,
-) -> Assessment:
-    points = points_of(recordings, options.pause)
-    grid = Grid.of(len(points), options.grid, options.spacing_m)
-    place = grid_points(points, grid, options.order)
+def _grid(empty: Assessment, given: _Given) -> Assessment:
+    points = given.points
+    grid = Grid.of(len(points), given.options.grid, given.options.spacing_m)
+    place = grid_points(points, grid, given.options.order)
     estimates = {
         'grid_matching_fre_m': IntervalEstimate(matching_error(place, grid)),
         'point_jitter_rms_m': _jitter(points),
@@ -189,7 +292,7 @@ def _grid(
             'neighbouring lines of holes seem to have the same error, as in a distorted field: '
             'intervals come from thirds of the board, and are wide',
         )
-    groups = distance_errors(place, grid, rng)
+    groups = distance_errors(place, grid, given.rng)
     return replace(empty, estimates=estimates, groups=groups, points=tuple(points), notes=notes)
 
 
@@ -197,14 +300,9 @@ def _jitter(points: Sequence[StillPoint]) -> IntervalEstimate:
     return IntervalEstimate(float(np.sqrt(np.mean([p.jitter_m**2 for p in points]))))
 
 
-def _rotation(
-    empty: Assessment,
-    recordings: Sequence[AssessedPoses],
-    options: ProtocolOptions,
-    rng: np.random.Generator,
-) -> Assessment:
-    points = points_of(recordings, options.pause)
-    group = rotation_errors(points, options.step_deg, options.axis, rng)
+def _rotation(empty: Assessment, given: _Given) -> Assessment:
+    points = given.points
+    group = rotation_errors(points, given.options.step_deg, given.options.axis, given.rng)
     place = np.array([p.position for p in points])
     estimates = {
         # The ring turns the sensor about a place that hardly moves: how far it seems to.
@@ -216,54 +314,38 @@ def _rotation(
     return replace(empty, estimates=estimates, groups={ROTATION: group}, points=tuple(points))
 
 
-def _metal(
-    empty: Assessment,
-    recordings: Sequence[AssessedPoses],
-    options: ProtocolOptions,
-    rng: np.random.Generator,
-) -> Assessment:
-    names = [f'{k}' for k in range(1, len(recordings))]
-    others = [(n, r.poses) for n, r in zip(names, recordings[1:], strict=True)]
-    shifts = metal_shifts(recordings[0].poses, others)
-    notes = [f'{n} is {r.session.path}' for n, r in zip(names, recordings[1:], strict=True)]
-    return replace(empty, estimates=shifts, notes=tuple(notes))
+def _metal(empty: Assessment, given: _Given) -> Assessment:
+    base, *others = given.recordings
+    shifts = metal_shifts(base.poses, [one.poses for one in others])
+    notes = tuple(f'{k} is {one.session.path}' for k, one in enumerate(others, start=1))
+    return replace(empty, estimates=shifts, notes=notes)
 
 
-def _single_point(
-    empty: Assessment,
-    recordings: Sequence[AssessedPoses],
-    options: ProtocolOptions,
-    rng: np.random.Generator,
-) -> Assessment:
-    group, estimates = single_point(recordings[0].poses, rng)
+def _single_point(empty: Assessment, given: _Given) -> Assessment:
+    group, estimates = single_point(given.recordings[0].poses, given.rng)
     return replace(empty, estimates=estimates, groups={'single point deviations': group})
 
 
-def _point_to_point(
-    empty: Assessment,
-    recordings: Sequence[AssessedPoses],
-    options: ProtocolOptions,
-    rng: np.random.Generator,
-) -> Assessment:
-    true, notes = options.truth, []
+def _point_to_point(empty: Assessment, given: _Given) -> Assessment:
+    true, notes = given.options.truth, []
     if true is None:
-        first = recordings[0]
-        if len(recordings) > 1 or first.session.reference is None:
+        first = given.recordings[0]
+        if len(given.recordings) > 1 or first.session.reference is None:
             raise ParameterError(
                 'point-to-point needs the true points: --truth FILE.csv, or one recording with '
                 'an optical reference'
             )
         found = fit_hand_eye(first.session)
         # As they are meant, where units or quaternions say something else.
-        recordings = [replace(first, poses=found.session.sensors[first.poses.name])]
-        points = points_of(recordings, options.pause)
-        true = _optical_points(found, recordings[0].poses, points)
+        poses = found.session.sensors[first.poses.name]
+        points = points_of([replace(first, poses=poses)], given.options.pause)
+        true = _optical_points(found, poses, points)
         notes.append(
             'the truth is the optical reference, whose own error is included in the figures'
         )
     else:
-        points = points_of(recordings, options.pause)
-    group, estimates = point_to_point(points, true, rng)
+        points = given.points
+    group, estimates = point_to_point(points, true, given.rng)
     alone = standing_alone(np.array([p.position for p in points]), true)
     if alone is not None:
         number, before, after = alone
@@ -282,37 +364,26 @@ def _point_to_point(
 
 def _optical_points(found: HandEye, poses: PoseSequence, points: Sequence[StillPoint]) -> Array:
     """Where the optical reference puts the sensor in each pause, m, tracker's frame."""
-    problem = found.fit.state.problem
-    same = np.zeros(poses.size, dtype=np.int64)
-    every = replace(
-        problem, sensors=(poses,), blocks=(same,), places=(same,), weight=(np.ones(poses.size),),
-        noise=problem.noise[:1],
-    )  # fmt: skip
-    part = every.state(found.fit.terms).parts[0]
+    view, _, known = predicted(found.fit.state.problem.path, poses, found.fit.terms)
     places = []
     for point in points:
-        inside = (poses.time >= point.begin_s) & (poses.time <= point.end_s) & part.used
+        inside = (poses.time >= point.begin_s) & (poses.time <= point.end_s) & known
         if not inside.any():
             raise FitError(
                 f'the reference does not see the tool in the pause at {point.begin_s:.1f} s'
             )
-        places.append(np.median(part.view.position[inside], axis=0))
+        places.append(np.median(view.position[inside], axis=0))
     return np.array(places)
 
 
-def _dynamic(
-    empty: Assessment,
-    recordings: Sequence[AssessedPoses],
-    options: ProtocolOptions,
-    rng: np.random.Generator,
-) -> Assessment:
-    session = recordings[0].session
+def _dynamic(empty: Assessment, given: _Given) -> Assessment:
+    session = given.recordings[0].session
     if session.reference is None:
         raise ParameterError('dynamic needs a moving reference: a bag with optical poses')
     found = fit_hand_eye(session)
-    motion = assess_motion(found, recordings[0].poses.name, rng)
+    estimates, speeds = assess_motion(found, given.recordings[0].poses.name, given.rng)
     notes = (
         'latency is measured against the reference and its clock, and includes the latency of '
         'the reference',
     )
-    return replace(empty, estimates=motion.estimates, speeds=motion.groups, notes=notes)
+    return replace(empty, estimates=estimates, speeds=speeds, notes=notes)

@@ -24,6 +24,7 @@ from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 Array = NDArray[np.float64]
 
+BAGS = ('.mcap', '.db3', '.bag')  # endings; a folder is a bag too
 TOOL = 'tool'
 """What the body of a file of poses is called that names none."""
 
@@ -52,6 +53,11 @@ class AssessedPoses:
     setup: Setup | None = None  # the document of a session of fluxes
 
 
+def is_bag(path: Path) -> bool:
+    """Return whether a recording is a bag and no file of poses."""
+    return path.is_dir() or path.suffix in BAGS
+
+
 def read_poses(
     path: str | os.PathLike[str],
     wanted: PoseSource,
@@ -59,19 +65,14 @@ def read_poses(
 ) -> AssessedPoses:
     """Read or track the poses of one body.
 
-    Raises
-    ------
-    BagError
-        When a recording has no such poses, or several and none is named.
-    PlausibilityError
-        When the positions cannot be in metres, and as `import_poses` and `track_session`.
-    ParameterError
-        As `import_poses` and `track_session`.
+    Raises `BagError` when a recording has no such poses, or several and none is named,
+    `PlausibilityError` when the positions cannot be in metres, and as `import_poses` and
+    `track_session`.
     """
     source = Path(path)
     if wanted.model:
         found = _tracked(path, wanted, progress)
-    elif source.is_dir() or source.suffix in ('.mcap', '.db3', '.bag'):
+    elif is_bag(source):
         found = _recorded(path, wanted)
     else:
         session = import_poses([source])

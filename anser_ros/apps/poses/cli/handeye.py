@@ -8,13 +8,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.poses.assessment.source import PoseSource, read_poses
+from anser_ros.apps.poses.assessment.source import PoseSource, is_bag, read_poses
 from anser_ros.apps.poses.cli.import_poses import add_form_options
 from anser_ros.apps.poses.cli.pose_session import add_topic_options, load_poses
 from anser_ros.apps.poses.convention import reading_words
-from anser_ros.apps.poses.corrector import finite
-from anser_ros.apps.poses.hand_eye import HandEye, fit_hand_eye, matrix_of, turn_of
+from anser_ros.apps.poses.corrector import as_document
+from anser_ros.apps.poses.hand_eye import HandEye, SensorFrames, fit_hand_eye
 from anser_ros.apps.poses.importing import import_poses
 from anser_ros.apps.poses.sequence import PoseSession, missing_words
 from anser_ros.cli.output import (
@@ -29,12 +31,11 @@ from anser_ros.cli.output import (
 )
 from anser_ros.cli.page import heading, listed, page, paragraph, picture, table, top
 from anser_ros.errors import ParameterError
-from anser_ros.field.model import plain
 from anser_ros.physics.constants import DEGREES
 from anser_ros.pictures import legend_beside
 
 SCHEMA = 'anser_handeye/1'
-BAGS = ('.mcap', '.db3', '.bag')
+Array = NDArray[np.float64]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,9 +78,10 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     document = to_document(found)
     written: tuple[Path, ...] = ()
     if args.out is not None:
-        plain_yaml = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
-        report = render(found, document)
-        files = {'handeye.yaml': plain_yaml, 'handeye.json': document, 'report.html': report}
+        files = {
+            'handeye.yaml': yaml.safe_dump(document, sort_keys=False, default_flow_style=None),
+            'handeye.json': document, 'report.html': render(found, document),
+        }  # fmt: skip
         written = write_files(args.out, files)
     notes = [session.lost] if session.lost else []
     if found.convention is not None:
@@ -96,7 +98,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
 
 def _session(args: argparse.Namespace) -> PoseSession:
     first = args.tracked[0]
-    if first.is_dir() or first.suffix in BAGS:
+    if is_bag(first):
         if len(args.tracked) > 1 or args.reference:
             raise ParameterError('one bag has both streams; --reference is for files of poses')
         if args.model:
@@ -114,17 +116,19 @@ def _session(args: argparse.Namespace) -> PoseSession:
 
 def to_document(found: HandEye) -> dict[str, Any]:
     """Return the result as plain data; null if it is not determined."""
-    vector, quaternion = turn_of(found.rotation)
+    vector, quaternion = _turn(found.rotation)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = found.rotation, found.translation_m
     offset, rate = (pair or (None, None) for pair in (found.offset_s, found.rate_ppm))
-    document: dict[str, Any] = {
+    return as_document({
         'schema': SCHEMA,
         'recording': found.session.path,
         'registration_rotation_deg': vector,
-        'registration_rotation_sigma_deg': np.rad2deg(found.rotation_sigma_rad).tolist(),
+        'registration_rotation_sigma_deg': np.rad2deg(found.rotation_sigma_rad),
         'registration_quaternion_xyzw': quaternion,
-        'registration_translation_m': found.translation_m.tolist(),
-        'registration_translation_sigma_m': found.translation_sigma_m.tolist(),
-        'registration_matrix': matrix_of(found.rotation, found.translation_m).tolist(),
+        'registration_translation_m': found.translation_m,
+        'registration_translation_sigma_m': found.translation_sigma_m,
+        'registration_matrix': matrix,
         'clock': {
             'offset_s': offset[0],
             'offset_sigma_s': offset[1],
@@ -132,24 +136,31 @@ def to_document(found: HandEye) -> dict[str, Any]:
             'rate_sigma_ppm': rate[1],
             'middle_s': found.middle_s,
         },
-        'sensors': {},
-        'undetermined': list(found.undetermined),
-        'convention': None if found.convention is None else plain(found.convention.parameters),
-    }
-    for name, one in found.sensors.items():
-        turned = (None, None) if one.mount is None else turn_of(one.mount)
-        document['sensors'][name] = {
-            'lever_arm_m': one.lever_m.tolist(),
-            'lever_arm_sigma_m': one.lever_sigma_m.tolist(),
-            'mount_rotation_deg': turned[0],
-            'mount_rotation_sigma_deg': np.rad2deg(one.mount_sigma_rad).tolist(),
-            'mount_quaternion_xyzw': turned[1],
-            'n': one.n, 'n_compared': one.n_compared,
-            'position_rmse_m': one.rms[0], 'orientation_rmse_rad': one.rms[1],
-            'heldout_position_rmse_m': one.held_out[0],
-            'heldout_orientation_rmse_rad': one.held_out[1],
-        }  # fmt: skip
-    return dict(finite(document))
+        'sensors': {name: _sensor(one) for name, one in found.sensors.items()},
+        'undetermined': found.undetermined,
+        'convention': None if found.convention is None else found.convention.parameters,
+    })  # fmt: skip
+
+
+def _sensor(one: SensorFrames) -> dict[str, Any]:
+    vector, quaternion = (None, None) if one.mount is None else _turn(one.mount)
+    return {
+        'lever_arm_m': one.lever_m,
+        'lever_arm_sigma_m': one.lever_sigma_m,
+        'mount_rotation_deg': vector,
+        'mount_rotation_sigma_deg': np.rad2deg(one.mount_sigma_rad),
+        'mount_quaternion_xyzw': quaternion,
+        'n': one.n, 'n_compared': one.n_compared,
+        'position_rmse_m': one.rms[0], 'orientation_rmse_rad': one.rms[1],
+        'heldout_position_rmse_m': one.held_out[0],
+        'heldout_orientation_rmse_rad': one.held_out[1],
+    }  # fmt: skip
+
+
+def _turn(rotation: Array) -> tuple[Array, Array]:
+    """A rotation matrix as a rotation vector, degrees, and a quaternion x y z w."""
+    turn = Rotation.from_matrix(rotation)
+    return np.rad2deg(turn.as_rotvec()), turn.as_quat()
 
 
 def left_out_words(document: dict[str, Any]) -> list[str]:
@@ -164,19 +175,16 @@ def left_out_words(document: dict[str, Any]) -> list[str]:
 
 def clock_words(document: dict[str, Any]) -> list[str]:
     """Return what is known of the clocks, in lines."""
-    lines, clock = [], document['clock']
-    if clock['offset_s'] is not None:
-        late = 'late' if clock['offset_s'] > 0 else 'early'
-        lines.append(
-            f'clocks: tracked stamps are {1e3 * abs(clock["offset_s"]):.1f} '
-            f'± {1e3 * clock["offset_sigma_s"]:.1f} ms {late}'
-        )
-    if clock['rate_ppm'] is not None:
-        gains = 'gains' if clock['rate_ppm'] > 0 else 'loses'
-        lines.append(
-            f'clocks: the tracked one {gains} {abs(clock["rate_ppm"]):.0f} '
-            f'± {clock["rate_sigma_ppm"]:.0f} ppm'
-        )
+    clock = document['clock']
+    lines = []
+    if (offset := clock['offset_s']) is not None:
+        late = 'late' if offset > 0 else 'early'
+        sigma = 1e3 * clock['offset_sigma_s']
+        lines.append(f'clocks: tracked stamps are {1e3 * abs(offset):.1f} ± {sigma:.1f} ms {late}')
+    if (rate := clock['rate_ppm']) is not None:
+        gains = 'gains' if rate > 0 else 'loses'
+        sigma = clock['rate_sigma_ppm']
+        lines.append(f'clocks: the tracked one {gains} {abs(rate):.0f} ± {sigma:.0f} ppm')
     return lines
 
 

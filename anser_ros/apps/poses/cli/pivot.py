@@ -160,7 +160,7 @@ def _write(
         aside = args.setup.with_name(args.setup.name + '.new')
         aside.write_text(new, encoding='utf-8')
         aside.replace(args.setup)
-    written: tuple[Path, ...] = () if args.setup is None else (args.setup,)
+    written = () if args.setup is None else (args.setup,)
     if args.out is None:
         return written
     tips = {'schema': SCHEMA, 'tips': dump_tips({body: spec})}

@@ -235,18 +235,16 @@ def _effects(document: dict[str, Any]) -> Html:
 def _frames(document: dict[str, Any]) -> Html:
     """The lever arm and mount of each sensor, and the registration, which all of them share."""
     rows, shared = [], []
-    for effect in document['effects']:
-        if effect['name'] == HAND_EYE:
-            pair = effect['parameters'], effect['uncertainty']
-            lever, mount, translation, rotation = (
-                _triple(*pair, key, scale)
-                for key, scale in (
-                    ('lever_arm_m', 1e3), ('mount_rotation_deg', 1.0),
-                    ('registration_translation_m', 1e3), ('registration_rotation_deg', 1.0),
-                )
-            )  # fmt: skip
-            rows.append([effect['parameters']['sensor'], lever, mount])
-            shared = [['optical frame', translation, rotation]] if translation else []
+    for effect in (e for e in document['effects'] if e['name'] == HAND_EYE):
+        lever, mount, translation, rotation = (
+            _triple(effect['parameters'], effect['uncertainty'], key, scale)
+            for key, scale in (
+                ('lever_arm_m', 1e3), ('mount_rotation_deg', 1.0),
+                ('registration_translation_m', 1e3), ('registration_rotation_deg', 1.0),
+            )
+        )  # fmt: skip
+        rows.append([effect['parameters']['sensor'], lever, mount])
+        shared = [['optical frame', translation, rotation]] if translation else []
     head = ['', 'place x, y, z ± 1 sigma, mm', 'rotation vector ± 1 sigma, deg']
     return table(head, [*rows, *shared])
 
@@ -263,9 +261,9 @@ def _triple(values: dict[str, Any], sigma: dict[str, Any], key: str, scale: floa
 
 def _groups(before: PoseState, after: PoseState) -> Figure:
     """Errors by distance, speed and orientation, in groups of equal numbers of poses."""
-    measures = {
-        'distance from the field generator, mm': _distance,
-        'speed, mm/s': _speed,
+    measures: dict[str, Callable[[PosePart], Array]] = {
+        'distance from the field generator, mm': lambda p: _size(1e3 * p.view.measured),
+        'speed, mm/s': lambda p: _size(1e3 * p.view.velocity[:, :3]),
         'turn from the mean orientation, deg': _turn,
     }
     if not any(part.view.velocity.any() for part in after.parts):
@@ -302,12 +300,8 @@ def _bars(
     panel.set_xticks(range(GROUPS), names, fontsize=7)
 
 
-def _distance(part: PosePart) -> Array:
-    return np.asarray(1e3 * np.linalg.norm(part.view.measured, axis=1))
-
-
-def _speed(part: PosePart) -> Array:
-    return np.asarray(1e3 * np.linalg.norm(part.view.velocity[:, :3], axis=1))
+def _size(vectors: Array) -> Array:
+    return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
 def _turn(part: PosePart) -> Array:
@@ -442,17 +436,13 @@ def _evaluation(found: PoseDiagnosis, document: dict[str, Any]) -> dict[str, Any
     """The errors of every sensor with the frames and effects that were found."""
     sensors: dict[str, Any] = {}
     for part in found.fit.state.parts:
-        name = part.view.sensor
-        row: dict[str, Any] = {'n': int(np.count_nonzero(part.used))}
-        poses = found.session.sensors[name]
-        row['tracked_fraction'] = poses.size / max(poses.size + poses.missing.size, 1)
-        for key, unit, columns in (
-            ('position', 'm', slice(0, 3)),
-            ('orientation', 'rad', slice(3, 6)),
-        ):
-            size = np.linalg.norm(part.residual[part.used, columns], axis=1)
-            row |= error_statistics(key, unit, size)
-        sensors[name] = row
+        poses, residual = found.session.sensors[part.view.sensor], part.residual[part.used]
+        sensors[part.view.sensor] = {
+            'n': len(residual),
+            'tracked_fraction': poses.size / max(poses.size + poses.missing.size, 1),
+            **error_statistics('position', 'm', np.linalg.norm(residual[:, :3], axis=1)),
+            **error_statistics('orientation', 'rad', np.linalg.norm(residual[:, 3:], axis=1)),
+        }
     return {
         'schema': 'anser_evaluation/1', 'sensors': sensors, 'bodies': {},
         'held_out': document['held_out'],
@@ -469,7 +459,7 @@ def _write_poses(path: Path, found: PoseDiagnosis) -> None:
             stamps = found.session.start_ns + np.round(1e9 * part.view.time).astype(np.int64)
             place = part.view.position + part.residual[:, :3]
             for k, stamp in enumerate(stamps.tolist()):
-                size = [np.linalg.norm(part.residual[k, :3]), np.linalg.norm(part.residual[k, 3:])]
+                size = [np.linalg.norm(half) for half in np.split(part.residual[k], 2)]
                 status = 'ok' if part.used[k] else 'outlier_or_no_reference'
                 values = [f'{v:.9g}' for v in (*place[k], *size)]
                 writer.writerow([stamp, part.view.sensor, *values, status])

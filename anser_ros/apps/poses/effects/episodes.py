@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from anser_ros.apps.poses.effect import PoseEffect, PoseResiduals, Sensing
+from anser_ros.apps.poses.effect import PoseEffect
+from anser_ros.apps.poses.problem import PoseResiduals, Sensing
 from anser_ros.field.model import EffectRecord
 
 Array = NDArray[np.float64]
@@ -181,10 +182,8 @@ class PoseMovingMetal(PoseEffect):
                 ends = min(other[0], group[0]), max(other[1], group[1])
                 group = *ends, other[2] + group[2]
             groups.append(group)
-        start, length = (
-            residuals.setting.start,
-            residuals.setting.duration / window_count(residuals),
-        )
+        start = residuals.setting.start
+        length = residuals.setting.duration / window_count(residuals)
         return [
             EffectRecord(
                 self.name,

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.apps.poses.effect import (
-    SMOOTH,
     PoseEffect,
     PoseMap,
     PoseSetting,
@@ -18,8 +17,8 @@ from anser_ros.apps.poses.effect import (
     PoseTerm,
     PoseView,
     Role,
-    smooth_map,
 )
+from anser_ros.calibration.error_map import PositionMap, Shape
 from anser_ros.effects.base import Remedy
 from anser_ros.effects.effect import needed, sigmas
 from anser_ros.errors import ModelFileError
@@ -27,6 +26,8 @@ from anser_ros.field.model import EffectRecord
 
 Array = NDArray[np.float64]
 
+SMOOTH = 'smooth'
+"""The kind of a map that is determined by the points that it was learnt from."""
 KINDS = {0: 'scale', 1: 'linear', 2: 'quadratic', 3: 'cubic'}
 """Degrees of the polynomials of position that are tried; of degree zero is a space that shrinks or
 grows alike in all directions about a point of its own, which takes four numbers."""
@@ -34,10 +35,18 @@ UNIT_M = 1e-3
 """Unit of theta, m: a coefficient is what it moves a pose at the rms distance from the middle."""
 
 
+def _smooth_map(record: EffectRecord) -> PositionMap:
+    """The map of a record: what is added to tracked positions."""
+    places, errors = (
+        np.asarray(needed(record, key), dtype=np.float64).reshape(-1, 3)
+        for key in ('places_m', 'errors_m')
+    )
+    trend, length, noise = (needed(record, key) for key in ('trend', 'length_m', 'noise'))
+    return PositionMap(places, errors, Shape(int(trend), float(length), float(noise)))
+
+
 def monomials(position: Array, centre: Array, size: float, degree: int, lowest: int = 1) -> Array:
-    """Return products of coordinates of positions (n, 3) about a centre, degrees ``lowest`` and
-    up.
-    """
+    """Return products of coordinates of positions (n, 3) about a centre, from ``lowest`` on."""
     scaled = (position - centre) / size
     columns = [np.prod(scaled[:, _factors(order)], axis=2) for order in range(lowest, degree + 1)]
     return np.concatenate(columns, axis=1)
@@ -176,7 +185,7 @@ class FieldDistortion(PoseEffect):
         The parameters' standard deviations are taken as independent.
         """
         if record.parameters.get('kind') == SMOOTH:
-            smooth = smooth_map(record)
+            smooth = _smooth_map(record)
             return lambda sensor, position: (smooth(position[None])[0], 0.0)
         term = self.term(record)
         sigmas_mm = np.asarray(record.uncertainty.get('coefficients_mm', 0.0), dtype=np.float64)

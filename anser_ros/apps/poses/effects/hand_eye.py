@@ -1,6 +1,4 @@
-"""The two unknown frames, which are always fitted, and what is found before anything is
-searched.
-"""
+"""The two unknown frames, which are always fitted, and what is found before any search."""
 
 from dataclasses import dataclass, replace
 

@@ -1,15 +1,14 @@
 """A sensor's noise is larger than the others', or grows with the distance."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from anser_ros.apps.poses.effect import PoseEffect, PoseResiduals, Sensing
+from anser_ros.apps.poses.effect import PoseEffect
 from anser_ros.apps.poses.effects.episodes import in_episode
-from anser_ros.apps.poses.jitter import jitter
+from anser_ros.apps.poses.problem import PoseResiduals, Sensing, jitter
 from anser_ros.field.model import EffectRecord
 
 Array = NDArray[np.float64]
@@ -44,8 +43,7 @@ FEWEST_DIFFERENCES = 60  # differences of neighbours that a power law is fitted 
 
 
 def power_law(square: Array, distance: Array) -> tuple[float, float, float]:
-    """Return the exponent of the noise by distance above a floor, its sigma, and the likelihood's
-    gain.
+    """Return the exponent of the noise by distance, its sigma, and the likelihood's gain.
 
     Square (n,) and distances (n, 3) are as of `jitter`. A squared deviation across the velocity
     has two degrees of freedom, so it is distributed exponentially about the variance, which is
@@ -99,14 +97,14 @@ def _likeliest(square: Array, place: Array) -> Array:
     return np.asarray(min(tries, key=lambda result: float(result.fun)).x)
 
 
-def _in_motion(sensing: Sensing, chosen: Mask) -> Mask:
-    """Which of some poses (n,) the body moves in; all of them where it hardly ever does.
+def _jitter(sensing: Sensing, chosen: Mask) -> tuple[Array, Array]:
+    """`jitter` of those of some poses (n,) in which the body moves; of all where it hardly does.
 
     A body that rests at one place and moves at others jitters less at the one.
     """
     moving = chosen & (np.linalg.norm(sensing.view.velocity[:, :3], axis=1) > AT_REST_M_S)
     hardly = np.count_nonzero(moving) < HARDLY_EVER * np.count_nonzero(chosen)
-    return chosen if hardly else moving
+    return jitter(sensing, chosen if hardly else moving, sensing.noise.stamp_s > 0)
 
 
 class PoseExcessNoise(PoseEffect):
@@ -131,7 +129,7 @@ class PoseExcessNoise(PoseEffect):
         exponent = float(law[0].parameters['exponent']) if law else 0.0
         for sensing in residuals.sensors:
             quiet = sensing.used & ~in_episode(sensing, residuals)
-            square, distance = jitter(replace(sensing, used=_in_motion(sensing, quiet)))
+            square, distance = _jitter(sensing, quiet)
             square = square / distance[:, 1] ** (2 * exponent)
             if square.size >= FEWEST_DIFFERENCES:
                 noise[sensing.view.sensor] = float(np.sqrt(np.median(square)))
@@ -160,26 +158,23 @@ class RangeNoise(PoseEffect):
         # Poses far away stand out from a noise that is taken as one; the law judges them too.
         # Those of an episode are off by something else.
         every = [
-            replace(one, used=_in_motion(one, (one.used | one.out) & ~in_episode(one, residuals)))
+            _jitter(one, (one.used | one.out) & ~in_episode(one, residuals))
             for one in residuals.sensors
         ]
-        pairs = [pair for pair in map(jitter, every) if pair[0].size >= FEWEST_DIFFERENCES]
+        pairs = [pair for pair in every if pair[0].size >= FEWEST_DIFFERENCES]
         if not pairs:
             return []
         places = np.concatenate([distance for _, distance in pairs])
         square = np.concatenate([one / np.median(one) for one, _ in pairs])
         distance = np.concatenate([one / np.median(one) for _, one in pairs])
-        low, high = (
-            np.percentile(distance, [5, 95]) if square.size >= FEWEST_DIFFERENCES else (1.0, 1.0)
-        )
+        low, high = np.percentile(distance, [5, 95])
         if high < WIDEST * low:
             return []
         exponent, spread, gain = power_law(square, distance)
         is_clear = gain > LEAST_LAW_SIGMAS**2 and exponent > LEAST_LAW_SIGMAS * spread
         if not (is_clear and EXPONENTS[0] <= exponent <= EXPONENTS[1]):
             return []
-        middle = float(np.median(places))
-        values = {'exponent': exponent, 'reference_m': middle}
+        values = {'exponent': exponent, 'reference_m': float(np.median(places))}
         return [EffectRecord(self.name, values, {'exponent': spread})]
 
 

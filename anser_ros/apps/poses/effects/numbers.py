@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.apps.poses.effect import NumberEffect, PoseSetting, PoseTerm, PoseView, Role
-from anser_ros.apps.poses.path import OpticalPath
+from anser_ros.apps.poses.sequence import OpticalPath, filtered
 from anser_ros.effects.base import Remedy
 
 Array = NDArray[np.float64]
@@ -131,7 +131,7 @@ class TrackerLag(NumberEffect):
 
     def filter(self, term: PoseTerm, path: OpticalPath) -> OpticalPath:
         """Return the optical path as it is behind the tracker's filter."""
-        return path.filtered(float(term.theta[0]), 'two_sided' in term.site)
+        return filtered(path, float(term.theta[0]), 'two_sided' in term.site)
 
     def rival(self, term: PoseTerm) -> PoseTerm:
         """Return the same smoothing without a sense of time."""

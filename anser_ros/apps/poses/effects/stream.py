@@ -1,15 +1,13 @@
-"""What is wrong with a stream: poses repeated, missing or outlying, stamps of receipt or of a
-poll.
-"""
+"""What is wrong with a stream: poses repeated, missing or outlying, stamps of receipt or poll."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.apps.poses.effect import PoseEffect, PoseResiduals, Sensing
+from anser_ros.apps.poses.effect import PoseEffect
 from anser_ros.apps.poses.effects.episodes import in_episode
-from anser_ros.apps.poses.jitter import stamp_step
+from anser_ros.apps.poses.problem import PoseResiduals, Sensing, stamp_step
 from anser_ros.apps.poses.sequence import PoseSequence, PoseSession, jumping_poses
 from anser_ros.diagnosis.decisions import FEWEST_OUTLIERS
 from anser_ros.field.model import EffectRecord
@@ -21,6 +19,7 @@ Array = NDArray[np.float64]
 FEWEST_STALE = 0.02
 """Share (0 to 1) of poses of a moving body from which repeats are named: one in 60 comes again
 where a tracker of 60 Hz is polled a hertz too fast, which harms nothing."""
+FEWEST_MOVING = 20  # poses of a moving body by which repeats are judged
 MOVING_M = 5e-4
 """Way between two poses, m, from which a body moves: trackers resolve a tenth of it."""
 FROZEN_WAY_M = 0.01
@@ -53,12 +52,9 @@ class StalePoses(PoseEffect):
         found = []
         for poses in residuals.session.streams.values():
             moving = _moving(poses)
-            count = int(np.count_nonzero(moving))
-            if count < 20:
-                continue
-            again = poses.repeated & moving
-            share = float(np.count_nonzero(again)) / count
-            if share < FEWEST_STALE:
+            count, again = int(np.count_nonzero(moving)), poses.repeated & moving
+            share = np.count_nonzero(again) / max(count, 1)
+            if count < FEWEST_MOVING or share < FEWEST_STALE:
                 continue
             runs = int(np.count_nonzero(np.diff(again.astype(int), prepend=0) == 1))
             values = {'stream': poses.name, 'fraction': share, 'runs': runs}
@@ -137,7 +133,7 @@ class PoseOutliers(PoseEffect):
         residual = np.concatenate([s.residual for s in residuals.sensors])[out]
         place, turn = (np.linalg.norm(residual[:, k : k + 3], axis=1) for k in (0, 3))
         noise = np.repeat(
-            [[s.position_m, s.orientation_rad] for s in residuals.sensors],
+            [[s.noise.position_m, s.noise.orientation_rad] for s in residuals.sensors],
             [np.count_nonzero(mask) for mask in outs],
             axis=0,
         )
@@ -206,15 +202,22 @@ STEP_SHARE = (0.15, 0.7)
 """Error over the step that rounding to a step makes: 0.29 if even, more if a poll is late."""
 
 
-def _is_wide(residuals: PoseResiduals) -> tuple[float, float]:
-    """The median error of the stamps over the sensors, and what believing it gains.
+def _stamp_error(residuals: PoseResiduals) -> tuple[float, float, float]:
+    """The median error of the stamps over the sensors, its gain, and the step that makes it.
 
-    None where fewer than half of the sensors have one: what one of two shows is no clock's.
+    All zero where the error is small or not clear, or fewer than half of the sensors have one. The
+    step is zero where no grid of the stamps makes the error.
     """
-    errors = [s.stamp_s for s in residuals.sensors]
-    if np.percentile(errors, 50, method='lower') < LEAST_S:
-        return 0.0, 0.0
-    return float(np.median(errors)), float(np.median([s.stamp_gain for s in residuals.sensors]))
+    errors = [s.noise.stamp_s for s in residuals.sensors]
+    rms = float(np.median(errors))
+    gain = float(np.median([s.stamp_gain for s in residuals.sensors]))
+    if np.percentile(errors, 50, method='lower') < LEAST_S or gain < LEAST_LIKELIHOOD_GAIN:
+        return 0.0, 0.0, 0.0
+    for sensing in residuals.sensors:
+        step = stamp_step(residuals.session.sensors[sensing.view.sensor].time)
+        if step and STEP_SHARE[0] * step < rms < STEP_SHARE[1] * step:
+            return rms, gain, step
+    return rms, gain, 0.0
 
 
 def _sigma(residuals: PoseResiduals) -> float:
@@ -225,27 +228,20 @@ def _sigma(residuals: PoseResiduals) -> float:
     differ by more than this have errors of their own; those that share stamps share the error.
     """
     sensors = residuals.sensors
-    sigmas = [s.stamp_s / np.sqrt(2 * max(np.sum(_stamp_share(s) ** 2), 1.0)) for s in sensors]
+    errors = np.array([s.noise.stamp_s for s in sensors])
+    told = np.array([np.sum(_stamp_share(s) ** 2) for s in sensors])
+    sigmas = errors / np.sqrt(2 * np.maximum(told, 1.0))
     apart = len({s.view.time.tobytes() for s in sensors})
-    scatter = np.std([s.stamp_s for s in sensors]) / np.sqrt(len(sensors))
+    scatter = np.std(errors) / np.sqrt(len(sensors))
     return float(max(scatter, np.median(sigmas) / np.sqrt(apart)))
 
 
 def _stamp_share(sensing: Sensing) -> Array:
     """Share (n,) of the variance along the velocity that errors of the stamps make."""
     velocity = sensing.view.velocity[sensing.used]
-    scale = np.repeat([sensing.position_m, sensing.orientation_rad], 3)
-    moved = sensing.stamp_s**2 * np.sum((velocity / scale) ** 2, axis=1)
+    scale = np.repeat([sensing.noise.position_m, sensing.noise.orientation_rad], 3)
+    moved = sensing.noise.stamp_s**2 * np.sum((velocity / scale) ** 2, axis=1)
     return np.asarray(moved / (1 + moved))
-
-
-def _step(residuals: PoseResiduals, rms: float) -> float:
-    """The step of the stamps that makes an error of that size, or zero."""
-    for sensing in residuals.sensors:
-        step = stamp_step(residuals.session.sensors[sensing.view.sensor].time)
-        if step and STEP_SHARE[0] * step < rms < STEP_SHARE[1] * step:
-            return step
-    return 0.0
 
 
 class ReceiptJitter(PoseEffect):
@@ -260,11 +256,14 @@ class ReceiptJitter(PoseEffect):
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for a residual that lies along the velocity and grows with it."""
-        rms, gain = _is_wide(residuals)
-        if rms < LEAST_S or gain < LEAST_LIKELIHOOD_GAIN or _step(residuals, rms):
+        rms, gain, step = _stamp_error(residuals)
+        if not rms or step:
             return []
         spread = _sigma(residuals)
-        values = {'rms_s': rms, 'by_sensor': {s.view.sensor: s.stamp_s for s in residuals.sensors}}
+        values = {
+            'rms_s': rms,
+            'by_sensor': {s.view.sensor: s.noise.stamp_s for s in residuals.sensors},
+        }
         return [EffectRecord(self.name, values, {'rms_s': spread}, {'likelihood_gain': gain})]
 
 
@@ -280,14 +279,12 @@ class QuantisedStamps(PoseEffect):
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for an error of the stamps that is that of their grid."""
-        rms, gain = _is_wide(residuals)
-        step = _step(residuals, rms) if rms >= LEAST_S and gain >= LEAST_LIKELIHOOD_GAIN else 0.0
+        rms, gain, step = _stamp_error(residuals)
         if not step:
             return []
+        sigma = {'step_s': 0.01 * step}
         values = {'step_s': step, 'rms_s': rms}
-        return [
-            EffectRecord(self.name, values, {'step_s': 0.01 * step}, {'likelihood_gain': gain})
-        ]
+        return [EffectRecord(self.name, values, sigma, {'likelihood_gain': gain})]
 
 
 EFFECTS = (

@@ -118,8 +118,8 @@ def to_document(error_map: ErrorMap) -> dict[str, Any]:
         'clearness': error_map.clearness,
         'heldout_rmse_before_m': error_map.before.judged,
         'heldout_rmse_after_m': error_map.after.judged,
-        'before': _plain(error_map.before),
-        'after': _plain(error_map.after),
+        'before': _errors(error_map.before),
+        'after': _errors(error_map.after),
         'n_points': len(error_map.places),
         'tried': [
             {'map': shape.describe(), 'noise_share': shape.noise, 'heldout_rmse_m': error}
@@ -128,7 +128,7 @@ def to_document(error_map: ErrorMap) -> dict[str, Any]:
     }
 
 
-def _plain(error: HeldOutError) -> dict[str, float | None]:
+def _errors(error: HeldOutError) -> dict[str, float | None]:
     return {
         'rmse_m': error.whole,
         'in_plane_rmse_m': error.in_plane,

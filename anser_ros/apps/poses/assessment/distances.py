@@ -1,9 +1,13 @@
-"""Follows Hummel's protocol: distances on a board of holes, and a ring of rotations.
+"""Compares distances and turns with known ones, by Hummel's protocol and by ASTM F2554.
 
 Hummel et al., "Design and application of an assessment protocol for electromagnetic tracking
-systems", Med. Phys. 32 (2005); the small volume of Maier-Hein et al., Med. Phys. 39 (2012).
-Orders, descriptions and statistics are those of MITK's HummelProtocolEvaluation, so that the
-figures can be compared.
+systems", Med. Phys. 32 (2005): distances on a board of holes, and a ring of rotations; the small
+volume of Maier-Hein et al., Med. Phys. 39 (2012). Orders, descriptions and statistics are those of
+MITK's HummelProtocolEvaluation, so that the figures can be compared.
+
+ASTM F2554, "Standard Practice for Measurement of Positional Accuracy of Computer Assisted Surgical
+Systems": how far readings of one location scatter while the tool is turned about it, and how far
+distances between points of a phantom are from the true ones.
 """
 
 from collections.abc import Sequence
@@ -15,12 +19,16 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.assessment.intervals import (
     IntervalEstimate,
+    blocks_of_time,
     cluster_weights,
     equal_parts,
+    mitk_statistics,
     summarised,
+    vertex_weights,
     widest,
 )
-from anser_ros.apps.poses.assessment.stillness import StillPoint
+from anser_ros.apps.poses.assessment.rest import StillPoint
+from anser_ros.apps.poses.sequence import PoseSequence
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.physics.rotations import axis_angles
 
@@ -42,8 +50,7 @@ DISTANCE_STEPS = ((NEIGHBOURS, 1), ('15 cm distance errors', 3), ('30 cm distanc
 ACCUMULATED = 'accumulated distance errors'
 COMMON_ERROR_SIGMAS = 1.0
 """Correlation of the errors of parallel neighbouring distances, in its standard errors, from which
-on they count as alike: in doubt the interval is the wider one. Chosen on simulated boards; those
-that the documentation reports are others."""
+on they count as alike: in doubt the interval is the wider one. Chosen on simulated boards."""
 PARTS = 3
 """Strips of a board, along and across, that are drawn again where lines are alike: with fewer
 nothing can be drawn, and more are alike themselves."""
@@ -75,10 +82,8 @@ class Grid:
     def of(cls, count: int, shape: tuple[int, int] | None, spacing_m: float) -> 'Grid':
         """Return the layout of so many points.
 
-        Raises
-        ------
-        ParameterError
-            When no layout is given and none has so many points, or the given one has others.
+        Raises `ParameterError` when no layout is given and none has so many points, or the given
+        one has others.
         """
         known = VOLUMES.get(count)
         if shape is None:
@@ -107,29 +112,23 @@ class Grid:
 def grid_points(points: Sequence[StillPoint], grid: Grid, order: str = 'rows') -> Array:
     """Return positions by row and column, shape (rows, columns, 3), m.
 
-    Raises
-    ------
-    FitError
-        When neighbours are so far off that the points are in another order.
+    Raises `FitError` when neighbours are so far off that the points are in another order.
     """
     place = np.array([p.position for p in points]).reshape(grid.rows, grid.columns, 3)
     turned = place.copy()
     turned[1::2] = turned[1::2, ::-1]
     taken, other = (turned, place) if order == 'serpentine' else (place, turned)
-    off, turned_off = (_off(p, grid) for p in (taken, other))
-    if turned_off[1] < WRONG_ORDER * off[1] and off[1] > WRONG_ORDER * grid.spacing_m:
-        better = next(o for o in ORDERS if o != order)
-        raise FitError(
-            f'the distances of neighbouring points are wrong by {1e3 * off[1]:.0f} mm (rms), '
-            f'but with --order {better} by only {1e3 * turned_off[1]:.1f} mm'
-        )
+    off = _off(taken, grid)
+    better = next(o for o in ORDERS if o != order)
     lying = place.reshape(grid.columns, grid.rows, 3)
-    if _off(lying, grid)[1] < WRONG_ORDER * off[1] and off[1] > WRONG_ORDER * grid.spacing_m:
-        raise FitError(
-            f'the distances of neighbouring points are wrong by {1e3 * off[1]:.0f} mm (rms), '
-            f'but with --grid {grid.columns}x{grid.rows} by only '
-            f'{1e3 * _off(lying, grid)[1]:.1f} mm'
-        )
+    for option, trial in ((f'--order {better}', other),
+                          (f'--grid {grid.columns}x{grid.rows}', lying)):  # fmt: skip
+        left = _off(trial, grid)[1]
+        if left < WRONG_ORDER * off[1] and off[1] > WRONG_ORDER * grid.spacing_m:
+            raise FitError(
+                f'the distances of neighbouring points are wrong by {1e3 * off[1]:.0f} mm (rms), '
+                f'but with {option} by only {1e3 * left:.1f} mm'
+            )
     if off[0] > WRONG_ORDER * grid.spacing_m:
         raise FitError(
             f'the median error of the distances of neighbouring points is {1e3 * off[0]:.0f} '
@@ -154,16 +153,7 @@ def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[
     MITK gives 15 cm, 30 cm and accumulated distances for the standard volume alone; here every
     board has those that fit. Intervals resample whole lines of holes, because errors along a line
     are correlated. If those of neighbouring lines are correlated too (`have_common_errors`),
-    strips of the board are also resampled.
-
-    Parameters
-    ----------
-    place : ndarray, shape (rows, columns, 3)
-        Measured places of the holes, m.
-    grid : Grid
-        The true layout.
-    rng : Generator
-        Draws the intervals.
+    strips of the board are also resampled. ``place`` (rows, columns, 3): measured, m.
     """
     found, alike = {}, have_common_errors(place, grid)
     for name, step in DISTANCE_STEPS:
@@ -183,25 +173,17 @@ def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[
 def have_common_errors(place: Array, grid: Grid) -> bool:
     """Return whether neighbouring distances have common errors, as in a distorted field.
 
-    Parallel distances share no hole, so the noise of holes leaves them uncorrelated.
-
-    Parameters
-    ----------
-    place : ndarray, shape (rows, columns, 3)
-        Measured places of the holes, m.
-    grid : Grid
-        The true layout.
+    Parallel distances share no hole, so the noise of holes leaves them uncorrelated. ``place``
+    (rows, columns, 3): measured, m.
     """
     for _, step in DISTANCE_STEPS:
         products, squares = [], []
         for axis, count in enumerate(place.shape[:2]):
             if count <= step:
                 continue
-            ends = (
-                np.take(place, range(step, count), axis),
-                np.take(place, range(count - step), axis),
-            )
-            signed = np.linalg.norm(ends[0] - ends[1], axis=2) - step * grid.spacing_m
+            ahead = np.take(place, range(step, count), axis)
+            apart = ahead - np.take(place, range(count - step), axis)
+            signed = np.linalg.norm(apart, axis=2) - step * grid.spacing_m
             lines = signed if axis else signed.T  # one in a row
             products.append((lines[:-1] * lines[1:]).ravel())
             squares.append(lines.ravel() ** 2)
@@ -263,22 +245,10 @@ def rotation_errors(
 ) -> ErrorGroup:
     """Return errors of the turns from one hole of the ring to the next, as MITK has them.
 
-    Parameters
-    ----------
-    points : sequence of StillPoint
-        In the order of the holes.
-    step_deg : float
-        True turn.
-    axis : ndarray, shape (3,), or None
-        Direction of the sensor whose turn counts (MITK's rotation vector, for sensors without
-        roll); None: the whole turn.
-    rng : Generator
-        Draws the intervals.
+    ``axis`` (3,): direction of the sensor whose turn counts (MITK's rotation vector, for sensors
+    without roll); None: the whole turn.
 
-    Raises
-    ------
-    FitError
-        When there are fewer than two points.
+    Raises `FitError` when there are fewer than two points, or they are in another order.
     """
     if len(points) < 2:
         raise FitError(
@@ -300,3 +270,103 @@ def rotation_errors(
     words = [f'Rotation Error ROT{k} / ROT{k + 1}' for k in range(1, len(points))]
     # Neighbouring turns share a hole: they are drawn again by twos.
     return grouped('deg', words, signed, [np.arange(signed.size) // 2], rng)
+
+
+FEWEST_READINGS = 10  # of a point: fewer give no mean that a bad reading leaves alone
+MOST_READINGS = 2000  # that take part, evenly over the recording: two million pairs of them
+FAR_M = 0.05
+"""Extent of readings, m, beyond which they are no readings of one location."""
+FEWEST_FOR_OUTLIER = 6
+"""Points without which none is said to stand alone: a rigid fit has six unknowns."""
+ALONE = 0.5
+"""Share of a rigid fit's error that is left without a point that stands alone."""
+
+
+def single_point(
+    poses: PoseSequence, rng: np.random.Generator
+) -> tuple[ErrorGroup, dict[str, IntervalEstimate]]:
+    """Return distances of the readings from their mean, mm, and the largest between two, m.
+
+    ``poses``: of the tip, while it stays at one location.
+
+    Raises `FitError` when there are too few readings, or they are of several locations.
+    """
+    if poses.size < FEWEST_READINGS:
+        raise FitError(f'a point needs at least {FEWEST_READINGS} readings, got {poses.size}')
+    rows = np.linspace(0, poses.size - 1, min(poses.size, MOST_READINGS)).astype(int)
+    place, time = poses.position[rows], poses.time[rows]
+    low, high = np.percentile(place, [5, 95], axis=0)
+    spread = float(np.linalg.norm(high - low))
+    if spread > FAR_M:
+        raise FitError(
+            f'the readings extend over {1e3 * spread:.0f} mm: they were taken at several '
+            'locations, or are those of the sensor instead of the tip (state the tip with '
+            '--tip)'
+        )
+    size = 1e3 * np.linalg.norm(place - place.mean(axis=0), axis=1)
+    group = grouped('mm', [f'Reading at {t:.2f} s' for t in time], size,
+                    [blocks_of_time(time)], rng)  # fmt: skip
+    return group, {'span_m': IntervalEstimate(_span(place))}
+
+
+def _span(place: Array) -> float:
+    """Largest distance of two of some places, m; exact for those that are farthest out."""
+    rest = place - place.mean(axis=0)
+    outer = rest[np.argsort(-np.linalg.norm(rest, axis=1))[:200]]
+    return float(np.max(np.linalg.norm(outer[:, None] - outer[None], axis=2)))
+
+
+def point_to_point(
+    points: Sequence[StillPoint], true: Array, rng: np.random.Generator
+) -> tuple[ErrorGroup, dict[str, IntervalEstimate]]:
+    """Return errors of all distances between points, mm, and what a rigid fit leaves, m.
+
+    ``true`` (n, 3): places of the points on the phantom, m, in any frame, in the same order.
+
+    Raises `FitError` when the numbers differ, there are too few, or the order is another one.
+    """
+    if len(points) != len(true):
+        raise FitError(f'{len(points)} points were found, but the truth has {len(true)}')
+    if len(points) < 3:
+        raise FitError(f'distances need at least three points, got {len(points)}')
+    place = np.array([p.position for p in points])
+    first, second = np.triu_indices(len(points), 1)
+    measured = np.linalg.norm(place[first] - place[second], axis=1)
+    wanted = np.linalg.norm(true[first] - true[second], axis=1)
+    signed = 1e3 * (measured - wanted)
+    size = np.abs(signed)
+    if float(np.median(size)) > 0.25 * 1e3 * float(np.median(wanted)):
+        raise FitError(
+            f'the median error of the distances is {np.median(size):.0f} mm: the '
+            'points are not in the order of the truth, or a unit is wrong'
+        )
+    pairs = np.stack([first, second], axis=1)
+    words = tuple(f'Distance {a + 1} to {b + 1}' for a, b in pairs)
+    weights = vertex_weights(pairs, rng)
+    group = ErrorGroup('mm', words, size, signed, summarised(size, weights, len(points)))
+    mean = summarised(signed, weights, len(points))['Mean']
+    return group, {
+        'mean_error_m': IntervalEstimate(1e-3 * mean.value, 1e-3 * mean.low, 1e-3 * mean.high),
+        'standard_deviation_of_error_m': IntervalEstimate(
+            1e-3 * mitk_statistics(signed)['Sample Standard Deviation']
+        ),
+        'least_error_m': IntervalEstimate(1e-3 * float(signed.min())),
+        'greatest_error_m': IntervalEstimate(1e-3 * float(signed.max())),
+        'rigid_fit_m': IntervalEstimate(rigid_distance(true, place)),
+    }
+
+
+def standing_alone(place: Array, true: Array) -> tuple[int, float, float] | None:
+    """Return the one point that a rigid fit is much better without, and what both fits leave.
+
+    Causes are a marker found in its second solution, or a tip that was not in its divot. None if
+    no single point stands alone, or if there are too few points.
+    """
+    count = len(place)
+    if count < FEWEST_FOR_OUTLIER:
+        return None
+    whole = rigid_distance(true, place)
+    both = np.stack([true, place])
+    rest = [rigid_distance(*np.delete(both, k, axis=1)) for k in range(count)]
+    best = int(np.argmin(rest))
+    return (best, whole, rest[best]) if rest[best] < ALONE * whole else None
