@@ -1,6 +1,7 @@
 """Writes the study of the article's experiments as tables and figures."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -267,20 +268,21 @@ def _bound_line(results: Document, experiment: str) -> str:
     return f'Cramer-Rao bound of the position (root mean square): {values}.'
 
 
+def _pair(
+    mm: recordings.Column, deg: recordings.Column, digits: int, sensor: str, statistic: str
+) -> str:
+    return f'{mm[sensor][statistic]:.{digits}f} / {deg[sensor][statistic]:.{digits}f}'
+
+
 def _table_2(results: Document) -> str:
-    def printed(model: str) -> Callable[[str, str], str]:
-        mm, deg = recordings.TABLE_2_MM[model], recordings.TABLE_2_DEG[model]
-        return lambda sensor, s: f'{mm[sensor][s]:.2f} / {deg[sensor][s]:.2f}'
-
-    def measured(of: Document) -> Callable[[str, str], str]:
-        mm, deg = 'position_mm', 'orientation_deg'
-        return lambda sensor, s: f'{of[sensor][mm][s]:.3f} / {of[sensor][deg][s]:.3f}'
-
     rows = []
-    for model in recordings.TABLE_2_MM:
-        rows += _sensor_rows(f'{PRINTED}: {model}', printed(model))
+    for model, mm in recordings.TABLE_2_MM.items():
+        deg = recordings.TABLE_2_DEG[model]
+        rows += _sensor_rows(f'{PRINTED}: {model}', partial(_pair, mm, deg, 2))
     for method, errors in results['tracking']['table_2'].items():
-        rows += _sensor_rows(WORDS[method], measured(errors))
+        mm = {sensor: found['position_mm'] for sensor, found in errors.items()}
+        deg = {sensor: found['orientation_deg'] for sensor, found in errors.items()}
+        rows += _sensor_rows(WORDS[method], partial(_pair, mm, deg, 3))
     head = ['model', 'sensor', *(f'{s}, mm / deg' for s in recordings.STATISTICS)]
     return (
         '## Table II: a new model of the board (simulated)\n\nTrained with tool A, tested with '
