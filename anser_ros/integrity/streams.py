@@ -194,8 +194,10 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
     for s in range(flux.shape[0]):
         ages[s] = 0
         if codes[s] != 0:
-            sums[s] = 0.0
-            ring[place, s] = complex(math.nan, math.nan)
+            for d in range(depth):
+                sums[s, d, 0] = sums[s, d, 1] = 0.0
+            for k in range(width):
+                ring[place, s, k] = complex(math.nan, math.nan)
             continue
         count = _fill_terms(flux[s], least, terms)
         for d in range(filled):
@@ -216,7 +218,8 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
             if ages[s] == 0 and max(sums[s, d, 0], sums[s, d, 1]) > certain:
                 ages[s] = d + 1
                 some = True
-        ring[place, s] = flux[s]
+        for k in range(width):
+            ring[place, s, k] = flux[s, k]
     return some
 
 

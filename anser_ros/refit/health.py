@@ -62,7 +62,7 @@ def evidence_without(
     """
     precision, _ = bank.precision(seen.noise)
     shape = len(bank.bases), len(coils)
-    gain, strength = np.empty(shape), np.zeros((*shape, 2), dtype=np.int64)
+    gain, strength = np.zeros(shape), np.zeros((*shape, 2), dtype=np.int64)
     fill_without(
         bank.bases, coils, bank.width, seen.projected, precision, seen.curve, seen.log_evidence,
         (RISE, REACH), gain, strength,

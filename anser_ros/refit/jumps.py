@@ -162,7 +162,7 @@ class Courses:
 def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
     """Return the evidence for metal that changes readings by no more than so many noise units."""
     count = max(1, int(np.count_nonzero(largest**2 >= STRENGTHS)))
-    evidence, strength = over_strengths(seen.curve[:, :count])
+    evidence, strength = over_strengths(seen.curve[..., :count])
     whole = np.zeros_like(seen.strength)
     whole[:, :, :count] = strength
     return replace(seen, log_evidence=evidence + bank.log_prior, strength=whole)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.kernels import fill_evidence, fill_precision, fill_products
+from anser_ros.refit.kernels import fill_evidence, fill_products
 from anser_ros.refit.prior import CloudPrior
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ class FrameEvidence:
     # (H, n, 2), whitened readings in each hypothesis' eigenvectors; real, imaginary
     projected: Single
     log_evidence: Array  # (H,)
-    # (H, A, 2), logarithm of the likelihood of each strength, real and imaginary part
+    # (H, 2, A), logarithm of the likelihood of each strength, of the real and imaginary part
     curve: Array
     strength: Array  # (H, 2, A), probability of each strength
     noise: float
@@ -61,12 +61,12 @@ def median(values: Array) -> float:
 
 
 def over_strengths(curve: Array) -> tuple[Array, Array]:
-    """Return log evidence (H,) and strength probabilities (H, 2, A) of the curves (H, A, 2)."""
-    top = curve.max(axis=1, keepdims=True)
+    """Return log evidence (H,) and strength probabilities of the curves, both (H, 2, A)."""
+    top = curve.max(axis=2, keepdims=True)
     weight = np.exp(curve - top)
-    total = weight.sum(axis=1, keepdims=True)
-    evidence = (top + np.log(total / len(STRENGTHS)))[:, 0].sum(axis=1)
-    return evidence, (weight / total).swapaxes(1, 2)
+    total = weight.sum(axis=2, keepdims=True)
+    evidence = (top + np.log(total / len(STRENGTHS))).sum(axis=(1, 2))
+    return evidence, weight / total
 
 
 MOST_TABLES, MOST_BLOCKS = 12, 128
@@ -220,9 +220,9 @@ class Bank:
         """
         precision, log_det = self.precision(noise)
         count, n = self.spectra.shape
-        projected = np.empty((count, n, 2), dtype=np.float32)
-        curve, evidence = np.empty((count, len(STRENGTHS), 2)), np.empty(count)
-        strength = np.empty((count, 2, len(STRENGTHS)))
+        projected = np.zeros((count, n, 2), dtype=np.float32)
+        curve, evidence = np.zeros((count, 2, len(STRENGTHS))), np.zeros(count)
+        strength = np.zeros(curve.shape)
         fill_evidence(
             self.analysis, _rows(readings), precision, log_det, np.isfinite(self.log_prior),
             projected, curve, strength, evidence,
@@ -255,9 +255,9 @@ class Bank:
     def moments(self, seen: FrameEvidence, hypothesis: int) -> NDArray[np.complex128]:
         """Return the posterior mean of the layer's moments (N, K) in units of the noise."""
         synthesis = self.to_moments(hypothesis)
-        out = np.empty((len(synthesis), 2))
+        out = np.empty((len(synthesis), 2), dtype=np.float32)
         fill_products(synthesis, _rows(self.coefficients(seen, hypothesis)), out)
-        return out.view(np.complex128).reshape(-1, self.width)
+        return out.astype(np.float64).view(np.complex128).reshape(-1, self.width)
 
     def drifts(self, seen: FrameEvidence, hypothesis: int) -> tuple[Array, Array]:
         """Return mean (K, 2) and variance (K, 2) of the emitters' drift in prior deviations."""
@@ -286,10 +286,8 @@ class Bank:
 
 def _precision(spectra: Array, noise: float) -> tuple[Single, Array]:
     """Return inverse variances (H, A, n) and log determinants (H, A) of spectra (H, n)."""
-    shape = (len(spectra), len(STRENGTHS), spectra.shape[1])
-    inverse, log_det = np.empty(shape, dtype=np.float32), np.empty(shape[:2])
-    fill_precision(spectra, STRENGTHS, noise**2, inverse, log_det)
-    return inverse, log_det
+    variance = STRENGTHS[:, None] * spectra[:, None] + noise**2
+    return (1.0 / variance).astype(np.float32), np.log(variance).sum(axis=2)
 
 
 def _rows(columns: Array) -> Single:
