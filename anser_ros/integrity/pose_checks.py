@@ -25,6 +25,8 @@ from anser_ros.kernel_cache import kernel
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.stamps import NANO
 
+Array = NDArray[np.float64]
+
 STREAM_GAP_S = 0.5
 """Frames further apart than this, s, are single points and no stream, as of a robot that stops
 once a second."""
@@ -92,13 +94,7 @@ class Continuity:
     """Judges one sensor's or body's poses through time."""
 
     def __init__(self) -> None:
-        self._track: list[Place] = []
-        self._run: list[Place] = []
-        self._frames = 0
-        self._began_ns = 0
-        self._last_ns = 0
-        self._record: deque[tuple[int, bool]] = deque()
-        self._refused = 0
+        self.forget()
 
     @property
     def refused_share(self) -> float:
@@ -107,29 +103,18 @@ class Continuity:
 
     def forget(self) -> None:
         """Forget all frames that were judged so far."""
-        self._track, self._run, self._frames, self._last_ns = [], [], 0, 0
-        self._record.clear()
-        self._refused = 0
+        self._track: list[Place] = []
+        self._run: list[Place] = []
+        self._frames = self._began_ns = self._last_ns = self._refused = 0
+        self._record: deque[tuple[int, bool]] = deque()
 
     def judge(
         self, stamp_ns: int, place: Place | None, refused: bool, bounds: MotionBounds
     ) -> str:
-        """Judge the next frame.
+        """Return why the next frame's pose is not confirmed; empty where it is, or there is none.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Of the frame.
-        place : Place or None
-            Of the pose, where it is good by itself.
-        refused : bool
-            Whether there is no pose although there are signals.
-        bounds : MotionBounds
-
-        Returns
-        -------
-        str
-            Why the pose is not confirmed; empty where it is, and where there is no pose.
+        ``place`` is that of a pose that is good by itself; ``refused`` says whether there is no
+        pose although there are signals.
         """
         last_ns = self._last_ns
         alone = not last_ns or not 0 < stamp_ns - last_ns <= STREAM_GAP_S / NANO
@@ -171,8 +156,6 @@ class Continuity:
             record.append((stamp_ns, refused))
             self._refused += refused
 
-
-Array = NDArray[np.float64]
 
 SELDOM = 1e-6
 """Probability that a sound coil contradicts its body."""
@@ -298,19 +281,10 @@ def distances(
     """Return how far each coil's own pose is from its place in the body, (3, S).
 
     The squared Mahalanobis distance, to be compared with `GATE`; the distance, m; the angle
-    between the axes, rad.
-
-    Parameters
-    ----------
-    body : position (3,), rotation (3, 3), covariance (6, 6)
-        m and rad, frame fg.
-    offsets, axes : ndarray, shape (S, 3)
-        Of the coils, in the body's frame, m and unit vectors.
-    coils : positions (S, 3), axes (S, 3), covariances (S, 6, 6)
-        What the coils say of themselves, frame fg.
-    took_part : ndarray of bool, shape (S,)
-        Whether the body's pose made use of the coil.
-    survey : SurveyErrors
+    between the axes, rad. ``body`` is position (3,), rotation (3, 3) and covariance (6, 6), m and
+    rad, frame fg; ``offsets`` and ``axes`` (S, 3) are the coils' in the body; ``coils`` are the
+    positions (S, 3), axes (S, 3) and covariances (S, 6, 6) that they say of themselves;
+    ``took_part`` (S,) is whether the body's pose made use of the coil.
     """
     found = np.empty((3, len(offsets)))
     survey_errors = np.array([survey.position_m, survey.axis_rad, survey.gain])

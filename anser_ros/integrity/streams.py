@@ -42,12 +42,8 @@ class Senders:
     """Distinguishes the senders of one topic.
 
     With ``is_constant`` what a sender says never changes: who says otherwise is another one,
-    whatever number the message has.
-
-    Attributes
-    ----------
-    complaint : str
-        Why the topic, by its name, can't be believed now; empty while it has one sender.
+    whatever number the message has. ``complaint`` is why the topic cannot be believed now; it is
+    empty while there is one sender.
     """
 
     def __init__(self, topic: str, is_constant: bool = False) -> None:
@@ -226,10 +222,8 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
 class Freshness:
     """Finds readings that repeat an earlier one.
 
-    Attributes
-    ----------
-    age_s : ndarray, shape (S,)
-        How long ago the same reading came, s, for the last frame that had any; 0 for new ones.
+    ``age_s`` (S,) is how long ago the same reading came, s, for the last frame that had any; 0
+    for new ones.
     """
 
     def __init__(self) -> None:

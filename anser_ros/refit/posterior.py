@@ -29,6 +29,7 @@ from anser_ros.refit.prior import CloudPrior
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
+ComplexArray = NDArray[np.complex128]
 
 STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
 """Variances of a reading, in noise variances, that the evidence is summed over."""
@@ -96,28 +97,14 @@ class Eigenbasis:
 class Bank:
     """Holds all hypotheses for the references that are in use.
 
-    Parameters
-    ----------
-    priors : sequence of CloudPrior
-    rows : ndarray of int, shape (n,)
-        Readings in use, as rows of the priors' covariance; all K of a coil or none.
-    drift : ndarray, shape (all readings, K)
-        Reading that one deviation of each emitter's drift makes, in noise units.
-    slots, among : int
-        Places for hypotheses that are put in later, and how many these are chosen from: each is
-        as much less likely.
+    ``rows`` (n,) are the readings in use as rows of the priors' covariance, all K (``width``) of
+    a coil or none; ``drift`` (all readings, K) is what one deviation of each emitter's drift
+    makes of them, in noise units. The hypotheses of ``slots`` are put in later; these are chosen
+    ``among`` so many, and each is as much less likely.
 
-    Attributes
-    ----------
-    width : int
-        Readings of a coil, one for each of the K emitters.
-    bases, analysis : ndarray, shape (H, n, n) and (H n, n)
-        Eigenvectors of each hypothesis in columns; the same in rows, single precision.
-    spectra : ndarray, shape (H, n)
-        Their eigenvalues.
-    log_prior : ndarray, shape (H,)
-        Natural logarithm of the probability before data; minus infinity for an empty slot.
-    is_slot : ndarray of bool, shape (H,)
+    ``bases`` (H, n, n) are each hypothesis' eigenvectors in columns, ``analysis`` (H n, n) the
+    same in rows, ``spectra`` (H, n) the eigenvalues. ``log_prior`` (H,) is the logarithm of the
+    probability before data, minus infinity for an empty slot.
     """
 
     def __init__(
@@ -308,8 +295,6 @@ def _whitening(drift: Array) -> Array:
     return out
 
 
-ComplexArray = NDArray[np.complex128]
-
 MOST = len(STRENGTHS) - 1
 """Index of the largest of the `STRENGTHS`."""
 
@@ -359,18 +344,14 @@ def error_draws(
     """
     prior, power = posterior.prior, STRENGTHS[strength]
     count = prior.draw_readings.shape[1]
-    drawn = noise * _noise_draws(count, bank.drift, part)
-    readings = np.sqrt(power) * prior.draw_readings[bank.rows] + drawn
+    # Repeatable draws of the readings' noise and drift.
+    rng = np.random.default_rng(1 + part)
+    drawn = rng.standard_normal((len(bank.drift), count))
+    drawn += bank.drift @ rng.standard_normal((bank.width, count))
+    readings = np.sqrt(power) * prior.draw_readings[bank.rows] + noise * drawn
     gain = power / (power * posterior.values + noise**2)
     weights = gain[:, None] * (posterior.basis.T @ readings)
     return np.asarray(np.sqrt(power) * prior.draw_moments - posterior.synthesis @ weights)
-
-
-def _noise_draws(count: int, drift: Array, part: int) -> Array:
-    """Return repeatable draws of the readings' noise and drift, (n, D)."""
-    rng = np.random.default_rng(1 + part)
-    white = rng.standard_normal((len(drift), count))
-    return np.asarray(white + drift @ rng.standard_normal((drift.shape[1], count)))
 
 
 def error_modes(
