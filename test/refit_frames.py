@@ -21,17 +21,23 @@ def run(refit, world, change, frames=3, seed=1, start=1, fault=None, flags=None)
     return result
 
 
-def errors(world, model, points):
+def errors(world, model, points, polarisability=-600.0 + 80.0j):
     """Rms of the field's error before and after, and the predicted sigma, over the volume, T."""
     places, axes = volume_points()
     tools = replace_geometry(world.references, places, axes)
-    truth = world.metal(points, tools)
+    truth = world.metal(points, tools, polarisability)
     made = model.flux(places, axes) - world.model.flux(places, axes)
     modes = np.zeros((0, 1)) if model.modes is None else model.modes
     spread = np.full(truth.shape, model.flux_error_t**2)
     for mode in modes:
         spread += np.abs(replace(model, moments=mode, modes=None).flux(places, axes)) ** 2 / 2.0
     return rms(truth), rms(truth - made), np.sqrt(spread), truth - made
+
+
+def share_left(world, model, points):
+    """What is left of the field's error over the volume."""
+    before, after, _, _ = errors(world, model, points)
+    return after / before
 
 
 def replace_geometry(table, places, axes):

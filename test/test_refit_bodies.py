@@ -93,16 +93,11 @@ def test_metal_beside_the_volume_is_found_corrected_and_honest(refit):
 
 @pytest.mark.long
 def test_slots_follow_metal_that_moves_and_are_emptied_by_a_reset(refit):
-    names = [
-        {
-            name
-            for name in follow(refit, BESIDE + [0.0, shift, 0.0], frames=16).weights
-            if 'body' in name
-        }
-        for shift in (-0.12, 0.12)
-    ]
-    assert len(names[0]) == len(names[1]) == 3
-    assert not names[0] & names[1]
+    before, after = (
+        {name for name in follow(refit, BESIDE + [0.0, y, 0.0], 16).weights if 'body' in name}
+        for y in (-0.12, 0.12)
+    )
+    assert len(before) == len(after) == 3 and not before & after
     refit.reset()
     flux = anser_world(24).baseline
     result = refit.update(1, anser_world(24).references.channel, flux)

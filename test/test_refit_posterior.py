@@ -97,7 +97,7 @@ def test_evidence_is_that_of_the_dense_normal_distribution(bank, parts, drift, r
             covariance = dense(parts, drift, hypothesis, STRENGTHS[a])
             for part in range(2):
                 expected = multivariate_normal.logpdf(readings[:, part], cov=covariance)
-                got = seen.curve[hypothesis, a, part] - constant - half
+                got = seen.curve[hypothesis, part, a] - constant - half
                 assert got == pytest.approx(expected, rel=1e-4)
     assert int(seen.log_evidence.argmax()) == 1
     np.testing.assert_allclose(seen.strength.sum(axis=2), 1.0)

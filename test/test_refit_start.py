@@ -10,7 +10,6 @@ from conftest import PATIENCE_S
 from rclpy.parameter import Parameter
 from refit_rig import Rig, setup_text
 from refit_world import anser_world
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import FitError
@@ -60,18 +59,9 @@ def rig(ros, tmp_path, held):
     rig.close()
 
 
-def given_baseline(rig):
-    if rig.node._setup is None:
-        rig.node._on_setup(String(data=setup_text(rig.world)))
-    for _ in range(12):
-        rig.say(0.0)
-    reply = rig.node._on_set_baseline(Trigger.Request(), Trigger.Response())
-    assert reply.success, reply.message
-
-
 def test_frames_and_services_are_answered_while_the_first_refit_is_made(rig, held):
     rig.stamp_ns = time.time_ns()
-    given_baseline(rig)
+    rig.give_baseline()
     rig.until(lambda: 'refit being prepared, 40%' in rig.node.status().message)
     assert rig.node.status().level == Level.WARN
     for _ in range(3):
@@ -88,11 +78,10 @@ def test_frames_and_services_are_answered_while_the_first_refit_is_made(rig, hel
 
 def test_the_former_refit_goes_on_until_that_to_a_new_baseline_is_there(rig, held):
     held.let.set()
-    given_baseline(rig)
-    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    rig.start()
     former = rig.node._refit.current
     held.let.clear()
-    given_baseline(rig)
+    rig.give_baseline()
     before = rig.node.counters['refits']
     rig.say(0.0)
     assert rig.node.counters['refits'] == before + 1 and rig.node._refit.current is former
@@ -105,8 +94,7 @@ def test_the_former_refit_goes_on_until_that_to_a_new_baseline_is_there(rig, hel
 
 def give_another_model(rig, held, tmp_path):
     held.let.set()
-    given_baseline(rig)
-    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    rig.start()
     rig.say(0.0)
     held.let.clear()
     model = rig.world.model
@@ -144,7 +132,7 @@ def test_a_refit_that_cannot_be_made_is_said_and_awaited_no_longer(rig, monkeypa
         raise FitError('the emitters make no field')
 
     monkeypatch.setattr(tables, 'build_tables', none)
-    given_baseline(rig)
+    rig.give_baseline()
     rig.until(lambda: rig.node.counters['baselines_refused'] == 1)
     state = rig.node.status()
     assert state.level == Level.WARN and 'no baseline: the emitters make no field' in state.message

@@ -37,18 +37,17 @@ NOT_FINITE_CODE, ABSURD_CODE = 6, 7
 STUCK_CODE = 8
 """Code of what earlier readings say: this one repeats one of them."""
 
-MISSING = Fault('missing', states.STALE, 'its channel is not in the frame')
-SATURATED = Fault('saturated', states.SATURATED, 'flagged saturated by the acquisition')
-STALE = Fault('stale', states.STALE, 'flagged stale by the acquisition')
-DROPPED = Fault('dropped', states.DROPPED, 'flagged dropped by the acquisition')
-FLAGGED = Fault('flagged', states.NO_SIGNAL, 'flagged by the acquisition with an unknown bit')
-NOT_FINITE = Fault('not_finite', states.NO_SIGNAL, 'the fluxes are not finite')
-ABSURD = Fault('absurd', states.NO_SIGNAL, f'fluxes beyond {LARGEST_FLUX_T:g} T are implausible')
-STUCK = Fault('stuck', states.STALE, 'stuck: the same reading as before')
-
 FAULTS: tuple[Fault | None, ...] = (
-    None, MISSING, SATURATED, STALE, DROPPED, FLAGGED, NOT_FINITE, ABSURD, STUCK,
-)  # fmt: skip
+    None,
+    Fault('missing', states.STALE, 'its channel is not in the frame'),
+    Fault('saturated', states.SATURATED, 'flagged saturated by the acquisition'),
+    Fault('stale', states.STALE, 'flagged stale by the acquisition'),
+    Fault('dropped', states.DROPPED, 'flagged dropped by the acquisition'),
+    Fault('flagged', states.NO_SIGNAL, 'flagged by the acquisition with an unknown bit'),
+    Fault('not_finite', states.NO_SIGNAL, 'the fluxes are not finite'),
+    Fault('absurd', states.NO_SIGNAL, f'fluxes beyond {LARGEST_FLUX_T:g} T are implausible'),
+    Fault('stuck', states.STALE, 'stuck: the same reading as before'),
+)
 
 
 def value_codes(flux: NDArray[np.complex128]) -> NDArray[np.int64]:

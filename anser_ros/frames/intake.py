@@ -60,25 +60,14 @@ class Frame:
 class Intake:
     """Puts frames into a table's order and judges them.
 
-    Parameters
-    ----------
-    channels : ndarray of int, shape (S,)
-        The table's channels; others in a frame are passed over.
-    count : callable, optional
-        Gets the counters of frames that are admitted: ``frames``, ``duplicates``; ``time_jumps``
-        back, ``time_jumps_forward``; ``frames_empty``, ``frames_dead_emitter``.
-    spares_dead : bool
-        Whether the user goes on without emitters that died: what is read of them is then set to
-        zero and is no fault.
-    error : type
-        What is raised for what is not a frame.
+    ``channels`` (S,) are the table's; others in a frame are passed over. ``count`` gets the
+    counters of frames that are admitted: ``frames``, ``duplicates``; ``time_jumps`` back,
+    ``time_jumps_forward``; ``frames_empty``, ``frames_dead_emitter``. With ``spares_dead`` the
+    user goes on without emitters that died: what is read of them is set to zero and is no fault.
+    ``error`` is raised for what is not a frame.
 
-    Attributes
-    ----------
-    last_ns : int
-        Stamp of the last admitted frame; 0 before.
-    dead : tuple of str
-        Emitters that no sensor received in that frame while others were received.
+    After a frame, ``last_ns`` is its stamp (0 before the first), and ``dead`` are the emitters
+    that no sensor received in it while others were received.
     """
 
     def __init__(
@@ -104,21 +93,10 @@ class Intake:
         emitters: tuple[str, ...] | None = None,
         jump_s: float = JUMP_NS * NANO,
     ) -> Frame | None:
-        """Judge a frame as the next one of a stream.
+        """Judge a frame as the next one of a stream; None for one that was already seen.
 
-        Parameters
-        ----------
-        stamp_ns, channels, flux, flags
-            As for `judge`.
-        emitters : tuple of str or None
-            Names of the emitters that there ought to be; None while no model is known.
-        jump_s : float
-            How far ahead of the last one a stamp may be, s.
-
-        Returns
-        -------
-        Frame or None
-            None for a frame that was already seen.
+        As `judge`, but ``emitters`` are the names of those that there ought to be, None while no
+        model is known; ``jump_s`` is how far ahead of the last one a stamp may be, s.
 
         Raises
         ------
@@ -162,18 +140,8 @@ class Intake:
     ) -> Frame:
         """Judge a frame by itself; nothing is counted.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Middle of the demodulation window; must be positive.
-        channels : ndarray, shape (N,)
-            Channel of each row, in any order.
-        flux : ndarray, shape (N, K), complex
-            T.
-        flags : ndarray, shape (N,), optional
-            Flag bits of `wire.points`.
-        emitters : int or None
-            How many there ought to be.
+        ``channels`` (N,) are those of the rows of ``flux`` (N, K), T, in any order; ``flags`` (N,)
+        are bits of `wire.points`; ``emitters`` says how many there ought to be.
 
         Raises
         ------

@@ -135,12 +135,8 @@ class BoardPlace:
 
 def _rows(drawn: DrawnReadings, centres: Array, middle: Array) -> Array:
     """What coils and a displaced frame do to readings, (S, K, 6 K + 6), T a prior deviation."""
-    own = [
-        drawn.by_manufacture(centres),
-        PRIOR_M * drawn.by_place,
-        PRIOR_RAD * drawn.turned(middle),
-    ]
-    return np.moveaxis(np.concatenate(own), 0, 2)
+    aside = PRIOR_M * drawn.by_place, PRIOR_RAD * drawn.turned(middle)
+    return np.moveaxis(np.concatenate([drawn.by_manufacture(centres), *aside]), 0, 2)
 
 
 def _survey_roots(drawn: DrawnReadings, accuracy: Accuracy) -> Array:

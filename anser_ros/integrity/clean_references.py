@@ -21,6 +21,9 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.settings import Accuracy, RefitSettings
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
 FieldAt = Callable[[Array], Array]
 """Drawn field at points (P, 3) in m, frame fg: (P, K, 3) in T."""
 
@@ -86,8 +89,6 @@ class DrawnReadings:
         return out
 
 
-ComplexArray = NDArray[np.complex128]
-
 STABLE_SHARE = 0.25
 """Share of `Accuracy.reference_gain` that a sensor's reading may change by from one day to
 another: more than a warm amplifier does, less than metal that moves poses by 0.1 mm."""
@@ -147,13 +148,9 @@ def check_steady(flux: ComplexArray) -> float | None:
     The means of `PARTS` parts are compared with each other, beside a gain of each emitter: the
     strength of an emitter may drift while there is no metal, and a refit follows it.
 
-    ``flux`` (F, R, K): frames of readings, T, in the order of time; NaN where a reading is bad.
-
-    Returns
-    -------
-    float or None
-        Noise of a component of the mean reading, T, by the frames' scatter; None for fewer than
-        `FEWEST_FRAMES_OF_CHANGE`, which are not judged.
+    ``flux`` (F, R, K) are frames of readings, T, in the order of time; NaN where one is bad.
+    Returns the noise of a component of the mean reading, T, by the frames' scatter; None for
+    fewer than `FEWEST_FRAMES_OF_CHANGE`, which are not judged.
 
     Raises
     ------

@@ -146,15 +146,13 @@ class ModelRecord:
     """Counts how many readings the model explained lately."""
 
     def __init__(self) -> None:
-        self._frames: deque[tuple[int, int, int, float]] = deque()
-        self._refused = self._total = 0
-        self._sound_since_ns = 0
-        self._last_ns = 0
-        self.is_doubtful = False
+        self.forget()
 
     def forget(self) -> None:
         """Forget all frames that were judged so far."""
-        self.__init__()  # type: ignore[misc]
+        self._frames: deque[tuple[int, int, int, float]] = deque()
+        self._refused = self._total = self._sound_since_ns = self._last_ns = 0
+        self.is_doubtful = False
 
     @property
     def refused_share(self) -> float:
@@ -179,14 +177,10 @@ class ModelRecord:
         if (total and refused > GOOD_SHARE * total) or not self._sound_since_ns:
             self._sound_since_ns = stamp_ns
         is_sound = stamp_ns - self._sound_since_ns >= RECOVERY_S / NANO
-        if (
-            self._total >= FEWEST_JUDGED_READINGS
-            and self.refused_share > DOUBTFUL
-            and not is_sound
-        ):
-            self.is_doubtful = True
-        elif is_sound:
+        if is_sound:
             self.is_doubtful = False
+        elif self._total >= FEWEST_JUDGED_READINGS and self.refused_share > DOUBTFUL:
+            self.is_doubtful = True
 
     @property
     def reason(self) -> str:

@@ -25,6 +25,8 @@ from anser_ros.kernel_cache import kernel
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.stamps import NANO
 
+Array = NDArray[np.float64]
+
 STREAM_GAP_S = 0.5
 """Frames further apart than this, s, are single points and no stream, as of a robot that stops
 once a second."""
@@ -92,13 +94,7 @@ class Continuity:
     """Judges one sensor's or body's poses through time."""
 
     def __init__(self) -> None:
-        self._track: list[Place] = []
-        self._run: list[Place] = []
-        self._frames = 0
-        self._began_ns = 0
-        self._last_ns = 0
-        self._record: deque[tuple[int, bool]] = deque()
-        self._refused = 0
+        self.forget()
 
     @property
     def refused_share(self) -> float:
@@ -107,29 +103,18 @@ class Continuity:
 
     def forget(self) -> None:
         """Forget all frames that were judged so far."""
-        self._track, self._run, self._frames, self._last_ns = [], [], 0, 0
-        self._record.clear()
-        self._refused = 0
+        self._track: list[Place] = []
+        self._run: list[Place] = []
+        self._frames = self._began_ns = self._last_ns = self._refused = 0
+        self._record: deque[tuple[int, bool]] = deque()
 
     def judge(
         self, stamp_ns: int, place: Place | None, refused: bool, bounds: MotionBounds
     ) -> str:
-        """Judge the next frame.
+        """Return why the next frame's pose is not confirmed; empty where it is, or there is none.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Of the frame.
-        place : Place or None
-            Of the pose, where it is good by itself.
-        refused : bool
-            Whether there is no pose although there are signals.
-        bounds : MotionBounds
-
-        Returns
-        -------
-        str
-            Why the pose is not confirmed; empty where it is, and where there is no pose.
+        ``place`` is that of a pose that is good by itself; ``refused`` says whether there is no
+        pose although there are signals.
         """
         last_ns = self._last_ns
         alone = not last_ns or not 0 < stamp_ns - last_ns <= STREAM_GAP_S / NANO
@@ -172,8 +157,6 @@ class Continuity:
             self._refused += refused
 
 
-Array = NDArray[np.float64]
-
 SELDOM = 1e-6
 """Probability that a sound coil contradicts its body."""
 GATE = float(chdtri(5, SELDOM))
@@ -210,6 +193,35 @@ class SurveyErrors:
 
 
 @kernel
+def _add_product(rows, covariance, total):  # type: ignore[no-untyped-def]
+    """Add ``rows covariance rows^T`` of rows (m, n) to a matrix (m, m)."""
+    for i in range(rows.shape[0]):
+        for b in range(rows.shape[1]):
+            part = 0.0
+            for a in range(rows.shape[1]):
+                part += rows[i, a] * covariance[a, b]
+            for j in range(rows.shape[0]):
+                total[i, j] += part * rows[j, b]
+
+
+@kernel
+def _squared_distance(covariance, apart):  # type: ignore[no-untyped-def]
+    """Return ``apart^T covariance^-1 apart`` by Cholesky's factor, which is written over both."""
+    total = 0.0
+    for i in range(apart.shape[0]):
+        for j in range(i + 1):
+            for k in range(j):
+                covariance[i, j] -= covariance[i, k] * covariance[j, k]
+            if j < i:
+                covariance[i, j] /= covariance[j, j]
+                apart[i] -= covariance[i, j] * apart[j]
+        covariance[i, i] = math.sqrt(covariance[i, i])
+        apart[i] /= covariance[i, i]
+        total += apart[i] ** 2
+    return total
+
+
+@kernel
 def fill_distances(  # type: ignore[no-untyped-def]
     position, rotation, covariance, offsets, axes, positions, directions, covariances, took_part,
     survey, found,
@@ -222,38 +234,40 @@ def fill_distances(  # type: ignore[no-untyped-def]
     ``axes`` (S, 3): the coils in the body. ``positions``, ``directions`` (S, 3), ``covariances``
     (S, 6, 6): what the coils say. ``took_part`` (S,). ``survey`` (3,): m, rad, relative gain.
     """
-    t, slopes, wide = np.empty((2, 3)), np.zeros((5, 6)), np.zeros((5, 6))
-    apart = np.empty(5)
-    arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
+    t, slopes, total = np.empty((2, 3)), np.zeros((2, 5, 6)), np.empty((5, 5))
+    apart, arm, n, cross = np.empty(5), np.empty(3), np.empty(3), np.empty(3)
     for s in range(offsets.shape[0]):
-        n, m = turned[s], directions[s]
+        m, cosine, radial = directions[s], 0.0, survey[2] * positions[s, 2] / 3.0
         fill_tangent(m, t)
-        cross = np.cross(n, m)
-        sine = math.sqrt(np.dot(cross, cross))
-        angle = math.atan2(sine, np.dot(n, m))
         for i in range(3):
-            apart[i] = positions[s, i] - position[i] - arms[s, i]
-        for j in range(2):
-            # The rotation vector from n to m lies across m; half a turn is about any such vector.
-            along = np.dot(t[j], cross) / sine if sine > 1e-12 else 1.0 - j
-            apart[3 + j] = along * angle
+            arm[i] = n[i] = 0.0
+            for j in range(3):
+                arm[i] += rotation[i, j] * offsets[s, j]
+                n[i] += rotation[i, j] * axes[s, j]
+            apart[i] = positions[s, i] - position[i] - arm[i]
+            cosine += n[i] * m[i]
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
-            wide[i, i] = slopes[i, i] = 1.0
-            wide[i, 3 + j], wide[i, 3 + k] = arms[s, k], -arms[s, j]
-            wide[3, 3 + i] = slopes[3, 3 + i] = t[0, i]
-            wide[4, 3 + i] = slopes[4, 3 + i] = t[1, i]
-        total = np.dot(np.dot(slopes, covariances[s]), slopes.T)
+            cross[i] = n[j] * m[k] - n[k] * m[j]
+            slopes[1, i, 3 + j], slopes[1, i, 3 + k] = arm[k], -arm[j]
+            for way in range(2):
+                slopes[way, i, i] = 1.0
+                slopes[way, 3, 3 + i], slopes[way, 4, 3 + i] = t[0, i], t[1, i]
+        sine = math.sqrt(cross[0] ** 2 + cross[1] ** 2 + cross[2] ** 2)
+        angle = math.atan2(sine, cosine)
+        for j in range(2):
+            # The rotation vector from n to m lies across m; half a turn is about any such vector.
+            along = t[j, 0] * cross[0] + t[j, 1] * cross[1] + t[j, 2] * cross[2]
+            apart[3 + j] = (along / sine if sine > 1e-12 else 1.0 - j) * angle
+        for i in range(5):
+            for j in range(5):
+                total[i, j] = 0.0
+            total[i, i] = survey[0] ** 2 + radial**2 if i < 3 else survey[1] ** 2
+        _add_product(slopes[0], covariances[s], total)
         if not took_part[s]:
-            total += np.dot(np.dot(wide, covariance), wide.T)
-        radial = survey[2] * positions[s, 2] / 3.0
-        for i in range(3):
-            total[i, i] += survey[0] * survey[0] + radial * radial
-        for i in range(3, 5):
-            total[i, i] += survey[1] * survey[1]
-        found[0, s] = np.dot(apart, np.linalg.solve(total, apart))
+            _add_product(slopes[1], covariance, total)
         found[1, s] = math.sqrt(apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2)
-        found[2, s] = angle
+        found[0, s], found[2, s] = _squared_distance(total, apart), angle
 
 
 def distances(
@@ -267,19 +281,10 @@ def distances(
     """Return how far each coil's own pose is from its place in the body, (3, S).
 
     The squared Mahalanobis distance, to be compared with `GATE`; the distance, m; the angle
-    between the axes, rad.
-
-    Parameters
-    ----------
-    body : position (3,), rotation (3, 3), covariance (6, 6)
-        m and rad, frame fg.
-    offsets, axes : ndarray, shape (S, 3)
-        Of the coils, in the body's frame, m and unit vectors.
-    coils : positions (S, 3), axes (S, 3), covariances (S, 6, 6)
-        What the coils say of themselves, frame fg.
-    took_part : ndarray of bool, shape (S,)
-        Whether the body's pose made use of the coil.
-    survey : SurveyErrors
+    between the axes, rad. ``body`` is position (3,), rotation (3, 3) and covariance (6, 6), m and
+    rad, frame fg; ``offsets`` and ``axes`` (S, 3) are the coils' in the body; ``coils`` are the
+    positions (S, 3), axes (S, 3) and covariances (S, 6, 6) that they say of themselves;
+    ``took_part`` (S,) is whether the body's pose made use of the coil.
     """
     found = np.empty((3, len(offsets)))
     survey_errors = np.array([survey.position_m, survey.axis_rad, survey.gain])

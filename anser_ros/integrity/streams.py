@@ -42,12 +42,8 @@ class Senders:
     """Distinguishes the senders of one topic.
 
     With ``is_constant`` what a sender says never changes: who says otherwise is another one,
-    whatever number the message has.
-
-    Attributes
-    ----------
-    complaint : str
-        Why the topic, by its name, can't be believed now; empty while it has one sender.
+    whatever number the message has. ``complaint`` is why the topic cannot be believed now; it is
+    empty while there is one sender.
     """
 
     def __init__(self, topic: str, is_constant: bool = False) -> None:
@@ -194,8 +190,10 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
     for s in range(flux.shape[0]):
         ages[s] = 0
         if codes[s] != 0:
-            sums[s] = 0.0
-            ring[place, s] = complex(math.nan, math.nan)
+            for d in range(depth):
+                sums[s, d, 0] = sums[s, d, 1] = 0.0
+            for k in range(width):
+                ring[place, s, k] = complex(math.nan, math.nan)
             continue
         count = _fill_terms(flux[s], least, terms)
         for d in range(filled):
@@ -216,17 +214,16 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
             if ages[s] == 0 and max(sums[s, d, 0], sums[s, d, 1]) > certain:
                 ages[s] = d + 1
                 some = True
-        ring[place, s] = flux[s]
+        for k in range(width):
+            ring[place, s, k] = flux[s, k]
     return some
 
 
 class Freshness:
     """Finds readings that repeat an earlier one.
 
-    Attributes
-    ----------
-    age_s : ndarray, shape (S,)
-        How long ago the same reading came, s, for the last frame that had any; 0 for new ones.
+    ``age_s`` (S,) is how long ago the same reading came, s, for the last frame that had any; 0
+    for new ones.
     """
 
     def __init__(self) -> None:

@@ -26,6 +26,7 @@ from anser_ros.physics.dipole import field_basis
 from anser_ros.physics.volume import TrackedVolume
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 LAYER_RATIO = 1.45
 """Ratio of the depths of neighbouring layers of sources: detail that sensors can tell grows with
@@ -116,7 +117,8 @@ def _shell(region: Region, inner: float, outer: float, spacing: float) -> Array:
     """Return lattice points between two boxes around the volume that are open at the bottom."""
     volume, deep = region.volume, 0.3 * region.half
     side = volume.reach
-    flat = [_centred(reach + outer, spacing) for reach in side.tolist()]
+    counts = [int((reach + outer) / spacing) for reach in side.tolist()]
+    flat = [spacing * np.arange(-count, count + 1) for count in counts]
     height = np.arange(-deep + spacing / 2.0, volume.ceiling + outer, spacing)
     x, y, z = (axis.ravel() for axis in np.meshgrid(*flat, height, indexing='ij'))
     beside = np.maximum(np.abs(x) - side[0], np.abs(y) - side[1])
@@ -124,12 +126,6 @@ def _shell(region: Region, inner: float, outer: float, spacing: float) -> Array:
     points: Array = np.stack([x, y, z], axis=1)[(away >= inner) & (away < outer)]
     points[:, :2] += volume.middle
     return points
-
-
-def _centred(reach: float, spacing: float) -> Array:
-    """Return a lattice over -reach..reach that is symmetric about 0."""
-    count = int(reach / spacing)
-    return np.asarray(spacing * np.arange(-count, count + 1))
 
 
 def bodies(region: Region) -> tuple[Cloud, ...]:
@@ -170,7 +166,6 @@ def default_clouds(region: Region) -> tuple[Cloud, ...]:
     )
 
 
-ComplexArray = NDArray[np.complex128]
 FieldFunction = Callable[[Array], Array]
 """Field of each emitter at its nominal current: points (P, 3), m, to (P, K, 3), T."""
 

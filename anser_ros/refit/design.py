@@ -81,21 +81,10 @@ def family(
     kinds: Sequence[str],
     error_m: float,
 ) -> list[StatedMetal]:
-    """Return the metals of the stated kinds, each as strong as to make poses wrong by an error.
+    """Return the metals of the stated kinds, ``below`` and ``around``.
 
-    Parameters
-    ----------
-    candidates : SensorTable
-        Coils, of which some will be chosen; places and axes in fg.
-    excitation, region
-        Field of the board, and its extent.
-    frequencies_hz : sequence of float, length K
-    settings : RefitSettings
-        Noise, errors of the survey, and drift of the emitters.
-    kinds : sequence of str
-        Of ``below`` and ``around``.
-    error_m : float
-        Root mean square error of poses in the volume that each metal makes.
+    Each is as strong as to make poses in the volume wrong by ``error_m``, root mean square. Of
+    the ``candidates``, in fg, some will be chosen.
     """
     noise = settings.accuracy.flux_noise_t
     clean = np.einsum('pa,pka->pk', candidates.axis, excitation.field(candidates.position))

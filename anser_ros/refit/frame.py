@@ -20,6 +20,7 @@ from anser_ros.refit import health
 from anser_ros.refit.posterior import median
 
 ComplexArray = NDArray[np.complex128]
+Array = NDArray[np.float64]
 
 FEWEST_BASELINE_FRAMES = 3
 """Frames that a baseline needs at least: their scatter is its noise."""
@@ -187,19 +188,8 @@ class NoiseUnits:
     """Turns changes of readings into units of the nominal noise, in phase with what drives the
     metal.
 
-    Parameters
-    ----------
-    baseline : ndarray, shape (S, K), complex
-        Readings without the metal, T; NaN for a coil that has none.
-    phase : ndarray, shape (K,), complex
-        Unit phasors of what drives the metal.
-    noise_t : float
-        Nominal noise of a phasor component, T.
-
-    Attributes
-    ----------
-    size : float
-        Root mean square of a component of the baseline, in the same units.
+    ``phase`` (K,) are unit phasors of what drives the metal; ``size`` is the root mean square of
+    a component of the baseline (S, K), in the same units.
     """
 
     def __init__(self, baseline: ComplexArray, phase: ComplexArray, noise_t: float) -> None:
@@ -213,8 +203,6 @@ class NoiseUnits:
         scaled = change * self._scale
         return scaled.view(np.float64).reshape(*scaled.shape, 2)
 
-
-Array = NDArray[np.float64]
 
 MEMORY_FRAMES = 50
 """Frames over which the ratio of measured to expected noise is averaged; as long as there are

@@ -20,6 +20,7 @@ from anser_ros.refit.posterior import STRENGTHS, Bank, FrameEvidence, log_sum, m
 from anser_ros.stamps import NANO
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 RISE, REACH = 0.5, 1000.0
 """Rise of a log likelihood from one strength to the next below which its top has been reached, and
@@ -62,7 +63,7 @@ def evidence_without(
     """
     precision, _ = bank.precision(seen.noise)
     shape = len(bank.bases), len(coils)
-    gain, strength = np.empty(shape), np.zeros((*shape, 2), dtype=np.int64)
+    gain, strength = np.zeros(shape), np.zeros((*shape, 2), dtype=np.int64)
     fill_without(
         bank.bases, coils, bank.width, seen.projected, precision, seen.curve, seen.log_evidence,
         (RISE, REACH), gain, strength,
@@ -113,8 +114,6 @@ def distance_of(
         total += float(r @ np.linalg.solve(block - weighted @ seen_by.T, r))
     return total
 
-
-ComplexArray = NDArray[np.complex128]
 
 OK = 'ok'
 FLAGGED = 'flagged'
@@ -218,17 +217,10 @@ def find_faults(
 
 
 class ReferenceWatch:
-    """Keeps account of the excluded coils and of the time for which they are excluded.
+    """Keeps account of which coils are ``excluded`` (S,), for what ``reason``, and how long.
 
     A coil must be readable and agree for ``hold_frames`` before it is used again, at low rates for
     fewer, see `HOLD_S`.
-
-    Attributes
-    ----------
-    excluded : ndarray of bool, shape (S,)
-        Which are not used.
-    reason : list of str, length S
-        Why, in a word; of the others that they are in order.
     """
 
     def __init__(self, count: int, hold_frames: int) -> None:
@@ -242,19 +234,18 @@ class ReferenceWatch:
         self._gap_s = math.inf
 
     def note(
-        self,
-        readable: NDArray[np.bool_],
-        reasons: list[str],
-        least: int = 0,
-        stamp_ns: int | None = None,
+        self, readable: NDArray[np.bool_], reasons: list[str], least: int, stamp_ns: int
     ) -> None:
         """Exclude unreadable coils, whose waiting time starts again with every such frame.
 
         If fewer than `least` can be read, samples were lost and no coil is at fault: the next
-        frame continues as before. Frames without a stamp have no rate.
+        frame continues as before.
         """
-        if stamp_ns is not None:
-            self._take_pace(stamp_ns)
+        # The time between frames; one that was lost, or points one by one, do not count.
+        gap_s = (stamp_ns - self._last_ns) * NANO
+        self._last_ns = stamp_ns
+        if 0.0 < gap_s <= STREAM_GAP_S:
+            self._gap_s = min(gap_s, 1.1 * self._gap_s)
         if self._before is not None:
             self.excluded, self.reason, self._good = self._before
             self._before = None
@@ -262,13 +253,6 @@ class ReferenceWatch:
             self._before = self.excluded.copy(), self.reason.copy(), self._good.copy()
         for coil in np.flatnonzero(~readable):
             self.excluded[coil], self.reason[coil], self._good[coil] = True, reasons[coil], 0
-
-    def _take_pace(self, stamp_ns: int) -> None:
-        """Follow the time between frames; one that was lost, or points one by one, don't count."""
-        gap_s = (stamp_ns - self._last_ns) * NANO
-        self._last_ns = stamp_ns
-        if 0.0 < gap_s <= STREAM_GAP_S:
-            self._gap_s = min(gap_s, 1.1 * self._gap_s)
 
     @property
     def hold(self) -> int:

@@ -21,6 +21,8 @@ from anser_ros.refit.posterior import STRENGTHS, Bank, Eigenbasis, make_room
 from anser_ros.refit.tables import BodySearch, RefitTables
 from anser_ros.settings import RefitSettings
 
+Array = NDArray[np.float64]
+
 DELAY_NS = 80_000_000
 """Time from asking for a result to its use, ns: four frames at 50 Hz. The longest work takes 20 ms
 of a free processor, and frames wait for it on a busy one; until then the interim answer holds."""
@@ -57,8 +59,6 @@ class BackgroundTask(Generic[Result]):
         """Return the result, and wait for it where that is necessary."""
         return self._future.result()
 
-
-Array = NDArray[np.float64]
 
 SLOTS = 3
 """Compact bodies that are full hypotheses at a time: two that explain the readings alike, and one
@@ -195,8 +195,7 @@ class Banks:
         if key not in self._known:
             coils, k = np.flatnonzero(in_use), self._width
             rows = (coils[:, None] * k + np.arange(k)).ravel()
-            if len(self._known) >= MOST_BANKS:
-                del self._known[next(iter(self._known))]
+            make_room(self._known, MOST_BANKS)
             tables = self._tables
             bank = Bank(tables.priors, rows, self._drift, SLOTS, len(tables.bodies))
             self._known[key] = (bank, BodySlots(bank, tables))
@@ -217,22 +216,16 @@ class Belief:
     """Holds probabilities of the hypotheses; the first of them is that nothing has changed.
 
     ``persistence`` is the probability that the hypothesis of one frame still holds in the next.
-
-    Attributes
-    ----------
-    weights : ndarray, shape (H,)
-        Probability of each hypothesis. It is replaced, never changed in place.
+    The ``weights`` (H,) are replaced, never changed in place.
     """
 
     def __init__(self, count: int, persistence: float) -> None:
-        self._persistence = persistence
-        self.weights = np.zeros(count)
+        self._count, self._persistence = count, persistence
         self.forget()
 
     def forget(self) -> None:
         """Believe that nothing has changed."""
-        self.weights = np.zeros(len(self.weights))
-        self.weights[0] = 1.0
+        self.weights = np.eye(self._count)[0]
 
     @property
     def may_have_changed(self) -> bool:

@@ -162,7 +162,7 @@ class Courses:
 def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
     """Return the evidence for metal that changes readings by no more than so many noise units."""
     count = max(1, int(np.count_nonzero(largest**2 >= STRENGTHS)))
-    evidence, strength = over_strengths(seen.curve[:, :count])
+    evidence, strength = over_strengths(seen.curve[..., :count])
     whole = np.zeros_like(seen.strength)
     whole[:, :, :count] = strength
     return replace(seen, log_evidence=evidence + bank.log_prior, strength=whole)
@@ -184,18 +184,10 @@ def jumped(
 ) -> NDArray[np.int64]:
     """Return the coils that jumped by themselves, as numbers among those in use; often none.
 
-    Parameters
-    ----------
-    bank, seen
-        Evidence of the jumps, as if they were a change.
-    jumps : ndarray, shape (U, K, 2)
-        Of the coils in use, in noise units, over their spread.
-    spread : float
-        Noise of a jump, in units of a reading's.
-    drift : float
-        Prior deviation of an emitter's strength.
-    largest : float
-        Size of the readings' change, noise units, that metal may have made since the last frame.
+    ``seen`` is the evidence of the ``jumps`` (U, K, 2), noise units over their ``spread``, as if
+    they were a change; ``spread`` is the noise of a jump in units of a reading's, ``drift`` the
+    prior deviation of an emitter's strength, ``largest`` the change in noise units that metal may
+    have made since the last frame.
     """
     free, seen = seen, _bounded(bank, seen, largest)
     freedom = bank.width

@@ -13,9 +13,6 @@ from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 
 FAST = {'reassoc', 'contract', 'nsz'}
-TOGETHER = 8
-"""Variances whose product has one logarithm, which takes ten times as long as a product. Variances
-are between 1e-3 and 1e14 of the noise's, so this many are far from the ends of the range."""
 
 
 @kernel(fastmath=FAST)
@@ -27,25 +24,6 @@ def fill_products(matrix, columns, out):  # type: ignore[no-untyped-def]
             first += matrix[i, j] * columns[0, j]
             second += matrix[i, j] * columns[1, j]
         out[i, 0], out[i, 1] = first, second
-
-
-@kernel(fastmath=FAST)
-def fill_precision(spectra, strengths, noise, inverse, log_det):  # type: ignore[no-untyped-def]
-    """Write the inverse variances (H, A, n) of spectra (H, n), and their log determinants (H, A).
-
-    ``strengths`` (A,) multiply the spectra, and ``noise`` is the variance that is added.
-    """
-    for h in range(spectra.shape[0]):
-        for a in range(strengths.shape[0]):
-            product, log_det[h, a] = 1.0, 0.0
-            for i in range(spectra.shape[1]):
-                variance = strengths[a] * spectra[h, i] + noise
-                inverse[h, a, i] = 1.0 / variance
-                product *= variance
-                if (i + 1) % TOGETHER == 0:
-                    log_det[h, a] += math.log(product)
-                    product = 1.0
-            log_det[h, a] += math.log(product)
 
 
 @kernel(fastmath=FAST)
@@ -69,14 +47,12 @@ def fill_evidence(  # type: ignore[no-untyped-def]
     """Write what readings (2, n) say about all hypotheses; see `FrameEvidence`.
 
     ``analysis`` (H n, n), ``precision`` (H, A, n), ``log_det`` (H, A); ``there`` (H,) is False for
-    empty slots.
+    empty slots, of which nothing is written.
     """
     count, strengths, n = precision.shape
     first, second = np.empty(n, np.float32), np.empty(n, np.float32)
     for h in range(count):
         if not there[h]:
-            projected[h], curve[h], strength[h] = 0.0, 0.0, 1.0 / strengths
-            log_evidence[h] = 0.0
             continue
         fill_products(analysis[h * n : (h + 1) * n], readings, projected[h])
         for i in range(n):
@@ -87,10 +63,10 @@ def fill_evidence(  # type: ignore[no-untyped-def]
             for i in range(n):
                 real += precision[h, a, i] * first[i]
                 imaginary += precision[h, a, i] * second[i]
-            curve[h, a, 0] = -0.5 * (real + log_det[h, a])
-            curve[h, a, 1] = -0.5 * (imaginary + log_det[h, a])
-        log_evidence[h] = _fill_probabilities(curve[h, :, 0], strength[h, 0])
-        log_evidence[h] += _fill_probabilities(curve[h, :, 1], strength[h, 1])
+            curve[h, 0, a] = -0.5 * (real + log_det[h, a])
+            curve[h, 1, a] = -0.5 * (imaginary + log_det[h, a])
+        log_evidence[h] = _fill_probabilities(curve[h, 0], strength[h, 0])
+        log_evidence[h] += _fill_probabilities(curve[h, 1], strength[h, 1])
 
 
 @kernel(nogil=True, fastmath=FAST)
@@ -222,9 +198,9 @@ def fill_without(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Write what all hypotheses say without the first coil, the first two, and so on.
 
-    ``bases`` (H, n, n), ``coils`` (Q,); ``curve`` (H, A, 2) and ``log_evidence`` (H,) are those of
-    all coils. ``gain`` (H, Q) is by how much the log likelihood at its top is larger without them,
-    and ``strength`` (H, Q, 2) where that top is. It has one top over the strengths, so only
+    ``bases`` (H, n, n), ``coils`` (Q,); ``curve`` (H, 2, A) and ``log_evidence`` (H,) are those of
+    all coils. ``gain`` (H, Q), zero on entry, is by how much the log likelihood at its top is
+    larger without them, ``strength`` (H, Q, 2) where that top is. It has one top, so only
     strengths between the top with all coils and that without them are worked out: as far as it
     rises by more than ``bounds[0]``, and where a hypothesis is within ``bounds[1]`` of the best.
     """
@@ -236,18 +212,24 @@ def fill_without(  # type: ignore[no-untyped-def]
     best = np.full(sets, -math.inf)
     for is_walk in (False, True):
         for h in range(count):
-            if not is_walk:
-                gain[h] = 0.0
             if log_evidence[h] == -math.inf:
                 continue
-            if is_walk and (log_evidence[h] + gain[h] - best).max() < -bounds[1]:
-                continue
-            gain[h] = 0.0
+            behind = math.inf
             for q in range(sets):
-                first = coils[q] * width
-                rows[q * width : (q + 1) * width] = bases[h, first : first + width]
+                behind = min(behind, best[q] - log_evidence[h] - gain[h, q])
+            if behind > bounds[1]:
+                continue
+            for r in range(size):
+                row = coils[r // width] * width + r % width
+                for i in range(n):
+                    rows[r, i] = bases[h, row, i]
+            for q in range(sets):
+                gain[h, q] = 0.0
             for part in range(2):
-                start = curve[h, :, part].argmax()
+                start = 0
+                for a in range(grid):
+                    if curve[h, part, a] > curve[h, part, start]:
+                        start = a
                 for q in range(sets):
                     top = start
                     for step in (1, -1):
@@ -259,8 +241,8 @@ def fill_without(  # type: ignore[no-untyped-def]
                                     rows, width, projected[h], precision[h, a], weighted, block,
                                     columns, gains[h, a],
                                 )  # fmt: skip
-                            rise = curve[h, a, part] + gains[h, a, q, part]
-                            rise -= curve[h, top, part] + gains[h, top, q, part]
+                            rise = curve[h, part, a] + gains[h, a, q, part]
+                            rise -= curve[h, part, top] + gains[h, top, q, part]
                             if not is_walk or (a != top and rise < bounds[0]):
                                 break
                             top = a
@@ -268,10 +250,11 @@ def fill_without(  # type: ignore[no-untyped-def]
                         if not is_walk or top != start:
                             break
                     strength[h, q, part] = top
-                    gain[h, q] += curve[h, top, part] + gains[h, top, q, part]
-                    gain[h, q] -= curve[h, start, part]
+                    gain[h, q] += curve[h, part, top] + gains[h, top, q, part]
+                    gain[h, q] -= curve[h, part, start]
             if not is_walk:
-                best = np.maximum(best, log_evidence[h] + gain[h])
+                for q in range(sets):
+                    best[q] = max(best[q], log_evidence[h] + gain[h, q])
 
 
 @kernel

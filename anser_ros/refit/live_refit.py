@@ -3,6 +3,11 @@
 The calibrated model is kept; what is refitted is the change since a distortion-free baseline. All
 emitters illuminate the same metal, so one polarisability per source explains all of them, and a
 few dozen readings determine the change of the whole field. See `docs/refit.md`.
+
+The steps of a frame: what can be read (`frame`); coils that jumped by themselves (`jumps`); the
+evidence of every hypothesis, without coils that contradict the others (`posterior`, `health`); how
+probable each hypothesis is after the frames before (`hypotheses`); the model with the metal, and
+its uncertainty (`model`); afterwards what tools contradict (`witness`).
 """
 
 import math
@@ -64,22 +69,11 @@ more asks for what needs it. Fewer leave 5 to 10 ms to a frame; more only make t
 class LiveRefit:
     """Makes a field model follow the readings of reference coils.
 
-    Parameters
-    ----------
-    model : FieldModel
-        Calibrated without the metal.
-    references : SensorTable
-        The reference coils, places and axes in fg.
-    baseline : ndarray, shape (S, K), complex
-        Their readings without the metal, T; NaN for a coil that has none.
-    settings : RefitSettings, optional
-    drawing : callable, optional
-        Field of the board as drawn (`physics.board.Board.field`): points (P, 3) to (P, K, 3), T.
-        Without it the model's own dipoles drive the metal, which is much less accurate.
-    volume : TrackedVolume, optional
-        Where the field must be right; by default the volume over such a board.
-    tables : RefitTables, optional
-        Of all these but the baseline, where they are there already.
+    The model was calibrated without the metal; ``baseline`` (S, K), T, are the references'
+    readings without it, NaN for a coil that has none. ``drawing`` is the field of the board as
+    drawn (`physics.board.Board.field`); without it the model's own dipoles drive the metal, which
+    is much less accurate. In the ``volume`` the field must be right. ``tables`` are those of all
+    these but the baseline, where they are there already.
 
     Raises
     ------

@@ -79,20 +79,9 @@ class Assembly:
     ) -> FieldModel:
         """Return the refitted model of one frame.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Of the frame.
-        bank, seen
-            The hypotheses and what they say.
-        weights : ndarray, shape (H,)
-            Their probabilities.
-        drift : ndarray, shape (K,), complex
-            Relative change of the emitters' strength.
-        typical : float
-            Left-out chi-square per degree of freedom of the typical coil.
-        witness : Witness, optional
-            What tools know of the hypotheses' errors.
+        ``weights`` (H,) are the hypotheses' probabilities, ``drift`` (K,) the relative change of
+        the emitters' strength; ``typical`` is the left-out chi-square per degree of freedom of
+        the typical coil. A ``witness`` knows the hypotheses' errors from tools.
         """
         active = [h for h in np.flatnonzero(weights > NEGLIGIBLE).tolist() if h > 0]
         place = self._dipoles_of([bank.prior(h).layer for h in active])
@@ -276,8 +265,9 @@ class _Change:
         return float(np.sqrt(np.mean(np.abs(field) ** 2) / 2.0))
 
     def _part(self, hypothesis: int) -> ComplexArray:
-        known = self.parts.get(hypothesis)
-        return self.bank.moments(self.seen, hypothesis) * self.scale if known is None else known
+        if hypothesis in self.parts:
+            return self.parts[hypothesis]
+        return self.bank.moments(self.seen, hypothesis) * self.scale
 
 
 @dataclass(frozen=True)
@@ -353,13 +343,7 @@ def locate_metal(
 
 @dataclass(frozen=True)
 class RefitResult:
-    """Holds the result of one frame of the references.
-
-    Attributes
-    ----------
-    judge, find : callable
-        Work out `references` and `metal`.
-    """
+    """Holds the result of one frame; ``judge`` and ``find`` work out `references` and `metal`."""
 
     stamp_ns: int
     model: FieldModel  # the active model; the calibrated one itself while nothing has changed

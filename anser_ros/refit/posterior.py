@@ -24,11 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.kernels import fill_evidence, fill_precision, fill_products
+from anser_ros.refit.kernels import fill_evidence, fill_products
 from anser_ros.refit.prior import CloudPrior
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
+ComplexArray = NDArray[np.complex128]
 
 STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
 """Variances of a reading, in noise variances, that the evidence is summed over."""
@@ -41,7 +42,7 @@ class FrameEvidence:
     # (H, n, 2), whitened readings in each hypothesis' eigenvectors; real, imaginary
     projected: Single
     log_evidence: Array  # (H,)
-    # (H, A, 2), logarithm of the likelihood of each strength, real and imaginary part
+    # (H, 2, A), logarithm of the likelihood of each strength, of the real and imaginary part
     curve: Array
     strength: Array  # (H, 2, A), probability of each strength
     noise: float
@@ -61,12 +62,12 @@ def median(values: Array) -> float:
 
 
 def over_strengths(curve: Array) -> tuple[Array, Array]:
-    """Return log evidence (H,) and strength probabilities (H, 2, A) of the curves (H, A, 2)."""
-    top = curve.max(axis=1, keepdims=True)
+    """Return log evidence (H,) and strength probabilities of the curves, both (H, 2, A)."""
+    top = curve.max(axis=2, keepdims=True)
     weight = np.exp(curve - top)
-    total = weight.sum(axis=1, keepdims=True)
-    evidence = (top + np.log(total / len(STRENGTHS)))[:, 0].sum(axis=1)
-    return evidence, (weight / total).swapaxes(1, 2)
+    total = weight.sum(axis=2, keepdims=True)
+    evidence = (top + np.log(total / len(STRENGTHS))).sum(axis=(1, 2))
+    return evidence, weight / total
 
 
 MOST_TABLES, MOST_BLOCKS = 12, 128
@@ -96,28 +97,14 @@ class Eigenbasis:
 class Bank:
     """Holds all hypotheses for the references that are in use.
 
-    Parameters
-    ----------
-    priors : sequence of CloudPrior
-    rows : ndarray of int, shape (n,)
-        Readings in use, as rows of the priors' covariance; all K of a coil or none.
-    drift : ndarray, shape (all readings, K)
-        Reading that one deviation of each emitter's drift makes, in noise units.
-    slots, among : int
-        Places for hypotheses that are put in later, and how many these are chosen from: each is
-        as much less likely.
+    ``rows`` (n,) are the readings in use as rows of the priors' covariance, all K (``width``) of
+    a coil or none; ``drift`` (all readings, K) is what one deviation of each emitter's drift
+    makes of them, in noise units. The hypotheses of ``slots`` are put in later; these are chosen
+    ``among`` so many, and each is as much less likely.
 
-    Attributes
-    ----------
-    width : int
-        Readings of a coil, one for each of the K emitters.
-    bases, analysis : ndarray, shape (H, n, n) and (H n, n)
-        Eigenvectors of each hypothesis in columns; the same in rows, single precision.
-    spectra : ndarray, shape (H, n)
-        Their eigenvalues.
-    log_prior : ndarray, shape (H,)
-        Natural logarithm of the probability before data; minus infinity for an empty slot.
-    is_slot : ndarray of bool, shape (H,)
+    ``bases`` (H, n, n) are each hypothesis' eigenvectors in columns, ``analysis`` (H n, n) the
+    same in rows, ``spectra`` (H, n) the eigenvalues. ``log_prior`` (H,) is the logarithm of the
+    probability before data, minus infinity for an empty slot.
     """
 
     def __init__(
@@ -220,9 +207,9 @@ class Bank:
         """
         precision, log_det = self.precision(noise)
         count, n = self.spectra.shape
-        projected = np.empty((count, n, 2), dtype=np.float32)
-        curve, evidence = np.empty((count, len(STRENGTHS), 2)), np.empty(count)
-        strength = np.empty((count, 2, len(STRENGTHS)))
+        projected = np.zeros((count, n, 2), dtype=np.float32)
+        curve, evidence = np.zeros((count, 2, len(STRENGTHS))), np.zeros(count)
+        strength = np.zeros(curve.shape)
         fill_evidence(
             self.analysis, _rows(readings), precision, log_det, np.isfinite(self.log_prior),
             projected, curve, strength, evidence,
@@ -255,9 +242,9 @@ class Bank:
     def moments(self, seen: FrameEvidence, hypothesis: int) -> NDArray[np.complex128]:
         """Return the posterior mean of the layer's moments (N, K) in units of the noise."""
         synthesis = self.to_moments(hypothesis)
-        out = np.empty((len(synthesis), 2))
+        out = np.empty((len(synthesis), 2), dtype=np.float32)
         fill_products(synthesis, _rows(self.coefficients(seen, hypothesis)), out)
-        return out.view(np.complex128).reshape(-1, self.width)
+        return out.astype(np.float64).view(np.complex128).reshape(-1, self.width)
 
     def drifts(self, seen: FrameEvidence, hypothesis: int) -> tuple[Array, Array]:
         """Return mean (K, 2) and variance (K, 2) of the emitters' drift in prior deviations."""
@@ -286,10 +273,8 @@ class Bank:
 
 def _precision(spectra: Array, noise: float) -> tuple[Single, Array]:
     """Return inverse variances (H, A, n) and log determinants (H, A) of spectra (H, n)."""
-    shape = (len(spectra), len(STRENGTHS), spectra.shape[1])
-    inverse, log_det = np.empty(shape, dtype=np.float32), np.empty(shape[:2])
-    fill_precision(spectra, STRENGTHS, noise**2, inverse, log_det)
-    return inverse, log_det
+    variance = STRENGTHS[:, None] * spectra[:, None] + noise**2
+    return (1.0 / variance).astype(np.float32), np.log(variance).sum(axis=2)
 
 
 def _rows(columns: Array) -> Single:
@@ -309,8 +294,6 @@ def _whitening(drift: Array) -> Array:
         out -= np.outer(unit, unit) * (1.0 - 1.0 / np.sqrt(1.0 + norm[column] ** 2))
     return out
 
-
-ComplexArray = NDArray[np.complex128]
 
 MOST = len(STRENGTHS) - 1
 """Index of the largest of the `STRENGTHS`."""
@@ -361,18 +344,14 @@ def error_draws(
     """
     prior, power = posterior.prior, STRENGTHS[strength]
     count = prior.draw_readings.shape[1]
-    drawn = noise * _noise_draws(count, bank.drift, part)
-    readings = np.sqrt(power) * prior.draw_readings[bank.rows] + drawn
+    # Repeatable draws of the readings' noise and drift.
+    rng = np.random.default_rng(1 + part)
+    drawn = rng.standard_normal((len(bank.drift), count))
+    drawn += bank.drift @ rng.standard_normal((bank.width, count))
+    readings = np.sqrt(power) * prior.draw_readings[bank.rows] + noise * drawn
     gain = power / (power * posterior.values + noise**2)
     weights = gain[:, None] * (posterior.basis.T @ readings)
     return np.asarray(np.sqrt(power) * prior.draw_moments - posterior.synthesis @ weights)
-
-
-def _noise_draws(count: int, drift: Array, part: int) -> Array:
-    """Return repeatable draws of the readings' noise and drift, (n, D)."""
-    rng = np.random.default_rng(1 + part)
-    white = rng.standard_normal((len(drift), count))
-    return np.asarray(white + drift @ rng.standard_normal((drift.shape[1], count)))
 
 
 def error_modes(

@@ -31,6 +31,7 @@ from anser_ros.refit.layer import Layer
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 STEP_M = 1e-4
 """Step of the numerical derivative by a reference's position, m."""
@@ -117,9 +118,7 @@ class _Sources:
     """A cloud with its excitation and response, with the products that covariances share."""
 
     def __init__(self, cloud: Cloud, excitation: Array, response: Response) -> None:
-        self.excitation = excitation
-        self.volumes = cloud.volumes
-        self.response = response
+        self.volumes, self.excitation, self.response = cloud.volumes, excitation, response
         self.width = excitation.shape[1]
         # (M, K, K): scalar products of the emitters' fields at each source.
         self.likeness = np.einsum('mka,mla->mkl', excitation, excitation)
@@ -259,8 +258,6 @@ def _draws(
         moments[:, k] = projected.reshape(len(projected), -1) @ induced
     return readings.reshape(-1, N_SAMPLES), moments.reshape(-1, N_SAMPLES)
 
-
-Single = NDArray[np.float32]
 
 DIRECTIONS = 64
 """Directions that are kept. What more would add, poses feel a thousandth of."""

@@ -35,6 +35,7 @@ from anser_ros.stamps import NANO
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+Floats = NDArray[np.floating[Any]]
 
 FREE_M, FREE_RAD = 0.02, 0.2
 """Error of the pose at which a tool's readings are compared: any that matters."""
@@ -80,7 +81,6 @@ class CoilErrors:
     """
 
     def __init__(self, table: SensorTable, tools: ToolSettings) -> None:
-        self.names = table.name
         self._prior = np.maximum(coil_spread(len(table), tools), 1e-9)
         self._precision = np.diag(self._prior**-2.0)
         self._pull = np.zeros(len(self._prior))
@@ -150,8 +150,6 @@ def linearised(
     return ToolRows(at, axes, left, pose.reshape(-1, 6), own.reshape(count * k, -1))
 
 
-Floats = NDArray[np.floating[Any]]
-
 MEMORY_S = 2.0
 """Time over which the references' error stays the same: with half a second errors are a tenth
 larger, with five no smaller (four references, the head at the board)."""
@@ -195,14 +193,11 @@ class _Errors(NamedTuple):
     repeated: float
 
     def weighed(self, metal: Array, off: Array) -> tuple[tuple[Array, bool], float]:
-        """Return the factor of the covariance of readings; their log likelihood.
+        """Return the factor of the covariance of readings, and the log likelihood of their misfit.
 
         What is the same in many frames counts once in all of them. Of the coils' errors this is
-        known; a contradiction shows itself by a misfit that one frame's errors do not explain.
-        That there is one is no news in each of these frames either.
-
-        ``metal`` (n, n): covariance of the readings that the metal adds. ``off`` (n,): by how much
-        the readings are off.
+        known; a contradiction shows itself by a misfit (n,) that one frame's errors and the
+        ``metal`` (n, n) do not explain. That there is one is no news in each frame either.
         """
         known = self.pose + metal
         chol = cho_factor(self.white + self.lasting * self.own + known, lower=True)
@@ -341,7 +336,7 @@ class Witness:
         """Take in what tools read while there is no metal: whatever is odd is theirs."""
         for reading in readings:
             rows = linearised(reading, self._model, self._model.moments, self._turn)
-            errors = self._errors(reading)
+            errors = self._errors(reading.table)
             for part in (np.real, np.imag):
                 pose, own, left = part(rows.pose), part(rows.own), part(rows.left)
                 factor = np.linalg.cholesky(self._noise_of(len(left)) + pose @ pose.T)
@@ -374,19 +369,17 @@ class Witness:
         # what stays so for a shorter time counts as often as its correlation in time allows.
         lasting = 1.0 + MEMORY_S / self._step_s
         repeated = 1.0 + 2.0 * CONTRADICTION_S / self._step_s
-        learnt = self._errors(reading)
+        learnt = self._errors(reading.table)
         mean, covariance = learnt.posterior
         white = self._noise_of(len(rows.left))
-        owns = [rows.own.real, rows.own.imag]
-        errors = [
-            _Errors(white, own @ covariance @ own.T, pose @ pose.T, lasting, repeated)
-            for own, pose in zip(owns, (rows.pose.real, rows.pose.imag), strict=True)
-        ]
-        left = (rows.left.real, rows.left.imag)
-        for error, own, values in zip(errors, owns, left, strict=True):
-            nothing = np.zeros_like(white)
-            evidence[bank.names[0]] += error.weighed(nothing, values - own @ mean)[1]
-        known = []
+        owns, errors, known = [], [], []
+        for part in (np.real, np.imag):
+            pose, own, left = part(rows.pose), part(rows.own), part(rows.left)
+            spread = own @ covariance @ own.T
+            error = _Errors(white, spread, pose @ pose.T, lasting, repeated)
+            evidence[bank.names[0]] += error.weighed(np.zeros_like(white), left - own @ mean)[1]
+            owns.append(own)
+            errors.append(error)
         for name, state in self._filters.items():
             h = bank.names.index(name)
             layer, length = bank.prior(h).layer, reading.table.length
@@ -404,11 +397,10 @@ class Witness:
         for rows_of_errors, values in known:
             learnt.learn(rows_of_errors, values)
 
-    def _errors(self, reading: ToolReading) -> CoilErrors:
-        names = reading.table.name
-        if names not in self._tool_errors:
-            self._tool_errors[names] = CoilErrors(reading.table, self._tools)
-        return self._tool_errors[names]
+    def _errors(self, table: SensorTable) -> CoilErrors:
+        if table.name not in self._tool_errors:
+            self._tool_errors[table.name] = CoilErrors(table, self._tools)
+        return self._tool_errors[table.name]
 
     def _noise_of(self, count: int) -> Array:
         nominal = self._tables.settings.accuracy.flux_noise_t

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import FieldFunction, default_clouds, excitation_for
-from anser_ros.refit.layer import Layer, bottom_layer
+from anser_ros.refit.layer import bottom_layer
 from anser_ros.refit.posterior import STRENGTHS
 from anser_ros.refit.prior import survey_variants, vector_basis
 from anser_ros.settings import Accuracy
@@ -78,11 +78,8 @@ class FreeDipoles:
             if evidence > best:
                 shrink = (STRENGTHS[:, None] / variance).T @ (weight / total)
                 best, kept = evidence, transfer @ (shrink * projected)
-        k = flux.shape[1]
-        phasors = np.asarray(kept[:, :k] + 1j * kept[:, k:], dtype=np.complex128)
-        return self._with(self._layer, phasors * self._noise)
-
-    def _with(self, layer: Layer, moments: ComplexArray) -> FieldModel:
+        k, layer = flux.shape[1], self._layer
+        moments = self._noise * (kept[:, :k] + 1j * kept[:, k:])
         rows = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
         base = self.model.moments.copy()
         base[rows] += moments[: rows.size]

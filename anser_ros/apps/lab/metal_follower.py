@@ -68,15 +68,10 @@ def places_around(volume: TrackedVolume, known: KnownMetal) -> Array:
 def likely_starts(
     scene: Scene, tools: ToolSettings, reading: ToolReading, places: Array, most: int
 ) -> tuple[list[Array], float]:
-    """Return poses (6,) of the metal that explain a tool's readings best, the best first, apart.
+    """Return poses (6,) of the metal that explain a tool's readings best, the best first, apart,
+    and the logarithm of how much more likely the first makes the readings than no metal does.
 
     ``reading``: at a pose that is right to some centimetres. ``places`` (P, 3): to be tried, m.
-
-    Returns
-    -------
-    starts : list of ndarray
-    gain : float
-        Logarithm of how much more likely the best one makes the readings than no metal does.
     """
     sigma = coil_spread(len(reading.table), tools)
     # What a pose that is off leaves beyond the first order would be taken for metal.
@@ -186,23 +181,16 @@ class KnownMetalFollower:
         state = predicted(self._chosen.state, seconds)
         growth = max(self._chosen.ratio, 1.0)
         model, placed = field_of(self._scene, state, self._near, MODES, growth)
-        reason = ''
-        if self._chosen.ratio > DOUBTFUL:
-            reason = (
-                f'{self._known.name} leaves {math.sqrt(self._chosen.ratio):.1f} times as much of '
-                f'the readings as expected'
-            )
+        reason, name = '', self._known.name
         driven = placed.strongest_t() / self._known.strongest_t
         nearest = placed.nearest_m(Coils(self._near, np.zeros_like(self._near), None))
         if driven > STRONGER:
-            reason = (
-                f'{self._known.name} is driven {driven:.1f} times as strongly as it was learnt'
-            )
+            reason = f'{name} is driven {driven:.1f} times as strongly as it was learnt'
         elif nearest < NEARER * self._known.nearest_m:
-            reason = (
-                f'a coil is {nearest * 1e3:.0f} mm from {self._known.name}, nearer than it was '
-                f'learnt'
-            )
+            reason = f'a coil is {nearest * 1e3:.0f} mm from {name}, nearer than it was learnt'
+        elif self._chosen.ratio > DOUBTFUL:
+            times = math.sqrt(self._chosen.ratio)
+            reason = f'{name} leaves {times:.1f} times as much of the readings as expected'
         return model, Withheld(MODEL_DOUBTFUL, reason) if reason else None
 
     def take(
@@ -288,10 +276,7 @@ def models_of(path: str | os.PathLike[str]) -> Callable[[PreparedSession], Frame
 class KnownMetalModels(FrameModels):
     """Gives each frame of a session the field with known metal where its tools say that it is.
 
-    Attributes
-    ----------
-    summary : RefitSummary
-        In how many frames the metal was followed.
+    The ``summary`` counts the frames in which the metal was followed.
 
     Raises
     ------

@@ -24,7 +24,6 @@ from anser_ros.apps.lab.metal_lattice import (
 )
 from anser_ros.errors import BagError, FitError
 from anser_ros.field.measurements import Measurements
-from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import Excitation
 from anser_ros.refit.live_refit import LiveRefit
@@ -309,10 +308,9 @@ SAME_TIME_S = 1e-4
 def learn(
     prepared: PreparedSession, name: str, report: Report = lambda stage, share: None
 ) -> KnownMetal:
-    """Learn the metal that moves in a session.
+    """Learn the metal that moves in a session, and report the stages and their shares done.
 
-    The session must have references, a baseline without the metal, and a tool that an optical
-    tracker follows. ``report`` is called with the stage and its share done.
+    It must have references, a baseline without the metal, and a tool with optical poses.
 
     Raises
     ------
@@ -378,7 +376,9 @@ def metal_frames(
     for row in there[np.linspace(0, there.size - 1, count).astype(int)].tolist():
         change = (reference.flux[row] - baseline.flux) * phase.conj()
         good = np.isfinite(change).all(axis=1) & reference.valid[row]
-        readings = [_of_references(reference.sensors.select(np.flatnonzero(good)), change[good])]
+        fixed, read = reference.sensors.select(np.flatnonzero(good)), change[good]
+        coils = Coils(fixed.position, fixed.axis, fixed.length)
+        readings = [CoilReadings(coils, read, np.zeros((2 * read.size, 0)))]
         for tool in session.tools:
             near = np.flatnonzero(np.abs(tool.time - reference.time[row]) < SAME_TIME_S)
             if near.size and tool.has_pose[near[0]] and tool.valid[near[0]].any():
@@ -392,11 +392,6 @@ def metal_frames(
     if not any(len(frame.readings) > 1 for frame in out):
         raise BagError(f'{session.path}: no tool has optical poses while metal is there')
     return out
-
-
-def _of_references(sensors: SensorTable, change: ComplexArray) -> CoilReadings:
-    coils = Coils(sensors.position, sensors.axis, sensors.length)
-    return CoilReadings(coils, change, np.zeros((2 * change.size, 0)))
 
 
 def _of_tool(
