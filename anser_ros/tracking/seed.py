@@ -103,10 +103,7 @@ def _look(  # type: ignore[no-untyped-def]
     ``normal`` (3, 3) and ``gradient`` (3,) are left for a step of the position.
     """
     width = flux.shape[0]
-    place = np.empty((1, 3))
-    for i in range(3):
-        place[0, i] = position[i]
-    fill_fields(place, dipoles, basis)
+    fill_fields(position.reshape(1, 3), dipoles, basis)
     f = np.dot(basis[0], moments)
     for k in range(width):
         for i in range(9):
@@ -148,7 +145,9 @@ def descend_projected(  # type: ignore[no-untyped-def]
     a point coil) and the evaluations used.
     """
     width = flux.shape[0]
-    white, basis = flux * inverse_sigma, np.empty((1, 9, dipoles.shape[1]))
+    basis, white = np.empty((1, 9, dipoles.shape[1])), np.empty(width)
+    for k in range(width):
+        white[k] = flux[k] * inverse_sigma[k]
     tangent, plane, residual = np.empty((2, 3)), np.empty((2, width)), np.empty(width)
     normal, gradient, new_normal, new_gradient = (
         np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
@@ -176,7 +175,8 @@ def descend_projected(  # type: ignore[no-untyped-def]
         if trial < chi2:
             done = chi2 - trial < NEAR * chi2
             chi2 = trial
-            position[:], axis[:] = new_position, new_axis
+            for i in range(3):
+                position[i], axis[i] = new_position[i], new_axis[i]
             normal, new_normal = new_normal, normal
             gradient, new_gradient = new_gradient, gradient
             damping *= 0.2

@@ -138,13 +138,42 @@ def solve_coil(
             f'the model has {width} flux components, got flux {flux.shape} and whitening '
             f'{whitening.shape}'
         )
-    r, n = np.array(position, dtype=np.float64), np.array(axis, dtype=np.float64)
-    normal, residual = np.empty((6, 6)), np.empty(width)
-    chi2, used, converged = descend(
-        r, n, length_m, flux, whitening, field.columns, field.moments, low, high,
-        MAX_EVALUATIONS, normal, residual,
+    (solution,) = solve_coils(
+        field, flux[None], whitening[None], np.array([position], dtype=np.float64),
+        np.array([axis], dtype=np.float64), low, high, np.array([length_m]),
     )  # fmt: skip
-    return CoilSolution(r, n, chi2, normal, residual, used, converged)
+    return solution
+
+
+def solve_coils(
+    field: RealField,
+    flux: Array,
+    whitening: Array,
+    positions: Array,
+    axes: Array,
+    low: Array,
+    high: Array,
+    lengths: Array,
+) -> list[CoilSolution]:
+    """Fit the poses of S coils, each from a start near it, which is written over.
+
+    The arguments are those of `solve_coil` with an axis of coils in front, and nothing is checked.
+    """
+    normals, residuals, found = (
+        np.empty((len(flux), 6, 6)),
+        np.empty(flux.shape),
+        np.empty((len(flux), 3)),
+    )
+    descend(
+        positions, axes, lengths, flux, whitening, field.columns, field.moments, low, high,
+        MAX_EVALUATIONS, normals, residuals, found,
+    )  # fmt: skip
+    return [
+        CoilSolution(position, axis, chi2, normal, residual, int(used), bool(converged))
+        for position, axis, normal, residual, (chi2, used, converged) in zip(
+            positions, axes, normals, residuals, found.tolist(), strict=True
+        )
+    ]
 
 
 ROLL_VARIANCE = math.pi**2 / 3.0
