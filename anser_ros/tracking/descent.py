@@ -1,5 +1,4 @@
-"""Compiles the kernels of a single coil's solve: flux and slopes, whitening, damped steps,
-descent.
+"""Compiles the kernels of a single coil's solve: whitening, damped steps, descent.
 
 Compiled; `solve` is what calls them. A coil's pose is its position and its unit axis, which moves
 by a two-parameter step in its tangent plane. The damping is Marquardt's (Nocedal and Wright,
@@ -11,8 +10,7 @@ import math
 import numpy as np
 
 from anser_ros.kernel_cache import kernel
-from anser_ros.physics.constants import DIPOLE_CONSTANT
-from anser_ros.physics.dipole import GAUSS_OFFSET
+from anser_ros.physics.dipole import fill_coil_basis
 from anser_ros.physics.rotations import fill_tangent
 
 LARGEST_MOVE_M, LARGEST_TURN = 0.04, 0.6
@@ -30,55 +28,6 @@ CONVERGED_CHI2 = 1e-6
 TRUSTED_CHI2, TRUSTED_MOVE_M, TRUSTED_TURN = 0.03, 50e-6, 1e-3
 """Fall of chi-square, move and turn up to which a step is taken without a look at where it leads:
 what a sixth of a sigma leaves, of second order, is less than a thousandth of a sigma."""
-
-
-@kernel
-def fill_coil_basis(point, axis, length, dipoles, basis):  # type: ignore[no-untyped-def]
-    """Write what each unit dipole does to a coil into ``basis``, shape (7, N).
-
-    Row 0 holds the flux, rows 1 to 3 its derivatives by the position, rows 4 to 6 those by the
-    free axis vector (the Gauss points move with it). One product with the moments gives all of it.
-    ``dipoles`` (6, N): `solve.RealField.columns`. Loops run along its rows and write few arrays
-    each, so that they go through vector registers.
-    """
-    half = length * GAUSS_OFFSET
-    count = 1 if half == 0.0 else 2
-    scale = DIPOLE_CONSTANT / count
-    nx, ny, nz = axis[0], axis[1], axis[2]
-    px, py, pz = dipoles[0], dipoles[1], dipoles[2]
-    vx, vy, vz = dipoles[3], dipoles[4], dipoles[5]
-    flux, work = basis[0], np.empty((4, dipoles.shape[1]))
-    along, across, away, near = work[0], work[1], work[2], work[3]
-    for s in range(count):
-        h = half * (1 - 2 * s)
-        x, y, z = point[0] + h * nx, point[1] + h * ny, point[2] + h * nz
-        for j in range(px.shape[0]):
-            dx, dy, dz = x - px[j], y - py[j], z - pz[j]
-            ux, uy, uz = vx[j], vy[j], vz[j]
-            inv2 = 1.0 / (dx * dx + dy * dy + dz * dz)
-            k3 = scale * inv2 * math.sqrt(inv2)
-            k5 = 3.0 * k3 * inv2
-            du = dx * ux + dy * uy + dz * uz
-            dn = dx * nx + dy * ny + dz * nz
-            nu = nx * ux + ny * uy + nz * uz
-            a = k5 * du
-            along[j], across[j], near[j] = a, k5 * dn, k3
-            away[j] = k5 * (nu - 5.0 * du * dn * inv2)
-            value = a * dn - k3 * nu
-            flux[j] = value if s == 0 else flux[j] + value
-        for i in range(3):
-            n, at = axis[i], point[i] + h * axis[i]
-            places, directions = dipoles[i], dipoles[3 + i]
-            slope, turn = basis[1 + i], basis[4 + i]
-            for j in range(places.shape[0]):
-                d, u = at - places[j], directions[j]
-                g = along[j] * n + across[j] * u + away[j] * d
-                b = along[j] * d - near[j] * u + h * g
-                if s == 0:
-                    slope[j], turn[j] = g, b
-                else:
-                    slope[j] += g
-                    turn[j] += b
 
 
 @kernel
@@ -232,7 +181,7 @@ def descend(  # type: ignore[no-untyped-def]
     ``found`` (S, 3): chi-square, evaluations used, whether it converged.
     """
     width = fluxes.shape[1]
-    basis = np.empty((7, dipoles.shape[1]))
+    basis = np.empty((1, 7, dipoles.shape[1]))
     white, trial_white, trial_residual = (
         np.empty((7, width)),
         np.empty((7, width)),
@@ -245,8 +194,9 @@ def descend(  # type: ignore[no-untyped-def]
     for s in range(positions.shape[0]):
         position, axis, flux, weights = positions[s], axes[s], fluxes[s], whitening[s]
         full, residual = normals[s], residuals[s]
-        fill_coil_basis(position, axis, lengths[s], dipoles, basis)
-        chi2 = _whiten(flux, np.dot(basis, moments), weights, residual, white)
+        length = lengths[s : s + 1]
+        fill_coil_basis(position.reshape(1, 3), axis.reshape(1, 3), length, dipoles, basis)
+        chi2 = _whiten(flux, np.dot(basis[0], moments), weights, residual, white)
         _normal_equations(white, axis, tangent, full, normal, gradient)
         used, damping, growth, converged = 1, FIRST_DAMPING, 2.0, False
         while used < budget and not converged and damping <= MOST_DAMPING:
@@ -263,9 +213,11 @@ def descend(  # type: ignore[no-untyped-def]
                 chi2 -= promised
                 converged = True
             else:
-                fill_coil_basis(trial_position, trial_axis, lengths[s], dipoles, basis)
+                fill_coil_basis(
+                    trial_position.reshape(1, 3), trial_axis.reshape(1, 3), length, dipoles, basis
+                )
                 used += 1
-                model = np.dot(basis, moments)
+                model = np.dot(basis[0], moments)
                 trial = _whiten(flux, model, weights, trial_residual, trial_white)
                 if not trial <= chi2:
                     damping = max(damping * growth, LEAST_RAISED)

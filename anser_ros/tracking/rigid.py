@@ -15,16 +15,14 @@ from scipy.linalg import solve_triangular
 
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import kernel
-from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.physics.dipole import dipole_field, fill_coil_basis
 from anser_ros.physics.rotations import nearest_rotation
-from anser_ros.physics.sensor import along_each_axis
 from anser_ros.tracking.descent import (
     CONVERGED_CHI2,
     FIRST_DAMPING,
     LEAST_RAISED,
     TRUSTED_CHI2,
     damped_step,
-    fill_coil_basis,
     limit_step,
 )
 from anser_ros.tracking.seed import SeedGrid
@@ -39,16 +37,17 @@ def _look(  # type: ignore[no-untyped-def]
 
     It is the residual (S, 2K), the whitened residual (row 0) and whitened derivatives by
     translation and turn, both in fg (7, S 2K), and the normal equations (6, 6) and (6,). Returns
-    chi-square. ``basis`` (7 S, N) is written over.
+    chi-square. ``basis`` (S, 7, N) is written over.
     """
     position, rotation, residual, white, information, gradient = pose
     coils, width = flux.shape
-    arms, turned, place = np.dot(offsets, rotation.T), np.dot(axes, rotation.T), np.empty(3)
+    arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
+    places = np.empty((coils, 3))
     for s in range(coils):
         for i in range(3):
-            place[i] = position[i] + arms[s, i]
-        fill_coil_basis(place, turned[s], lengths[s], dipoles, basis[7 * s : 7 * s + 7])
-    model = np.dot(basis, moments)
+            places[s, i] = position[i] + arms[s, i]
+    fill_coil_basis(places, turned, lengths, dipoles, basis)
+    model = np.dot(basis.reshape(7 * coils, dipoles.shape[1]), moments)
     for s in range(coils):
         m = model[7 * s : 7 * s + 7]
         for k in range(width):
@@ -118,7 +117,7 @@ def descend_body(  # type: ignore[no-untyped-def]
     Returns chi-square, evaluations used, whether it converged; position and rotation; residual,
     whitened residual with derivatives, and information as `_look` fills them at its last pose.
     """
-    basis, size = np.empty((7 * flux.shape[0], dipoles.shape[1])), flux.size
+    basis, size = np.empty((flux.shape[0], 7, dipoles.shape[1])), flux.size
     step, factor = np.empty(6), np.empty((6, 6))
     pose = (
         position, rotation, np.empty(flux.shape), np.empty((7, size)), np.empty((6, 6)),
@@ -354,13 +353,8 @@ def start_from_grid(
     At every grid point the emitters' fields are turned to fit the fluxes (S, 2K), T, of all coils
     at once, the lever arms neglected; the poses with the least misfit come first.
     """
-    total = len(grid.points)
-    complex_moments = field.moments.view(np.complex128)
-    points, axes = along_each_axis(grid.points)
-    model, _, _ = flux_jacobian(
-        points, axes, None, field.positions, field.directions, complex_moments
-    )
-    fields = model.view(np.float64).reshape(total, 3, -1)
+    moments = field.moments.view(np.complex128)
+    fields = dipole_field(grid.points, field.positions, field.directions, moments).view(np.float64)
     measured = coils.axes.T @ flux
     rotations = nearest_rotation(np.einsum('gik,jk->gij', fields, measured))
     predicted = np.einsum('sj,gij,gik->gsk', coils.axes, rotations, fields, optimize=True)

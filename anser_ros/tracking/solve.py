@@ -21,6 +21,7 @@ from scipy.special import chdtri
 
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import kernel
+from anser_ros.physics.dipole import dipole_rows
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.tracking.descent import damped_step, descend
 
@@ -72,7 +73,7 @@ class RealField:
     @cached_property
     def columns(self) -> Array:
         """Return coordinates of the positions and of the directions in rows, shape (6, N)."""
-        return np.ascontiguousarray(np.concatenate([self.positions, self.directions], axis=1).T)
+        return dipole_rows(self.positions, self.directions)
 
     @property
     def emitters(self) -> int:
@@ -138,11 +139,14 @@ def solve_coil(
             f'the model has {width} flux components, got flux {flux.shape} and whitening '
             f'{whitening.shape}'
         )
-    (solution,) = solve_coils(
-        field, flux[None], whitening[None], np.array([position], dtype=np.float64),
-        np.array([axis], dtype=np.float64), low, high, np.array([length_m]),
+    r, n = np.array(position, dtype=np.float64), np.array(axis, dtype=np.float64)
+    normal, residual, found = np.empty((6, 6)), np.empty(width), np.empty((1, 3))
+    descend(
+        r[None], n[None], np.array([length_m]), flux[None], whitening[None], field.columns,
+        field.moments, low, high, MAX_EVALUATIONS, normal[None], residual[None], found,
     )  # fmt: skip
-    return solution
+    chi2, used, converged = found[0].tolist()
+    return CoilSolution(r, n, chi2, normal, residual, int(used), bool(converged))
 
 
 def solve_coils(
