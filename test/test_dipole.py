@@ -11,14 +11,12 @@
 | field turned with its source      | turned field                                      |
 """
 
-import math
-
 import magpylib
 import numpy as np
 import pytest
 from metal_world import dipole_field, dipole_gradient
 
-from anser_ros.physics.constants import DIPOLE_CONSTANT, MU_0
+from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.physics.dipole import (
     field_basis,
     flux_basis,
@@ -38,10 +36,6 @@ def world(rng):
     axes = rng.normal(size=(5, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     return points, axes, positions, directions
-
-
-def test_constants():
-    assert pytest.approx(MU_0 / (4 * math.pi)) == DIPOLE_CONSTANT == pytest.approx(1e-7)
 
 
 def test_field_on_axis_and_equator():

@@ -37,23 +37,18 @@ def one_coil(kind, geometry, rotation=0.0):
     return build_board(kind, geometry, ['coil0'], np.zeros((1, 3)), np.array([rotation]), [1e3])
 
 
-def test_sign_of_the_textbook():
-    """A current along +z turns the field counter-clockwise: at +x it points to +y."""
-    field = segment_field(
-        np.array([[0, 0, -1.0]]), np.array([[0, 0, 1.0]]), np.array([[0.1, 0, 0]])
-    )
-    assert field[0, 1] > 0
-    assert field[0, 0] == field[0, 2] == 0
-
-
 def test_long_wire_is_the_endless_one():
-    """B = mu0 I / (2 pi r) times the sine of the angle that its half is seen under."""
+    """B = mu0 I / (2 pi r) times the sine of the angle that its half is seen under.
+
+    A current along +z turns the field counter-clockwise: at +x it points to +y.
+    """
     half, away = 2.0, 0.02
     field = segment_field(
         np.array([[0, 0, -half]]), np.array([[0, 0, half]]), np.array([[away, 0, 0]]), 3.0
     )
     endless = MU_0 * 3.0 / (2 * math.pi * away)
     assert field[0, 1] == pytest.approx(endless * half / math.hypot(half, away), rel=1e-9)
+    assert field[0, 0] == field[0, 2] == 0
 
 
 def test_segments_are_magpylibs(rng):
@@ -63,16 +58,11 @@ def test_segments_are_magpylibs(rng):
     np.testing.assert_allclose(loop_field(corners, points, 2.5), source.getB(points), rtol=1e-7)
 
 
-def test_points_in_line_with_a_segment_are_no_trouble():
-    start, end = np.array([[0, 0, 0.0]]), np.array([[0, 0, 1.0]])
-    field = segment_field(start, end, np.array([[0, 0, 1.5], [1e-9, 0, 2.0]]))
-    assert np.isfinite(field).all()
-    assert np.abs(field).max() < 1e-12
-
-
-def test_segments_without_length_make_no_field():
-    zero = np.zeros((1, 3))
-    assert (segment_field(zero, zero, np.ones((2, 3))) == 0).all()
+def test_points_in_line_with_a_segment_and_segments_without_length_have_no_field():
+    start, end = np.zeros((1, 3)), np.array([[0, 0, 1.0]])
+    points = np.array([[0, 0, 1.5], [1e-9, 0, 2.0]])
+    assert np.abs(segment_field(start, end, points)).max() < 1e-12
+    assert (segment_field(start, start, points) == 0).all()
 
 
 def test_circle_on_its_axis():
@@ -266,11 +256,3 @@ def test_a_coil_too_big_for_the_nodes_is_refused():
     board = one_coil('rectangular_loop', {'side_x_m': 3.0, 'side_y_m': 3.0})
     with pytest.raises(FitError, match='miss the nominal field'):
         nominal_model(board)
-
-
-def test_a_board_s_field_is_each_loop_on_its_own():
-    board = anser_board()
-    points = np.array([[0.0, 0.02, 0.1]])
-    fields = board.field(points)
-    assert fields.shape == (1, 8, 3)
-    np.testing.assert_allclose(fields[:, 3], loop_field(board.paths[3], points, board.current_a))

@@ -6,10 +6,8 @@ from tracking_world import NOISE_T, certain_model
 
 from anser_ros.errors import TrackingError
 from anser_ros.physics import rotations
-from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.rotations import fill_tangent, nearest_rotation
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.tracking.descent import fill_coil_basis
 from anser_ros.tracking.seed import descend_projected
 from anser_ros.tracking.solve import (
     UNKNOWN_VARIANCE,
@@ -43,21 +41,6 @@ def nearby(rng, position, axis, move=2e-3, turn=0.035):
     step = rng.normal(size=3)
     other = axis + turn * np.cross(axis, rng.normal(size=3))
     return position + move * step / np.linalg.norm(step), other / np.linalg.norm(other)
-
-
-@pytest.mark.parametrize('length', [0.0, 0.008])
-def test_kernel_is_the_public_jacobian(rng, length):
-    position, axis = pose(rng)
-    basis = np.empty((7, len(FIELD.positions)))
-    fill_coil_basis(position, axis, length, FIELD.columns, basis)
-    flux, *slopes = basis @ FIELD.moments
-    value, by_place, by_axis = flux_jacobian(
-        position[None], axis[None], np.array([length]), MODEL.positions, MODEL.directions,
-        MODEL.moments,
-    )  # fmt: skip
-    np.testing.assert_allclose(flux, value.view(np.float64)[0], rtol=1e-12)
-    np.testing.assert_allclose(slopes[:3], by_place.view(np.float64)[0], rtol=1e-10)
-    np.testing.assert_allclose(slopes[3:], by_axis.view(np.float64)[0], rtol=1e-10)
 
 
 @pytest.mark.parametrize('length', [0.0, 0.008])

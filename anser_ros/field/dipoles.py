@@ -85,12 +85,7 @@ def symmetry_axis(
 ) -> SymmetryAxis | None:
     """Return the axis on which all dipoles lie and along which all moments point, if there is one.
 
-    Parameters
-    ----------
-    positions, directions : ndarray, shape (N, 3)
-        Places (m) and unit directions of the dipoles, frame fg.
-    moments : ndarray, shape (N, K)
-        A m^2, for each emitter.
+    Positions (m) and unit directions (N, 3) are in the frame fg, moments (N, K) in A m^2.
     """
     size = np.abs(moments)
     strong = size > OFF_AXIS * size.max()

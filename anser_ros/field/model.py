@@ -54,9 +54,7 @@ class ReferenceReadings:
 
 def readings_document(readings: ReferenceReadings) -> dict[str, Any]:
     """Return readings as plain lists and mappings, a row per sensor."""
-    parts = np.stack([readings.flux.real, readings.flux.imag], axis=2).reshape(
-        len(readings.name), -1
-    )
+    parts = np.ascontiguousarray(readings.flux).view(np.float64)
     rows = np.concatenate([readings.position, readings.axis, parts], axis=1)
     return {
         'sigma_t': readings.sigma_t,
@@ -98,18 +96,9 @@ class ScanGaps:
     moments: Array
 
     def sigma_t(self, points: Array, axes: Array, lengths: Array) -> Array:
-        """Return how far the modelled flux may be off, T a phasor component.
+        """Return how far the modelled flux may be off, T a phasor component, shape (F, S).
 
-        Parameters
-        ----------
-        points, axes : ndarray, shape (F, S, 3)
-            Sensor centres (m) and unit axes, frame fg.
-        lengths : ndarray, shape (S,)
-            Coil lengths, m.
-
-        Returns
-        -------
-        ndarray, shape (F, S)
+        Sensor centres (m) and unit axes (F, S, 3) are in the frame fg, coil ``lengths`` (S,) in m.
         """
         frames, sensors = points.shape[:2]
         basis = flux_basis(
@@ -236,16 +225,10 @@ class FieldModel:
     def with_dipoles(
         self, positions: Array, directions: Array, moments: ComplexArray
     ) -> 'FieldModel':
-        """Return this model with further dipoles, such as those of metal, added.
+        """Return this model with M further dipoles, such as those of metal, that count as certain.
 
-        The modes of uncertainty stay the same: the added dipoles count as certain.
-
-        Parameters
-        ----------
-        positions, directions : ndarray, shape (M, 3)
-            Positions (m) and unit directions, frame fg.
-        moments : ndarray, shape (M, K), complex
-            Moments, A m^2.
+        ``positions`` (m) and unit ``directions`` (M, 3) are in the frame fg, ``moments`` (M, K) in
+        A m^2.
         """
         modes = self.modes
         if modes is not None:
@@ -262,16 +245,8 @@ class FieldModel:
 
 def to_document(model: FieldModel) -> dict[str, Any]:
     """Return the model as plain lists and mappings, ready to be written to a text file."""
-    table = np.concatenate(
-        [
-            model.positions,
-            model.directions,
-            np.stack([model.moments.real, model.moments.imag], axis=2).reshape(
-                len(model.moments), -1
-            ),
-        ],
-        axis=1,
-    )
+    parts = np.ascontiguousarray(model.moments, dtype=np.complex128).view(np.float64)
+    table = np.concatenate([model.positions, model.directions, parts], axis=1)
     document: dict[str, Any] = {
         'schema': SCHEMA,
         'fingerprint': model.fingerprint,
@@ -309,8 +284,8 @@ def to_document(model: FieldModel) -> dict[str, Any]:
     if model.gaps is not None:
         document['gaps'] = gaps_document(model.gaps)
     if model.modes is not None:
-        parts = np.stack([model.modes.real, model.modes.imag], axis=3)
-        document['modes'] = parts.reshape(*model.modes.shape[:2], -1).tolist()
+        modes = np.ascontiguousarray(model.modes, dtype=np.complex128)
+        document['modes'] = modes.view(np.float64).tolist()
     return document
 
 

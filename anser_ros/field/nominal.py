@@ -148,20 +148,10 @@ def _changes(shape: Array, current_a: float, dipoles: _CoilDipoles, allowed: Tol
 
 
 def nominal_model(board: Board, tolerances: Tolerances | None = None) -> FieldModel:
-    """Express the field of a drawn board by dipoles.
+    """Express the field of a drawn board by dipoles; its tolerances become the model's ``modes``.
 
-    Parameters
-    ----------
-    board : Board
-        The board as drawn.
-    tolerances : Tolerances, optional
-        How far a real board may be from the drawing; they become the model's ``modes``.
-
-    Returns
-    -------
-    FieldModel
-        Its provenance holds ``heldout_relative_rms`` and ``heldout_relative_max``, the misfit
-        relative to a coil's field at points above `LOWEST_M` that took no part in the fit.
+    The provenance holds ``heldout_relative_rms`` and ``heldout_relative_max``, the misfit relative
+    to a coil's field at points above `LOWEST_M` that took no part in the fit.
 
     Raises
     ------

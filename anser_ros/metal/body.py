@@ -150,13 +150,9 @@ def body_sizes(kind: str) -> tuple[Array, ...]:
 
 
 def centre_sigma(polarisability: NDArray[np.complexfloating]) -> float:
-    """Return how well the centre of a body of unknown shape is known at best, m.
+    """Return how well the centre of a body of a polarisability (3, 3), m^3, is known at best, m.
 
-    Parameters
-    ----------
-    polarisability : ndarray, shape (3, 3)
-        Of the whole body, m^3. Its radius is taken for that of a perfectly conducting ball which
-        is as strong, 2 pi r^3.
+    Its radius is taken for that of a perfectly conducting ball which is as strong, 2 pi r^3.
     """
     strength = float(np.linalg.norm(polarisability)) / np.sqrt(3)
     return float(ODD * (strength / (2 * np.pi)) ** (1 / 3))

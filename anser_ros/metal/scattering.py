@@ -65,17 +65,9 @@ class Shapes:
         return np.asarray(np.swapaxes(flat @ field.reshape(shape), -1, -2))
 
     def received(self, centre: Array, centres: Array, axes: Array, lengths: Array) -> Array:
-        """Return amplitudes of unit dipoles in the sensors' places, T / (A m^2).
+        """Return amplitudes (..., S, M) of unit dipoles in the sensors' places, T / (A m^2).
 
-        Parameters
-        ----------
-        centre : ndarray, shape (..., 3)
-        centres, axes : ndarray, shape (..., S, 3)
-        lengths : ndarray, shape (S,)
-
-        Returns
-        -------
-        ndarray, shape (..., S, M)
+        The ``centre`` has the shape (..., 3), the sensors' centres and axes (..., S, 3).
         """
         points = centre[..., None, :] + self.offsets
         if np.any(lengths):

@@ -32,16 +32,9 @@ def _add_segments(starts, ends, points, factor, out):  # type: ignore[no-untyped
     for p in range(points.shape[0]):
         bx, by, bz = 0.0, 0.0, 0.0
         for s in range(starts.shape[0]):
-            ax, ay, az = (
-                points[p, 0] - starts[s, 0],
-                points[p, 1] - starts[s, 1],
-                points[p, 2] - starts[s, 2],
-            )
-            cx, cy, cz = (
-                points[p, 0] - ends[s, 0],
-                points[p, 1] - ends[s, 1],
-                points[p, 2] - ends[s, 2],
-            )
+            ax, cx = points[p, 0] - starts[s, 0], points[p, 0] - ends[s, 0]
+            ay, cy = points[p, 1] - starts[s, 1], points[p, 1] - ends[s, 1]
+            az, cz = points[p, 2] - starts[s, 2], points[p, 2] - ends[s, 2]
             a = np.sqrt(ax * ax + ay * ay + az * az)
             c = np.sqrt(cx * cx + cy * cy + cz * cz)
             product = a * c
@@ -132,18 +125,7 @@ class Board:
         return tuple(self.shape @ turn.T + centre for turn, centre in pairs)
 
     def field(self, points: NDArray[np.generic]) -> Array:
-        """Return the field of every coil at its nominal current.
-
-        Parameters
-        ----------
-        points : ndarray, shape (P, 3)
-            Where the field is wanted, m, frame fg.
-
-        Returns
-        -------
-        ndarray, shape (P, K, 3)
-            Flux density, T, frame fg.
-        """
+        """Return each coil's field (P, K, 3), T, at its nominal current; points (P, 3) in m."""
         return np.stack([loop_field(path, points, self.current_a) for path in self.paths], axis=1)
 
     def moments(self) -> Array:
@@ -286,28 +268,11 @@ def build_board(
     rotations_deg: NDArray[np.generic],
     frequencies_hz: Sequence[float],
 ) -> Board:
-    """Draw all coils of an emitter board.
+    """Draw all K coils of an emitter board as closed current paths.
 
-    Parameters
-    ----------
-    kind : str
-        One of `KINDS`.
-    geometry : mapping
-        The dimensions that the kind needs (``turns``, ``side_m``, ``pitch_m``, ...; SI units) and
-        ``current_a``, which is 1 A by default. Other keys are ignored.
-    names : sequence of str, length K
-        Names of the coils.
-    centres_m : ndarray, shape (K, 3)
-        Coil centres, m, frame fg.
-    rotations_deg : ndarray, shape (K,)
-        Rotation of each coil about z, degrees.
-    frequencies_hz : sequence of float, length K
-        Drive frequencies, Hz.
-
-    Returns
-    -------
-    Board
-        The coils as closed current paths.
+    ``kind`` is one of `KINDS`; ``geometry`` holds the dimensions that it needs (``turns``,
+    ``side_m``, ``pitch_m``, ...; SI units) and ``current_a``, 1 A by default; other keys are
+    ignored. ``centres_m`` (K, 3) are in the frame fg, ``rotations_deg`` (K,) about z.
 
     Raises
     ------

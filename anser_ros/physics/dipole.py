@@ -63,6 +63,57 @@ def fill_flux_basis(points, axes, lengths, dipoles, out):  # type: ignore[no-unt
 
 
 @kernel(nogil=True)
+def fill_coil_basis(points, axes, lengths, dipoles, out):  # type: ignore[no-untyped-def]
+    """Write what each unit dipole does to each coil into ``out``, shape (P, 7, N).
+
+    Row 0 holds the flux, rows 1 to 3 its derivatives by the position, rows 4 to 6 those by the
+    free axis vector (the Gauss points move with it). One product with the moments gives all of it.
+    The other arguments are those of `fill_flux_basis`. Loops run along the rows and write few
+    arrays each, so that they go through vector registers.
+    """
+    px, py, pz = dipoles[0], dipoles[1], dipoles[2]
+    vx, vy, vz = dipoles[3], dipoles[4], dipoles[5]
+    work = np.empty((4, dipoles.shape[1]))
+    along, across, away, near = work[0], work[1], work[2], work[3]
+    for p in range(points.shape[0]):
+        point, axis, basis = points[p], axes[p], out[p]
+        half = lengths[p] * GAUSS_OFFSET
+        count = 1 if half == 0.0 else 2
+        scale, flux = DIPOLE_CONSTANT / count, basis[0]
+        nx, ny, nz = axis[0], axis[1], axis[2]
+        for s in range(count):
+            h = half * (1 - 2 * s)
+            x, y, z = point[0] + h * nx, point[1] + h * ny, point[2] + h * nz
+            for j in range(px.shape[0]):
+                dx, dy, dz = x - px[j], y - py[j], z - pz[j]
+                ux, uy, uz = vx[j], vy[j], vz[j]
+                inv2 = 1.0 / (dx * dx + dy * dy + dz * dz)
+                k3 = scale * inv2 * math.sqrt(inv2)
+                k5 = 3.0 * k3 * inv2
+                du = dx * ux + dy * uy + dz * uz
+                dn = dx * nx + dy * ny + dz * nz
+                nu = nx * ux + ny * uy + nz * uz
+                a = k5 * du
+                along[j], across[j], near[j] = a, k5 * dn, k3
+                away[j] = k5 * (nu - 5.0 * du * dn * inv2)
+                value = a * dn - k3 * nu
+                flux[j] = value if s == 0 else flux[j] + value
+            for i in range(3):
+                n, at = axis[i], point[i] + h * axis[i]
+                places, directions = dipoles[i], dipoles[3 + i]
+                slope, turn = basis[1 + i], basis[4 + i]
+                for j in range(places.shape[0]):
+                    d, u = at - places[j], directions[j]
+                    g = along[j] * n + across[j] * u + away[j] * d
+                    b = along[j] * d - near[j] * u + h * g
+                    if s == 0:
+                        slope[j], turn[j] = g, b
+                    else:
+                        slope[j] += g
+                        turn[j] += b
+
+
+@kernel(nogil=True)
 def fill_fields(points, dipoles, out):  # type: ignore[no-untyped-def]
     """Write each unit dipole's field at points into ``out``, shape (P, 3 or 9, N).
 
@@ -123,8 +174,8 @@ def _sensors(
         raise ValueError(f'points and axes must match, got {r.shape} and {n.shape}')
     if lengths is None:
         return r, n, np.zeros(r.shape[0])
-    spans = np.ascontiguousarray(np.broadcast_to(lengths, r.shape[:1]), dtype=np.float64)
-    return r, n, spans
+    # A copy, since kernels are compiled once more for an array that cannot be written to.
+    return r, n, np.array(np.broadcast_to(lengths, r.shape[:1]), dtype=np.float64)
 
 
 def flux_basis(
@@ -209,6 +260,30 @@ def dipole_field(
     return out.view(np.complex128)
 
 
+def flux_and_slopes(
+    points: NDArray[np.generic],
+    axes: NDArray[np.generic],
+    lengths: NDArray[np.generic] | None,
+    positions: NDArray[np.generic],
+    directions: NDArray[np.generic],
+    moments: Array,
+) -> Array:
+    """Return `flux_jacobian`'s results for real moments (N, C) side by side, shape (P, 7, C)."""
+    r, n, spans = _sensors(points, axes, lengths)
+    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
+    out, dipoles = np.empty((len(r), 7, moments.shape[1])), dipole_rows(q, u)
+
+    def work(rows: slice) -> None:
+        basis = np.empty((AT_ONCE, 7, len(q)))
+        for here in slices_of(rows, AT_ONCE):
+            few = basis[: here.stop - here.start]
+            fill_coil_basis(r[here], n[here], spans[here], dipoles, few)
+            np.matmul(few.reshape(-1, len(q)), moments, out=out[here].reshape(7 * len(few), -1))
+
+    in_order(work, slices(len(r), POINTS_A_THREAD))
+    return out
+
+
 def flux_jacobian(
     points: NDArray[np.generic],
     axes: NDArray[np.generic],
@@ -241,34 +316,6 @@ def flux_jacobian(
     ValueError
         When the shapes do not fit together.
     """
-    r, n, spans = _sensors(points, axes, lengths)
-    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
     m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)
-    flux = np.zeros((r.shape[0], m.shape[1]))
-    d_r = np.zeros((r.shape[0], 3, m.shape[1]))
-    d_n, dipoles, half = np.zeros_like(d_r), dipole_rows(q, u), GAUSS_OFFSET * spans[:, None]
-    signs = (1.0, -1.0) if half.any() else (1.0,)
-
-    def work(rows: slice) -> None:
-        f, basis = (
-            np.empty((rows.stop - rows.start, 9, m.shape[1])),
-            np.empty((AT_ONCE, 9, len(m))),
-        )
-        n0, n1, n2 = n[rows].T[:, :, None]
-        for sign in signs:
-            away = sign * half[rows]
-            places = r[rows] + away * n[rows]
-            for here in slices_of(slice(0, len(f)), AT_ONCE):
-                few = basis[: here.stop - here.start]
-                fill_fields(places[here], dipoles, few)
-                np.matmul(few.reshape(-1, len(m)), m, out=f[here].reshape(9 * len(few), -1))
-            f /= len(signs)
-            slope = np.empty((len(f), 3, m.shape[1]))
-            for i, (x, y, z) in enumerate(((3, 4, 5), (4, 6, 7), (5, 7, 8))):
-                slope[:, i] = n0 * f[:, x] + n1 * f[:, y] + n2 * f[:, z]
-            flux[rows] += n0 * f[:, 0] + n1 * f[:, 1] + n2 * f[:, 2]
-            d_r[rows] += slope
-            d_n[rows] += f[:, :3] + away[:, :, None] * slope
-
-    in_order(work, slices(len(r), POINTS_A_THREAD))
-    return flux.view(np.complex128), d_r.view(np.complex128), d_n.view(np.complex128)
+    parts = flux_and_slopes(points, axes, lengths, positions, directions, m).view(np.complex128)
+    return parts[:, 0], parts[:, 1:4], parts[:, 4:]

@@ -64,21 +64,9 @@ class PoseTrack:
         chords, and a field that was fitted along chords is too small by a part in ten thousand. If
         a track is too slow or too short to determine its curvature, the chord is used.
 
-        Parameters
-        ----------
-        time : ndarray, shape (F,)
-            Times on the clock of the track, s.
-        longest_gap : float, optional
-            Between two poses that are farther apart than this (s) nothing is interpolated.
-
-        Returns
-        -------
-        position : ndarray, shape (F, 3)
-            Origin of the body, m, frame fg.
-        rotation : ndarray, shape (F, 3, 3)
-            Rotation matrix from the body's frame to fg.
-        valid : ndarray of bool, shape (F,)
-            False before the first pose, after the last one and in gaps; the pose there is NaN.
+        Returns positions (F, 3), m, rotations (F, 3, 3) from the body's frame to fg, and where
+        they are valid (F,): not before the first pose, after the last one, and in gaps longer than
+        ``longest_gap``, s. The pose there is NaN.
         """
         position = np.full((time.size, 3), np.nan)
         rotation = np.full((time.size, 3, 3), np.nan)
@@ -105,15 +93,9 @@ class PoseTrack:
         return position, rotation, valid
 
     def velocity(self, time: Array) -> Array:
-        """Return the velocity (m/s) and angular velocity (rad/s) at some times, frame fg, shape
-        (F, 6).
+        """Return velocity (m/s) and angular velocity (rad/s) at times (F,), s; (F, 6), frame fg.
 
         Each is the mean over `VELOCITY_STEP_S` before and after, as far as the track goes.
-
-        Parameters
-        ----------
-        time : ndarray, shape (F,)
-            Times on the clock of the track, s.
         """
         low = np.clip(time - VELOCITY_STEP_S, self.time[0], self.time[-1])
         high = np.clip(time + VELOCITY_STEP_S, self.time[0], self.time[-1])
@@ -121,14 +103,8 @@ class PoseTrack:
         after, turned_after, _ = self.at(high, np.inf)
         span = np.maximum(high - low, 1e-9)[:, None]
         turn = turned_after @ turned_before.transpose(0, 2, 1)
-        spin = 0.5 * np.stack(
-            [
-                turn[:, 2, 1] - turn[:, 1, 2],
-                turn[:, 0, 2] - turn[:, 2, 0],
-                turn[:, 1, 0] - turn[:, 0, 1],
-            ],
-            axis=1,
-        )
+        skew = turn - turn.transpose(0, 2, 1)
+        spin = 0.5 * np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
         return np.concatenate([after - before, spin], axis=1) / span
 
 

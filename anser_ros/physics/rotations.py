@@ -51,25 +51,16 @@ Array = NDArray[np.float64]
 
 
 def axis_angles(first: Array, second: Array) -> Array:
-    """Return the angles between axes of any length but zero, shape (...), rad, 0 to pi.
+    """Return the angles (...) between axes (..., 3) of any length but zero, rad, 0 to pi.
 
-    Parameters
-    ----------
-    first, second : ndarray, shape (..., 3)
-        Both in the same frame; NaN where one is not known, which gives NaN.
+    NaN where an axis is.
     """
     sine = np.linalg.norm(np.cross(first, second), axis=-1)
     return np.asarray(np.arctan2(sine, np.sum(first * second, axis=-1)))
 
 
 def rotation_angles(matrices: Array) -> Array:
-    """Return the angles of rotation matrices, shape (...), rad, 0 to pi.
-
-    Parameters
-    ----------
-    matrices : ndarray, shape (..., 3, 3)
-        Proper rotations, or NaN, which gives NaN.
-    """
+    """Return the angles (...) of proper rotations (..., 3, 3), rad, 0 to pi; NaN where one is."""
     transposed = np.swapaxes(matrices, -1, -2)
     # The skew part has each component of the axis twice, times the sine.
     sine = np.linalg.norm(matrices - transposed, axis=(-2, -1)) / np.sqrt(8.0)

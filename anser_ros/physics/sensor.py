@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.physics.dipole import flux_basis, flux_jacobian
+from anser_ros.physics.dipole import flux_and_slopes, flux_basis
 
 Array = NDArray[np.float64]
 
@@ -221,27 +221,17 @@ class PlacedPoints:
         C parts of the ``moments`` (N, C), A m^2, of dipoles at ``positions`` (m) with unit
         ``directions`` (N, 3).
         """
-        by_place, by_axis = self._by_point(positions, directions, moments)
-        turn = np.cross(self.arms[:, :, None], by_place, axis=1)
-        turn = turn + np.cross(self.axes[:, :, None], by_axis, axis=1)
-        return self.summed(by_place), self.summed(turn)
+        parts = self._by_point(positions, directions, moments)
+        turn = np.cross(self.arms[:, :, None], parts[:, 1:4], axis=1)
+        turn = turn + np.cross(self.axes[:, :, None], parts[:, 4:], axis=1)
+        return self.summed(parts[:, 1:4]), self.summed(turn)
 
     def shifts(self, positions: Array, directions: Array, moments: Array) -> Array:
         """Return the first of `slopes` alone."""
-        return self.summed(self._by_point(positions, directions, moments)[0])
+        return self.summed(self._by_point(positions, directions, moments)[:, 1:4])
 
-    def _by_point(
-        self, positions: Array, directions: Array, moments: Array
-    ) -> tuple[Array, Array]:
-        """Derivatives (P, 3, C) of each point's flux by its place and its axis."""
-        # The kernel takes complex columns: two real ones make one.
-        pairs = np.zeros((len(moments), 2 * ((moments.shape[1] + 1) // 2)))
-        pairs[:, : moments.shape[1]] = moments
-        _, by_place, by_axis = flux_jacobian(
-            self.points, self.axes, self.lengths, positions, directions,
-            np.ascontiguousarray(pairs).view(np.complex128),
-        )  # fmt: skip
-        shape, count = (len(self.points), 3, pairs.shape[1]), moments.shape[1]
-        place = np.ascontiguousarray(by_place).view(np.float64).reshape(shape)
-        axis = np.ascontiguousarray(by_axis).view(np.float64).reshape(shape)
-        return place[:, :, :count], axis[:, :, :count]
+    def _by_point(self, positions: Array, directions: Array, moments: Array) -> Array:
+        """Each point's flux and its derivatives by place and axis, (P, 7, C)."""
+        return flux_and_slopes(
+            self.points, self.axes, self.lengths, positions, directions, moments
+        )

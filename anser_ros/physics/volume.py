@@ -50,14 +50,9 @@ class TrackedVolume:
 
     @classmethod
     def over_board(cls, centre: Array, half: float) -> 'TrackedVolume':
-        """Return the default volume over a board.
+        """Return the default volume over a board with its middle at ``centre`` (2,), m.
 
-        Parameters
-        ----------
-        centre : ndarray, shape (2,)
-            x and y of the board's middle, m.
-        half : float
-            Half of the board's larger side, m.
+        ``half`` is half of the board's larger side, m.
         """
         middle, reach = np.asarray(centre, dtype=np.float64), REACH * half
         low, high = (*(middle - reach), FLOOR * half), (*(middle + reach), CEILING * half)
@@ -102,13 +97,8 @@ class TrackedVolume:
     def samples(self, across: int = 6, up: int = 5, part: float = 1.0) -> Array:
         """Return points of the box, shape (across^2 up, 3), m, denser near the board.
 
-        Parameters
-        ----------
-        across, up : int
-            Points along x and y, and along z; the heights form a geometric series, so the floor
-            must be positive.
-        part : float
-            Share of the box that the points fill: the sides and the ceiling are scaled by it.
+        The heights form a geometric series, so the floor must be positive. The points fill a part
+        of the box: its sides and its ceiling are scaled by it.
         """
         floor = self.low[2]
         x, y = (

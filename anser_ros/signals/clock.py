@@ -204,14 +204,9 @@ class SampleClock:
         self._unexplained_from_ns = 0
 
     def observe(self, sample: float, arrival_ns: int) -> None:
-        """Take in the arrival of a block.
+        """Take in the arrival of a block, host time, ns, monotonic.
 
-        Parameters
-        ----------
-        sample : float
-            Number of the sample behind the block's last one.
-        arrival_ns : int
-            Host time of the arrival, ns, monotonic.
+        ``sample`` is the number of the sample behind the block's last one.
         """
         time_ns = sample * self._ns_per_sample
         offset = arrival_ns - time_ns
@@ -242,14 +237,9 @@ class SampleClock:
         """Take in that a sample was not yet taken when a command was sent that is now answered.
 
         The answer takes the same way as the samples: if they come late because the line is late,
-        so does the answer; if the device lost time, the answer is quick.
-
-        Parameters
-        ----------
-        sample : float
-            Number of a sample that the device took after it had answered.
-        sent_ns : int
-            Host time before the command left, ns, monotonic.
+        so does the answer; if the device lost time, the answer is quick. The device took the
+        ``sample`` after it had answered; the command left after ``sent_ns``, host time, ns,
+        monotonic.
         """
         if self._false_answers >= _FALSE_ANSWERS:
             return

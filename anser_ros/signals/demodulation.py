@@ -65,22 +65,11 @@ class _Solution:
 
 
 class Demodulator:
-    """Demodulates windows of a fixed length by least squares.
+    """Demodulates windows of a fixed length, with drive tones (K,), by least squares.
 
-    Parameters
-    ----------
-    sample_rate_hz : float
-        Samples a second and channel.
-    frequencies_hz : ndarray, shape (K,)
-        Drive tones, Hz.
-    window_samples : int
-        Samples in a window, 5 to 50 ms of them.
-    mains_hz : float, optional
-        Fundamental of the mains, of which `MAINS_HARMONICS` are fitted as well; one that falls on
-        a tone is left out.
-    follow_motion : bool, optional
-        Whether the phasors' rates of change are fitted. By default they are where that does not
-        double the variance of the phasors (from 10 ms on with tones 170 Hz apart).
+    `MAINS_HARMONICS` of ``mains_hz`` are fitted as well, without one that falls on a tone. By
+    default the phasors' rates of change are fitted where that does not double the variance of the
+    phasors (from 10 ms on with tones 170 Hz apart); ``follow_motion`` says whether.
 
     Raises
     ------
@@ -134,14 +123,9 @@ class Demodulator:
     def demodulate(
         self, samples: NDArray[np.generic], present: NDArray[np.bool_] | None = None
     ) -> ToneFit:
-        """Fit the phasors of all tones of all channels.
+        """Fit the phasors of all tones of all channels to a window's samples (N, C).
 
-        Parameters
-        ----------
-        samples : ndarray, shape (N, C)
-            Samples of a window, of any real type.
-        present : ndarray of bool, shape (N,), optional
-            False where a sample was lost; its values are ignored.
+        Samples that are not ``present`` (N,) were lost, and their values are ignored.
 
         Raises
         ------

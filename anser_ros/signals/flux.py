@@ -44,26 +44,10 @@ class FluxWindow:
 class FluxConverter:
     """Converts fitted phasors of all columns to the fluxes of the sensor columns.
 
-    Parameters
-    ----------
-    frequencies_hz : ndarray, shape (K,)
-        Drive tones, Hz.
-    sensor_columns : ndarray of int, shape (S,)
-        Columns of the sensors in the order wanted.
-    volts_per_code : ndarray, shape (S,)
-        Scale of these columns, V.
-    area_m2 : ndarray, shape (S,)
-        Effective areas N A G, m^2; negative for a coil wired the other way round.
-    delay_s : ndarray, shape (S,)
-        Delays of the channels behind the coils, s.
-    current_column : int
-        Column of the summed currents.
-    amperes_per_code : float
-        Scale of that column, A.
-    nominal_currents_a : ndarray, shape (K,)
-        Peak currents that the fluxes are given for, A.
-    current_delay_s : float
-        Delay of the channel of the currents, s.
+    ``frequencies_hz`` (K,) are the drive tones, ``nominal_currents_a`` (K,) the peak currents that
+    fluxes are given for. ``sensor_columns`` (S,) are in the order wanted, each with its scale, its
+    effective area N A G (negative for a coil wired the other way round) and the delay of its
+    channel. The column of the summed currents has its own scale and delay.
 
     Raises
     ------
@@ -101,13 +85,8 @@ class FluxConverter:
     ) -> FluxWindow:
         """Convert the phasors of one window to fluxes.
 
-        Parameters
-        ----------
-        fit : ToneFit
-            Phasors of all columns.
-        flux_rates : ndarray, shape (S, K), complex, optional
-            Rates of change of the fluxes, T/s, for windows that are too short to fit them; the
-            bias of the phasors by them is subtracted.
+        Windows that are too short to fit ``flux_rates`` (S, K), T/s, are given these, and the bias
+        of the phasors by them is subtracted.
         """
         current = fit.phasors[self._current_column] * self._amperes_per_code
         current_sigma = fit.sigma[self._current_column] * np.abs(self._amperes_per_code)

@@ -50,22 +50,6 @@ latest after twice the number; that a longer one has no anchor has a probability
 
 
 @kernel
-def _run_length(history, row, column, lag, longest):  # type: ignore[no-untyped-def]
-    """Return how many samples up to that of a row equal those `lag` before, at most `longest`."""
-    rows = history.shape[0]
-    for back in range(longest):
-        one = row - back
-        if one < 0:
-            one += rows
-        other = one - lag
-        if other < 0:
-            other += rows
-        if history[one, column] != history[other, column]:
-            return back
-    return longest
-
-
-@kernel
 def search(  # type: ignore[no-untyped-def]
     history, first, count, position, contiguous, fingerprint, probes, probed_at, slots, needed,
     lag, run, until, age,
@@ -127,21 +111,30 @@ def search(  # type: ignore[no-untyped-def]
                 found = at - probed_at[0 if mark == short[c] else 1 if mark == middle[c] else 2]
             if found <= 0 or lag[c] > 0 or found >= rows - needed[c]:
                 continue
-            if _run_length(history, row, c, found, FINGERPRINT_SAMPLES) < FINGERPRINT_SAMPLES:
-                continue
-            # What a buffer repeats it repeats in all columns, of which most meet no anchor yet.
-            for b in range(columns):
+            # What a buffer repeats it repeats in all columns, of which most meet no anchor yet;
+            # the column that met one comes first, for there may be no more to it.
+            for ahead in range(columns):
+                b = (c + ahead) % columns
                 if lag[b] > 0:
                     continue
-                same = _run_length(history, row, b, found, min(needed[b], contiguous + i + 1))
+                same, most = 0, min(needed[b], contiguous + i + 1)
+                while same < most:
+                    one = row - same if same <= row else row - same + rows
+                    other = one - found if found <= one else one - found + rows
+                    if history[one, b] != history[other, b]:
+                        break
+                    same += 1
                 if same >= FINGERPRINT_SAMPLES:
                     lag[b], run[b] = found, same
                     followed += 1
                     if same >= needed[b]:
                         until[b], age[b] = at + 1, found
+                elif ahead == 0:
+                    break
         for k in range(probed_at.size):
             if (at + 1) % PROBE_SAMPLES[k] == 0:
-                probes[k] = fingerprint
+                for c in range(columns):
+                    probes[k, c] = fingerprint[c]
                 probed_at[k] = at
 
 

@@ -168,16 +168,7 @@ class WindowCutter:
     with less than half of its samples counts as lost. A sequence number that does not fit the
     device's ticks begins a new stream, and so does one that was already used with other samples.
 
-    Parameters
-    ----------
-    window_samples : int
-        Samples in a window.
-    hop_samples : int
-        Samples from one window to the next; a hop longer than the window leaves samples out.
-    watch : RepetitionWatch
-        Keeps the samples of the stream and finds what comes again in them.
-    ticks : TickCheck
-        Compares the device's ticks with the samples.
+    A hop, the way from one window to the next, leaves samples out if it is longer than the window.
 
     Attributes
     ----------
@@ -222,16 +213,9 @@ class WindowCutter:
         return self._until_next
 
     def push(self, sequence: int, timestamp_ticks: int, codes: NDArray[np.int16]) -> list[Window]:
-        """Add a block and return the windows that it completes.
+        """Add a block of samples (n, C) and return the windows that it completes.
 
-        Parameters
-        ----------
-        sequence : int
-            Number of the block, modulo 2^32.
-        timestamp_ticks : int
-            Device time of its first sample, ticks.
-        codes : ndarray of int16, shape (n, C)
-            Its samples.
+        ``sequence`` is its number modulo 2^32, the ticks are those of its first sample.
 
         Raises
         ------

@@ -141,13 +141,12 @@ class BodyFrame(SolveFrame):
         if not coils.observable:
             return start
         known = [s for s in (self.single[i].solution for i in rows) if s is not None]
-        position, rotation = start[0].copy(), start[1].copy()
-        step_to_coils(
-            position, rotation, coils.offsets, coils.axes, np.array([s.position for s in known]),
+        nearer: Start = step_to_coils(
+            *start, coils.offsets, coils.axes, np.array([s.position for s in known]),
             np.array([s.axis for s in known]), np.array([s.normal for s in known]),
             self.context.low - coils.reach, self.context.high + coils.reach,
         )  # fmt: skip
-        return position, rotation
+        return nearer
 
 
 def _solve(frame: BodyFrame, used: NDArray[np.int64], start: Start) -> BodyFit:

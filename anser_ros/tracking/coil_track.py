@@ -13,16 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
-from anser_ros.kernel_cache import kernel
 from anser_ros.stamps import NANO
-from anser_ros.tracking.descent import descend
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import (
-    MAX_EVALUATIONS,
     CoilSolution,
     coil_covariance,
     solve_coil,
+    solve_coils,
     whitening_of,
 )
 from anser_ros.tracking.solve_context import SolveContext
@@ -262,23 +260,6 @@ def _judge(
     )  # fmt: skip
 
 
-@kernel
-def descend_all(  # type: ignore[no-untyped-def]
-    positions, axes, lengths, fluxes, whitening, dipoles, moments, low, high, budget, normals,
-    residuals, found,
-):  # fmt: skip
-    """Descend from a start for each coil (S of them): `descent.descend` for all rows.
-
-    ``found`` (S, 3): chi-square, evaluations, whether it converged.
-    """
-    for s in range(positions.shape[0]):
-        chi2, used, converged = descend(
-            positions[s], axes[s], lengths[s], fluxes[s], whitening[s], dipoles, moments, low,
-            high, budget, normals[s], residuals[s],
-        )  # fmt: skip
-        found[s, 0], found[s, 1], found[s, 2] = chi2, used, converged
-
-
 def _expected(tracks: list[CoilTrack], stamp_ns: int) -> tuple[Array, Array]:
     """Positions and axes (S, 3) of sensors that move on as between their last two good poses.
 
@@ -327,17 +308,9 @@ def solve_warm(
                 followed[k].error = error
     each = zip(followed, positions, axes, spans.tolist(), strict=True)
     weights = np.array([whitening_at(track, context, *start) for track, *start in each])
-    count, width = len(rows), values.shape[1]
-    normals, residuals = np.empty((count, 6, 6)), np.empty((count, width))
-    found, field = np.empty((count, 3)), context.field
-    descend_all(
-        positions, axes, spans, values[rows], weights, field.columns, field.moments,
-        context.low, context.high, MAX_EVALUATIONS, normals, residuals, found,
-    )  # fmt: skip
-    for i, position, axis, normal, residual, (chi2, used, converged) in zip(
-        rows, positions, axes, normals, residuals, found.tolist(), strict=True
-    ):
-        solutions[i] = CoilSolution(
-            position, axis, chi2, normal, residual, int(used), bool(converged)
-        )
+    found = solve_coils(
+        context.field, values[rows], weights, positions, axes, context.low, context.high, spans
+    )
+    for i, solution in zip(rows, found, strict=True):
+        solutions[i] = solution
     return solutions

@@ -1,5 +1,4 @@
-"""Compiles the kernels of a single coil's solve: flux and slopes, whitening, damped steps,
-descent.
+"""Compiles the kernels of a single coil's solve: whitening, damped steps, descent.
 
 Compiled; `solve` is what calls them. A coil's pose is its position and its unit axis, which moves
 by a two-parameter step in its tangent plane. The damping is Marquardt's (Nocedal and Wright,
@@ -11,8 +10,7 @@ import math
 import numpy as np
 
 from anser_ros.kernel_cache import kernel
-from anser_ros.physics.constants import DIPOLE_CONSTANT
-from anser_ros.physics.dipole import GAUSS_OFFSET
+from anser_ros.physics.dipole import fill_coil_basis
 from anser_ros.physics.rotations import fill_tangent
 
 LARGEST_MOVE_M, LARGEST_TURN = 0.04, 0.6
@@ -23,60 +21,13 @@ FIRST_DAMPING = 1e-8
 LEAST_RAISED = 1e-3
 """Damping at least after a step that failed. Growing from `FIRST_DAMPING` alone, several more
 would fail until steps get shorter."""
+MOST_DAMPING = 1e12
+"""Damping beyond which no step can lead lower."""
 CONVERGED_CHI2 = 1e-6
 """Fall of chi-square below which a step is not worth another one (a thousandth of a sigma)."""
 TRUSTED_CHI2, TRUSTED_MOVE_M, TRUSTED_TURN = 0.03, 50e-6, 1e-3
 """Fall of chi-square, move and turn up to which a step is taken without a look at where it leads:
 what a sixth of a sigma leaves, of second order, is less than a thousandth of a sigma."""
-
-
-@kernel
-def fill_coil_basis(point, axis, length, dipoles, basis):  # type: ignore[no-untyped-def]
-    """Write what each unit dipole does to a coil into ``basis``, shape (7, N).
-
-    Row 0 holds the flux, rows 1 to 3 its derivatives by the position, rows 4 to 6 those by the
-    free axis vector (the Gauss points move with it). One product with the moments gives all of it.
-    ``dipoles`` (6, N): `solve.RealField.columns`. Loops run along its rows and write few arrays
-    each, so that they go through vector registers.
-    """
-    half = length * GAUSS_OFFSET
-    count = 1 if half == 0.0 else 2
-    scale = DIPOLE_CONSTANT / count
-    nx, ny, nz = axis[0], axis[1], axis[2]
-    px, py, pz = dipoles[0], dipoles[1], dipoles[2]
-    vx, vy, vz = dipoles[3], dipoles[4], dipoles[5]
-    flux, work = basis[0], np.empty((4, dipoles.shape[1]))
-    along, across, away, near = work[0], work[1], work[2], work[3]
-    for s in range(count):
-        h = half * (1 - 2 * s)
-        x, y, z = point[0] + h * nx, point[1] + h * ny, point[2] + h * nz
-        for j in range(px.shape[0]):
-            dx, dy, dz = x - px[j], y - py[j], z - pz[j]
-            ux, uy, uz = vx[j], vy[j], vz[j]
-            inv2 = 1.0 / (dx * dx + dy * dy + dz * dz)
-            k3 = scale * inv2 * math.sqrt(inv2)
-            k5 = 3.0 * k3 * inv2
-            du = dx * ux + dy * uy + dz * uz
-            dn = dx * nx + dy * ny + dz * nz
-            nu = nx * ux + ny * uy + nz * uz
-            a = k5 * du
-            along[j], across[j], near[j] = a, k5 * dn, k3
-            away[j] = k5 * (nu - 5.0 * du * dn * inv2)
-            value = a * dn - k3 * nu
-            flux[j] = value if s == 0 else flux[j] + value
-        for i in range(3):
-            n, at = axis[i], point[i] + h * axis[i]
-            places, directions = dipoles[i], dipoles[3 + i]
-            slope, turn = basis[1 + i], basis[4 + i]
-            for j in range(places.shape[0]):
-                d, u = at - places[j], directions[j]
-                g = along[j] * n + across[j] * u + away[j] * d
-                b = along[j] * d - near[j] * u + h * g
-                if s == 0:
-                    slope[j], turn[j] = g, b
-                else:
-                    slope[j] += g
-                    turn[j] += b
 
 
 @kernel
@@ -111,8 +62,9 @@ def _whiten(flux, model, whitening, residual, white):  # type: ignore[no-untyped
 
 
 @kernel
-def _normal_equations(white, tangent, full, normal, gradient):  # type: ignore[no-untyped-def]
+def _normal_equations(white, axis, tangent, full, normal, gradient):  # type: ignore[no-untyped-def]
     """``full`` (6, 6) by position and free axis; ``normal``, ``gradient`` in the tangent plane."""
+    fill_tangent(axis, tangent)
     g = np.zeros(6)
     for i in range(6):
         for j in range(i, 6):
@@ -196,9 +148,14 @@ def limit_step(step):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _advance(position, axis, tangent, step, low, high, new_position, new_axis):  # type: ignore[no-untyped-def]
-    """Take a step: the position stays in the box, the axis stays a unit vector."""
-    norm = 0.0
+def _advance(  # type: ignore[no-untyped-def]
+    position, axis, tangent, normal, gradient, step, low, high, new_position, new_axis
+):  # fmt: skip
+    """Take a step: the position stays in the box, the axis stays a unit vector.
+
+    Returns the fall of chi-square that the local model promises for it.
+    """
+    norm, promised = 0.0, 0.0
     for i in range(3):
         new_position[i] = min(max(position[i] + step[i], low[i]), high[i])
         new_axis[i] = axis[i] + step[3] * tangent[0, i] + step[4] * tangent[1, i]
@@ -206,79 +163,75 @@ def _advance(position, axis, tangent, step, low, high, new_position, new_axis): 
     norm = 1.0 / math.sqrt(norm)
     for i in range(3):
         new_axis[i] *= norm
-
-
-@kernel
-def _promised(normal, gradient, step):  # type: ignore[no-untyped-def]
-    """Fall of chi-square that the local model promises for a step."""
-    total = 0.0
     for i in range(5):
         row = 0.0
         for j in range(5):
             row += normal[i, j] * step[j]
-        total += step[i] * (2.0 * gradient[i] - row)
-    return total
+        promised += step[i] * (2.0 * gradient[i] - row)
+    return promised
 
 
 @kernel
 def descend(  # type: ignore[no-untyped-def]
-    position, axis, length, flux, whitening, dipoles, moments, low, high, budget, full, residual,
+    positions, axes, lengths, fluxes, whitening, dipoles, moments, low, high, budget, normals,
+    residuals, found,
 ):  # fmt: skip
-    """Move ``position`` and ``axis`` (in place) to the least chi-square near them.
+    """Move ``positions`` and ``axes`` (S, 3; in place), a coil each, to the least chi-square near.
 
-    Returns chi-square, evaluations used, whether it converged.
+    ``found`` (S, 3): chi-square, evaluations used, whether it converged.
     """
-    width = flux.shape[0]
-    basis = np.empty((7, dipoles.shape[1]))
-    white, trial_white = np.empty((7, width)), np.empty((7, width))
-    trial_residual = np.empty(width)
-    tangent, step = np.empty((2, 3)), np.empty(5)
-    normal, gradient, factor = np.empty((5, 5)), np.empty(5), np.empty((5, 5))
-    trial_position, trial_axis = np.empty(3), np.empty(3)
-
-    fill_coil_basis(position, axis, length, dipoles, basis)
-    chi2 = _whiten(flux, np.dot(basis, moments), whitening, residual, white)
-    used, damping, growth, converged = 1, FIRST_DAMPING, 2.0, False
-    while used < budget and not converged:
-        fill_tangent(axis, tangent)
-        _normal_equations(white, tangent, full, normal, gradient)
-        accepted = False
-        while used < budget and not accepted:
+    width = fluxes.shape[1]
+    basis = np.empty((1, 7, dipoles.shape[1]))
+    white, trial_white, trial_residual = (
+        np.empty((7, width)),
+        np.empty((7, width)),
+        np.empty(width),
+    )
+    tangent, step, factor = np.empty((2, 3)), np.empty(5), np.empty((5, 5))
+    normal, gradient, trial_position, trial_axis = (
+        np.empty((5, 5)), np.empty(5), np.empty(3), np.empty(3)
+    )  # fmt: skip
+    for s in range(positions.shape[0]):
+        position, axis, flux, weights = positions[s], axes[s], fluxes[s], whitening[s]
+        full, residual = normals[s], residuals[s]
+        length = lengths[s : s + 1]
+        fill_coil_basis(position.reshape(1, 3), axis.reshape(1, 3), length, dipoles, basis)
+        chi2 = _whiten(flux, np.dot(basis[0], moments), weights, residual, white)
+        _normal_equations(white, axis, tangent, full, normal, gradient)
+        used, damping, growth, converged = 1, FIRST_DAMPING, 2.0, False
+        while used < budget and not converged and damping <= MOST_DAMPING:
             if not damped_step(normal, gradient, damping, factor, step):
                 damping = max(10.0 * damping, 1e-8)
-                if damping > 1e12:
-                    return chi2, used, False
                 continue
             short = limit_step(step)
-            promised = _promised(normal, gradient, step)
-            _advance(position, axis, tangent, step, low, high, trial_position, trial_axis)
+            promised = _advance(
+                position, axis, tangent, normal, gradient, step, low, high, trial_position,
+                trial_axis,
+            )  # fmt: skip
             negligible = promised < CONVERGED_CHI2 + 1e-9 * chi2
             if negligible or (short and promised < TRUSTED_CHI2):
-                converged = True
                 chi2 -= promised
-                position[:] = trial_position
-                axis[:] = trial_axis
-                break
-            fill_coil_basis(trial_position, trial_axis, length, dipoles, basis)
-            used += 1
-            model = np.dot(basis, moments)
-            trial = _whiten(flux, model, whitening, trial_residual, trial_white)
-            if trial <= chi2:
+                converged = True
+            else:
+                fill_coil_basis(
+                    trial_position.reshape(1, 3), trial_axis.reshape(1, 3), length, dipoles, basis
+                )
+                used += 1
+                model = np.dot(basis[0], moments)
+                trial = _whiten(flux, model, weights, trial_residual, trial_white)
+                if not trial <= chi2:
+                    damping = max(damping * growth, LEAST_RAISED)
+                    growth *= 2.0
+                    continue
                 gain = (chi2 - trial) / max(promised, 1e-300)
                 damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
                 growth = 2.0
                 converged = chi2 - trial < CONVERGED_CHI2 + 1e-9 * chi2
                 chi2 = trial
-                position[:] = trial_position
-                axis[:] = trial_axis
-                residual[:] = trial_residual
                 white, trial_white = trial_white, white
-                accepted = True
-            else:
-                damping = max(damping * growth, LEAST_RAISED)
-                growth *= 2.0
-                if damping > 1e12:
-                    return chi2, used, False
-    fill_tangent(axis, tangent)
-    _normal_equations(white, tangent, full, normal, gradient)
-    return chi2, used, converged
+                for k in range(width):
+                    residual[k] = trial_residual[k]
+                _normal_equations(white, trial_axis, tangent, full, normal, gradient)
+            for i in range(3):
+                position[i], axis[i] = trial_position[i], trial_axis[i]
+        found[s, 0], found[s, 1], found[s, 2] = chi2, used, converged

@@ -174,16 +174,10 @@ class NoiseScale:
         return max(self._lasting / self._weight - model_share - SLIGHT, 0.0)
 
     def add(self, ratio: float, whitened: Array | None = None, freedom: int = 1) -> None:
-        """Take in one more good frame.
+        """Take in one more good frame with its residual power over the expected one.
 
-        Parameters
-        ----------
-        ratio : float
-            Residual power per degree of freedom, in units of the expected one.
-        whitened : ndarray, shape (2K,), optional
-            Residuals in units of their sigma; nothing is found to last without them.
-        freedom : int
-            Their degrees of freedom.
+        ``whitened`` (2K,) are residuals in units of their sigma, with so many degrees of freedom;
+        nothing is found to last without them.
         """
         keep, most = 1.0 - 1.0 / MEMORY_FRAMES, 4.0 * self.value
         last, self._last = self._last, whitened
@@ -199,21 +193,13 @@ class NoiseScale:
     ) -> float:
         """Return one frame's variance scale: the running one, or more if its residual asks for it.
 
-        Parameters
-        ----------
-        ratio : float
-            Residual power of the frame per degree of freedom, in units of the expected one.
-        usual : float
-            What noise of the expected size seldom exceeds; more comes from a bent field.
-        share : float
-            Degrees of freedom for each dimension of the pose: what stays in the former of a bent
-            field shows, as a power, what goes into the latter.
-        model_share : float
-            Part of the expected residual that is the model's own error. It bends the field as
-            metal does, and as much of it goes into the pose, however many readings there are.
-        follows : bool
-            Whether the model states its error by modes. Then no small residual takes that error
-            off the pose, and no lasting misfit is taken for noise.
+        ``ratio`` is its residual power over the expected one, and ``usual`` what noise seldom
+        exceeds; more comes from a bent field. ``share`` are degrees of freedom for each dimension
+        of the pose: what stays in the former of a bent field shows, as a power, what goes into the
+        latter. ``model_share`` of the expected residual is the model's own error. It bends the
+        field as metal does, and as much of it goes into the pose, however many readings there are.
+        If the model states its error by modes, which it ``follows``, no small residual takes that
+        error off the pose, and no lasting misfit is taken for noise.
         """
         hidden, misfit = HIDDEN * share, self.misfit(model_share)
         noise = max(self.value - misfit, SLIGHT)

@@ -11,19 +11,18 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import kernel
-from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.physics.dipole import dipole_field, fill_coil_basis
 from anser_ros.physics.rotations import nearest_rotation
-from anser_ros.physics.sensor import along_each_axis
 from anser_ros.tracking.descent import (
     CONVERGED_CHI2,
     FIRST_DAMPING,
     LEAST_RAISED,
     TRUSTED_CHI2,
     damped_step,
-    fill_coil_basis,
     limit_step,
 )
 from anser_ros.tracking.seed import SeedGrid
@@ -31,54 +30,24 @@ from anser_ros.tracking.solve import Array, RealField
 
 
 @kernel
-def fill_common(modes, inverse_sigma, common):  # type: ignore[no-untyped-def]
-    """Write E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E``; False when D is not finite.
-
-    ``modes`` (S, R, 2K): fluxes (T) that make D when divided by the noise.
-    """
-    coils, count, width = modes.shape
-    for r in range(count):
-        for s in range(coils):
-            for k in range(width):
-                common[r, s * width + k] = modes[s, r, k] * inverse_sigma[s, k]
-    gram = np.dot(common, common.T)
-    for r in range(count):
-        # Cholesky factor of I + D D^T row by row, and its inverse times D on the way.
-        for q in range(r + 1):
-            total = gram[r, q]
-            for p in range(q):
-                total -= gram[r, p] * gram[q, p]
-            if q < r:
-                gram[r, q] = total / gram[q, q]
-            elif total + 1.0 > 0.0 and math.isfinite(total):
-                gram[r, r] = math.sqrt(total + 1.0)
-            else:
-                return False
-        for q in range(r):
-            for i in range(common.shape[1]):
-                common[r, i] -= gram[r, q] * common[q, i]
-        for i in range(common.shape[1]):
-            common[r, i] /= gram[r, r]
-    return True
-
-
-@kernel
-def fill_body(  # type: ignore[no-untyped-def]
-    position, rotation, offsets, axes, lengths, flux, inverse_sigma, dipoles, moments, basis,
-    residual, white,
+def _look(  # type: ignore[no-untyped-def]
+    pose, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments, basis
 ):  # fmt: skip
-    """Write a pose's residual (S, 2K) and ``white`` (7, S 2K).
+    """Fill what `descend_body` keeps of a pose, beginning with position and rotation.
 
-    Row 0 of ``white``: the whitened residual; rows 1 to 6: the whitened flux's derivatives by the
-    translation and the turn, both in fg. ``basis`` (7 S, N) is written over.
+    It is the residual (S, 2K), the whitened residual (row 0) and whitened derivatives by
+    translation and turn, both in fg (7, S 2K), and the normal equations (6, 6) and (6,). Returns
+    chi-square. ``basis`` (S, 7, N) is written over.
     """
+    position, rotation, residual, white, information, gradient = pose
     coils, width = flux.shape
     arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
+    places = np.empty((coils, 3))
     for s in range(coils):
-        fill_coil_basis(
-            position + arms[s], turned[s], lengths[s], dipoles, basis[7 * s : 7 * s + 7]
-        )
-    model = np.dot(basis, moments)
+        for i in range(3):
+            places[s, i] = position[i] + arms[s, i]
+    fill_coil_basis(places, turned, lengths, dipoles, basis)
+    model = np.dot(basis.reshape(7 * coils, dipoles.shape[1]), moments)
     for s in range(coils):
         m = model[7 * s : 7 * s + 7]
         for k in range(width):
@@ -91,103 +60,112 @@ def fill_body(  # type: ignore[no-untyped-def]
                 turn += turned[s, j] * m[4 + n, k] - turned[s, n] * m[4 + j, k]
                 white[1 + i, column] = w * m[1 + i, k]
                 white[4 + i, column] = w * turn
+    products, shared = np.dot(white, white.T), np.dot(white, common.T)
+    shared = np.dot(shared, shared.T)
+    for i in range(6):
+        gradient[i] = products[1 + i, 0] - shared[1 + i, 0]
+        for j in range(6):
+            information[i, j] = products[1 + i, 1 + j] - shared[1 + i, 1 + j]
+    return products[0, 0] - shared[0, 0]
 
 
 @kernel
-def _products(white, common):  # type: ignore[no-untyped-def]
-    """``W C^-1 W^T`` (7, 7) for the covariance I + D^T D."""
-    products = np.dot(white, white.T)
-    if common.shape[0] > 0:
-        shared = np.dot(common, white.T)
-        products -= np.dot(shared.T, shared)
-    return products
+def _advance(  # type: ignore[no-untyped-def]
+    position, rotation, information, gradient, step, low, high, new_position, new_rotation
+):  # fmt: skip
+    """Take a step: the position stays in the box, the rotation stays orthonormal.
 
-
-@kernel
-def _turned(vector, rotation):  # type: ignore[no-untyped-def]
-    """A rotation after a further turn by a rotation vector, rad, kept orthonormal."""
-    x, y, z = vector[0], vector[1], vector[2]
-    square = x * x + y * y + z * z
+    Returns the fall of chi-square that the local model promises for it.
+    """
+    promised = 0.0
+    for i in range(6):
+        row = 0.0
+        for j in range(6):
+            row += information[i, j] * step[j]
+        promised += step[i] * (2.0 * gradient[i] - row)
+    for i in range(3):
+        new_position[i] = min(max(position[i] + step[i], low[i]), high[i])
+    square = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
     angle = math.sqrt(square)
     if angle < 1e-4:
         a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
     else:
         a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
     turn = np.empty((3, 3))
-    turn[0, 0], turn[0, 1], turn[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z
-    turn[0, 2] += a * y
-    turn[1, 0], turn[1, 1], turn[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z
-    turn[1, 2] -= a * x
-    turn[2, 0], turn[2, 1], turn[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0
-    turn[2, 2] -= b * (x * x + y * y)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        x, y, z = step[3 + i], step[3 + j], step[3 + k]
+        turn[i, i] = 1.0 - b * (y * y + z * z)
+        turn[i, j], turn[j, i] = b * x * y - a * z, b * x * y + a * z
     new = np.dot(turn, rotation)
-    # One step towards the nearest rotation takes off what rounding has added.
-    return 1.5 * new - 0.5 * np.dot(new, np.dot(new.T, new))
+    square_of_new = np.dot(new, new.T)
+    rounded = np.dot(square_of_new, new)
+    for i in range(3):
+        for j in range(3):
+            # One step towards the nearest rotation takes off what rounding has added.
+            new_rotation[i, j] = 1.5 * new[i, j] - 0.5 * rounded[i, j]
+    return promised
 
 
 @kernel
 def descend_body(  # type: ignore[no-untyped-def]
     position, rotation, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments,
-    low, high, budget, residual, white, information,
+    low, high, budget,
 ):  # fmt: skip
-    """Move ``position`` and ``rotation`` (in place) to the least chi-square near them.
+    """Find the least chi-square near a pose, whose arrays are written over.
 
-    ``residual``, ``white`` as `fill_body` leaves them at the last look, ``information`` (6, 6).
-    Returns chi-square, evaluations used, whether it converged.
+    Returns chi-square, evaluations used, whether it converged; position and rotation; residual,
+    whitened residual with derivatives, and information as `_look` fills them at its last pose.
     """
-    basis = np.empty((7 * offsets.shape[0], dipoles.shape[1]))
-    trial_residual, trial_white = np.empty_like(residual), np.empty_like(white)
-    step, factor, gradient = np.empty(6), np.empty((6, 6)), np.empty(6)
-    trial_position = np.empty(3)
-    fill_body(
-        position, rotation, offsets, axes, lengths, flux, inverse_sigma, dipoles, moments, basis,
-        residual, white,
+    basis, size = np.empty((flux.shape[0], 7, dipoles.shape[1])), flux.size
+    step, factor = np.empty(6), np.empty((6, 6))
+    pose = (
+        position, rotation, np.empty(flux.shape), np.empty((7, size)), np.empty((6, 6)),
+        np.empty(6),
     )  # fmt: skip
-    products = _products(white, common)
-    chi2, used, damping, converged = products[0, 0], 1, FIRST_DAMPING, False
-    information[:] = products[1:, 1:]
-    gradient[:] = products[1:, 0]
+    trial = (
+        np.empty(3), np.empty((3, 3)), np.empty(flux.shape), np.empty((7, size)),
+        np.empty((6, 6)), np.empty(6),
+    )  # fmt: skip
+    chi2 = _look(
+        pose, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments, basis
+    )
+    used, damping, converged = 1, FIRST_DAMPING, False
+    place = pose[:2]
     while used < budget and not converged and damping < 1e10:
-        if not damped_step(information, gradient, damping, factor, step):
+        if not damped_step(pose[4], pose[5], damping, factor, step):
             damping = max(10.0 * damping, LEAST_RAISED)
             continue
         short = limit_step(step)
-        promised = np.dot(step, 2.0 * gradient - np.dot(information, step))
-        for i in range(3):
-            trial_position[i] = min(max(position[i] + step[i], low[i]), high[i])
-        trial_rotation = _turned(step[3:], rotation)
+        promised = _advance(
+            pose[0], pose[1], pose[4], pose[5], step, low, high, trial[0], trial[1]
+        )
         negligible = promised < CONVERGED_CHI2 + 1e-9 * chi2
         if negligible or (short and promised < TRUSTED_CHI2):
-            position[:] = trial_position
-            rotation[:] = trial_rotation
-            return chi2 - promised, used, True
-        fill_body(
-            trial_position, trial_rotation, offsets, axes, lengths, flux, inverse_sigma,
-            dipoles, moments, basis, trial_residual, trial_white,
-        )  # fmt: skip
+            chi2 -= promised
+            converged, place = True, trial[:2]
+            break
+        trial_chi2 = _look(
+            trial, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments, basis
+        )
         used += 1
-        products = _products(trial_white, common)
-        fall = chi2 - products[0, 0]
+        fall = chi2 - trial_chi2
         if fall >= 0.0:
             converged = fall < CONVERGED_CHI2 + 1e-9 * chi2
             damping *= 0.1 if fall > 0.5 * promised else 0.5
-            chi2 = products[0, 0]
-            position[:] = trial_position
-            rotation[:] = trial_rotation
-            residual[:] = trial_residual
-            white[:] = trial_white
-            information[:] = products[1:, 1:]
-            gradient[:] = products[1:, 0]
+            chi2 = trial_chi2
+            pose, trial = trial, pose
+            place = pose[:2]
         else:
             damping = max(5.0 * damping, LEAST_RAISED)
-    return chi2, used, converged
+    return chi2, used, converged, place[0], place[1], pose[2], pose[3], pose[4]
 
 
 @kernel
 def step_to_coils(  # type: ignore[no-untyped-def]
     position, rotation, offsets, axes, coil_positions, coil_axes, normals, low, high
 ):  # fmt: skip
-    """Move ``position`` and ``rotation`` (in place) to where single coils' own poses agree best.
+    """Return the position and rotation nearby where single coils' own poses agree best.
 
     ``normals`` (S, 6, 6) weigh each coil's position and free axis vector. It is the first step of
     the descent, from the slopes that the coils' own solves have found already.
@@ -202,18 +180,22 @@ def step_to_coils(  # type: ignore[no-untyped-def]
             j, n = (i + 1) % 3, (i + 2) % 3
             apart[i] = coil_positions[s, i] - position[i] - arms[s, i]
             apart[3 + i] = coil_axes[s, i] - turned[s, i]
-            # A turn w moves a vector v by w x v.
-            slopes[i, 3 + j], slopes[i, 3 + n] = arms[s, n], -arms[s, j]
-            slopes[3 + i, 3 + j], slopes[3 + i, 3 + n] = turned[s, n], -turned[s, j]
-        weighted = np.dot(slopes.T, normals[s])
-        normal += np.dot(weighted, slopes)
-        gradient += np.dot(weighted, apart)
+            # A turn w moves a vector v by w x v. The columns are those of the coil's pose.
+            slopes[3 + j, i], slopes[3 + n, i] = arms[s, n], -arms[s, j]
+            slopes[3 + j, 3 + i], slopes[3 + n, 3 + i] = turned[s, n], -turned[s, j]
+        weighted = np.dot(slopes, normals[s])
+        product = np.dot(weighted, slopes.T)
+        for i in range(6):
+            for j in range(6):
+                normal[i, j] += product[i, j]
+                gradient[i] += weighted[i, j] * apart[j]
     step, factor = np.empty(6), np.empty((6, 6))
-    if damped_step(normal, gradient, FIRST_DAMPING, factor, step):
-        limit_step(step)
-        for i in range(3):
-            position[i] = min(max(position[i] + step[i], low[i]), high[i])
-        rotation[:] = _turned(step[3:], rotation)
+    new_position, new_rotation = np.empty(3), np.empty((3, 3))
+    if not damped_step(normal, gradient, FIRST_DAMPING, factor, step):
+        return position, rotation
+    limit_step(step)
+    _advance(position, rotation, normal, gradient, step, low, high, new_position, new_rotation)
+    return new_position, new_rotation
 
 
 MAX_EVALUATIONS = 30
@@ -296,10 +278,15 @@ def common_factor(modes: Array, inverse_sigma: Array) -> Array:
     TrackingError
         When the modes are not finite.
     """
-    common = np.empty((modes.shape[1], inverse_sigma.size))
-    if not fill_common(modes, inverse_sigma, common):
+    count = modes.shape[1]
+    whitened = (modes * inverse_sigma[:, None]).swapaxes(0, 1).reshape(count, inverse_sigma.size)
+    if count == 0:
+        return whitened
+    gram = whitened @ whitened.T
+    if not np.isfinite(gram).all():
         raise TrackingError('the model covariance must be finite')
-    return common
+    factor = np.linalg.cholesky(gram + np.eye(count))
+    return np.ascontiguousarray(solve_triangular(factor, whitened, lower=True, check_finite=False))
 
 
 def solve_body(
@@ -329,12 +316,9 @@ def solve_body(
         raise TrackingError(f'{count} coils and {width} components, got flux {flux.shape}')
 
     r, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
-    residual, white = np.empty((count, width)), np.empty((7, count * width))
-    information = np.empty((6, 6))
-    chi2, used, converged = descend_body(
+    chi2, used, converged, r, turn, residual, white, information = descend_body(
         r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma, common,
-        field.columns, field.moments, low, high, MAX_EVALUATIONS, residual, white,
-        information,
+        field.columns, field.moments, low, high, MAX_EVALUATIONS,
     )  # fmt: skip
     coil_chi2 = (white[0].reshape(count, width) ** 2).sum(axis=1)
     return BodySolution(r, turn, chi2, information, residual, coil_chi2, used, converged)
@@ -369,13 +353,8 @@ def start_from_grid(
     At every grid point the emitters' fields are turned to fit the fluxes (S, 2K), T, of all coils
     at once, the lever arms neglected; the poses with the least misfit come first.
     """
-    total = len(grid.points)
-    complex_moments = field.moments.view(np.complex128)
-    points, axes = along_each_axis(grid.points)
-    model, _, _ = flux_jacobian(
-        points, axes, None, field.positions, field.directions, complex_moments
-    )
-    fields = model.view(np.float64).reshape(total, 3, -1)
+    moments = field.moments.view(np.complex128)
+    fields = dipole_field(grid.points, field.positions, field.directions, moments).view(np.float64)
     measured = coils.axes.T @ flux
     rotations = nearest_rotation(np.einsum('gik,jk->gij', fields, measured))
     predicted = np.einsum('sj,gij,gik->gsk', coils.axes, rotations, fields, optimize=True)

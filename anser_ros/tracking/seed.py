@@ -103,10 +103,7 @@ def _look(  # type: ignore[no-untyped-def]
     ``normal`` (3, 3) and ``gradient`` (3,) are left for a step of the position.
     """
     width = flux.shape[0]
-    place = np.empty((1, 3))
-    for i in range(3):
-        place[0, i] = position[i]
-    fill_fields(place, dipoles, basis)
+    fill_fields(position.reshape(1, 3), dipoles, basis)
     f = np.dot(basis[0], moments)
     for k in range(width):
         for i in range(9):
@@ -148,18 +145,37 @@ def descend_projected(  # type: ignore[no-untyped-def]
     a point coil) and the evaluations used.
     """
     width = flux.shape[0]
-    white, basis = flux * inverse_sigma, np.empty((1, 9, dipoles.shape[1]))
+    basis, white = np.empty((1, 9, dipoles.shape[1])), np.empty(width)
+    for k in range(width):
+        white[k] = flux[k] * inverse_sigma[k]
     tangent, plane, residual = np.empty((2, 3)), np.empty((2, width)), np.empty(width)
     normal, gradient, new_normal, new_gradient = (
-        np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+        np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros(3)
     )  # fmt: skip
     step, factor, new_position, new_axis = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
-    chi2 = _look(
-        position, axis, white, inverse_sigma, dipoles, moments, basis, tangent, plane, residual,
-        normal, gradient,
-    )  # fmt: skip
-    used, damping = 1, 1e-3
-    while used < budget and damped_step(normal, gradient, damping, factor, step):
+    for i in range(3):
+        new_position[i], new_axis[i] = position[i], axis[i]
+    chi2, damping, used = np.inf, 1e-3, 0
+    while used < budget:
+        trial = _look(
+            new_position, new_axis, white, inverse_sigma, dipoles, moments, basis, tangent, plane,
+            residual, new_normal, new_gradient,
+        )  # fmt: skip
+        used += 1
+        if trial < chi2:
+            done = chi2 - trial < NEAR * chi2
+            damping *= 0.2 if used > 1 else 1.0
+            chi2 = trial
+            for i in range(3):
+                position[i], axis[i] = new_position[i], new_axis[i]
+            normal, new_normal = new_normal, normal
+            gradient, new_gradient = new_gradient, gradient
+            if done:
+                break
+        else:
+            damping = max(8.0 * damping, 1e-4)
+        if damping > 1e8 or not damped_step(normal, gradient, damping, factor, step):
+            break
         size = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
         part, moved = min(1.0, LARGEST_MOVE_M / max(size, 1e-300)), 0.0
         for i in range(3):
@@ -168,24 +184,6 @@ def descend_projected(  # type: ignore[no-untyped-def]
             new_axis[i] = axis[i]
         if moved < 1e-6:
             break
-        trial = _look(
-            new_position, new_axis, white, inverse_sigma, dipoles, moments, basis, tangent, plane,
-            residual, new_normal, new_gradient,
-        )  # fmt: skip
-        used += 1
-        if trial < chi2:
-            done = chi2 - trial < NEAR * chi2
-            chi2 = trial
-            position[:], axis[:] = new_position, new_axis
-            normal, new_normal = new_normal, normal
-            gradient, new_gradient = new_gradient, gradient
-            damping *= 0.2
-            if done:
-                break
-        else:
-            damping = max(8.0 * damping, 1e-4)
-            if damping > 1e8:
-                break
     return chi2, used
 
 
@@ -313,14 +311,8 @@ def build_grid(
 def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[NDArray[np.int64], Array, Array]:
     """Return the cheapest distinct grid points for fluxes (2K,), T, ``count`` of them at most.
 
-    Returns
-    -------
-    chosen : ndarray, shape (C,)
-        Indices into ``grid.points``, best first.
-    axes : ndarray, shape (G, 3)
-        Best unit axis at every grid point.
-    cost : ndarray, shape (G,)
-        Whitened squared misfit with that axis.
+    They are indices, best first; with them come the best unit axis (G, 3) at every grid point, and
+    the whitened squared misfit (G,) with it.
     """
     white = flux / grid.sigma
     total = len(grid.points)

@@ -21,6 +21,7 @@ from scipy.special import chdtri
 
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import kernel
+from anser_ros.physics.dipole import dipole_rows
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.tracking.descent import damped_step, descend
 
@@ -72,7 +73,7 @@ class RealField:
     @cached_property
     def columns(self) -> Array:
         """Return coordinates of the positions and of the directions in rows, shape (6, N)."""
-        return np.ascontiguousarray(np.concatenate([self.positions, self.directions], axis=1).T)
+        return dipole_rows(self.positions, self.directions)
 
     @property
     def emitters(self) -> int:
@@ -139,12 +140,44 @@ def solve_coil(
             f'{whitening.shape}'
         )
     r, n = np.array(position, dtype=np.float64), np.array(axis, dtype=np.float64)
-    normal, residual = np.empty((6, 6)), np.empty(width)
-    chi2, used, converged = descend(
-        r, n, length_m, flux, whitening, field.columns, field.moments, low, high,
-        MAX_EVALUATIONS, normal, residual,
+    normal, residual, found = np.empty((6, 6)), np.empty(width), np.empty((1, 3))
+    descend(
+        r[None], n[None], np.array([length_m]), flux[None], whitening[None], field.columns,
+        field.moments, low, high, MAX_EVALUATIONS, normal[None], residual[None], found,
     )  # fmt: skip
-    return CoilSolution(r, n, chi2, normal, residual, used, converged)
+    chi2, used, converged = found[0].tolist()
+    return CoilSolution(r, n, chi2, normal, residual, int(used), bool(converged))
+
+
+def solve_coils(
+    field: RealField,
+    flux: Array,
+    whitening: Array,
+    positions: Array,
+    axes: Array,
+    low: Array,
+    high: Array,
+    lengths: Array,
+) -> list[CoilSolution]:
+    """Fit the poses of S coils, each from a start near it, which is written over.
+
+    The arguments are those of `solve_coil` with an axis of coils in front, and nothing is checked.
+    """
+    normals, residuals, found = (
+        np.empty((len(flux), 6, 6)),
+        np.empty(flux.shape),
+        np.empty((len(flux), 3)),
+    )
+    descend(
+        positions, axes, lengths, flux, whitening, field.columns, field.moments, low, high,
+        MAX_EVALUATIONS, normals, residuals, found,
+    )  # fmt: skip
+    return [
+        CoilSolution(position, axis, chi2, normal, residual, int(used), bool(converged))
+        for position, axis, normal, residual, (chi2, used, converged) in zip(
+            positions, axes, normals, residuals, found.tolist(), strict=True
+        )
+    ]
 
 
 ROLL_VARIANCE = math.pi**2 / 3.0

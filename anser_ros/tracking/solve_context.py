@@ -31,38 +31,42 @@ less, and no layout has neighbours within a millimetre."""
 
 
 @kernel
-def _fill_whitening(errors, sigma, factor, out):  # type: ignore[no-untyped-def]
-    """Write the inverse Cholesky factor of ``diag(sigma)^2 + E^T E``; False if there is none."""
+def _fill_whitening(errors, sigma, out):  # type: ignore[no-untyped-def]
+    """Write the inverse Cholesky factors of ``diag(sigma)^2 + E^T E``; False if one is missing.
+
+    ``errors`` (S, R, 2K) are the E of each of S coils, ``out`` is (S, 2K, 2K).
+    """
     width = sigma.shape[0]
-    scaled = np.empty(errors.shape)
-    for r in range(errors.shape[0]):
+    factor, scaled = np.empty((width, width)), np.empty((width, errors.shape[1]))
+    for s in range(errors.shape[0]):
         for i in range(width):
-            scaled[r, i] = errors[r, i] / sigma[i]
-    gram = np.dot(scaled.T, scaled)
-    for i in range(width):
-        gram[i, i] += 1.0
-        for j in range(i + 1):
-            total = gram[i, j]
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i > j:
-                factor[i, j] = total / factor[j, j]
-            elif total > 0.0 and math.isfinite(total):
-                factor[i, i] = math.sqrt(total)
-            else:
-                return False
-    for j in range(width):
+            for r in range(errors.shape[1]):
+                scaled[i, r] = errors[s, r, i] / sigma[i]
+        gram = np.dot(scaled, scaled.T)
         for i in range(width):
-            out[i, j] = 0.0
-        out[j, j] = 1.0 / factor[j, j]
-        for i in range(j + 1, width):
-            total = 0.0
-            for k in range(j, i):
-                total += factor[i, k] * out[k, j]
-            out[i, j] = -total / factor[i, i]
-    for i in range(width):
-        for j in range(i + 1):
-            out[i, j] /= sigma[j]
+            gram[i, i] += 1.0
+            for j in range(i + 1):
+                total = gram[i, j]
+                for k in range(j):
+                    total -= factor[i, k] * factor[j, k]
+                if i > j:
+                    factor[i, j] = total / factor[j, j]
+                elif total > 0.0 and math.isfinite(total):
+                    factor[i, i] = math.sqrt(total)
+                else:
+                    return False
+        for j in range(width):
+            for i in range(j):
+                out[s, i, j] = 0.0
+            out[s, j, j] = 1.0 / factor[j, j]
+            for i in range(j + 1, width):
+                total = 0.0
+                for k in range(j, i):
+                    total += factor[i, k] * out[s, k, j]
+                out[s, i, j] = -total / factor[i, i]
+        for i in range(width):
+            for j in range(i + 1):
+                out[s, i, j] /= sigma[j]
     return True
 
 
@@ -78,32 +82,6 @@ def source_spacing(positions: Array, floor_m: float) -> Array:
     square[square <= SAME_PLACE_M**2] = np.inf
     nearest = np.sqrt(square.min(axis=1, initial=np.inf))
     return np.where((nearest < np.inf) & (positions[:, 2] >= floor_m), nearest, 0.0)
-
-
-@kernel
-def _fill_all(  # type: ignore[no-untyped-def]
-    points, axes, lengths, dipoles, spacing, modes, sigma, errors, out, away, among
-):  # fmt: skip
-    """Write what `error_whitening` returns; False where a covariance has no factor."""
-    width = sigma.shape[0]
-    basis, factor = np.empty((points.shape[0], dipoles.shape[1])), np.empty((width, width))
-    fill_flux_basis(points, axes, lengths, dipoles, basis)
-    flat = np.dot(basis, modes)
-    good = True
-    for s in range(points.shape[0]):
-        for r in range(errors.shape[1]):
-            for k in range(width):
-                errors[s, r, k] = flat[s, r * width + k]
-        good &= _fill_whitening(errors[s], sigma, factor, out[s])
-        nearest, deepest = np.inf, 0.0
-        for j in range(dipoles.shape[1]):
-            square = 0.0
-            for i in range(3):
-                square += (points[s, i] - dipoles[i, j]) ** 2
-            nearest = min(nearest, square)
-            deepest = max(deepest, spacing[j] * spacing[j] / square)
-        away[s], among[s] = math.sqrt(nearest), math.sqrt(deepest)
-    return good
 
 
 def error_whitening(
@@ -140,13 +118,13 @@ def error_whitening(
         Where the covariance is not finite.
     """
     count, width = len(points), len(sigma)
-    errors = np.empty((count, modes.shape[1] // width, width))
-    whitening = np.empty((count, width, width))
-    away, among = np.empty(count), np.empty(count)
-    if not _fill_all(
-        points, axes, lengths, dipoles, spacing, modes, sigma, errors, whitening, away, among
-    ):
+    basis, whitening = np.empty((count, len(modes))), np.empty((count, width, width))
+    fill_flux_basis(points, axes, lengths, dipoles, basis)
+    errors = (basis @ modes).reshape(count, -1, width)
+    if not _fill_whitening(errors, sigma, whitening):
         raise TrackingError('the model covariance must be finite')
+    square = ((points[:, :, None] - dipoles[:3]) ** 2).sum(axis=1)
+    away, among = np.sqrt(square.min(axis=1)), np.sqrt((spacing**2 / square).max(axis=1))
     return errors, whitening, away, among
 
 

@@ -43,20 +43,8 @@ def variance_scale(
 ) -> float:
     """Return the factor on the variances of a pose; 1 where the noise is not adapted.
 
-    Parameters
-    ----------
-    noise : NoiseScale
-        Of the coil or body that the pose is of.
-    chi2 : float
-        Whitened residual power of the solve.
-    freedom, unknowns : int
-        Degrees of freedom of the residual, and numbers that the pose has.
-    seldom : float
-        Probability of a residual beyond which it counts as more than noise.
-    context : SolveContext
-        What the pose was solved with.
-    settings : TrackerSettings
-        The tracker's.
+    ``chi2`` is the whitened residual power, with ``freedom`` degrees of freedom, of a pose of so
+    many ``unknowns``; a residual of a probability below ``seldom`` counts as more than noise.
     """
     if not settings.adaptive:
         return 1.0
@@ -83,32 +71,13 @@ def verdict(
 ) -> tuple[str, str]:
     """Return the state of a solved pose, and the reason in words where it is not ``ok``.
 
-    Parameters
-    ----------
-    settings : TrackerSettings
-        Gate, volume, largest sigma and odds.
-    chi2 : float
-        Whitened residual power of the solve.
-    freedom : int
-        Degrees of freedom of the residual.
-    residual_t : float
-        Root mean square of the residual, T, for the reason.
-    place : ndarray, shape (3,)
-        What has to be in the volume: the coil, or the middle of the body's coils; m, frame fg.
-    converged : bool
-        Whether the descent has ended.
-    sigma_m : float
-        Square root of the trace of the position covariance, m.
-    scale : float
-        What variances were multiplied by, see `variance_scale`.
-    what : str
-        What is uncertain where ``sigma_m`` is too large.
-    in_metal : bool
-        Whether the pose lies where the model's field is none, among the dipoles that stand for
-        metal.
-    rivals : iterable of tuple of float and str
-        Other poses, the likeliest first: the chi-square of each, and its name in the reason. They
-        are looked at only where the pose is good by itself.
+    ``chi2`` is the whitened residual power with ``freedom`` degrees of freedom, ``residual_t`` the
+    root mean square of the residual, T. ``place`` (3,) has to be in the volume: the coil, or the
+    middle of the body's coils, m, frame fg. ``sigma_m`` is the root of the position covariance's
+    trace, m, ``what`` is uncertain where it is too large, and ``scale`` is from `variance_scale`.
+    ``in_metal``: whether the pose lies among the dipoles that stand for metal, where the model's
+    field is none. ``rivals`` are other poses, the likeliest first: the chi-square of each, and its
+    name in the reason; they are looked at only where the pose is good by itself.
     """
     ratio = chi2 / freedom
     if not ratio <= settings.gate**2:

@@ -127,18 +127,9 @@ class SolveFrame:
     ) -> PoseEstimate:
         """Judge a solution by itself: its covariance, its state, and the reason for it.
 
-        Parameters
-        ----------
-        noise : NoiseScale
-            Of what was solved for.
-        solution : Solution
-        freedom : Freedom
-        pose : tuple of ndarray
-            Position, axis, and rotation or None, as the estimate has them.
-        covariance : callable
-            Returns the pose's covariance (6, 6) before the scale, which it is given.
-        rivals, place, what, in_metal
-            As for `verdict`.
+        ``pose`` are position, axis, and rotation or None, as the estimate has them. ``covariance``
+        returns the pose's (6, 6) before the scale, which it is given. The last four are those of
+        `verdict`.
         """
         settings, chi2 = self.settings, solution.chi2
         scale = variance_scale(noise, chi2, *freedom, self.context, settings)
