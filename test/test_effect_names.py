@@ -39,7 +39,7 @@ MAY_IMPORT = {
     'diagnosis/screening.py': {'wiring'},
     'diagnosis/findings.py': {'seen'},
     'diagnosis/fit.py': {'metal_remainder'},
-    'diagnosis/departure.py': {'departed_metal', 'metal_path'},
+    'diagnosis/departure.py': {'metal_path', 'moving_metal'},
 }
 """Modules of single effects that a file may import, as it makes their terms without the search:
 wiring, noise and outliers are seen directly, and have no parameter whose fit could propose them;

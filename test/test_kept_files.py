@@ -11,7 +11,6 @@ from refit_rig import HEAD, Rig, setup_text
 from refit_world import anser_world
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
-from test_refit_start import given_baseline
 
 from anser_ros.cli import warm_up
 from anser_ros.nodes.field_model_io import BASELINE_S, KeptBaseline
@@ -139,7 +138,7 @@ def started(ros, tmp_path, monkeypatch):
 
 def test_a_node_that_is_started_near_metal_follows_the_references_again(started):
     rig = started()
-    given_baseline(rig)
+    rig.give_baseline()
     rig.until(lambda: rig.node.counters['refit_starts'] == 1)
     for _ in range(3):
         rig.say(0.0)
@@ -159,7 +158,7 @@ def test_a_node_that_is_started_near_metal_follows_the_references_again(started)
 
 def test_a_baseline_that_references_contradict_is_not_taken_up(started):
     rig = started()
-    given_baseline(rig)
+    rig.give_baseline()
     rig.until(lambda: rig.node.counters['refit_starts'] == 1)
     for _ in range(12):
         rig.say(0.0)

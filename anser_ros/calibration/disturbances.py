@@ -1,7 +1,8 @@
 """Finds what disturbs a scan: moving metal, reflected poses, emitters whose strength changes.
+
 Frames that no steady field and pose explain are left out. A change of an emitter's strength
-changes all references' readings of it by one factor, and nothing else; metal changes each of
-them by another one.
+changes all references' readings of it by one factor, and nothing else; metal changes each of them
+by another one.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,10 @@
-"""Fits a layout: its dipoles are placed, pulled towards the nominal field, moved if asked. The
-nominal model is first scaled by one complex gain per emitter and expressed by the layout's
-dipoles (`ScaledNominal`); the damping pulls towards these moments, so that moments which the
-data do not determine stay as drawn. Dipoles may then be moved (`LayoutPlacer`), and overlapping
-regions of the volume get moments of their own, blended into one finer layer, which is free of
-sources again (`join_regions`). `LayoutFitter` does what several fits have in common once.
+"""Fits a layout: its dipoles are placed, pulled towards the nominal field, moved if asked.
+
+The nominal model is first scaled by one complex gain per emitter and expressed by the layout's
+dipoles (`ScaledNominal`); the damping pulls towards these moments, so that moments which the data
+do not determine stay as drawn. Dipoles may then be moved (`LayoutPlacer`), and overlapping regions
+of the volume get moments of their own, blended into one finer layer, which is free of sources
+again (`join_regions`). `LayoutFitter` does what several fits have in common once.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,12 @@
-"""Lays virtual dipoles out: in layers over the field generator, on its coils, or on axes of
-their own. A magnet, an electromagnet or a coil of unknown shape has an axis; around it the
-field hardly changes. One dipole is its far field. Equal distances h along the axis make three
-or five dipoles the multipoles of the source's size: their moments are linear, and of either
-sign, so that a long source and a flat one are both described, whatever h is, as long as it is
-small compared with the distance of the sensors. Such a source's place and axis are found with
-the moments eliminated (`fit_coaxial`, variable projection).
+"""Lays virtual dipoles out: in layers over the field generator, on its coils, or on axes of their
+own.
+
+A magnet, an electromagnet or a coil of unknown shape has an axis; around it the field hardly
+changes. One dipole is its far field. Equal distances h along the axis make three or five dipoles
+the multipoles of the source's size: their moments are linear, and of either sign, so that a long
+source and a flat one are both described, whatever h is, as long as it is small compared with the
+distance of the sensors. Such a source's place and axis are found with the moments eliminated
+(`fit_coaxial`, variable projection).
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,11 @@
 """Solves least squares: many rows by one small kept factor, large normal matrices in strips.
-`TriangularFactor` and `GramFactor` keep a problem of any number of rows as one small matrix,
-whose `Spectrum` gives the solution for every damping. `NormalFactor` factors the matrix of a
-joint system in strips that threads share. The strips are the same for any number of threads,
-and so are the results, bit by bit, which they are not when the threads of a BLAS divide one
-product among them. The factor is Cholesky's, worked out by blocks (Golub and Van Loan, Matrix
-Computations, section 4.2.9).
+
+`TriangularFactor` and `GramFactor` keep a problem of any number of rows as one small matrix, whose
+`Spectrum` gives the solution for every damping. `NormalFactor` factors the matrix of a joint
+system in strips that threads share. The strips are the same for any number of threads, and so are
+the results, bit by bit, which they are not when the threads of a BLAS divide one product among
+them. The factor is Cholesky's, worked out by blocks (Golub and Van Loan, Matrix Computations,
+section 4.2.9).
 """
 
 from dataclasses import dataclass

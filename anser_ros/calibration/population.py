@@ -1,10 +1,10 @@
-"""Finds widths of populations, and which kinds of errors the data support at all. The
-likelihood of the parameters is Gaussian about the present estimate. A population's values are
-random with one width, which is the one that makes the data most probable (empirical Bayes;
-MacKay, Bayesian interpolation, Neural Computation 1992). A kind of error is kept if that
-probability is larger with it than without. A channel far outside its population is removed from
-it and treated separately. The jitter of an optical tracker is such a width too: that of the
-poses' errors.
+"""Finds widths of populations, and which kinds of errors the data support at all.
+
+The likelihood of the parameters is Gaussian about the present estimate. A population's values are
+random with one width, which is the one that makes the data most probable (empirical Bayes; MacKay,
+Bayesian interpolation, Neural Computation 1992). A kind of error is kept if that probability is
+larger with it than without. A channel far outside its population is removed from it and treated
+separately. The jitter of an optical tracker is such a width too: that of the poses' errors.
 """
 
 from collections.abc import Sequence

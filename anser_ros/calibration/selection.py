@@ -1,12 +1,13 @@
-"""Chooses the dipoles' layout and the damping by the predictive error of held-out blocks of
-space. All layouts are compared at the same poses (corrected once with a rich layer) and on the
-same blocks (`LayoutScorer`). A layout costs one matrix: the rows of each fold are summed to a
-Gram matrix, those of the other folds are added up, and the eigenvectors of the sum give the
-solutions for all dampings. The score is the predictive chi-square of the held-out frames with
-their poses marginalised, so that the jitter of the poses, much larger than the flux noise, does
-not hide the differences. The search (`choose_layout`) goes from coarse to fine layers and then
-varies their size, their depth and the kind of the dipoles. Its result, dipoles that are moved
-and overlapping regions are the finalists, among which a complete fit decides (`fit_scan`).
+"""Chooses the dipoles' layout and the damping by the predictive error of held-out blocks of space.
+
+All layouts are compared at the same poses (corrected once with a rich layer) and on the same
+blocks (`LayoutScorer`). A layout costs one matrix: the rows of each fold are summed to a Gram
+matrix, those of the other folds are added up, and the eigenvectors of the sum give the solutions
+for all dampings. The score is the predictive chi-square of the held-out frames with their poses
+marginalised, so that the jitter of the poses, much larger than the flux noise, does not hide the
+differences. The search (`choose_layout`) goes from coarse to fine layers and then varies their
+size, their depth and the kind of the dipoles. Its result, dipoles that are moved and overlapping
+regions are the finalists, among which a complete fit decides (`fit_scan`).
 """
 
 from collections.abc import Sequence

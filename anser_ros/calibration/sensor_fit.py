@@ -1,15 +1,16 @@
 """Finds what is wrong with a scan's own sensors, clock and optics, together with the field.
+
 Every step solves for the field and all parameters at once, with the poses marginalised
 (`joint_system`), and then weights the parameters with the widths of their populations
 (`population`). The noise of the fluxes and the jitter of the poses are estimated from the
 residuals, and frames that no step explains are left out (`disturbances`). At last every session
-gets its own parameters: values that two sessions give for a sensor must agree
-(`contradictions`). Values that the data cannot determine follow a rule. A gain that all sensors
-share is attributed to the emitters: the mean of the gains is one. A shift that all sensors of a
-body share is its lever arm: the mean of their places is zero. The frame is the optical
-tracker's, and so is that of the body: a rotation that all axes share is part of their tilts. If
-a scan does not turn the tool, a shift of all sensors is one of the field, which the drawing
-fixes.
+gets its own parameters: values that two sessions give for a sensor must agree (`contradictions`).
+
+Values that the data cannot determine follow a rule. A gain that all sensors share is attributed to
+the emitters: the mean of the gains is one. A shift that all sensors of a body share is its lever
+arm: the mean of their places is zero. The frame is the optical tracker's, and so is that of the
+body: a rotation that all axes share is part of their tilts. If a scan does not turn the tool, a
+shift of all sensors is one of the field, which the drawing fixes.
 """
 
 from collections.abc import Callable, Sequence

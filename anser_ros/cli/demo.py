@@ -1,6 +1,7 @@
-"""Runs the demo: all nodes track a simulated tool, with a table, a bag and a picture. Two
-chains of field model and tracker run side by side: one refits its model to the reference coils,
-the other keeps the model as calibrated. A steel disc comes from below and leaves again.
+"""Runs the demo: all nodes track a simulated tool, with a table, a bag and a picture.
+
+Two chains of field model and tracker run side by side: one refits its model to the reference
+coils, the other keeps the model as calibrated. A steel disc comes from below and leaves again.
 """
 
 from __future__ import annotations

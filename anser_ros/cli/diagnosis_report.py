@@ -1,5 +1,6 @@
-"""Shows the diagnosis as a self-contained page for readers who do not know the code. In its
-figures 1 is what noise alone would give.
+"""Shows the diagnosis as a self-contained page for readers who do not know the code.
+
+In its figures 1 is what noise alone would give.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,6 +1,7 @@
 """Makes self-contained pages of HTML from headings, paragraphs, tables, pictures and details.
-Each of them takes plain text and returns an `Html`; a page is a sequence of them, in which what
-is empty is left out.
+
+Each of them takes plain text and returns an `Html`; a page is a sequence of them, in which what is
+empty is left out.
 """
 
 import html

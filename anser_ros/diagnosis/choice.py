@@ -1,4 +1,5 @@
 """Starts explanations with freedom in time, and chooses among several: the steps of one round.
+
 Spreads of fluctuations; places of metal that moves, block by block; which fitted explanation is
 taken; and whether metal that seems to move rests.
 """

@@ -1,7 +1,8 @@
-"""Sums the fields of sets of dipoles, and finds the axis about which a set may be turned. The
-octupole of sources on an axis, about their middle, is that of their second moment: the mean
-square distance from the middle, weighted by the moments. It is negative where moments beside
-the middle are of the opposite sign, as those are that stand for a flat coil.
+"""Sums the fields of sets of dipoles, and finds the axis about which a set may be turned.
+
+The octupole of sources on an axis, about their middle, is that of their second moment: the mean
+square distance from the middle, weighted by the moments. It is negative where moments beside the
+middle are of the opposite sign, as those are that stand for a flat coil.
 """
 
 from dataclasses import dataclass

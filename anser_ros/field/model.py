@@ -1,6 +1,7 @@
-"""Defines the field model that all packages share, and its document. Virtual dipoles with
-moments for each emitter, where their field is uncertain (in the gaps of the scan that it was
-fitted to), and what reference sensors read without metal when it was calibrated.
+"""Defines the field model that all packages share, and its document.
+
+Virtual dipoles with moments for each emitter, where their field is uncertain (in the gaps of the
+scan that it was fitted to), and what reference sensors read without metal when it was calibrated.
 """
 
 from collections.abc import Mapping

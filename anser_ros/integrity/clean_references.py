@@ -1,9 +1,10 @@
-"""Judges whether reference readings are those of a field without metal. A baseline is what all
-later readings are compared with: metal that was present when it was taken becomes part of the
-field for good, and no refit detects it. So a baseline has to agree with independent knowledge
-of the references: their readings when the model was calibrated, or else what the drawing of the
-board predicts (`DrawnReadings`). The strength of an emitter may have changed, and single
-sensors may be bad.
+"""Judges whether reference readings are those of a field without metal.
+
+A baseline is what all later readings are compared with: metal that was present when it was taken
+becomes part of the field for good, and no refit detects it. So a baseline has to agree with
+independent knowledge of the references: their readings when the model was calibrated, or else what
+the drawing of the board predicts (`DrawnReadings`). The strength of an emitter may have changed,
+and single sensors may be bad.
 """
 
 import itertools

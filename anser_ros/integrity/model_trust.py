@@ -1,9 +1,10 @@
 """Says how far a model may be trusted: by its age since references last gave it, and by the
-readings that it explained. Metal continues to move when no references report it. So the
-uncertainty of a model that followed them grows from frame to frame, by the change of the field
-while the metal was still observed; beyond a bound it no longer describes the field. And a model
-that leaves most readings of the last seconds unexplained is doubtful, though single poses pass
-by chance.
+readings that it explained.
+
+Metal continues to move when no references report it. So the uncertainty of a model that followed
+them grows from frame to frame, by the change of the field while the metal was still observed;
+beyond a bound it no longer describes the field. And a model that leaves most readings of the last
+seconds unexplained is doubtful, though single poses pass by chance.
 """
 
 import math

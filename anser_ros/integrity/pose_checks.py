@@ -1,14 +1,17 @@
-"""Judges a pose by those before it, and by what the coils of a rigid body say of each other. A
-single residual that passes the gate proves little when most of its neighbours in time do not: a
+"""Judges a pose by those before it, and by what the coils of a rigid body say of each other.
+
+A single residual that passes the gate proves little when most of its neighbours in time do not: a
 few wrong poses pass by chance. So after withheld poses a pose needs consistent ones before it.
 Points that were recorded one by one, further apart than `STREAM_GAP_S`, have no neighbours in
-time, and each is judged alone. A body's pose predicts the place of each of its coils, and each
-coil has its own pose. The two may differ by their errors, by the errors of the body's survey,
-and by the effect of an error of the coil's gain. A coil that differs by more is in another
-place, or is another coil. A coil that took part in the body's solve shares its noise with it:
-the difference of an estimate and one that makes better use of the same data has the
-*difference* of their covariances (Hausman, Econometrica 1978), which the coil's own bounds from
-above. A coil that was left out shares no noise with the body, and the covariances add up.
+time, and each is judged alone.
+
+A body's pose predicts the place of each of its coils, and each coil has its own pose. The two may
+differ by their errors, by the errors of the body's survey, and by the effect of an error of the
+coil's gain. A coil that differs by more is in another place, or is another coil. A coil that took
+part in the body's solve shares its noise with it: the difference of an estimate and one that makes
+better use of the same data has the *difference* of their covariances (Hausman, Econometrica 1978),
+which the coil's own bounds from above. A coil that was left out shares no noise with the body, and
+the covariances add up.
 """
 
 import math

@@ -1,17 +1,20 @@
-"""Judges a stream of messages: does it have one sender, and are its readings new? The
-middleware numbers the messages of a publisher, 1, 2, 3, but does not identify the publisher.
+"""Judges a stream of messages: does it have one sender, and are its readings new?
+
+The middleware numbers the messages of a publisher, 1, 2, 3, but does not identify the publisher.
 Messages that continue one sequence are one stream; a second sequence is a second sender,
-recognised by its first message. The number of publishers that the graph knows distinguishes a
-lost message from another sequence, and shows when a sender has gone. A sender that crashed
-stays in the graph for some time: it does not count once it has been silent, unless its last
-message holds until it is replaced. A reading without new noise is an old one. Each reading is
-compared with the channel's own readings of the last seconds. Two explanations compete: *new*,
-the difference contains the noise of two readings; *stuck*, it contains rounding alone or,
-because a flux is a voltage divided by a measured current, also the noise of the current. The
-logarithm of the odds is summed over frames that follow one another with the same distance in
-time; odds of ``exp(h)`` come about by chance with a probability of ``exp(-h)`` at most (Ville's
-inequality), however many emitters there are and however long the run is. So with eight emitters
-one exact repetition is enough, and one emitter needs a few.
+recognised by its first message. The number of publishers that the graph knows distinguishes a lost
+message from another sequence, and shows when a sender has gone. A sender that crashed stays in the
+graph for some time: it does not count once it has been silent, unless its last message holds until
+it is replaced.
+
+A reading without new noise is an old one. Each reading is compared with the channel's own readings
+of the last seconds. Two explanations compete: *new*, the difference contains the noise of two
+readings; *stuck*, it contains rounding alone or, because a flux is a voltage divided by a measured
+current, also the noise of the current. The logarithm of the odds is summed over frames that follow
+one another with the same distance in time; odds of ``exp(h)`` come about by chance with a
+probability of ``exp(-h)`` at most (Ville's inequality), however many emitters there are and
+however long the run is. So with eight emitters one exact repetition is enough, and one emitter
+needs a few.
 """
 
 import math

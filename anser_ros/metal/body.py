@@ -1,15 +1,19 @@
-"""Models pieces of metal: spheres, bodies seen from outside, thin sheets. Time convention
-exp(+j w t): a conductor's induced moment opposes the field, and lags by at most a quarter
-period. Near a body's centre a field is a sum of gradients of solid harmonics; those are the
-shapes that count (`anser_ros.metal.scattering`). The leading block of T (orders 1, 1) is the
-polarisability, and a block of orders l, l' grows as R^(l + l' + 1) with the body's radius R.
-Where the body is its own mirror image about the centre, blocks of odd l + l' vanish, which
-shows where its centre is. A body as large as its distance is no sum of few multipoles: it is a
-lattice of small pieces. A sheet is a mesh of square loops. Loop i of a mesh of edge h obeys
-``sum_j (R_ij + j w M_ij) I_j = -j w Phi_i``: M from Neumann's formula for parallel filaments at
-the mean distance of the strips that they stand for (Grover, Inductance Calculations, 1946, ch.
-3), R from the sheet resistance, one square an edge. M scales with h and R not at all, so one
-generalised eigenproblem serves all sizes and resistances.
+"""Models pieces of metal: spheres, bodies seen from outside, thin sheets.
+
+Time convention exp(+j w t): a conductor's induced moment opposes the field, and lags by at most a
+quarter period.
+
+Near a body's centre a field is a sum of gradients of solid harmonics; those are the shapes that
+count (`anser_ros.metal.scattering`). The leading block of T (orders 1, 1) is the polarisability,
+and a block of orders l, l' grows as R^(l + l' + 1) with the body's radius R. Where the body is its
+own mirror image about the centre, blocks of odd l + l' vanish, which shows where its centre is. A
+body as large as its distance is no sum of few multipoles: it is a lattice of small pieces.
+
+A sheet is a mesh of square loops. Loop i of a mesh of edge h obeys ``sum_j (R_ij + j w M_ij) I_j =
+-j w Phi_i``: M from Neumann's formula for parallel filaments at the mean distance of the strips
+that they stand for (Grover, Inductance Calculations, 1946, ch. 3), R from the sheet resistance,
+one square an edge. M scales with h and R not at all, so one generalised eigenproblem serves all
+sizes and resistances.
 """
 
 from collections.abc import Callable, Mapping

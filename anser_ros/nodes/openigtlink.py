@@ -1,6 +1,7 @@
-"""Serves every pose, and the state of what has none, to 3D Slicer as OpenIGTLink. Every TCP
-client is served the same messages by a thread of its own (`IgtlServer`), and what it asks is
-answered.
+"""Serves every pose, and the state of what has none, to 3D Slicer as OpenIGTLink.
+
+Every TCP client is served the same messages by a thread of its own (`IgtlServer`), and what it
+asks is answered.
 """
 
 import contextlib

@@ -1,6 +1,7 @@
-"""Turns fluxes into poses of every tool sensor and rigid body, with covariance, state and
-reason. A pose is published only in the state ``ok``; ``/diagnostics`` gives the reason for any
-other state.
+"""Turns fluxes into poses of every tool sensor and rigid body, with covariance, state and reason.
+
+A pose is published only in the state ``ok``; ``/diagnostics`` gives the reason for any other
+state.
 """
 
 import sys

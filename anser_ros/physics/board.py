@@ -1,14 +1,16 @@
 """Draws an emitter board as closed current paths, and computes their field by Biot and Savart.
+
 The number of coils, their kind and their places are data. A *kind* is a function that draws one
 coil around its own centre; a new kind of board needs one more function in `KINDS`. The key
 ``winding`` of the geometry states which way a positive current runs, seen from +z: ``ccw``
-(counter-clockwise, moment along +z) or ``cw``. Printed spirals are ``cw`` by default because
-the Anser board's are (its measured in-phase moments are negative); plain loops are ``ccw``. A
-segment from A to B with the current I flowing from A to B makes, at the offsets ``a = P - A``
-and ``b = P - B``, ``B = mu0 I/(4 pi) (a x b) (|a| + |b|) / (|a| |b| (|a| |b| + a . b))``, which
-is the integral of ``dl x r / r^3`` in closed form (Hanson and Hirshman, Phys. Plasmas 9, 2002).
-No digits cancel at points near the line that extends the segment. Only closed paths have a
-field that is curl-free outside the copper, and only such a field can be fitted by dipoles.
+(counter-clockwise, moment along +z) or ``cw``. Printed spirals are ``cw`` by default because the
+Anser board's are (its measured in-phase moments are negative); plain loops are ``ccw``.
+
+A segment from A to B with the current I flowing from A to B makes, at the offsets ``a = P - A``
+and ``b = P - B``, ``B = mu0 I/(4 pi) (a x b) (|a| + |b|) / (|a| |b| (|a| |b| + a . b))``, which is
+the integral of ``dl x r / r^3`` in closed form (Hanson and Hirshman, Phys. Plasmas 9, 2002). No
+digits cancel at points near the line that extends the segment. Only closed paths have a field that
+is curl-free outside the copper, and only such a field can be fitted by dipoles.
 """
 
 import math

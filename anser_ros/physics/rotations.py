@@ -1,9 +1,10 @@
 """Turns and compares directions and rotations: planes across an axis, angles, vectors,
-quaternions. Angles are in rad, by arctangent: small ones are exact too. Functions of scipy's
-``Rotation`` are repeated for speed: trackers convert one rotation at a time, several times per
-pose and frame. One call takes 5 to 9 us here, and in scipy 1.17 11 us from a vector or a
-quaternion and 58 us from a matrix, which it makes orthogonal first. Whole tracks are turned by
-scipy.
+quaternions.
+
+Angles are in rad, by arctangent: small ones are exact too. Functions of scipy's ``Rotation`` are
+repeated for speed: trackers convert one rotation at a time, several times per pose and frame. One
+call takes 5 to 9 us here, and in scipy 1.17 11 us from a vector or a quaternion and 58 us from a
+matrix, which it makes orthogonal first. Whole tracks are turned by scipy.
 """
 
 import math

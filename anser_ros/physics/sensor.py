@@ -1,5 +1,6 @@
-"""Holds the table of pick-up coils, and computes the fluxes of those that are sums of points. A
-table is taken apart into points, each with the axis of its sensor; the kernels of `dipole` work
+"""Holds the table of pick-up coils, and computes the fluxes of those that are sums of points.
+
+A table is taken apart into points, each with the axis of its sensor; the kernels of `dipole` work
 on these, and the points of each sensor are summed up again. A single coil is one point with its
 length.
 """

@@ -1,15 +1,19 @@
-"""Says where unknown metal may be, and what field drives it there. A *cloud* fills a part of
-space with point sources of independent polarisability, each of a variance proportional to the
-volume it stands for: the prior is then white in space and does not depend on how finely that
-part is sampled. All that a cloud asserts is that no metal is nearer than its *standoff*: the
-distance from the board for clouds below it, from the tracked volume for clouds around it. A
-*compact body* is a small cloud, a ball of sources at one place: the hypothesis of one piece of
-metal beside or over the volume. The evidence decides, frame by frame, which is right (see
-`refit.posterior`). The emitters' field drives the metal. A calibrated model is fitted where
-tools are, over the board; extrapolated below it, it is wrong by tens of percent near the coils,
-while the coils' drawing gives that field to a percent. So the drawing is used if there is one,
-with strength and phase taken from the calibrated model. The frame ``fg`` has its board at z = 0
-with z up towards the patient, so "below" is z < 0.
+"""Says where unknown metal may be, and what field drives it there.
+
+A *cloud* fills a part of space with point sources of independent polarisability, each of a
+variance proportional to the volume it stands for: the prior is then white in space and does not
+depend on how finely that part is sampled. All that a cloud asserts is that no metal is nearer than
+its *standoff*: the distance from the board for clouds below it, from the tracked volume for clouds
+around it. A *compact body* is a small cloud, a ball of sources at one place: the hypothesis of one
+piece of metal beside or over the volume. The evidence decides, frame by frame, which is right (see
+`refit.posterior`).
+
+The emitters' field drives the metal. A calibrated model is fitted where tools are, over the board;
+extrapolated below it, it is wrong by tens of percent near the coils, while the coils' drawing
+gives that field to a percent. So the drawing is used if there is one, with strength and phase
+taken from the calibrated model.
+
+The frame ``fg`` has its board at z = 0 with z up towards the patient, so "below" is z < 0.
 """
 
 import math

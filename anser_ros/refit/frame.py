@@ -1,5 +1,6 @@
-"""Turns a frame of the references into a change since the baseline, in units of the noise. The
-steps, in the order in which a frame passes them: the baseline is the mean reading of the last
+"""Turns a frame of the references into a change since the baseline, in units of the noise.
+
+The steps, in the order in which a frame passes them: the baseline is the mean reading of the last
 moments without metal; a reading that is silent, or has no baseline, is named; the noise is
 measured from second differences in time; readings are averaged while they do not change.
 """

@@ -1,10 +1,11 @@
-"""Finds faults of reference coils, each judged by what the others predict for it. A reference
-that is dead, moved, saturated or unplugged changes alone; metal changes many readings at once,
-in the proportions that the emitters' fields have at one place. So "coil s is at fault" is one
-more hypothesis, with readings of any size, while the others alone determine the metal, and its
-odds against "all is well" come from the same evidence. All of it follows from the
-decompositions that a `Bank` holds, by the rules of the conditional normal distribution. A coil
-that is left out is watched, and returns when it has agreed with the others for a while.
+"""Finds faults of reference coils, each judged by what the others predict for it.
+
+A reference that is dead, moved, saturated or unplugged changes alone; metal changes many readings
+at once, in the proportions that the emitters' fields have at one place. So "coil s is at fault" is
+one more hypothesis, with readings of any size, while the others alone determine the metal, and its
+odds against "all is well" come from the same evidence. All of it follows from the decompositions
+that a `Bank` holds, by the rules of the conditional normal distribution. A coil that is left out
+is watched, and returns when it has agreed with the others for a while.
 """
 
 import math

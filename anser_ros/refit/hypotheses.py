@@ -1,12 +1,14 @@
-"""Keeps the hypotheses that are in use, and follows how probable each is. Hundreds of compact
-bodies (`refit.clouds`) are too many to be judged in full in every frame. So a bank has a few
-*slots*, places for one body each; a body that explains the readings better takes over the slot
-of the one that explains them worst. For each set of reference coils in use there is a bank,
-computed once. The `Belief` goes on from frame to frame. Work that takes longer than a frame
-runs in one background thread of the process. A result comes into use at a fixed time after it
-was requested, measured by the stamps of the frames: so the refit's results do not depend on how
-busy the machine is, and a recording gives the live results. If the thread has not finished by
-then, the refit waits for it.
+"""Keeps the hypotheses that are in use, and follows how probable each is.
+
+Hundreds of compact bodies (`refit.clouds`) are too many to be judged in full in every frame. So a
+bank has a few *slots*, places for one body each; a body that explains the readings better takes
+over the slot of the one that explains them worst. For each set of reference coils in use there is
+a bank, computed once. The `Belief` goes on from frame to frame.
+
+Work that takes longer than a frame runs in one background thread of the process. A result comes
+into use at a fixed time after it was requested, measured by the stamps of the frames: so the
+refit's results do not depend on how busy the machine is, and a recording gives the live results.
+If the thread has not finished by then, the refit waits for it.
 """
 
 from collections.abc import Callable, Mapping, Sequence

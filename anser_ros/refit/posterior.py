@@ -1,19 +1,24 @@
 """Keeps the bank of hypotheses: their evidence, the field's change under each of them, and its
-uncertainty. Every cloud's hypothesis is a Gaussian of the readings, ``y ~ N(0, a C + s^2 N)``:
-metal of a total strength ``a`` distributed as in the cloud, the survey's errors in proportion,
-and noise. In the eigenvectors of C (whitened by N) all of it is diagonal, so the evidence of
-any strength costs a sum, and the strength is integrated over a grid instead of being chosen
-(MacKay, Neural Computation 4 (1992) 415). In-phase and quadrature parts share the geometry and
-have a strength each. Hypothesis 0 is that nothing has changed. The *bank* holds all hypotheses
-with the matrices that are computed for them in advance, so that one pass over the readings of a
-frame gives the evidence of each. A *slot* of the bank is an empty place in which a compact body
-can be put later (`refit.hypotheses`). `refit.health` compares coils with each other by the same
-tables. N is white noise plus the drift of the emitters: an error of an emitter's measured
-current changes all references in proportion to their baseline, which metal does not. A *mode*
-is one direction in which the refitted model may be wrong: a set of moments whose field has the
-size of one standard deviation. Modes are independent of each other. They are the principal
-directions of random draws of the posterior's error; one number states the remainder. Readings
-are in units of the nominal noise throughout this module.
+uncertainty.
+
+Every cloud's hypothesis is a Gaussian of the readings, ``y ~ N(0, a C + s^2 N)``: metal of a total
+strength ``a`` distributed as in the cloud, the survey's errors in proportion, and noise. In the
+eigenvectors of C (whitened by N) all of it is diagonal, so the evidence of any strength costs a
+sum, and the strength is integrated over a grid instead of being chosen (MacKay, Neural Computation
+4 (1992) 415). In-phase and quadrature parts share the geometry and have a strength each.
+Hypothesis 0 is that nothing has changed. The *bank* holds all hypotheses with the matrices that
+are computed for them in advance, so that one pass over the readings of a frame gives the evidence
+of each. A *slot* of the bank is an empty place in which a compact body can be put later
+(`refit.hypotheses`). `refit.health` compares coils with each other by the same tables.
+
+N is white noise plus the drift of the emitters: an error of an emitter's measured current changes
+all references in proportion to their baseline, which metal does not.
+
+A *mode* is one direction in which the refitted model may be wrong: a set of moments whose field
+has the size of one standard deviation. Modes are independent of each other. They are the principal
+directions of random draws of the posterior's error; one number states the remainder.
+
+Readings are in units of the nominal noise throughout this module.
 """
 
 import math

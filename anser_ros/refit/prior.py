@@ -1,15 +1,20 @@
 """Predicts by one hypothesis: the covariance of readings, the map to the field, and the few
-numbers that poses feel. With the excitation B_k(r_j) of emitter k at source j and the coupling
-G_s(r_j) of coil s, a source of the polarisability tensor P_j changes the reading by
-``G_s(r_j)^T P_j B_k(r_j)``: the same P_j for all emitters. Independent P_j of variance ``a
-v_j`` (v_j the source's volume) make the readings Gaussian with the covariance ``a C``. All that
-depends on the geometry is computed here, once. Polarisabilities vary a little with the drive
-frequency: each source gets a second, independent part proportional to log(f_k / f_mean), of
-`FREQUENCY_SLOPE` times the first one's deviation. A surveyed coil differs slightly from the
-table in place, direction and gain. Without metal this is part of its baseline and cancels; in
-the change caused by metal it leaves an error proportional to the change. To first order it is
-the reading of a few displaced, turned and scaled copies of the coil (`survey_variants`). The
-field of a cloud's thousands of sources, as the layer makes it in the tracked volume, has some
+numbers that poses feel.
+
+With the excitation B_k(r_j) of emitter k at source j and the coupling G_s(r_j) of coil s, a source
+of the polarisability tensor P_j changes the reading by ``G_s(r_j)^T P_j B_k(r_j)``: the same P_j
+for all emitters. Independent P_j of variance ``a v_j`` (v_j the source's volume) make the readings
+Gaussian with the covariance ``a C``. All that depends on the geometry is computed here, once.
+
+Polarisabilities vary a little with the drive frequency: each source gets a second, independent
+part proportional to log(f_k / f_mean), of `FREQUENCY_SLOPE` times the first one's deviation.
+
+A surveyed coil differs slightly from the table in place, direction and gain. Without metal this is
+part of its baseline and cancels; in the change caused by metal it leaves an error proportional to
+the change. To first order it is the reading of a few displaced, turned and scaled copies of the
+coil (`survey_variants`).
+
+The field of a cloud's thousands of sources, as the layer makes it in the tracked volume, has some
 tens of directions that affect poses (`reduced`). Coordinates along them have unit variance for
 metal of unit strength, so a posterior over metal is a mean and a small covariance matrix, which
 readings of coils that move can update frame by frame. The directions are those of a randomised

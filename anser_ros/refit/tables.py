@@ -1,9 +1,11 @@
-"""Computes a refit's tables once, and turns them into plain arrays and back, so that they need
-not be computed again. Tables are the driving field, the layers, the predictions of all clouds,
-and for the search of compact bodies the few directions of the space of readings that each
-body's readings lie in: with them alone, and one variance for the remainder, its evidence costs
-a hundredth of the full one. Stored is what takes seconds; the emitters' field and the clouds
-are worked out anew, in a fraction of that.
+"""Computes a refit's tables once, and turns them into plain arrays and back, so that they need not
+be computed again.
+
+Tables are the driving field, the layers, the predictions of all clouds, and for the search of
+compact bodies the few directions of the space of readings that each body's readings lie in: with
+them alone, and one variance for the remainder, its evidence costs a hundredth of the full one.
+Stored is what takes seconds; the emitters' field and the clouds are worked out anew, in a fraction
+of that.
 """
 
 from collections.abc import Callable, Mapping, Sequence

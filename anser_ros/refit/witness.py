@@ -1,16 +1,19 @@
 """Uses tools as witnesses of metal: contradictions of coils settle what references leave open.
-The readings of a tool's coils are compared at the pose that was found for it. The pose is free,
-so the directions in which a translation or rotation of the tool would change them carry no
+
+The readings of a tool's coils are compared at the pose that was found for it. The pose is free, so
+the directions in which a translation or rotation of the tool would change them carry no
 information (`ToolRows.pose`). The errors of the coils themselves (gain, place and axis) are the
-same in every frame, and `CoilErrors` estimates them from the part that no metal explains: a
-wrong gain must not be taken for metal. The references determine a hypothesis' metal with a
-known error (`refit.posterior`). A tool that moves through the field senses this error: a pose
-takes six numbers of the readings of its coils, and all others remain. They enter a Kalman
-filter over the coordinates of the error (`refit.prior.reduced`), one filter per hypothesis,
-after the poses of their frame have been given: the next frame's poses are then independent of
-them, and nothing is counted twice. Metal moves slowly, and so does the error of its estimate.
-So the error is a stationary process with a memory of `MEMORY_S`; the references of every frame
-bound its size again.
+same in every frame, and `CoilErrors` estimates them from the part that no metal explains: a wrong
+gain must not be taken for metal.
+
+The references determine a hypothesis' metal with a known error (`refit.posterior`). A tool that
+moves through the field senses this error: a pose takes six numbers of the readings of its coils,
+and all others remain. They enter a Kalman filter over the coordinates of the error
+(`refit.prior.reduced`), one filter per hypothesis, after the poses of their frame have been given:
+the next frame's poses are then independent of them, and nothing is counted twice.
+
+Metal moves slowly, and so does the error of its estimate. So the error is a stationary process
+with a memory of `MEMORY_S`; the references of every frame bound its size again.
 """
 
 import math

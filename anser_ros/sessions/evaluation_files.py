@@ -1,7 +1,7 @@
-"""Writes the document and tables that an evaluation leaves, and compares two of the same
-frames. Frames close in time share the causes of their errors, so whole stretches of time are
-resampled (the moving-block idea of Künsch, Annals of Statistics 17, 1989), all coils of a
-stretch together.
+"""Writes the document and tables that an evaluation leaves, and compares two of the same frames.
+
+Frames close in time share the causes of their errors, so whole stretches of time are resampled
+(the moving-block idea of Künsch, Annals of Statistics 17, 1989), all coils of a stretch together.
 """
 
 import csv

@@ -1,7 +1,8 @@
 """Judges whether a recording can be what its units, clocks and poses say, before it is used.
-First the conventions in which poses and fluxes were written, by the fluxes of the nominal
-board; then refused poses, clocks, an optical tracker that stood still, and distances. Every
-check refuses on evidence only, and names it; what the data cannot decide passes.
+
+First the conventions in which poses and fluxes were written, by the fluxes of the nominal board;
+then refused poses, clocks, an optical tracker that stood still, and distances. Every check refuses
+on evidence only, and names it; what the data cannot decide passes.
 """
 
 import itertools

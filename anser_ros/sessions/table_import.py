@@ -1,4 +1,5 @@
 """Makes a session of tables of fluxes or tracked poses, and of optical poses, by a document.
+
 The document names the files, their columns, units, the order of quaternions and the time base;
 `docs/howto/import.md` has every key with examples.
 """

@@ -1,12 +1,17 @@
-"""Converts phasors in codes to fluxes in tesla, referred to the measured coil currents. A coil
-of N turns and area A behind an amplifier of gain G turns a flux density B exp(+j w t) along its
-axis into the voltage (Faraday's law; the winding sense makes the sign positive)     V = j w a B
-exp(-j w d),    a = N A G,    d = delay of the channel and the channel of the summed currents
-has the current I_k of emitter k at that emitter's tone, so     B_k = V_k / (j w_k a exp(-j w_k
-d)) * I_nominal,k exp(-j w_k d_I) / I_k is the flux density at nominal current, with the phase
-of the measured current as its zero. A drift of the current and the unknown start of the window
-cancel. Rates of change of the fluxes, for windows too short to fit them, come from earlier
-windows.
+"""Converts phasors in codes to fluxes in tesla, referred to the measured coil currents.
+
+A coil of N turns and area A behind an amplifier of gain G turns a flux density B exp(+j w t) along
+its axis into the voltage (Faraday's law; the winding sense makes the sign positive)
+
+    V = j w a B exp(-j w d),    a = N A G,    d = delay of the channel
+
+and the channel of the summed currents has the current I_k of emitter k at that emitter's tone, so
+
+    B_k = V_k / (j w_k a exp(-j w_k d)) * I_nominal,k exp(-j w_k d_I) / I_k
+
+is the flux density at nominal current, with the phase of the measured current as its zero. A drift
+of the current and the unknown start of the window cancel. Rates of change of the fluxes, for
+windows too short to fit them, come from earlier windows.
 """
 
 from __future__ import annotations

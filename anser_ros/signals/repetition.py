@@ -1,11 +1,13 @@
-"""Finds repeated samples: a column whose newest samples equal earlier ones bit for bit. Fresh
-samples carry new noise, so that a long run of them never equals an earlier one. How long a run
-must be follows from the observed noise of a column: at the lag at which its tones return most
-nearly, two fresh samples coincide with a probability q, which is counted, and a run of n of
-them with q^n. A column whose n samples contain too little randomness proves nothing, and is
-called noiseless: if nothing changes, new and old samples cannot be distinguished. The search is
-compiled, and goes a sample at a time. Positions count samples since the last reset; the sample
-at position p is in row p mod H of the history (H, C).
+"""Finds repeated samples: a column whose newest samples equal earlier ones bit for bit.
+
+Fresh samples carry new noise, so that a long run of them never equals an earlier one. How long a
+run must be follows from the observed noise of a column: at the lag at which its tones return most
+nearly, two fresh samples coincide with a probability q, which is counted, and a run of n of them
+with q^n. A column whose n samples contain too little randomness proves nothing, and is called
+noiseless: if nothing changes, new and old samples cannot be distinguished.
+
+The search is compiled, and goes a sample at a time. Positions count samples since the last reset;
+the sample at position p is in row p mod H of the history (H, C).
 """
 
 from __future__ import annotations

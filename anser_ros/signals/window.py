@@ -1,5 +1,6 @@
-"""Cuts overlapping windows from a stream of sample blocks, with the samples that they miss. The
-device's ticks and its samples share a clock and must advance together; ticks confirm how many
+"""Cuts overlapping windows from a stream of sample blocks, with the samples that they miss.
+
+The device's ticks and its samples share a clock and must advance together; ticks confirm how many
 blocks were lost.
 """
 

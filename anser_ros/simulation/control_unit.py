@@ -1,4 +1,5 @@
 """Simulates a control unit: the world's fluxes become samples, and commands become records.
+
 `Sampler` samples the fluxes into the codes of an analogue-to-digital converter; `ControlUnit`
 turns the bytes of commands into the bytes of records. It has no clock: its owner passes it the
 elapsed time as a number of samples.

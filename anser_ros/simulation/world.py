@@ -1,8 +1,8 @@
 """Simulates the world around a control unit: a board, moving tools, reference coils and metal.
-It gives the true flux of every sensor at any time. Bodies move on paths; metal is a rigid cloud
-of conducting and permeable spheres; the board's field is that of all tracks of its coils, which
-may differ from the drawing as manufactured boards do. Samples, noise and bytes are added
-elsewhere.
+
+It gives the true flux of every sensor at any time. Bodies move on paths; metal is a rigid cloud of
+conducting and permeable spheres; the board's field is that of all tracks of its coils, which may
+differ from the drawing as manufactured boards do. Samples, noise and bytes are added elsewhere.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Follows tool sensors through time: warm or cold solve, gate, state, uncertainty. The steps of
-a frame: all coils are solved near where they are expected, in one call of compiled code
-(`solve_warm`); each is confirmed, looked at again, or scanned for (`track_coil`); its solution
-is judged by itself and remembered as good or suspect.
+"""Follows tool sensors through time: warm or cold solve, gate, state, uncertainty.
+
+The steps of a frame: all coils are solved near where they are expected, in one call of compiled
+code (`solve_warm`); each is confirmed, looked at again, or scanned for (`track_coil`); its
+solution is judged by itself and remembered as good or suspect.
 """
 
 import math

@@ -1,7 +1,9 @@
-"""Solves for the 6-DoF pose of a rigid tool from all of its coils at once. The steps: errors
-that coils share become a low-rank part of the residuals' covariance (Woodbury's identity);
-every coil's flux and its slopes; damped steps of translation and rotation vector in fg, R <-
-exp([w]) R, so that no attitude is singular; starts from the coils' own poses, or from the grid.
+"""Solves for the 6-DoF pose of a rigid tool from all of its coils at once.
+
+The steps: errors that coils share become a low-rank part of the residuals' covariance (Woodbury's
+identity); every coil's flux and its slopes; damped steps of translation and rotation vector in fg,
+R <- exp([w]) R, so that no attitude is singular; starts from the coils' own poses, or from the
+grid.
 """
 
 import math

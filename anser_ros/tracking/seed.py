@@ -1,12 +1,15 @@
 """Finds a coil's pose without any guess: a scan of a precomputed grid, then polish of the best
-few. For a given position the fluxes are linear in the axis, ``y = B^T n`` with the emitters'
-fields as columns of B. With ``B B^T = L L^T`` the unexplained power at a grid point is ``|y|^2
-- |c|^2``, ``c = L^-1 B y``, and the axis is ``L^-T c``: one small product per point. That a
-true axis has length one is a constraint that distinguishes positions; its cost is added to
-second order. From far away the joint descent is slow and ends in false minima, because position
-and axis trade against each other. So the first descent is by position alone, with the best axis
-at every position (variable projection: Golub and Pereyra 1973, with Kaufman's simplification),
-the coil taken for a point; the joint descent that follows knows its length.
+few.
+
+For a given position the fluxes are linear in the axis, ``y = B^T n`` with the emitters' fields as
+columns of B. With ``B B^T = L L^T`` the unexplained power at a grid point is ``|y|^2 - |c|^2``,
+``c = L^-1 B y``, and the axis is ``L^-T c``: one small product per point. That a true axis has
+length one is a constraint that distinguishes positions; its cost is added to second order.
+
+From far away the joint descent is slow and ends in false minima, because position and axis trade
+against each other. So the first descent is by position alone, with the best axis at every position
+(variable projection: Golub and Pereyra 1973, with Kaufman's simplification), the coil taken for a
+point; the joint descent that follows knows its length.
 """
 
 import math

@@ -1,13 +1,14 @@
-"""Solves for a coil's pose from complex fluxes, and computes how well the pose is known. Damped
-least squares with the dipoles' own gradient: the unknowns are the position and the unit axis;
-the axis moves by a two-parameter step in its tangent plane, so that no direction is singular.
-In-phase and quadrature parts are fitted together, each divided by its standard deviation: the
-residual has no unit, and a step is small when it is small against the pose's own uncertainty.
-The damping is Marquardt's (Nocedal and Wright, Numerical Optimization, section 10.3). The error
-of a pose comes from the flux noise and from the error of the field model. Both enter the
-whitening, so the inverse of the whitened normal matrix is the covariance. Roll about a coil's
-axis is not observable: the rotation covariance is that of the tilt plus ``roll_variance a
-a^T``.
+"""Solves for a coil's pose from complex fluxes, and computes how well the pose is known.
+
+Damped least squares with the dipoles' own gradient: the unknowns are the position and the unit
+axis; the axis moves by a two-parameter step in its tangent plane, so that no direction is
+singular. In-phase and quadrature parts are fitted together, each divided by its standard
+deviation: the residual has no unit, and a step is small when it is small against the pose's own
+uncertainty. The damping is Marquardt's (Nocedal and Wright, Numerical Optimization, section 10.3).
+
+The error of a pose comes from the flux noise and from the error of the field model. Both enter the
+whitening, so the inverse of the whitened normal matrix is the covariance. Roll about a coil's axis
+is not observable: the rotation covariance is that of the tilt plus ``roll_variance a a^T``.
 """
 
 import math

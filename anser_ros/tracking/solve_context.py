@@ -1,5 +1,6 @@
-"""Makes a field model ready for tracking: kernel layout, error model, cold-start grid. Noise
-and model error are whitened in one kernel, for models that change every frame. An emitter of
+"""Makes a field model ready for tracking: kernel layout, error model, cold-start grid.
+
+Noise and model error are whitened in one kernel, for models that change every frame. An emitter of
 which no sensor has a flux (not finite, or exactly zero) has no part in the solve: it has no
 weight, and the covariance grows accordingly.
 """

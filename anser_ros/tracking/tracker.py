@@ -1,10 +1,11 @@
-"""Turns fluxes into poses with a state each, for the live node and the offline evaluation
-alike. The steps of a frame, in order: intake and freshness judge the readings; effects of the
-model are undone; each coil is solved by itself (`coil_track`), then each body by all of its
-coils (`body_track`), then what an application follows besides (`Observer`); poses are compared
-with each other and with their past (`judgement`). A pose is good only when its state is ``ok``;
-only good poses start the next frame's solve, and a warm solve that misses the gate is repeated
-without any guess.
+"""Turns fluxes into poses with a state each, for the live node and the offline evaluation alike.
+
+The steps of a frame, in order: intake and freshness judge the readings; effects of the model are
+undone; each coil is solved by itself (`coil_track`), then each body by all of its coils
+(`body_track`), then what an application follows besides (`Observer`); poses are compared with each
+other and with their past (`judgement`). A pose is good only when its state is ``ok``; only good
+poses start the next frame's solve, and a warm solve that misses the gate is repeated without any
+guess.
 """
 
 from collections import Counter

@@ -1,7 +1,9 @@
 """Runs the control unit's serial port: a reader thread that survives cables, and names every
-fault. One line is opened and read as fast as pyserial can. The thread reads, finds records and
-queues them; it never waits for the receiver. A receiver that is too slow loses whole blocks,
-counted as `overrun_blocks`. The port is reopened with growing pauses after an unplugged cable.
+fault.
+
+One line is opened and read as fast as pyserial can. The thread reads, finds records and queues
+them; it never waits for the receiver. A receiver that is too slow loses whole blocks, counted as
+`overrun_blocks`. The port is reopened with growing pauses after an unplugged cable.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Reads values of a setup document, or refuses them with their place, and the tips of tools.
-All functions raise `SetupError` with one line that names the value and its place. Tips are the
-key ``tips`` of a setup document, or a file of their own.
+
+All functions raise `SetupError` with one line that names the value and its place. Tips are the key
+``tips`` of a setup document, or a file of their own.
 """
 
 import difflib

@@ -1,4 +1,5 @@
 """Lets a person close the loop on the page: record, diagnose, load the better model, or undo.
+
 All that is read and written lies in the folder of recordings; commands of the package run as
 processes of their own, whose progress is read.
 """

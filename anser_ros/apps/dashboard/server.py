@@ -1,5 +1,6 @@
-"""Serves the page: uvicorn in a thread of its own, behind a guard. The guard decides who may
-look, only this machine or who knows the token, and how many at a time.
+"""Serves the page: uvicorn in a thread of its own, behind a guard.
+
+The guard decides who may look, only this machine or who knows the token, and how many at a time.
 """
 
 import contextlib

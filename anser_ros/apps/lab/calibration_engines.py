@@ -1,9 +1,10 @@
 """Calibrates bodies of many sensors that hardly move, and magnets, beside the usual scans.
+
 `ENGINES` are registered before the core's own (`sessions/calibration.py`). A scan of emitters
-without a drawing also says how large they are: moments of several dipoles on an axis are fitted
-in turn with the poses, and a size is close to a shift of all poses, which would take very many
-turns. So place, axis, moment and size of each emitter are fitted by Gauss-Newton to fluxes of
-which the part that poses explain counts as little as the jitter is large (`with_source_sizes`).
+without a drawing also says how large they are: moments of several dipoles on an axis are fitted in
+turn with the poses, and a size is close to a shift of all poses, which would take very many turns.
+So place, axis, moment and size of each emitter are fitted by Gauss-Newton to fluxes of which the
+part that poses explain counts as little as the jitter is large (`with_source_sizes`).
 """
 
 from collections.abc import Callable, Sequence

@@ -79,7 +79,7 @@ class FreeDipoles:
                 shrink = (STRENGTHS[:, None] / variance).T @ (weight / total)
                 best, kept = evidence, transfer @ (shrink * projected)
         k, layer = flux.shape[1], self._layer
-        moments = self._noise * (kept[:, :k] + 1j * kept[:, k:])
+        moments = (self._noise * (kept[:, :k] + 1j * kept[:, k:])).astype(np.complex128)
         rows = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
         base = self.model.moments.copy()
         base[rows] += moments[: rows.size]

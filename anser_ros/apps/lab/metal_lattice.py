@@ -1,9 +1,11 @@
 """Describes a rigid piece of metal as a lattice of points that drive each other, and keeps what
-was learnt in files. Each point answers to the field that it feels, that of the emitters and of
-all other points, with a moment in proportion, ``m = (1 - A G)^-1 A b`` (Foldy, Phys. Rev. 67,
-1945: multiple scattering by point scatterers). An answer is complex, and changes with the
-logarithm of the frequency. So a lattice carries its shape and the screening within it from one
-place in the emitters' field to another, which independent sources do not.
+was learnt in files.
+
+Each point answers to the field that it feels, that of the emitters and of all other points, with a
+moment in proportion, ``m = (1 - A G)^-1 A b`` (Foldy, Phys. Rev. 67, 1945: multiple scattering by
+point scatterers). An answer is complex, and changes with the logarithm of the frequency. So a
+lattice carries its shape and the screening within it from one place in the emitters' field to
+another, which independent sources do not.
 """
 
 import os

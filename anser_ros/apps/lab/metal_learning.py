@@ -1,7 +1,8 @@
-"""Learns a rigid piece of metal from a recording with reference sensors. Answers of a lattice's
-points and its pose in each frame are fitted together to what references and tools read; the
-refit's own estimate of the metal's place is the start, so nobody has to measure where the metal
-is. How large the lattice is decides what it predicts in frames that took no part.
+"""Learns a rigid piece of metal from a recording with reference sensors.
+
+Answers of a lattice's points and its pose in each frame are fitted together to what references and
+tools read; the refit's own estimate of the metal's place is the start, so nobody has to measure
+where the metal is. How large the lattice is decides what it predicts in frames that took no part.
 """
 
 import math

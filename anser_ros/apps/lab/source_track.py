@@ -1,8 +1,9 @@
-"""Tracks where an axisymmetric source is, seen from a body with many sensors. A field that is
-the same all around its axis leaves one of a body's six degrees of freedom open: the turn about
-that axis. Jointly, the sensors determine the place of the source in the body's frame and the
-direction of its axis. These are five numbers, like a coil's pose; by reciprocity, a magnet in
-front of an array of magnetometers is tracked in this way.
+"""Tracks where an axisymmetric source is, seen from a body with many sensors.
+
+A field that is the same all around its axis leaves one of a body's six degrees of freedom open:
+the turn about that axis. Jointly, the sensors determine the place of the source in the body's
+frame and the direction of its axis. These are five numbers, like a coil's pose; by reciprocity, a
+magnet in front of an array of magnetometers is tracked in this way.
 """
 
 import math

@@ -1,11 +1,12 @@
-"""Fits emitters without a drawing and all errors of a body that rests at few poses, jointly. A
-channel's own gain and tilt touch only its own readings, so they are marginalised there: they
-widen the covariance of those readings, and what is left is one generalised least-squares
-problem in the dipoles' moments and the frames' poses and bends (`StillSystem`; Golub and Van
-Loan, Matrix Computations, section 3.2). In Gauss-Newton steps, widths of populations follow the
-spread that is found (expectation maximisation), and readings that fit badly lose weight
-(`StillFitter`). The noise, the kinds of errors and the free dipoles in addition to the emitters
-are chosen by Laplace's approximation of the log evidence.
+"""Fits emitters without a drawing and all errors of a body that rests at few poses, jointly.
+
+A channel's own gain and tilt touch only its own readings, so they are marginalised there: they
+widen the covariance of those readings, and what is left is one generalised least-squares problem
+in the dipoles' moments and the frames' poses and bends (`StillSystem`; Golub and Van Loan, Matrix
+Computations, section 3.2). In Gauss-Newton steps, widths of populations follow the spread that is
+found (expectation maximisation), and readings that fit badly lose weight (`StillFitter`). The
+noise, the kinds of errors and the free dipoles in addition to the emitters are chosen by Laplace's
+approximation of the log evidence.
 """
 
 from collections.abc import Sequence

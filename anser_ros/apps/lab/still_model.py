@@ -1,10 +1,11 @@
-"""Models the fluxes of a body of many sensors that rests at few poses, and linearises them. A
-reading has the gain and the tilt of its channel, which are the same in every frame; a frame has
-an error of its stated pose and a bend of the body, which all channels share; and the field is
-that of dipoles at given places. With a constant field (no imaginary part in any reading) only
-the real parts are there. A thin plate that is held at its rim or by a few screws is bent by
-fractions of a millimetre, and otherwise wherever it is laid (`SmoothBend`; Timoshenko and
-Woinowsky-Krieger, Theory of Plates and Shells, chapter 2).
+"""Models the fluxes of a body of many sensors that rests at few poses, and linearises them.
+
+A reading has the gain and the tilt of its channel, which are the same in every frame; a frame has
+an error of its stated pose and a bend of the body, which all channels share; and the field is that
+of dipoles at given places. With a constant field (no imaginary part in any reading) only the real
+parts are there. A thin plate that is held at its rim or by a few screws is bent by fractions of a
+millimetre, and otherwise wherever it is laid (`SmoothBend`; Timoshenko and Woinowsky-Krieger,
+Theory of Plates and Shells, chapter 2).
 """
 
 from dataclasses import dataclass, replace

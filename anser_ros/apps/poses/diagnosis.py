@@ -1,5 +1,6 @@
-"""Diagnoses a session of poses: convention, hand-eye, search, and what held-out poses say. The
-stages are those of a diagnosis of fluxes: read and set up, search on four fifths of the blocks
+"""Diagnoses a session of poses: convention, hand-eye, search, and what held-out poses say.
+
+The stages are those of a diagnosis of fluxes: read and set up, search on four fifths of the blocks
 of time, judge on the fifth that took no part; then the parameters are fitted to all poses.
 """
 

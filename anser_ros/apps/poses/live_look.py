@@ -1,5 +1,6 @@
-"""Diagnoses the last seconds of running trackers of poses: the effects, and what has changed. A
-diagnosis of a recording takes the two frames as they are. Live they are known from earlier, so
+"""Diagnoses the last seconds of running trackers of poses: the effects, and what has changed.
+
+A diagnosis of a recording takes the two frames as they are. Live they are known from earlier, so
 that a camera that was pushed, or a sensor that came loose, is recognised by comparison.
 """
 

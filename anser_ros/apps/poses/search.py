@@ -1,6 +1,7 @@
-"""Searches which effects a session of poses shows: each must improve held-out blocks. The
-currencies and prices are those of `anser_ros.diagnosis.decisions`: gains in the whitened sum of
-squares, cross-validated over blocks of time, and for effects that depend on place also over
+"""Searches which effects a session of poses shows: each must improve held-out blocks.
+
+The currencies and prices are those of `anser_ros.diagnosis.decisions`: gains in the whitened sum
+of squares, cross-validated over blocks of time, and for effects that depend on place also over
 blocks of space, because a map looks too good on neighbours in time.
 """
 

@@ -1,5 +1,6 @@
-"""Shows a live view in the browser: scene, states, curves, diagnosis and correction. On behalf
-of the page it asks the running nodes for services and model files (`ChainClient`).
+"""Shows a live view in the browser: scene, states, curves, diagnosis and correction.
+
+On behalf of the page it asks the running nodes for services and model files (`ChainClient`).
 """
 
 import asyncio

@@ -1,5 +1,6 @@
-"""Gives the page what the graph shows: topics are polled, and become arrays and words. Between
-two looks a message costs no Python: an executor would run Python for each, while a display
+"""Gives the page what the graph shows: topics are polled, and become arrays and words.
+
+Between two looks a message costs no Python: an executor would run Python for each, while a display
 needs only the newest; the middleware keeps as many as the queue is deep.
 """
 

@@ -1,6 +1,8 @@
 """Keeps earlier assessments in a folder, a small file each, and judges a new one by control
-limits. A figure is compared with those of the same protocol and body in earlier sessions; the
-limits are those of a control chart of individual values.
+limits.
+
+A figure is compared with those of the same protocol and body in earlier sessions; the limits are
+those of a control chart of individual values.
 """
 
 import json

@@ -1,9 +1,8 @@
 """The refit's ablation: references spread out, the rival without shared polarisability, a plot."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from conftest import REPO
 from refit_world import NOISE_T, anser_world, metal_block, volume_points
 
 from anser_ros.apps.lab.experiments.refit_ablation import (
@@ -21,7 +20,7 @@ from anser_ros.sessions.starting_model import board_of
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 
-BAGS = Path(__file__).resolve().parents[1] / 'bags'
+BAGS = REPO / 'bags'
 
 
 def test_references_are_spread_out():

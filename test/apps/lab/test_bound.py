@@ -1,13 +1,13 @@
 """The bound on what few references could know: its derivatives, and what more knowledge does."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 from refit_world import anser_world
 
-sys.path.append(str(Path(__file__).resolve().parent / 'bench'))
+sys.path.append(str(REPO / 'test' / 'bench'))
 
 from bench_bound import marginal
 from bound_block import BALL, Block, block_points
