@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.convention import PoseReading
 from anser_ros.apps.poses.diagnosis import PoseDiagnosis
-from anser_ros.apps.poses.effect import PoseMap, Role, effect_of_record, effect_with
-from anser_ros.apps.poses.effects.field_distortion import SMOOTH
+from anser_ros.apps.poses.effect import SMOOTH, PoseMap, Role, effect_of_record, effect_with
 from anser_ros.apps.poses.hand_eye import PoseClock
 from anser_ros.apps.poses.sequence import FARTHEST, NO_TURN, PoseSequence
 from anser_ros.calibration.error_map import ErrorMap

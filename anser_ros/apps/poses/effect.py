@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+SMOOTH = 'smooth'
+"""The kind of a map of places that is determined by the points that it was learnt from."""
+
 
 class PoseSite(TypedDict, total=False):
     """States where an effect acts, in the words of records and reports."""
@@ -122,6 +125,11 @@ class PoseTerm(BaseTerm):
         """Return the only sensor that it is about; None where it is about all of them."""
         name = self.site.get('sensor')
         return None if name is None else str(name)
+
+    @property
+    def middle_s(self) -> float:
+        """Return the time at which a clock's offset is its offset, s."""
+        return float(self.site.get('middle_s', 0.0))
 
     def acts_on(self, sensor: str) -> bool:
         """Return whether it is about a sensor."""

@@ -329,7 +329,8 @@ def _described(
             f'the rate of the clocks: in {fit.state.problem.setting.duration:.0f} s it is known '
             f'to more than {LEAST_KNOWN_PPM:.0f} ppm; record longer'
         )
-    middle = next((t.site['middle_s'] for t in fit.terms if t.role is Role.RATE), 0.0)
+    rated = next((t for t in fit.terms if t.role is Role.RATE), None)
+    middle = 0.0 if rated is None else rated.middle_s
     return HandEye(
         session, convention, frames.rotation, sigma[3:], place, sigma[:3], offset, rate, middle,
         sensors, tuple(words), fit,

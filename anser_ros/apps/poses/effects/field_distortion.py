@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.apps.poses.effect import (
+    SMOOTH,
     PoseEffect,
     PoseMap,
     PoseSetting,
@@ -26,8 +27,6 @@ from anser_ros.field.model import EffectRecord
 
 Array = NDArray[np.float64]
 
-SMOOTH = 'smooth'
-"""The kind of a map that is determined by the points that it was learnt from."""
 KINDS = {0: 'scale', 1: 'linear', 2: 'quadratic', 3: 'cubic'}
 """Degrees of the polynomials of position that are tried; of degree zero is a space that shrinks or
 grows alike in all directions about a point of its own, which takes four numbers."""
