@@ -17,12 +17,13 @@ ARGS ?=
 PACKAGING = setup.py package.xml anser_ros/cli/commands.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick test-oldest lint format types parameters bench browser chaos soak paper loop measured docs clean
+.PHONY: help demo test test-core test-quick test-oldest lint format types parameters bench browser chaos soak paper loop measured docs clean
 
 help:
 	@echo 'make demo [DURATION=30]  watch a simulated tool being tracked'
 	@echo 'make test                lint, types, tests'
-	@echo 'make test-quick          the same without the tests that start processes or take long'
+	@echo 'make test-core           the same without the tests of the applications'
+	@echo 'make test-quick          all without the tests that start processes or take long'
 	@echo 'make test-oldest         tests with the oldest dependencies (needs Python 3.12)'
 	@echo 'make bench               speed and accuracy beside rivals, writes bench.json'
 	@echo 'make browser             the live view in a headless Chromium: closes the loop by clicking alone'
@@ -77,6 +78,9 @@ test: lint
 test-quick: QUICK = -m 'not processes and not long'
 test-quick: COUNT = 2
 test-quick: test
+
+test-core: QUICK = --ignore=test/apps
+test-core: test
 
 test-oldest: $(READY_OLDEST)
 	$(ENVIRONMENT) $(VENV_OLDEST)/bin/python -m pytest $(WORKERS) $(ARGS)

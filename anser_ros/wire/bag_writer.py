@@ -144,7 +144,7 @@ def _topic(topic: TopicRecord) -> dict[str, Any]:
     }
 
 
-CHUNK_BYTES = 1024 * 1024
+CHUNK_BYTES = 256 * 1024
 """Size of a chunk, bytes; smaller ones make larger files, and a larger index in memory."""
 CHUNK_NS = 4_000_000_000
 """Longest time in a chunk while messages are flushed, ns. The index of an hour takes 1.6 MB of
