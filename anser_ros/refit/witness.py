@@ -375,14 +375,16 @@ class Witness:
         learnt = self._errors(reading.table)
         mean, covariance = learnt.posterior
         white = self._noise_of(len(rows.left))
-        owns, errors, known = [], [], []
-        for part in (np.real, np.imag):
-            pose, own, left = part(rows.pose), part(rows.own), part(rows.left)
-            spread = own @ covariance @ own.T
-            error = _Errors(white, spread, pose @ pose.T, lasting, repeated)
-            evidence[bank.names[0]] += error.weighed(np.zeros_like(white), left - own @ mean)[1]
-            owns.append(own)
-            errors.append(error)
+        owns = [rows.own.real, rows.own.imag]
+        errors = [
+            _Errors(white, own @ covariance @ own.T, pose @ pose.T, lasting, repeated)
+            for own, pose in zip(owns, (rows.pose.real, rows.pose.imag), strict=True)
+        ]
+        left = (rows.left.real, rows.left.imag)
+        for error, own, values in zip(errors, owns, left, strict=True):
+            nothing = np.zeros_like(white)
+            evidence[bank.names[0]] += error.weighed(nothing, values - own @ mean)[1]
+        known = []
         for name, state in self._filters.items():
             h = bank.names.index(name)
             layer, length = bank.prior(h).layer, reading.table.length
