@@ -172,7 +172,8 @@ def test_a_baseline_that_references_contradict_is_not_taken_up(started):
 
     rig = started()
     rig.node._on_setup(String(data=setup_text(rig.world)))
-    assert rig.node.counters['baselines_resumed'] == 0 and not getattr(rig.node._refit.start, 'words', '')
+    assert rig.node.counters['baselines_resumed'] == 0
+    assert not getattr(rig.node._refit.start, 'words', '')
 
 
 @pytest.mark.long
