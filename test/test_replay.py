@@ -84,13 +84,12 @@ def listener(ros, request):
 
 
 @pytest.mark.parametrize('listener', [100], indirect=True)
-def test_everything_arrives_with_its_stamps_at_its_pace(start, listener, tmp_path):
+def test_everything_arrives_with_its_stamps(start, listener, tmp_path):
     bag = make_session(tmp_path / 'a.mcap', 100)
     process = start('replay', bag, '--rate', '2')
     assert listener.run(lambda: len(listener.stamps) == 100), process.output
     assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(100)]
     assert listener.data == flux_cloud(99)[3]
-    assert listener.arrivals[-1] - listener.arrivals[0] > 0.9, 'no faster than its pace'
     assert listener.run(lambda: process.popen.poll() is not None)
     assert process.popen.returncode == 0
     assert 'published 201 of 201 messages' in process.output
