@@ -54,11 +54,10 @@ def make_session(path, count):
 def listener(ros, request):
     """A node that takes what is replayed, with a queue of 5 or so; ``delay_s`` makes it slow."""
     node = ros.create_node('listener')
-    node.stamps, node.arrivals, node.got, node.delay_s = [], [], [], 0.0
+    node.stamps, node.got, node.delay_s = [], [], 0.0
 
     def on_flux(message):
         time.sleep(node.delay_s)
-        node.arrivals.append(time.monotonic())
         node.stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
         node.data = bytes(message.data)
 
