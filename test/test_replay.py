@@ -237,6 +237,29 @@ def test_nobody_listens(ros, tmp_path):
     node.destroy_node()
 
 
+class Dues(threading.Event):
+    """Ends every wait at once, and keeps the moment at which it would have ended."""
+
+    def __init__(self):
+        super().__init__()
+        self.until = []
+
+    def wait(self, timeout=None):
+        self.until.append(time.monotonic() + timeout)
+        return super().wait(min(timeout, 1e-3))
+
+
+def test_messages_are_due_at_the_pace_of_the_rate(ros, tmp_path):
+    """Counted in moments that are waited for, so that no busy machine makes a difference."""
+    began = time.monotonic()
+    node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 100)), rate=0.2, wait=0.2)
+    node._ending = dues = Dues()
+    assert spin_until(node, lambda: node.exit_code is not None)
+    assert dues.until[-1] - began > 99 * PERIOD_NS * 1e-9 / 0.2, 'no faster than its pace'
+    node.close()
+    node.destroy_node()
+
+
 def test_a_node_that_is_still_starting_is_waited_for_longer(ros, tmp_path):
     """A tracker that compiles its kernels is in the graph, and has not said a word yet."""
     starting = ros.create_node('tracker', namespace='anser')
