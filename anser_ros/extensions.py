@@ -19,7 +19,7 @@ an object in it; it is loaded when the core uses it. Tables that are not stated 
 
 import functools
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -44,11 +44,12 @@ def entries(table: str) -> Iterator[Any]:
         yield from stated
 
 
-def loaded(table: str) -> Iterator[Any]:
-    """Yield the modules or objects that a table names; of a mapping, those of its values."""
+def loaded(table: str, is_wanted: Callable[[str], Any] = bool) -> Iterator[Any]:
+    """Yield the modules or objects that a table names; of a mapping, the values of wanted keys."""
     for extension in _extensions():
         stated = getattr(extension, table, ())
-        for entry in stated.values() if isinstance(stated, dict) else stated:
+        is_named = isinstance(stated, dict)
+        for entry in (stated[key] for key in stated if is_wanted(key)) if is_named else stated:
             module, _, name = entry.partition(':')
             found = importlib.import_module(f'{extension.__package__}.{module}')
             yield getattr(found, name) if name else found

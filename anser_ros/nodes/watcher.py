@@ -195,9 +195,8 @@ class FluxStreams:
 
 def streams_of(node: 'Watcher', table: WatcherParameters) -> Streams:
     """Return what the parameters ask for: streams of an application, or fluxes."""
-    asked = zip(extensions.entries('STREAMS'), extensions.loaded('STREAMS'), strict=True)
-    made = (make(node, table) for name, make in asked if getattr(table, name))
-    return next(made, None) or FluxStreams(node, table)
+    asked = extensions.loaded('STREAMS', lambda name: getattr(table, name))
+    return next((make(node, table) for make in asked), None) or FluxStreams(node, table)
 
 
 class Watcher(AnserNode):
