@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tracking_world import certain_model
 
-from anser_ros.integrity.model_trust import ModelAge
+from anser_ros.integrity.model_age import ModelAge
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OF_MODEL, REFERENCES_DOUBTFUL, REFERENCES_LOST, code_of
 from anser_ros.pose_states import state_of as state_of_code

@@ -17,7 +17,7 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.model_trust import FrameModel
+from anser_ros.integrity.model_age import FrameModel
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Trouble

@@ -15,7 +15,7 @@ from sensor_msgs.msg import PointCloud2
 
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.model_trust import FrameModel, ModelAge
+from anser_ros.integrity.model_age import FrameModel, ModelAge
 from anser_ros.nodes.streams.clouds import read_dipoles, read_error
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld, state_of

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import BagError, FitError, ParameterError
 from anser_ros.frames.faults import GOOD, reading_codes
-from anser_ros.integrity.model_trust import UNCHANGED_MODEL, FrameModel, ModelAge
+from anser_ros.integrity.model_age import UNCHANGED_MODEL, FrameModel, ModelAge
 from anser_ros.pose_states import OK, REFERENCES_LOST, Withheld
 from anser_ros.refit.frame import Pace, check_enough
 from anser_ros.refit.live_refit import LiveRefit

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from anser_ros import extensions
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.model_trust import UNCHANGED_MODEL
+from anser_ros.integrity.model_age import UNCHANGED_MODEL
 from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.pose_states import OK
 from anser_ros.sessions.baseline import check_place

@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 from anser_ros import pose_states as states
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.stamps import NANO
-from anser_ros.tracking.coil_track import CoilResult, take_errors
+from anser_ros.tracking.coil_track import (
+    CoilResult,
+    Freedom,
+    SolveFrame,
+    Start,
+    Track,
+    take_errors,
+)
 from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.tracking.rigid import (
     BodyCoils,
@@ -23,7 +30,6 @@ from anser_ros.tracking.rigid import (
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import bounded_inverse
 from anser_ros.tracking.solve_verdict import RARE
-from anser_ros.tracking.track import Freedom, SolveFrame, Start, Track
 
 Array = NDArray[np.float64]
 

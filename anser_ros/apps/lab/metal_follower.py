@@ -25,7 +25,7 @@ from anser_ros.apps.lab.metal_track import (
 )
 from anser_ros.errors import BagError, ModelFileError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.model_trust import FrameModel
+from anser_ros.integrity.model_age import FrameModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import MODEL_DOUBTFUL, OK, Withheld

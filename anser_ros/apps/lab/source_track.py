@@ -21,13 +21,12 @@ from anser_ros.physics.rotations import nearest_rotation, rotation_of_vector
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.tracked_session import PoseSeries, pose_series
 from anser_ros.tracking.body_track import BodyFrame
-from anser_ros.tracking.coil_track import UNKNOWNS
+from anser_ros.tracking.coil_track import UNKNOWNS, Freedom, SolveFrame, Start, Track
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate
 from anser_ros.tracking.rigid import BodyCoils, BodySolution, common_factor, solve_body
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import ROLL_VARIANCE, RealField, bounded_inverse
 from anser_ros.tracking.solve_verdict import RARE
-from anser_ros.tracking.track import Freedom, SolveFrame, Start, Track
 
 Array = NDArray[np.float64]
 

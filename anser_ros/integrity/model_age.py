@@ -1,10 +1,8 @@
-"""Says how far a model may be trusted: by its age since references last gave it, and by the
-readings that it explained.
+"""Says how far a model may be trusted by its age since references last gave it.
 
 Metal continues to move when no references report it. So the uncertainty of a model that followed
 them grows from frame to frame, by the change of the field while the metal was still observed;
-beyond a bound it no longer describes the field. And a model that leaves most readings of the last
-seconds unexplained is doubtful, though single poses pass by chance.
+beyond a bound it no longer describes the field.
 """
 
 import math
@@ -14,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.pose_checks import STREAM_GAP_S
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import REFERENCES_LOST, Withheld
@@ -125,70 +122,3 @@ class ModelAge:
         moved = replace(model, moments=mode[0]).flux(self._points, self._axes)
         rest = ELSEWHERE * float(np.sqrt(0.5 * (np.abs(moved) ** 2).mean()))
         return replace(model, modes=modes, flux_error_t=math.hypot(model.flux_error_t, rest))
-
-
-RECORD_S = 2.0
-"""How far back readings count, s. Smaller, and metal that passes makes the model doubtful; larger,
-and a wrong model gives poses for longer."""
-DOUBTFUL = 0.8
-"""Share of refused readings from which on the model is doubtful; by chance every third pose passes
-a model that is a little wrong."""
-FEWEST_JUDGED_READINGS = 6
-"""Readings that a share is made of at least: a single bad coil is not the whole chain."""
-GOOD_SHARE = 0.2
-"""Share (0 to 1) of refused readings up to which a frame speaks for the model: one bad coil of
-five."""
-RECOVERY_S = 0.5
-"""For so long, s, all frames must speak for a doubtful model before it gives poses again: where it
-happens to fit, it is not yet right."""
-
-
-class ModelRecord:
-    """Counts how many readings the model explained lately."""
-
-    def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget all frames that were judged so far."""
-        self._frames: deque[tuple[int, int, int, float]] = deque()
-        self._refused = self._total = self._sound_since_ns = self._last_ns = 0
-        self.is_doubtful = False
-
-    @property
-    def refused_share(self) -> float:
-        """Return the share of the last seconds' readings that the model did not explain."""
-        return self._refused / max(self._total, 1)
-
-    def add(self, stamp_ns: int, refused: int, total: int, residual: float) -> None:
-        """Take in a frame: how many of its readings the model did not explain.
-
-        ``residual`` is the typical one of these in units of the expected one; NaN for none.
-        """
-        last_ns = self._last_ns
-        if not last_ns or not 0 < stamp_ns - last_ns <= STREAM_GAP_S / NANO:
-            self.forget()
-        self._last_ns = stamp_ns
-        frames = self._frames
-        while frames and stamp_ns - frames[0][0] > RECORD_S / NANO:
-            _, gone, counted, _ = frames.popleft()
-            self._refused, self._total = self._refused - gone, self._total - counted
-        frames.append((stamp_ns, refused, total, residual))
-        self._refused, self._total = self._refused + refused, self._total + total
-        if (total and refused > GOOD_SHARE * total) or not self._sound_since_ns:
-            self._sound_since_ns = stamp_ns
-        is_sound = stamp_ns - self._sound_since_ns >= RECOVERY_S / NANO
-        if is_sound:
-            self.is_doubtful = False
-        elif self._total >= FEWEST_JUDGED_READINGS and self.refused_share > DOUBTFUL:
-            self.is_doubtful = True
-
-    @property
-    def reason(self) -> str:
-        """Return why the model is doubtful: the share, and how large residuals are."""
-        residuals = sorted(r for _, _, _, r in self._frames if math.isfinite(r))
-        typical = residuals[len(residuals) // 2] if residuals else math.nan
-        return (
-            f'{100 * self.refused_share:.0f} % of the readings of the last {RECORD_S:g} s '
-            f'contradict the model, residual {typical:.3g} times the expected one'
-        )
