@@ -9,7 +9,7 @@ from tracking_world import certain_model
 
 from anser_ros.integrity.model_age import ModelAge
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.pose_states import OF_MODEL, REFERENCES_DOUBTFUL, REFERENCES_LOST, code_of
+from anser_ros.pose_states import OF_MODEL, REFERENCES_DOUBTFUL, REFERENCES_LOST, Withheld, code_of
 from anser_ros.pose_states import state_of as state_of_code
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
@@ -59,11 +59,12 @@ def test_what_moves_on_unseen_stays_within_what_the_aged_model_says(added):
 def test_what_rests_keeps_its_certainty_until_it_is_given_up():
     model, age = certain_model(), ModelAge(LONGEST_S, TrackedVolume())
     assert age.at(7).model is None and age.at(7).withheld is None, 'it never followed anything'
-    assert age.at(7, '2 usable references').withheld.state == REFERENCES_LOST
+    few = Withheld(REFERENCES_LOST, 'too few')
+    assert age.at(7, few).withheld == few
     for frame in range(100):
         age.answered(1 + frame * STEP_NS, model)
     assert age.at(age.newest_ns + 400_000_000).model is model
-    assert 'too few' in age.at(age.newest_ns + 600_000_000, 'too few').withheld.reason
+    assert 'too few' in age.at(age.newest_ns + 600_000_000, few).withheld.reason
     age.answered(age.newest_ns + 10**9, model)
     assert age.at(age.newest_ns).withheld is None, 'they are back'
     age.answered(5, model)

@@ -30,7 +30,7 @@ from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.prepared import correct, prepare
 from anser_ros.sessions.session import empty_session, frames_of, load_session
 from anser_ros.sessions.starting_model import FOUND_ON, date_drifts, load_model, save_model
-from anser_ros.sessions.tracked_session import compare, track
+from anser_ros.sessions.tracked_session import metrics, pose_series, track
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 
@@ -145,11 +145,11 @@ class TestTrack:
 
     def test_tracked_compared_and_written(self, moving, model, tmp_path):
         prepared = prepare(beginning(moving, 5), model)
-        tracked = track(prepared)
-        assert {len(given) for given in tracked.estimates.values()} == {5}
-        assert set(tracked.estimates) == {*prepared.sensors.name, 'tool_a'}
-        assert tracked.refit is None and tracked.seconds_per_frame > 0.0
-        evaluation = compare(prepared, tracked)
+        evaluation = track(prepared)
+        series = evaluation.sensors | evaluation.bodies
+        assert {len(one.estimates) for one in series.values()} == {5}
+        assert set(series) == {*prepared.sensors.name, 'tool_a'}
+        assert evaluation.refit is None and evaluation.seconds_per_frame > 0.0
         assert max(np.max(s.position_error) for s in evaluation.sensors.values()) < 1e-3
         assert (
             json.loads(json.dumps(evaluation_document(evaluation)))['bodies']['tool_a']['n'] == 5
@@ -158,10 +158,8 @@ class TestTrack:
         rows = list(csv.DictReader((tmp_path / 'poses.csv').read_text().splitlines()))
         assert tuple(rows[0]) == POSE_COLUMNS and len(rows) == 9 * 5
 
-    def test_nothing_to_compare_has_no_figures(self, moving, model):
-        prepared = prepare(beginning(moving, 2), model)
-        nothing = replace(track(prepared), estimates={})
-        figures = evaluation_document(compare(prepared, nothing))['sensors']['tool_a/0/x']
+    def test_nothing_to_compare_has_no_figures(self):
+        figures = metrics(pose_series('tool_a/0/x', (), np.empty((0, 3)), np.empty((0, 3))))
         assert figures['n'] == 0 and figures['position_rmse_m'] is None
 
     def test_without_tools_is_refused(self, moving, model):

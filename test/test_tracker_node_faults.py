@@ -197,14 +197,14 @@ def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, li
         tracker.stamp_ns = time.time_ns()
     ready(tracker)
     place = random_pose(rng)
-    node, whole, pause_s = tracker.node, Tracker.estimates, [0.2]
+    node, whole, pause_s = tracker.node, Tracker.update, [0.2]
     worked = Backlog.worked
 
     def slow(self, *arguments):
         time.sleep(pause_s.pop() if pause_s else work_s)
         return whole(self, *arguments)
 
-    monkeypatch.setattr(Tracker, 'estimates', slow)
+    monkeypatch.setattr(Tracker, 'update', slow)
     # What a frame costs is what the test says, however busy the machine is.
     monkeypatch.setattr(Backlog, 'worked', lambda self, _: worked(self, max(work_s, 1e-3)))
     work_s = 0.0

@@ -81,10 +81,18 @@ class ModelAge:
         answers.append((stamp_ns, model))
         self._aged = None
 
-    def at(self, stamp_ns: int, why: str = '') -> FrameModel:
-        """Return what a frame may be tracked with; ``why`` states why the references gave no
-        answer.
+    def at(self, stamp_ns: int, withheld: Withheld | None = None) -> FrameModel:
+        """Return what a frame may be tracked with.
+
+        ``withheld`` is for what the refit wants no pose to be given. With `REFERENCES_LOST` the
+        newest model still ages, and gives poses as long as it may.
         """
+        is_lost = withheld is not None and withheld.state == REFERENCES_LOST
+        standing = self._aged_at(stamp_ns, withheld.reason if withheld and is_lost else '')
+        return standing if withheld is None or is_lost else FrameModel(standing.model, withheld)
+
+    def _aged_at(self, stamp_ns: int, why: str) -> FrameModel:
+        """The newest model with its age; ``why`` states why the references gave no answer."""
         if not self._answers:
             return FrameModel(None, Withheld(REFERENCES_LOST, why)) if why else UNCHANGED_MODEL
         last_ns, model = self._answers[-1]

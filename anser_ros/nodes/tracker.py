@@ -41,7 +41,7 @@ from anser_ros.sessions.prepared import settings_for
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import check_emitters, model_of
 from anser_ros.stamps import SECOND_NS
-from anser_ros.tracking.estimate import NO_GATE, USUAL_GATE, Tip, TrackerSettings
+from anser_ros.tracking.estimate import NO_GATE, USUAL_GATE, PoseEstimate, Tip, TrackerSettings
 from anser_ros.tracking.tracker import Tracker, warm_up
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Setup, parse_setup
@@ -361,7 +361,6 @@ class TrackerNode(AnserNode):
             return
         begin_s = time.perf_counter()
         stamp_ns, points = frame
-        estimates, now_ns = [], 0
         conflict = sender_words(self._sources)
         if conflict:  # the frame may be another sender's: its stamp does not tell the model's age
             standing = FrameModel(None, Withheld(TWO_SOURCES, conflict))
@@ -373,32 +372,35 @@ class TrackerNode(AnserNode):
         try:
             if standing.model is not None and standing.model is not self._tracker.model:
                 self._track_with(standing.model, self._given)
-            for estimate in self._tracker.estimates(
+            found = self._tracker.update(
                 stamp_ns, points.channel, points.flux, points.flags, standing.withheld
-            ):
-                now_ns = now_ns or self.get_clock().now().nanoseconds
-                self._topics[estimate.name].publish(estimate)
-                estimates.append(estimate)
-                tip = self._tips.get(estimate.name)
-                if tip is not None:
-                    estimates.append(tip.of_body(estimate))
-                    self._topics[tip.name].publish(estimates[-1])
+            )
         except AnserError as error:
             self._refuse('fluxes_refused', error)
             return
-        changed = False
-        for estimate in estimates:
-            changed |= self._topics[estimate.name].note(estimate, now_ns)
-            self._topics[estimate.name].publish_covariance()
-        if self._transforms is not None:
-            moved = [self._topics[e.name] for e in estimates if e.state == OK]
-            if moved:
-                self._transforms.publish(transform_message(moved))
+        now_ns = self.get_clock().now().nanoseconds
+        found += [self._tips[e.name].of_body(e) for e in found if e.name in self._tips]
+        changed = self._publish([(self._topics[e.name], e) for e in found], now_ns)
         self.count('frames')
         self._solve_s = time.perf_counter() - begin_s
         self._fluxes.backlog.worked(self._solve_s)
         if changed and time.monotonic() - self._diagnosed_s > EARLIEST_DIAGNOSTICS_S:
             self.publish_diagnostics()
+
+    def _publish(self, found: list[tuple[PoseTopic, PoseEstimate]], now_ns: int) -> bool:
+        """Publish good poses first, then all else; return whether a state is another than before.
+
+        ``now_ns`` is when they were found.
+        """
+        for topic, estimate in found:
+            topic.publish(estimate)
+        changed = [topic.note(estimate, now_ns) for topic, estimate in found]
+        for topic, _ in found:
+            topic.publish_covariance()
+        moved = [topic for topic, estimate in found if estimate.state == OK]
+        if self._transforms is not None and moved:
+            self._transforms.publish(transform_message(moved))
+        return any(changed)
 
     # What is reported ---------------------------------------------------------------------
 

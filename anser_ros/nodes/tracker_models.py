@@ -8,7 +8,7 @@ as offline.
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
@@ -207,11 +207,9 @@ class ActiveModel:
         state = '' if self.given is None else self.given.withheld
         if state == UNCALIBRATED and self._uncalibrated:
             state = ''
-        aged = self._age.at(stamp_ns, NO_READINGS if state == REFERENCES_LOST else '')
-        withheld = aged.withheld
-        if state and state != REFERENCES_LOST:
-            withheld = Withheld(state, 'reported by field_model')
-        return FrameModel(self.field if aged.model is None else aged.model, withheld)
+        reason = NO_READINGS if state == REFERENCES_LOST else 'reported by field_model'
+        aged = self._age.at(stamp_ns, Withheld(state, reason) if state else None)
+        return replace(aged, model=aged.model or self.field)
 
     def soon(self) -> FieldModel | None:
         """Return the model that a frame will be tracked with that comes just after the newest."""

@@ -24,7 +24,7 @@ from anser_ros.sessions.follower import ModelFollower
 from anser_ros.sessions.prepared import PreparedSession, correct, prepare
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import date_drifts, made_for
-from anser_ros.sessions.tracked_session import compare, track
+from anser_ros.sessions.tracked_session import track
 from anser_ros.tracking.estimate import TrackerSettings
 
 Array = NDArray[np.float64]
@@ -154,7 +154,7 @@ def _errors(
     """Errors with a gate as wide as the misfit: a wrong model's poses are to be seen here."""
     usual = TrackerSettings()
     settings = replace(usual, gate=usual.gate * max(1.0, ROOM * misfit))
-    evaluation = compare(prepared, track(prepared, settings, follower))
+    evaluation = track(prepared, settings, follower)
     # Where no coil has a pose (a field that is the same all around an axis), the source has.
     further = [one for group in evaluation.further.values() for one in group.values()]
     series = further or list(evaluation.sensors.values())

@@ -12,7 +12,7 @@ from anser_ros.effects.correction import Correction
 from anser_ros.errors import BagError, FitError, ParameterError
 from anser_ros.frames.faults import GOOD, reading_codes
 from anser_ros.integrity.model_age import UNCHANGED_MODEL, FrameModel, ModelAge
-from anser_ros.pose_states import OK, REFERENCES_LOST, Withheld
+from anser_ros.pose_states import OK, Withheld
 from anser_ros.refit.frame import Pace, check_enough
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.model import RefitResult
@@ -157,11 +157,10 @@ class ModelFollower(FrameModels):
             return UNCHANGED_MODEL  # as live: there is nothing to follow, the checks decide
         if frame.reference is not None:
             self._follow(frame.stamp_ns, frame.reference)
-        result = None if frame.reference is None else self._result
-        standing = self._age.at(frame.stamp_ns, '' if result is None else result.reason)
-        if result is not None and result.withheld not in ('', REFERENCES_LOST):
-            return FrameModel(standing.model, Withheld(result.withheld, result.reason))
-        return standing
+        result, withheld = self._result, None
+        if frame.reference is not None and result is not None and result.withheld:
+            withheld = Withheld(result.withheld, result.reason)
+        return self._age.at(frame.stamp_ns, withheld)
 
     def witnessed(self, tools: FrameReadings, found: Sequence[PoseEstimate]) -> None:
         """Let a frame's tools show metal, at the poses that were found for their bodies."""

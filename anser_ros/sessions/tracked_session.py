@@ -1,4 +1,4 @@
-"""Evaluates a recorded session: `prepare`, `track` as the live nodes would, and `compare`."""
+"""Evaluates a recorded session: tracks it as live, and compares with the optical poses."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -37,20 +37,6 @@ class SessionObserver(Observer, Protocol):
         """Compare the estimates of all frames, by body, with the optical poses."""
 
 
-@dataclass(frozen=True)
-class TrackedSession:
-    """Holds the estimates of every sensor and body by its name, one per frame by its stamp.
-
-    The seconds are the mean wall time that a frame took, the refit included; ``further`` is what
-    else was tracked, by kind and name.
-    """
-
-    estimates: dict[str, tuple[PoseEstimate, ...]]
-    seconds_per_frame: float
-    refit: RefitSummary | None = None
-    further: dict[str, dict[str, tuple[PoseEstimate, ...]]] = field(default_factory=dict)
-
-
 def in_phase_model(model: FieldModel) -> FieldModel:
     """Return the model without its quadrature part, as the article's own method uses it."""
     modes = None if model.modes is None else model.modes.real.astype(complex)
@@ -63,11 +49,11 @@ def track(
     follower: FrameModels | None = None,
     in_phase: bool = False,
     progress: Progress | None = None,
-) -> TrackedSession:
-    """Track every tool sensor and body of a session at every frame.
+) -> 'Evaluation':
+    """Track every tool sensor and body of a session at every frame, and compare with the optics.
 
-    The optical pose is never used: neither as a start value nor to refuse a pose. The noise is
-    that of the session's setup. With ``in_phase``, for an `in_phase_model`, only the fluxes'
+    The optical pose is never used before: neither as a start value nor to refuse a pose. The noise
+    is that of the session's setup. With ``in_phase``, for an `in_phase_model`, only the fluxes'
     in-phase parts are used. Raises `BagError` when the session has no tool fluxes.
     """
     if not prepared.session.tools:
@@ -106,14 +92,12 @@ def track(
         if progress is not None:
             progress(count / len(frames))
     seconds = (time.perf_counter() - start) / max(len(frames), 1)
-    by_name = {name: tuple(given) for name, given in estimates.items()}
+    sensors, bodies = _compared(prepared, estimates)
+    found_by = {one.KIND: one for one in observers if further[one.KIND]}
+    others = {kind: one.compare(prepared, further[kind]) for kind, one in found_by.items()}
+    others = {kind: series for kind, series in others.items() if series}
     summary = None if follower is None else follower.summary
-    others = {
-        kind: {name: tuple(given) for name, given in group.items()}
-        for kind, group in further.items()
-        if group
-    }
-    return TrackedSession(by_name, seconds, summary, others)
+    return Evaluation(sensors, bodies, seconds, summary, others)
 
 
 Array = NDArray[np.float64]
@@ -236,12 +220,13 @@ def track_session(
     follower = None if models is None else models(prepared)
     if refit:
         follower = ModelFollower(prepared, witnesses)
-    tracked = track(prepared, settings, follower, in_phase, progress)
-    return compare(prepared, tracked)
+    return track(prepared, settings, follower, in_phase, progress)
 
 
-def compare(prepared: PreparedSession, tracked: TrackedSession) -> Evaluation:
-    """Compare tracked poses with the optical ones, as the model's corrections place these."""
+def _compared(
+    prepared: PreparedSession, estimates: Mapping[str, Sequence[PoseEstimate]]
+) -> tuple[dict[str, PoseSeries], dict[str, PoseSeries]]:
+    """Compare sensors and bodies with the optical poses, as the model's corrections place them."""
     sensors: dict[str, PoseSeries] = {}
     bodies: dict[str, PoseSeries] = {}
     for tool in prepared.session.tools:
@@ -249,15 +234,9 @@ def compare(prepared: PreparedSession, tracked: TrackedSession) -> Evaluation:
         position = np.where(true.has_pose[:, None], true.position, np.nan)
         centres, axes = true.sensors.placed(position, true.rotation)
         for column, name in enumerate(true.sensors.name):
-            given = tracked.estimates.get(name, ())
+            given = estimates.get(name, ())
             sensors[name] = pose_series(name, given, centres[:, column], axes[:, column])
-        if tool.body in tracked.estimates:
-            given = tracked.estimates[tool.body]
+        if tool.body in estimates:
+            given = estimates[tool.body]
             bodies[tool.body] = pose_series(tool.body, given, position, true.rotation)
-    further = {
-        observer.KIND: series
-        for observer in extensions.loaded('OBSERVERS')
-        if observer.KIND in tracked.further
-        and (series := observer.compare(prepared, tracked.further[observer.KIND]))
-    }
-    return Evaluation(sensors, bodies, tracked.seconds_per_frame, tracked.refit, further)
+    return sensors, bodies

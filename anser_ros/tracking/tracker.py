@@ -9,7 +9,7 @@ guess.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -265,18 +265,9 @@ class Tracker:
         flags: NDArray[np.generic] | None = None,
         withheld: Withheld | None = None,
     ) -> list[PoseEstimate]:
-        """Estimate all poses from one frame; arguments and errors are those of `estimates`."""
-        return list(self.estimates(stamp_ns, channels, flux, flags, withheld))
+        """Estimate the poses of one frame: one a sensor, then one a rigid body.
 
-    def estimates(
-        self,
-        stamp_ns: int,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
-        flags: NDArray[np.generic] | None = None,
-        withheld: Withheld | None = None,
-    ) -> Iterator[PoseEstimate]:
-        """Estimate the poses of one frame.
+        There are none for a frame that was already seen.
 
         Parameters
         ----------
@@ -291,55 +282,39 @@ class Tracker:
         withheld : Withheld, optional
             Why no pose may be given for this frame.
 
-        Yields
-        ------
-        PoseEstimate
-            One a sensor, then one a rigid body. None for a frame that was already seen.
-
         Raises
         ------
         TrackingError
-            Before the first estimate: when the stamp is not positive, shapes don't fit, a channel
-            appears twice, or the emitters are not as many as the model's.
+            When the stamp is not positive, shapes don't fit, a channel appears twice, or the
+            emitters are not as many as the model's.
         """
         names = None if self.model is None else self.model.emitters
         frame = self._past.intake.admit(
             stamp_ns, channels, flux, flags, names, self.settings.warm_age_s
         )
-        if frame is not None:
-            yield from self.track(frame, withheld)
+        return [] if frame is None else self._track(frame, withheld)
 
-    def track(self, frame: Frame, withheld: Withheld | None = None) -> Iterator[PoseEstimate]:
-        """Estimate the poses of a frame that has been judged; yields what `estimates` does.
-
-        Parameters
-        ----------
-        frame : Frame
-            Of an `Intake` of this tracker's sensors that spares dead emitters.
-        withheld : Withheld, optional
-            Why no pose may be given for it.
-        """
+    def _track(self, frame: Frame, withheld: Withheld | None) -> list[PoseEstimate]:
+        """Estimate the poses of a frame that has been judged."""
         past, context = self._past, self._scene.context
         if frame.goes_back:
             self.reset()
         frame = past.freshness.judged(frame, self.settings.flux_noise_t)
         past.first_ns = past.first_ns or frame.stamp_ns
         if context is None:
-            yield from self._without_poses(frame, states.NO_MODEL, '', 'no field model yet')
-            return
+            return self._without_poses(frame, states.NO_MODEL, '', 'no field model yet')
         state, reason = '', ''
         if withheld is not None:
             state, reason = withheld.state, withheld.reason
         elif frame.living is not None and frame.living.sum() < FEWEST_EMITTERS:
             state, reason = states.NO_SIGNAL, self._few_emitters(frame.living)
         if state:
-            yield from self._without_poses(frame, state, context.model_id, reason)
-            return
+            return self._without_poses(frame, state, context.model_id, reason)
         flux, codes = self._corrected(frame)
         if frame.living is not None:
             self._scene.reduced = without_dead(context, frame.living, self._scene.reduced)
             flux, context = flux[:, frame.living], self._scene.reduced.context
-        yield from self._solved(frame.stamp_ns, np.ascontiguousarray(flux), codes, context)
+        return self._solved(frame.stamp_ns, np.ascontiguousarray(flux), codes, context)
 
     def _few_emitters(self, living: NDArray[np.bool_]) -> str:
         """Why a frame with so few emitters has no poses."""
@@ -365,11 +340,8 @@ class Tracker:
 
     def _solved(
         self, stamp_ns: int, flux: ComplexArray, codes: NDArray[np.int64], context: SolveContext
-    ) -> Iterator[PoseEstimate]:
-        """Yield the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,).
-
-        None is published before all are known, because they are compared with each other.
-        """
+    ) -> list[PoseEstimate]:
+        """Return the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,)."""
         values = flux.view(np.float64)
         coils = self._solved_coils(stamp_ns, values, codes, context)
         frames, bodies = [], []
@@ -387,10 +359,9 @@ class Tracker:
             observer.observe(frames)
         judged = self._past.judgement.judged(stamp_ns, coils, bodies, self.settings)
         if context.shift_sigma_m == 0.0:
-            yield from judged
-            return
+            return judged
         # No judge reckons with it: what all poses share contradicts none of them.
-        yield from (estimate.with_shift(context.shift_sigma_m) for estimate in judged)
+        return [estimate.with_shift(context.shift_sigma_m) for estimate in judged]
 
     def _solved_coils(
         self, stamp_ns: int, values: Array, codes: NDArray[np.int64], context: SolveContext
@@ -415,10 +386,10 @@ class Tracker:
 
     def _without_poses(
         self, frame: Frame, state: str, model_id: str, reason: str
-    ) -> Iterator[PoseEstimate]:
-        """Yield an estimate without a pose for every sensor and body."""
-        for name in (*self._scene.table.name, *self._scene.bodies):
-            yield no_pose(name, frame.stamp_ns, state, model_id, reason)
+    ) -> list[PoseEstimate]:
+        """Return an estimate without a pose for every sensor and body."""
+        names = (*self._scene.table.name, *self._scene.bodies)
+        return [no_pose(name, frame.stamp_ns, state, model_id, reason) for name in names]
 
 
 def _checked(sensors: SensorTable) -> SensorTable:
