@@ -10,8 +10,7 @@ from anser_ros.diagnosis import departure as departing
 from anser_ros.diagnosis.departure import departure
 from anser_ros.diagnosis.prepare import train_blocks
 from anser_ros.diagnosis.problem import evaluate
-from anser_ros.effects.metal_path import FreePath
-from anser_ros.effects.moving_metal import DepartedMetal
+from anser_ros.effects.moving_metal import DepartedMetal, FreePath
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.metal.body import sphere_polarisability
 

@@ -21,8 +21,7 @@ from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.screening import without_outliers
 from anser_ros.effects.effect import Richness
-from anser_ros.effects.metal_path import FreePath
-from anser_ros.effects.moving_metal import DepartedMetal, DepartedTerm
+from anser_ros.effects.moving_metal import DepartedMetal, DepartedTerm, FreePath
 from anser_ros.effects.view import View
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 

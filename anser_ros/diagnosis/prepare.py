@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.problem import Problem, References, Spread
-from anser_ros.effects.prediction import Fields
+from anser_ros.effects.correction import Fields
 from anser_ros.effects.view import Apparatus
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.dipoles import Dipoles

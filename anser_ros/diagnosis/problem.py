@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.engine import JointState
+from anser_ros.effects.correction import Fields, reference_view, tool_view
 from anser_ros.effects.effect import Remedy, Term
-from anser_ros.effects.prediction import Fields, reference_view, tool_view
 from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.measurements import Measurements
 from anser_ros.parallel import in_order, slices, slices_of

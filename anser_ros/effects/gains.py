@@ -1,4 +1,4 @@
-"""A gain is off: of one channel, of a tool's channels, or of an emitter, which may also drift."""
+"""A gain is off: of a channel, a tool, or an emitter, which may also drift; or phasors are late."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -228,4 +228,38 @@ class CoilDrift(Effect[CoilDriftTerm]):
         return CoilDriftTerm(self, self.site_of(record), theta)
 
 
-EFFECTS = CoilGain(), SensorGain(), ToolGain(), CoilDrift()
+DELAY_UNIT = 1e-6
+"""theta counts microseconds."""
+
+
+class PhaseDelay(Effect[Term]):
+    """Theta is the delay d, us: a phasor at w becomes exp(-j w d) times itself."""
+
+    name = 'phase_delay'
+    summary = 'a common acquisition delay turns all phasors'
+    units = {'delay_s': 's'}
+    plausible = {'delay_s': (-5e-5, 5e-5)}
+    remedy = Remedy.FLUX
+    typical = 5.0  # delays are some microseconds
+    recorded = {'delay_s': (1, DELAY_UNIT)}
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        """Return one candidate, as one delay holds for all channels."""
+        return [Term(self, {}, np.zeros(1))]
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Return minus j omega times the flux, for a microsecond of delay."""
+        return np.asarray((-1j * DELAY_UNIT * view.omega * view.linear)[..., None])
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        """Return the turn of each emitter's phasors on the diagonal."""
+        return np.diag(np.exp(-1j * omega * term.theta[0] * DELAY_UNIT))[None]
+
+
+EFFECTS = (
+    CoilGain(),
+    SensorGain(),
+    ToolGain(),
+    CoilDrift(),
+    PhaseDelay(),
+)

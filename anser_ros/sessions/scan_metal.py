@@ -17,7 +17,7 @@ from anser_ros.calibration.result import Calibration, Scan
 from anser_ros.diagnosis.departure import KNOWN, Departure, departure
 from anser_ros.diagnosis.prepare import build_problem
 from anser_ros.diagnosis.problem import Problem, Spread
-from anser_ros.effects.prediction import tool_view
+from anser_ros.effects.correction import tool_view
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord

@@ -21,7 +21,7 @@ from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.result import SPREADS, Calibration
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.diagnosis.decisions import UNSTRUCTURED
-from anser_ros.effects.registry import all_effects
+from anser_ros.effects.effect import all_effects
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.sessions.calibration import calibrate_sessions, is_estimated_jointly
 from anser_ros.sessions.diagnosis import document_of, effect_figures

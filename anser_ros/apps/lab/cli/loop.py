@@ -31,14 +31,15 @@ from anser_ros.errors import AnserError, DiagnosisError, ParameterError, SetupEr
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.recorded_health import (
+from anser_ros.sessions.recorded_poses import (
+    LiveErrors,
     first_warnings,
     kept_share,
     last_words,
+    live_errors,
     ok_share,
     overload,
 )
-from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.sessions.tracked_session import error_statistics
