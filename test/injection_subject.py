@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Problem, Spread
+from anser_ros.diagnosis.problem import Problem, Spread, build_problem
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel

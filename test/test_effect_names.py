@@ -30,7 +30,7 @@ ALLOWED = {
     'apps/lab/one_place.py': 'the same, of a body of many sensors at one place',
     'apps/lab/calibration_engines.py': 'the same, of the sizes of magnets',
 }
-GENERAL = {'base', 'correction', 'effect', 'view'}
+GENERAL = {'base', 'correction', 'effect'}
 """Modules in the room of effects that are about no single one; others may import these."""
 MAY_IMPORT = {
     'diagnosis/screening.py': {'seen'},

@@ -17,8 +17,8 @@ from anser_ros.diagnosis.engine import BlockSums, Score, Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, parts
 from anser_ros.diagnosis.screening import noise_scale
+from anser_ros.effects.base import View
 from anser_ros.effects.effect import INEXACT, Family, Term, all_effects
-from anser_ros.effects.view import View
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

@@ -12,8 +12,16 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.choice import Confirmation, doubtful, refit_spreads
 from anser_ros.diagnosis.fit import FINE, Fit, Fitter, settled
-from anser_ros.diagnosis.prepare import test_blocks, train_blocks
-from anser_ros.diagnosis.problem import Problem, State, evaluate, expected_rms, rms, tool_parts
+from anser_ros.diagnosis.problem import (
+    Problem,
+    State,
+    evaluate,
+    expected_rms,
+    rms,
+    test_blocks,
+    tool_parts,
+    train_blocks,
+)
 from anser_ros.diagnosis.screening import (
     StructureTest,
     clean_start,
@@ -225,7 +233,7 @@ def diagnose(
 ) -> Diagnosis:
     """Find what a model lacks: screen, search, confirm and conclude.
 
-    ``problem``: of the whole session (`anser_ros.diagnosis.prepare.build_problem`); ``model``:
+    ``problem``: of the whole session (`anser_ros.diagnosis.problem.build_problem`); ``model``:
     what the problem was built with; ``progress``: called with words on what goes on.
     """
     how = settings or SearchSettings()

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.base import View
 from anser_ros.effects.effect import Effect, Remedy, Term, effect_named
-from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements

@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import anser_ros.effects
-from anser_ros.effects.base import BaseEffect, BaseTerm
+from anser_ros.effects.base import Apparatus, BaseEffect, BaseTerm, View
 from anser_ros.effects.base import Remedy as Remedy
-from anser_ros.effects.view import Apparatus, View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord

@@ -12,6 +12,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     FROZEN,
     Array,
@@ -27,7 +28,6 @@ from anser_ros.effects.effect import (
     pairs_of,
     sigmas,
 )
-from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord
 from anser_ros.metal.body import (
@@ -101,7 +101,6 @@ class StaticMetal(MetalAtRest):
     plausible = {'position_m': (-1.0, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Return a candidate at every place of a grid."""
         none = np.zeros(2 * ball_modes().shape[1])
         return [
             Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, none]))
@@ -109,7 +108,6 @@ class StaticMetal(MetalAtRest):
         ]
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
-        """Return the indices of the modes' amplitudes."""
         return np.arange(3, term.theta.size)
 
     def prior(self, term: Term) -> Array:
@@ -168,13 +166,11 @@ class StaticMetal(MetalAtRest):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Return the dipoles that the emitters induce in the metal, or None without any."""
         if not np.any(term.theta[3:]):
             return None
         return multipoles().sources(term.theta[:3], self._couplings(term), illumination, omega)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the place, m, and the whole polarisability of the metal."""
         total = multipoles().polarisability(self._couplings(term))
         return EffectRecord(
             self.name,
@@ -187,7 +183,6 @@ class StaticMetal(MetalAtRest):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """Read the place, m, and the polarisability by groups of modes from a record."""
         place = np.asarray(needed(record, 'position_m'), dtype=np.float64)
         alpha = np.asarray(needed(record, 'groups'), dtype=np.float64) / UNIT
         return Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, alpha]))
@@ -214,7 +209,6 @@ class ConductivePlate(MetalAtRest):
     plausible = {'z_m': (-1.0, 1.0), 'edge_m': (0.02, 2.0), 'sheet_ohm': (1e-7, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Try heights below the board and above the volume, in two sizes."""
         size = float(np.max(apparatus.board[1, :2] - apparatus.board[0, :2]))
         middle = apparatus.board.mean(axis=0)
         below = apparatus.board[0, 2] - size * np.array([0.08, 0.16, 0.26, 0.4, 0.6])
@@ -257,7 +251,6 @@ class ConductivePlate(MetalAtRest):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Return the loops of the sheet; none where no amount has been set yet."""
         z, edge, x, y, log_ohm = term.theta
         centre, edges = np.array([x, y, z]), np.array([edge, edge])
         return sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, illumination, omega)
@@ -268,7 +261,6 @@ class ConductivePlate(MetalAtRest):
         return view.along(added.flux(*view.flat))
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Return the flux's derivatives, taken by central differences with `DIFFERENCE_STEPS`."""
         if term.held:
             return view.columns(5)
         steps, theta = np.diag(DIFFERENCE_STEPS), term.theta
@@ -280,11 +272,9 @@ class ConductivePlate(MetalAtRest):
         return both_phases(self._flux(term.theta, view)[..., None])
 
     def started(self, term: Term, solution: Array) -> Sequence[Term]:
-        """Return the term of the sheet as it was probed."""
         return (term,)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record height, edge length and centre of the sheet, m, and its resistance, ohm."""
         z, edge, x, y, log_ohm = (float(v) for v in term.theta)
         ohm, rim = float(np.exp(log_ohm)), RIM * edge
         least = [HEIGHT * edge, np.sqrt(2) * rim, rim / np.sqrt(2), rim / np.sqrt(2), OHM]
@@ -301,7 +291,6 @@ class ConductivePlate(MetalAtRest):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """Read height, edge length, centre and sheet resistance from a record."""
         x, y = (float(v) for v in needed(record, 'centre_m'))
         z, edge, ohm = (float(needed(record, key)) for key in ('z_m', 'edge_m', 'sheet_ohm'))
         return Term(self, {}, np.array([z, edge, x, y, np.log(ohm)]))
@@ -424,17 +413,14 @@ class MetalRemainder(Effect[RemainderTerm]):
         )  # fmt: skip
 
     def belongs(self, term: RemainderTerm, other: Term) -> bool:
-        """Return whether ``other`` is the metal that this leftover belongs to."""
         return term.parent == other.name_and_site
 
     def columns(self, term: RemainderTerm, view: View) -> ComplexArray | None:
-        """Return the leftover's own columns: it is linear in its parameters."""
         return term.leftover.columns(view)
 
     def sources(
         self, term: RemainderTerm, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Return the dipoles of the leftover, none while all is zero."""
         if not np.any(term.theta):
             return None
         return term.leftover.sources(term.theta, illumination, omega)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     FROZEN,
     LARGEST,
@@ -24,7 +25,6 @@ from anser_ros.effects.effect import (
     sigmas,
 )
 from anser_ros.effects.metal_at_rest import STATIC_METAL
-from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 from anser_ros.metal.body import COMPACT, SPACINGS, ball_modes, centre_sigma
 from anser_ros.metal.scattering import UNIT
@@ -133,7 +133,6 @@ class FreePath:
         return np.full(self.count, 0.1)
 
     def bounded(self, theta: Array) -> Array:
-        """Return the parameters unchanged, as a free path has no bounds."""
         return theta
 
     @staticmethod
@@ -314,11 +313,9 @@ class MovingMetal(Effect[MovingTerm]):
         return max(int(term.theta.size), SHAPED)
 
     def body(self, term: MovingTerm) -> MovingTerm:
-        """Return the term itself, whose body and path are refined."""
         return term
 
     def amounts(self, term: MovingTerm) -> NDArray[np.int64]:
-        """Return the indices of the modes' amplitudes."""
         return np.arange(term.placed, term.theta.size)
 
     def prior(self, term: MovingTerm) -> Array:
@@ -329,7 +326,6 @@ class MovingMetal(Effect[MovingTerm]):
         return np.concatenate([path, term.spread, term.spread])
 
     def bounded(self, term: MovingTerm) -> MovingTerm:
-        """Return the term with its path brought back into its domain."""
         course = term.path.bounded(term.course)
         return term.with_theta(np.concatenate([course, term.theta[term.placed :]]))
 
@@ -348,11 +344,9 @@ class MovingMetal(Effect[MovingTerm]):
         return out
 
     def moving_flux(self, term: MovingTerm, view: View) -> ComplexArray:
-        """Return the flux that the moving body adds to a view."""
         return term.flux(view, np.zeros(3))
 
     def record(self, term: MovingTerm, covariance: Array) -> EffectRecord:
-        """Record path, times, polarisability, and all that makes the term again."""
         total, couplings = term.shapes.polarisability(term.couplings), UNIT * term.couplings
         times = np.linspace(0.0, term.duration, PATH_SAMPLES)
         start, end = moving_times(term.path, term.course, times)
@@ -481,7 +475,6 @@ class DepartedMetal(MovingMetal):
         return DepartedTerm(**vars(plain), rest_s=self.rest_s)
 
     def columns(self, term: MovingTerm, view: View) -> ComplexArray:
-        """Return the derivatives where the metal is, less those where it rests."""
         assert isinstance(term, DepartedTerm)
         rest = super().columns(term.alone, term.resting(view))
         return super().columns(term.alone, view) - rest

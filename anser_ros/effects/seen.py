@@ -31,7 +31,6 @@ class Wiring(Effect[Term]):
     family = Family.SEEN
 
     def term(self, record: EffectRecord) -> Term:
-        """Read the channels or emitters, and those that they are read as, from a record."""
         return Term(self, self.site_of(record))
 
 
@@ -64,7 +63,6 @@ class SwappedCoils(Wiring):
     remedy = Remedy.FLUX
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        """Return the emitters' permutation as a matrix."""
         matrix = unit_matrix(omega.size)
         for shown, true in zip(term.site['read_as'], term.site['coils'], strict=True):
             matrix[shown] = 0.0
@@ -80,7 +78,6 @@ class DeadChannel(Wiring):
     units = {'channels': '1'}
 
     def silenced(self, term: Term) -> tuple[int, ...]:
-        """Return all channels that the term names."""
         return term.channels
 
 
@@ -93,7 +90,6 @@ class SensorPolarity(Wiring):
     remedy = Remedy.FLUX
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """Return a diagonal matrix with -1 for every reversed channel."""
         signs = np.where(np.isin(channels, term.site['channels']), -1.0, 1.0)
         return np.diag(signs).astype(complex)
 
@@ -120,12 +116,10 @@ class SeenEffect(Effect[SeenTerm]):
         return next(iter(self.units))
 
     def record(self, term: SeenTerm, covariance: Array) -> EffectRecord:
-        """Record the number, and the channels where not all have the effect."""
         parameters = {self._key: term.amount, **recorded_site(term)}
         return EffectRecord(self.name, parameters, {self._key: term.sigma})
 
     def term(self, record: EffectRecord) -> SeenTerm:
-        """Read the number from a record."""
         return SeenTerm(self, amount=float(needed(record, self._key)))
 
     def seen(self, amount: float, sigma: float, channels: Sequence[int] = ()) -> SeenTerm:

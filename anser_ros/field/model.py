@@ -150,10 +150,7 @@ class EffectRecord:
 class FieldModel:
     """Represents the field generator and all that distorts its field by virtual dipoles.
 
-    Raises
-    ------
-    ModelFileError
-        When the shapes do not fit together or there is no dipole.
+    Raises `ModelFileError` when the shapes do not fit together or there is no dipole.
     """
 
     # (N, 3), positions (m) and unit vectors, frame fg. A dipole whose three components are free
@@ -325,10 +322,7 @@ def from_document(document: Any) -> FieldModel:
 
     A document of an earlier version, without fingerprints, is accepted unchecked.
 
-    Raises
-    ------
-    ModelFileError
-        With the rule that the document breaks.
+    Raises `ModelFileError` with the rule that the document breaks.
     """
     if not isinstance(document, dict) or document.get('schema') != SCHEMA:
         got = document.get('schema') if isinstance(document, dict) else document

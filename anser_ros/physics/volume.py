@@ -31,10 +31,7 @@ class TrackedVolume:
     It is what `over_board` makes of the demo's board (`test/test_setup.py`), for setups whose
     board cannot be drawn.
 
-    Raises
-    ------
-    TrackingError
-        When the corners make no box.
+    Raises `TrackingError` when the corners make no box.
     """
 
     # low, high: Corners, low < high in x, y and z

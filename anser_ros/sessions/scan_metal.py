@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 from anser_ros.calibration.disturbances import spans_of
 from anser_ros.calibration.result import Calibration, Scan
 from anser_ros.diagnosis.departure import KNOWN, Departure, departure
-from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Problem, Spread
+from anser_ros.diagnosis.problem import Problem, Spread, build_problem
 from anser_ros.effects.correction import tool_view
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.measurements import Measurements

@@ -54,10 +54,7 @@ class FluxConverter:
     effective area N A G (negative for a coil wired the other way round) and the delay of its
     channel. The column of the summed currents has its own scale and delay.
 
-    Raises
-    ------
-    ParameterError
-        When an area or nominal current is zero or not finite.
+    Raises `ParameterError` when an area or nominal current is zero or not finite.
     """
 
     def __init__(

@@ -278,12 +278,8 @@ class KnownMetalModels(FrameModels):
 
     The ``summary`` counts the frames in which the metal was followed.
 
-    Raises
-    ------
-    BagError
-        When the session has no tool fluxes.
-    ModelFileError
-        When the metal was learnt at other frequencies than the emitters'.
+    Raises `BagError` when the session has no tool fluxes; `ModelFileError` when the metal was
+    learnt at other frequencies than the emitters'.
     """
 
     def __init__(self, prepared: PreparedSession, known: KnownMetal) -> None:

@@ -108,10 +108,7 @@ def learn_metal(
     unexplained. ``noise_t`` is that of a phasor component of the readings, T; ``report`` is called
     with the stage and its share done.
 
-    Raises
-    ------
-    FitError
-        When no lattice explains the readings.
+    Raises `FitError` when no lattice explains the readings.
     """
     train, held_out = frames[::2], frames[1::2]
     mean_hz = float(np.exp(np.log(frequencies_hz).mean()))
@@ -313,10 +310,7 @@ def learn(
 
     It must have references, a baseline without the metal, and a tool with optical poses.
 
-    Raises
-    ------
-    BagError
-        When the session lacks what is needed, or no rigid piece explains it.
+    Raises `BagError` when the session lacks what is needed, or no rigid piece explains it.
     """
     session = prepared.session
     if session.reference is None or not len(session.reference.sensors):
@@ -350,10 +344,7 @@ def metal_frames(
     The session must have references, a baseline and optical poses of the tools; ``phase`` (K,) is
     that of the emitters' fields.
 
-    Raises
-    ------
-    BagError
-        When the session has no metal, or no tool with poses.
+    Raises `BagError` when the session has no metal, or no tool with poses.
     """
     session = correct(prepared).session
     reference, baseline = session.reference, prepared.baseline

@@ -20,8 +20,7 @@ from anser_ros.calibration.calibrate import Options, fit_scan
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.result import Scan, to_document
 from anser_ros.diagnosis.diagnose import diagnose
-from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Spread
+from anser_ros.diagnosis.problem import Spread, build_problem
 from anser_ros.effects.effect import effect_named
 from anser_ros.field.dipoles import Dipoles, size_parameters, symmetry_axis
 from anser_ros.field.measurements import Measurements

@@ -282,6 +282,11 @@ def write_step(folder: Path, into: Path) -> list[Path]:
     return [path]
 
 
+def step_commands(bags: list[Path], out: Path) -> list[list[str]]:
+    """Return the commands that model the robot's file, with sensors as stated and as found."""
+    return calibrations(bags[0], out)
+
+
 def step_rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     """Return the errors of the field at blocks of poses that took no part."""
     before, after = (
@@ -297,6 +302,4 @@ def step_rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     ]  # fmt: skip
 
 
-STEP_RECIPE = Recipe(
-    STEP, write_step, lambda bags, out: calibrations(bags[0], out), step_rows, folder=NAME
-)
+STEP_RECIPE = Recipe(STEP, write_step, step_commands, step_rows, folder=NAME)

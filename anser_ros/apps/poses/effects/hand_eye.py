@@ -68,7 +68,6 @@ class _Frame(PoseEffect):
         return np.full(6, FREE)
 
     def bounded(self, term: PoseTerm) -> PoseTerm:
-        """Return the same frame with a turn of zero."""
         frame = _frame(term)
         return replace(frame, theta=np.array([*frame.translation, 0, 0, 0]), start=frame.rotation)
 
@@ -81,7 +80,6 @@ class OpticalFrame(_Frame):
     role = Role.REGISTRATION
 
     def framed(self, term: PoseTerm, sensor: str, frames: Frames) -> Frames:
-        """Return the frames with this one from the reference to the tracker."""
         frame = _frame(term)
         return replace(frames, rotation=frame.rotation, translation=frame.translation)
 
@@ -116,7 +114,6 @@ class Mount(_Frame):
     role = Role.MOUNT
 
     def framed(self, term: PoseTerm, sensor: str, frames: Frames) -> Frames:
-        """Return the frames with the mount and lever arm of the term's own sensor."""
         if not term.acts_on(sensor):
             return frames
         frame = _frame(term)

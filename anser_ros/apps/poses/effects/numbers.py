@@ -26,7 +26,6 @@ class PoseTimeOffset(NumberEffect):
     spread = 0.3  # s: offsets are some tenths of a second
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
-        """Try one offset for all sensors, and one per sensor."""
         own = [PoseTerm(self, {'sensor': s}, np.zeros(1)) for s in setting.sensors]
         return [PoseTerm(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
 
@@ -35,7 +34,6 @@ class PoseTimeOffset(NumberEffect):
         return -view.velocity[:, :, None] if term.acts_on(view.sensor) else None
 
     def clock(self, term: PoseTerm, sensor: str, time: Array) -> Array:
-        """Return the stamps less the offset."""
         return time - term.theta[0] if term.acts_on(sensor) else time
 
 
@@ -55,7 +53,6 @@ class PoseClockRate(NumberEffect):
     spread = 2.0  # rates err by some parts in a thousand
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
-        """Return one term, as one rate holds for all sensors."""
         middle = setting.start + 0.5 * setting.duration
         return [PoseTerm(self, {'middle_s': middle}, np.zeros(1))]
 
@@ -85,11 +82,9 @@ class PoseOpticalScale(NumberEffect):
     spread = 30.0  # scales are off by some percent
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
-        """Try one reference for all sensors, scaled about the middle of what it saw."""
         return [PoseTerm(self, {}, np.zeros(1))]
 
     def is_scale(self, term: PoseTerm) -> bool:
-        """Return that it is a scale."""
         return True
 
     def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
@@ -99,7 +94,6 @@ class PoseOpticalScale(NumberEffect):
         return out
 
     def seen(self, term: PoseTerm, position: Array) -> Array:
-        """Return the positions as the optical tracker scales them, m."""
         return position / (1 + 1e-3 * float(term.theta[0]))
 
 
@@ -126,11 +120,9 @@ class TrackerLag(NumberEffect):
     spread = 0.1  # s: lags are some tenths of a second
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
-        """Return one term for all sensors, which a tracker filters alike."""
         return [PoseTerm(self, {}, np.array([tau])) for tau in TAUS_S]
 
     def filter(self, term: PoseTerm, path: OpticalPath) -> OpticalPath:
-        """Return the optical path as it is behind the tracker's filter."""
         return filtered(path, float(term.theta[0]), 'two_sided' in term.site)
 
     def rival(self, term: PoseTerm) -> PoseTerm:
