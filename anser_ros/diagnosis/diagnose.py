@@ -27,9 +27,9 @@ from anser_ros.diagnosis.screening import (
     clean_start,
     noise_scale,
     noise_t,
+    not_white,
     outlying_share,
     structure_tests,
-    whiteness,
     wiring_faults,
     without_outliers,
 )
@@ -37,8 +37,7 @@ from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_
 from anser_ros.effects.correction import Fields, changed_illumination
 from anser_ros.effects.effect import Family, Remedy, Term
 from anser_ros.effects.seen import EXCESS_NOISE, known_share, outliers_of
-from anser_ros.field.dipoles import Dipoles
-from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.model import Dipoles, EffectRecord, FieldModel
 
 SCHEMA = 'anser_diagnosis/1'
 """Name of the document's layout (`docs/interfaces.md`), which stands in it."""
@@ -137,7 +136,7 @@ def corrected_model(
 
     Metal that moves is not included: the live refit finds its place from the references.
     """
-    dipoles = Dipoles(model.positions, model.directions, model.moments)
+    dipoles = model.dipoles
     light = changed_illumination(terms, fields.illumination)
     for term in terms:
         if term.effect.remedy is Remedy.FIELD and not term.effect.moving:
@@ -309,11 +308,11 @@ def conclude(
     whole, cleaned, fit = screened.whole, confirmed.cleaned, confirmed.fit
     unseen = cleaned.in_blocks(test_blocks())
     before, after = evaluate(unseen, ()), evaluate(unseen, fit.terms)
-    white = whiteness(after)
+    depending = not_white(after)
     expected = expected_rms(after)
     # Residuals that are no noise must not make the floor that they are measured by.
     grown = noise_t(after) > decisions.LEAST_NOISE_GROWTH * cleaned.spread.noise_t
-    scale = min(noise_scale(after), 1.0) if grown and not white.holds else noise_scale(after)
+    scale = min(noise_scale(after), 1.0) if grown and depending else noise_scale(after)
     floor = min(scale * expected, rms(after))
     tests = tuple(structure_tests(after))
     excess = max(rms(after) ** 2 - floor**2, 0.0)
@@ -331,7 +330,7 @@ def conclude(
     records = [finding.record for finding in findings]
     depends: tuple[str, ...] = ()
     if excess > decisions.DEPENDENT * floor**2:
-        depends = tuple(dict.fromkeys([*(white.depends_on if grown else ()), *named]))
+        depends = tuple(dict.fromkeys([*(depending if grown else ()), *named]))
     return Diagnosis(
         findings=tuple(findings),
         flux_rms_before_t=rms(before),

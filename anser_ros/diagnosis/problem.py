@@ -15,9 +15,8 @@ from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.correction import Fields, reference_view, tool_view
 from anser_ros.effects.effect import Remedy, Term
 from anser_ros.errors import DiagnosisError
-from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import Dipoles, FieldModel
 from anser_ros.parallel import in_order, slices, slices_of
 from anser_ros.physics.dipole import field_basis, flux_basis
 from anser_ros.settings import Accuracy
@@ -363,10 +362,10 @@ def fit_illumination(
     error of the references' gains.
     """
     if drawn is None:
-        return Dipoles(model.positions, model.directions, model.moments)
+        return model.dipoles
     place, direction = drawn.positions, drawn.directions
     basis = field_basis(points, place, direction).transpose(0, 2, 1).reshape(-1, len(place))
-    wanted = Dipoles(model.positions, model.directions, model.moments).field(points)
+    wanted = model.dipoles.field(points)
     wanted = wanted.reshape(-1, wanted.shape[2])
     # Complex gain of each emitter that brings the drawn field nearest to the wanted one.
     near = basis @ drawn.moments
@@ -459,7 +458,7 @@ def build_problem(
     gain_error = spread.accuracy.reference_gain
     illumination = fit_illumination(model, drawn, some, references, gain_error)
     omega = 2 * np.pi * np.asarray(model.frequencies_hz)
-    fields = Fields(Dipoles(model.positions, model.directions, model.moments), illumination, omega)
+    fields = Fields(model.dipoles, illumination, omega)
     apparatus = Apparatus(
         tools=tuple(tool.sensors for tool in posed),
         references=None if references is None else references.readings.sensors,

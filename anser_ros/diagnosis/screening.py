@@ -331,45 +331,23 @@ OUTLYING = 4.5
 """Standard deviations beyond which a value is not used here: one alone would make a kurtosis."""
 
 
-@dataclass(frozen=True)
-class Whiteness:
-    """Holds the strongest structure of each kind that is no noise; zero where none is found."""
+def not_white(state: State) -> tuple[str, ...]:
+    """Return what the tools' residuals, each over the spread of its own kind, depend on.
 
-    memory: float
-    shared: float
-    with_size: float
-    kurtosis: float
-
-    @property
-    def holds(self) -> bool:
-        """Return whether the residuals may be called noise."""
-        return not self.depends_on
-
-    @property
-    def depends_on(self) -> tuple[str, ...]:
-        """Return what they depend on, in the words of `docs/interfaces.md`."""
-        found: list[str] = []
-        if self.memory > decisions.LEAST_CORRELATION:
-            found.append('time')
-        if self.shared > decisions.SHARED:
-            found += ['channel', 'emitter']
-        if self.with_size > decisions.WITH_SIZE or abs(self.kurtosis) > decisions.NOT_NORMAL:
-            found.append('amplitude')
-        return tuple(found)
-
-
-def whiteness(state: State) -> Whiteness:
-    """Test the tools' whitened residuals, each value over the spread of its own kind."""
+    In the words of `docs/interfaces.md`; nothing where they may be called noise.
+    """
     tools = [part for part in tool_parts(state) if part.white.shape[0] > 2 * LAGS]
-    if not tools:
-        return Whiteness(0.0, 0.0, 0.0, 0.0)
     values = [_scaled(part) for part in tools]
-    return Whiteness(
-        max(_memory(part, v) for part, v in zip(tools, values, strict=True)),
-        max(_shared(v) for v in values),
-        max(_with_size(part, v) for part, v in zip(tools, values, strict=True)),
-        _kurtosis(values),
-    )
+    pairs = list(zip(tools, values, strict=True))
+    found: list[str] = []
+    if any(_memory(part, v) > decisions.LEAST_CORRELATION for part, v in pairs):
+        found.append('time')
+    if any(_shared(v) > decisions.SHARED for v in values):
+        found += ['channel', 'emitter']
+    with_size = any(_with_size(part, v) > decisions.WITH_SIZE for part, v in pairs)
+    if with_size or (values and abs(_kurtosis(values)) > decisions.NOT_NORMAL):
+        found.append('amplitude')
+    return tuple(found)
 
 
 def _scaled(part: Part) -> Array:

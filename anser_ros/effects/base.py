@@ -12,8 +12,7 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.field.dipoles import Dipoles
-from anser_ros.field.model import EffectRecord
+from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
 Array = NDArray[np.float64]

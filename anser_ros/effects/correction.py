@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from anser_ros.effects.base import View
 from anser_ros.effects.effect import Effect, Remedy, Term, effect_named
 from anser_ros.errors import ModelFileError
-from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import EffectRecord
+from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable

@@ -28,8 +28,7 @@ import anser_ros.effects
 from anser_ros.effects.base import Apparatus, BaseEffect, BaseTerm, View
 from anser_ros.effects.base import Remedy as Remedy
 from anser_ros.errors import ModelFileError
-from anser_ros.field.dipoles import Dipoles
-from anser_ros.field.model import EffectRecord
+from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.metal.body import BODIES, COMPACT, ball_modes
 from anser_ros.metal.scattering import Shapes
 from anser_ros.physics.pose_track import PoseTrack

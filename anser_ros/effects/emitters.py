@@ -21,8 +21,13 @@ from anser_ros.effects.effect import (
     sigmas,
     unit_matrix,
 )
-from anser_ros.field.dipoles import Dipoles, size_parameters, spread_along, symmetry_axis
-from anser_ros.field.model import EffectRecord
+from anser_ros.field.model import (
+    Dipoles,
+    EffectRecord,
+    size_parameters,
+    spread_along,
+    symmetry_axis,
+)
 
 
 class CoilGain(ComplexGain):

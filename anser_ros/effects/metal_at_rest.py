@@ -28,8 +28,7 @@ from anser_ros.effects.effect import (
     pairs_of,
     sigmas,
 )
-from anser_ros.field.dipoles import Dipoles
-from anser_ros.field.model import EffectRecord
+from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.metal.body import (
     BODIES,
     COMPACT,

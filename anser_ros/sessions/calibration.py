@@ -146,16 +146,6 @@ def _difference(one: Setup, other: Setup) -> str:
     return 'the geometry of the coils'
 
 
-def _engine_for(sessions: Sequence[Session], options: Options) -> Engine:
-    return next(engine for engine in all_engines() if engine.accepts(sessions, options))
-
-
-def is_estimated_jointly(session: Session) -> bool:
-    """Return whether a session has few poses of a body of many sensors, and no drawn emitters."""
-    options = Options(session.setup.accuracy, is_joint=True)
-    return _engine_for([session], options).is_joint
-
-
 def calibrate_sessions(
     sessions: Sequence[Session],
     options: Options,
@@ -169,7 +159,7 @@ def calibrate_sessions(
     compared.
     """
     options = replace(options, accuracy=sessions[0].setup.accuracy)
-    chosen = _engine_for(sessions, options)
+    chosen = next(engine for engine in all_engines() if engine.accepts(sessions, options))
     for engine in () if chosen.is_joint else all_engines():
         if asked := [kind for kind in options.estimate if kind in engine.kinds]:
             raise FitError(f'{", ".join(asked)}: can be determined only from {engine.needs}')

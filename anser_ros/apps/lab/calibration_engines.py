@@ -34,9 +34,8 @@ from anser_ros.calibration.readings import (
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN
 from anser_ros.errors import FitError
-from anser_ros.field.dipoles import Dipoles, size_parameters, spread_along
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.model import Dipoles, EffectRecord, FieldModel, size_parameters, spread_along
 from anser_ros.physics.rotations import tilted
 from anser_ros.sessions.calibration import SCAN, Engine, at_constant_strength, generator_of
 from anser_ros.sessions.nominal_board import NominalBoard

@@ -21,9 +21,8 @@ from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.correction import Correction
 from anser_ros.effects.effect import effect_named
 from anser_ros.errors import FitError, ModelFileError
-from anser_ros.field.dipoles import symmetry_axis
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.model import EffectRecord, FieldModel, symmetry_axis
 from anser_ros.fingerprint import Identity
 from anser_ros.physics.board import loop_field
 from anser_ros.physics.pose_track import PoseTrack
