@@ -424,10 +424,9 @@ def build_problem(
 
     ``tools``: bodies without an optical pose are left out; ``baseline`` (R, K): clean readings of
     the reference sensors (NaN where there are none); without them the references say nothing;
-    ``drawn``: the nominal model of the setup, if its kind of emitter has one.
-
-    Raises `DiagnosisError` when a sensor is a sum of windings, fewer than 30 frames have fluxes
-    and a pose, or all poses are the same.
+    ``drawn``: the nominal model of the setup, if its kind of emitter has one. Raises
+    `DiagnosisError` when a sensor is a sum of windings, fewer than 30 frames have fluxes and a
+    pose, or all poses are the same.
     """
     for tool in tools:
         if not tool.sensors.is_single.all():

@@ -465,9 +465,8 @@ def _made_for(item: Any) -> Identity | None:
 def from_document(document: Any) -> FieldModel:
     """Return the field model that a document of plain data holds.
 
-    A document of an earlier version, without fingerprints, is accepted unchecked.
-
-    Raises `ModelFileError` with the rule that the document breaks.
+    A document of an earlier version, without fingerprints, is accepted unchecked. Raises
+    `ModelFileError` with the rule that the document breaks.
     """
     if not isinstance(document, dict) or document.get('schema') != SCHEMA:
         got = document.get('schema') if isinstance(document, dict) else document

@@ -191,9 +191,8 @@ def flux_basis(
 
     Sensor centres ``points`` (m), unit ``axes`` (P, 3) and dipole ``positions`` (m) with unit
     ``directions`` (N, 3) are in the frame fg; coil ``lengths`` (P,), m, are None or 0 for point
-    sensors. The result (P, N) is the flux density per moment, T / (A m^2).
-
-    Raises `ValueError` when the shapes do not fit together.
+    sensors. The result (P, N) is the flux density per moment, T / (A m^2). Raises `ValueError`
+    when the shapes do not fit together.
     """
     r, n, spans = _sensors(points, axes, lengths)
     q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
@@ -283,7 +282,6 @@ def flux_jacobian(
     each of the K emitters, A m^2. Returns the flux density along each sensor's axis (P, K), T, and
     its derivatives (P, 3, K) by the sensor's position, T/m, and by the components of the axis, T.
     The axis counts as a free vector, not as a unit one, and the quadrature points move with it.
-
     Raises `ValueError` when the shapes do not fit together.
     """
     m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)

@@ -198,9 +198,8 @@ class WindowCutter:
     def push(self, sequence: int, timestamp_ticks: int, codes: NDArray[np.int16]) -> list[Window]:
         """Add a block of samples (n, C) and return the windows that it completes.
 
-        ``sequence`` is its number modulo 2^32, the ticks are those of its first sample.
-
-        Raises `ParameterError` when the block has another number of channels.
+        ``sequence`` is its number modulo 2^32, the ticks are those of its first sample. Raises
+        `ParameterError` when the block has another number of channels.
         """
         if codes.shape[1] != self._codes.shape[1]:
             raise ParameterError(

@@ -97,9 +97,7 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     """Return the session as it is meant, and the convention by which it is, if that is another.
 
     Raises `PlausibilityError` when hand-eye fits in no reading, or the reference itself is in
-    another unit.
-
-    Raises `DiagnosisError` when there are too few poses.
+    another unit; `DiagnosisError` when there are too few poses.
     """
     if session.reference is None:
         return session, None

@@ -159,9 +159,8 @@ class CorrectedPose:
 class PoseCorrector:
     """Applies a pose model's offsets, conventions and maps.
 
-    ``document``: as `anser_ros.apps.poses.corrector.to_model` makes it.
-
-    Raises `ModelFileError` when it is no pose model, or a record lacks a parameter.
+    ``document``: as `anser_ros.apps.poses.corrector.to_model` makes it. Raises `ModelFileError`
+    when it is no pose model, or a record lacks a parameter.
     """
 
     def __init__(self, document: Mapping[str, Any]) -> None:

@@ -75,9 +75,8 @@ class LoopFiles(NamedTuple):
 def make_world(folder: Path) -> LoopFiles:
     """Write the demo's setup and model with the loop's tones.
 
-    The field without metal does not depend on the tones, so that the model stays right.
-
-    Raises `SetupError` when the demo's setup has another number of coils than there are tones.
+    The field without metal does not depend on the tones, so that the model stays right. Raises
+    `SetupError` when the demo's setup has another number of coils than there are tones.
     """
     setup = parse_setup(read_config('demo_setup.yaml'))
     if len(setup.emitter.coils) != len(TONES_HZ):
@@ -112,9 +111,8 @@ def record(run: Run) -> Path:
     """Record a run and return the folder of its bag.
 
     The unit is started once all nodes are ready: drifts begin with its first start, which is then
-    the first frame of the recording and of every tracker.
-
-    Raises `DiagnosisError` when a process ends, or no flux arrives in time.
+    the first frame of the recording and of every tracker. Raises `DiagnosisError` when a process
+    ends, or no flux arrives in time.
     """
     ports = Path(tempfile.mkdtemp(prefix='anser_loop_'))
     bag = run.folder / 'bag'
