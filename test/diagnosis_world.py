@@ -6,7 +6,6 @@ import numpy as np
 from injection_subject import JITTER_M, JITTER_RAD, NOISE_T, Subject
 from scipy.spatial.transform import Rotation
 
-from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.pose_track import PoseTrack
@@ -75,7 +74,7 @@ def world(seed: int = 0, frames: int = 500, emitters: int = 4) -> World:
     """A clean session at 25 Hz with an optical tracker at 60 Hz."""
     rng = np.random.default_rng(seed)
     model, sensors, fixed = board(emitters), tool_sensors(), reference_sensors()
-    dipoles = Dipoles(model.positions, model.directions, model.moments)
+    dipoles = model.dipoles
     time = np.arange(frames) / 25.0
     position, turn = _path(time)
     centres, axes = sensors.placed(position, turn.as_matrix())

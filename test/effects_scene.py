@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from anser_ros.effects.effect import Term
-from anser_ros.effects.metal_path import FreePath, StraightPath
-from anser_ros.effects.registry import all_effects
-from anser_ros.field.dipoles import Dipoles
+from anser_ros.effects.effect import Term, all_effects
+from anser_ros.effects.moving_metal import FreePath, StraightPath
+from anser_ros.field.model import Dipoles
 from anser_ros.metal.body import lattice
 
 

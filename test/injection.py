@@ -38,7 +38,7 @@ from injection_subject import (
 )
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.saturation import compressed
+from anser_ros.effects.channels import compressed
 from anser_ros.physics.pose_track import PoseTrack
 
 __all__ = [

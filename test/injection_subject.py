@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Problem, Spread
-from anser_ros.field.dipoles import Dipoles
+from anser_ros.diagnosis.problem import Problem, Spread, build_problem
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import Dipoles, FieldModel
 from anser_ros.physics.pose_track import PoseTrack
 
 NOISE_T = 60e-12
@@ -35,7 +33,7 @@ class Subject:
         # Where the sensors truly are, whatever becomes of the optical track.
         self.rotation = self.tool.rotation
         self.centres, self.axes = self.tool.placed()
-        self.field = Dipoles(self.model.positions, self.model.directions, self.model.moments)
+        self.field = self.model.dipoles
         self.omega = 2 * np.pi * np.asarray(self.model.frequencies_hz)
         self.time = self.tool.time
         self.clean = self.read(self.centres, self.axes)

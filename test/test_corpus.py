@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tracking_world import triaxial_tool
 
 from anser_ros.effects.correction import Correction
-from anser_ros.effects.registry import all_effects
+from anser_ros.effects.effect import all_effects
 from anser_ros.errors import AnserError, ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.nodes.openigtlink import IgtlServer

@@ -8,11 +8,9 @@ from diagnosis_world import board, world
 
 from anser_ros.diagnosis import departure as departing
 from anser_ros.diagnosis.departure import departure
-from anser_ros.diagnosis.prepare import train_blocks
-from anser_ros.diagnosis.problem import evaluate
-from anser_ros.effects.metal_path import FreePath
-from anser_ros.effects.moving_metal import DepartedMetal
-from anser_ros.field.dipoles import Dipoles
+from anser_ros.diagnosis.problem import evaluate, train_blocks
+from anser_ros.effects.moving_metal import DepartedMetal, FreePath
+from anser_ros.field.model import Dipoles
 from anser_ros.metal.body import sphere_polarisability
 
 REST, NEAREST = np.array([0.12, -0.1, -0.16]), np.array([0.03, -0.02, -0.08])

@@ -9,8 +9,8 @@ from diagnosis_world import world
 from injection import CATALOGUE, LISTED, SIZES, UNLISTED
 
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
-from anser_ros.effects.metal_path import StraightPath
-from anser_ros.effects.registry import all_effects
+from anser_ros.effects.effect import all_effects
+from anser_ros.effects.moving_metal import StraightPath
 
 
 def found(names: str, seed: int, size: str = 'medium') -> tuple[Diagnosis, dict]:

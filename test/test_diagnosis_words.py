@@ -10,8 +10,8 @@ from diagnosis_world import world
 from anser_ros.cli.diagnosis_report import course
 from anser_ros.cli.diagnosis_words import MOST_CHARACTERS, paths, short_ones, value_text, verdict
 from anser_ros.diagnosis.problem import evaluate
-from anser_ros.effects.metal_path import StraightPath
-from anser_ros.effects.registry import all_effects
+from anser_ros.effects.effect import all_effects
+from anser_ros.effects.moving_metal import StraightPath
 from anser_ros.field.model import plain
 from anser_ros.sessions.diagnosis import DEPENDENCIES, MODEL_FILE_ONLY
 

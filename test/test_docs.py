@@ -10,7 +10,7 @@ from conftest import REPO
 
 from anser_ros.api.setup import load_setup
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
-from anser_ros.effects.registry import all_effects
+from anser_ros.effects.effect import all_effects
 from anser_ros.physics.board import KINDS
 from anser_ros.pose_states import STATES
 from anser_ros.sessions.diagnosis import DEPENDENCIES

@@ -16,7 +16,7 @@ import anser_ros.apps.poses.effects as pose_package
 import anser_ros.effects as package
 from anser_ros.apps.poses.effect import pose_effects
 from anser_ros.effects.base import BaseEffect, BaseTerm
-from anser_ros.effects.registry import all_effects
+from anser_ros.effects.effect import all_effects
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 ALLOWED = {
@@ -30,16 +30,13 @@ ALLOWED = {
     'apps/lab/one_place.py': 'the same, of a body of many sensors at one place',
     'apps/lab/calibration_engines.py': 'the same, of the sizes of magnets',
 }
-GENERAL = {
-    'apparatus', 'base', 'body_term', 'correction', 'effect', 'prediction', 'registry', 'term',
-    'view',
-}  # fmt: skip
+GENERAL = {'base', 'correction', 'effect'}
 """Modules in the room of effects that are about no single one; others may import these."""
 MAY_IMPORT = {
-    'diagnosis/screening.py': {'wiring'},
-    'diagnosis/findings.py': {'seen'},
-    'diagnosis/fit.py': {'metal_remainder'},
-    'diagnosis/departure.py': {'metal_path', 'moving_metal'},
+    'diagnosis/screening.py': {'seen'},
+    'diagnosis/diagnose.py': {'seen'},
+    'diagnosis/fit.py': {'metal_at_rest'},
+    'diagnosis/departure.py': {'moving_metal'},
 }
 """Modules of single effects that a file may import, as it makes their terms without the search:
 wiring, noise and outliers are seen directly, and have no parameter whose fit could propose them;

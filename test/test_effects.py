@@ -7,11 +7,9 @@ import pytest
 from diagnosis_world import world
 from effects_scene import candidates, in_force, undrawn
 
-from anser_ros.effects.correction import Correction
-from anser_ros.effects.effect import Effect, Family, Remedy, Term
-from anser_ros.effects.prediction import reference_view, tool_view
-from anser_ros.effects.registry import all_effects, effect_named
-from anser_ros.effects.saturation import compressed
+from anser_ros.effects.channels import compressed
+from anser_ros.effects.correction import Correction, reference_view, tool_view
+from anser_ros.effects.effect import Effect, Family, Remedy, Term, all_effects, effect_named
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable

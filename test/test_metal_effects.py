@@ -8,10 +8,10 @@ from diagnosis_world import world
 from effects_scene import candidates, in_force, moving, visiting
 from metal_world import induced_moments
 
-from anser_ros.effects.metal_path import FreePath, StraightPath, moving_times
-from anser_ros.effects.metal_remainder import REMAINDER, UP_M, Couplings, IlluminationChange
-from anser_ros.effects.prediction import tool_view
-from anser_ros.field.dipoles import Dipoles
+from anser_ros.effects.correction import tool_view
+from anser_ros.effects.metal_at_rest import REMAINDER, UP_M, Couplings, IlluminationChange
+from anser_ros.effects.moving_metal import FreePath, StraightPath, moving_times
+from anser_ros.field.model import Dipoles
 from anser_ros.metal.body import (
     BODIES,
     ODD,

@@ -10,8 +10,7 @@ from calibration_world import NOISE_T, scene
 from anser_ros.calibration.calibrate import Options, _better, correct_scan, fit_scan
 from anser_ros.calibration.held_out import factor_of
 from anser_ros.calibration.layouts import Layout
-from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Spread, evaluate, expected_rms, rms
+from anser_ros.diagnosis.problem import Spread, build_problem, evaluate, expected_rms, rms
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import from_document, parse_gaps, to_document
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from anser_ros.diagnosis.diagnose import conclude, confirm, screen, search_screened
-from anser_ros.diagnosis.prepare import test_blocks as held_out_blocks
+from anser_ros.diagnosis.problem import test_blocks as held_out_blocks
 from anser_ros.diagnosis.search import SearchSettings
 from anser_ros.errors import BagError, DiagnosisError, ModelFileError
 from anser_ros.field.model import EffectRecord, plain

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.result import Calibration
 from anser_ros.cli.diagnosis_words import flux_unit
-from anser_ros.effects.registry import effect_named
+from anser_ros.effects.effect import effect_named
 from anser_ros.field.model import EffectRecord
 
 if TYPE_CHECKING:

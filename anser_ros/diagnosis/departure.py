@@ -17,13 +17,11 @@ from anser_ros.diagnosis.choice import course_of
 from anser_ros.diagnosis.decisions import SOMETHING_LEFT
 from anser_ros.diagnosis.engine import Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter, Known, Shaping, best_modes, unit_of
-from anser_ros.diagnosis.prepare import test_blocks, train_blocks
-from anser_ros.diagnosis.problem import Problem, State, evaluate
+from anser_ros.diagnosis.problem import Problem, State, evaluate, test_blocks, train_blocks
 from anser_ros.diagnosis.screening import without_outliers
+from anser_ros.effects.base import View
 from anser_ros.effects.effect import Richness
-from anser_ros.effects.metal_path import FreePath
-from anser_ros.effects.moving_metal import DepartedMetal, DepartedTerm
-from anser_ros.effects.view import View
+from anser_ros.effects.moving_metal import DepartedMetal, DepartedTerm, FreePath
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 
 Array = NDArray[np.float64]

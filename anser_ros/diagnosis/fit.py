@@ -16,7 +16,8 @@ from anser_ros.diagnosis.decisions import (
 )
 from anser_ros.diagnosis.engine import BlockSums, JointFit, block_sums, descended, joined
 from anser_ros.diagnosis.problem import Problem, State, evaluate, parts, tools_misfit
-from anser_ros.diagnosis.structure import noise_scale
+from anser_ros.diagnosis.screening import noise_scale
+from anser_ros.effects.base import View
 from anser_ros.effects.effect import (
     BodyTerm,
     Family,
@@ -26,8 +27,7 @@ from anser_ros.effects.effect import (
     Term,
     both_phases,
 )
-from anser_ros.effects.metal_remainder import REMAINDER, Couplings, IlluminationChange
-from anser_ros.effects.view import View
+from anser_ros.effects.metal_at_rest import REMAINDER, Couplings, IlluminationChange
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 from anser_ros.metal.scattering import Shapes
 from anser_ros.parallel import in_order

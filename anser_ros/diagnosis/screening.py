@@ -1,16 +1,16 @@
-"""Finds what needs no search: values that stand out from their neighbours, and wiring faults."""
+"""Looks at residuals alone: what stands out, wiring faults, what they depend on, what is noise."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
 from anser_ros.diagnosis import decisions
-from anser_ros.diagnosis.problem import Problem, State, evaluate, tool_parts
+from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, tool_parts
 from anser_ros.effects.effect import Family, Site, Term
-from anser_ros.effects.wiring import DEAD_CHANNEL, SENSOR_POLARITY, SWAPPED_CHANNELS, SWAPPED_COILS
+from anser_ros.effects.seen import DEAD_CHANNEL, SENSOR_POLARITY, SWAPPED_CHANNELS, SWAPPED_COILS
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -191,3 +191,216 @@ def _swapped_coils(state: State) -> Term | None:
         return None
     true = tuple(int(c) for c in order[moved])
     return Term(SWAPPED_COILS, {'coils': true, 'read_as': tuple(moved.tolist())})
+
+
+BINS = 12
+"""Cells into which frames are binned by one variable, tens of frames in each."""
+BINNED = ('time', 'position', 'orientation', 'speed', 'amplitude')  # by which frames are binned
+FEWEST_CELL_VALUES = 4
+"""Values that a cell needs for its mean to be compared: fewer add more noise than information."""
+
+
+@dataclass(frozen=True)
+class StructureTest:
+    """Holds the test of one variable."""
+
+    variable: str
+    share: float  # part of the residual power that the cell means explain beyond chance
+    probability: float  # of as much structure in noise
+
+    @property
+    def significant(self) -> bool:
+        """Return whether noise hardly does that, and it matters."""
+        return self.probability < decisions.SIGNIFICANT and self.share > decisions.LEAST_DEPENDENCE
+
+
+def structure_tests(state: State) -> list[StructureTest]:
+    """Test the tools' whitened residuals against every variable, strongest first.
+
+    For time, position, orientation, speed and amplitude the frames are binned, and the mean of
+    each phasor part of each sensor in each bin is compared with zero. For channel, emitter and
+    frequency the spread over the groups is compared with the spread of all.
+    """
+    tools = tool_parts(state)
+    noise = _noise(tools)
+    tests = [_binned(tools, name, noise) for name in BINNED]
+    tests += [_grouped(tools, name, noise) for name in ('channel', 'emitter', 'quadrature')]
+    return sorted(tests, key=lambda test: -test.share)
+
+
+def _noise(parts: list[Part]) -> float:
+    """Variance of the white part of the residuals, from differences of neighbouring frames."""
+    squares, count = 0.0, 0
+    for part in parts:
+        if part.white.shape[0] < 2:
+            continue
+        both = (part.whitener.weight[1:] > 0) & (part.whitener.weight[:-1] > 0)
+        close = np.diff(part.view.time) < 3 * np.median(np.diff(part.view.time))
+        step = np.diff(part.white, axis=0)[close][both[close]] / np.sqrt(2)
+        squares += float(np.sum(step**2))
+        count += step.size
+    return squares / count if count else 1.0
+
+
+def noise_scale(state: State) -> float:
+    """Return the deviation of the white part of the tools' residuals over the expected one."""
+    return float(np.sqrt(_noise(tool_parts(state))))
+
+
+def noise_t(state: State) -> float:
+    """Return the noise of a phasor component, T: the white part.
+
+    The six directions of a frame's pose are not counted: the residual along them is as large as
+    the jitter's prior allows, whatever the noise.
+    """
+    tools = tool_parts(state)
+    count = sum(part.count for part in tools)
+    frames = sum(int((part.whitener.weight > 0).any(axis=1).sum()) for part in tools)
+    share = min(6 * frames / max(count, 1), 0.9)
+    variance = max((_noise(tools) - share) / (1 - share), 1e-6)
+    return float(np.sqrt(variance)) * state.problem.spread.flux_t
+
+
+def _quantiles(values: Array, bins: int) -> NDArray[np.int64]:
+    edges = np.quantile(values, np.linspace(0, 1, bins + 1)[1:-1])
+    return np.searchsorted(edges, values, side='right')
+
+
+def _cells(part: Part, name: str) -> list[NDArray[np.int64]]:
+    """Cell of each frame by a variable; by the amplitude, those of each reading apart."""
+    view = part.view
+    if name == 'time':
+        return [_quantiles(view.time, BINS)]
+    if name == 'amplitude':
+        size = view.flux.real.reshape(len(view.flux), -1)
+        return [_quantiles(column, BINS) for column in size.T]
+    if name == 'position':
+        x, y, z = view.position.T
+        return [_quantiles(x, 4) * 8 + _quantiles(y, 4) * 2 + _quantiles(z, 2)]
+    if name == 'speed':
+        x, y, z = view.velocity[:, :3].T
+    else:
+        # The turn from the middle frame's orientation, by its components.
+        turn = view.rotation[len(view.rotation) // 2].T @ view.rotation
+        x, y, z = (turn[:, b, a] - turn[:, a, b] for a, b in ((1, 2), (2, 0), (0, 1)))
+    return [_quantiles(x, 3) * 9 + _quantiles(y, 3) * 3 + _quantiles(z, 3)]
+
+
+def _binned(parts: list[Part], name: str, noise: float) -> StructureTest:
+    explained, cells, total = 0.0, 0, 0.0
+    for part in parts:
+        bins = _cells(part, name)
+        good = part.whitener.weight > 0
+        total += float(np.sum(part.white[good] ** 2))
+        half = part.white.shape[1] // 2
+        for i, number in enumerate(bins):
+            columns = slice(None) if len(bins) == 1 else [i, half + i]
+            white, counted = part.white[:, columns], good[:, columns]
+            for cell in np.unique(number):
+                rows = number == cell
+                n = counted[rows].sum(axis=0)
+                sums = (white[rows] * counted[rows]).sum(axis=0)
+                use = n >= FEWEST_CELL_VALUES
+                explained += float(np.sum(sums[use] ** 2 / n[use]))
+                cells += int(use.sum())
+    share = max(explained - cells * noise, 0.0) / max(total, 1e-300)
+    return StructureTest(name, share, float(chdtrc(max(cells, 1), explained / noise)))
+
+
+def _grouped(parts: list[Part], name: str, noise: float) -> StructureTest:
+    groups, squares, counts = [], [], []
+    for part in parts:
+        quadrature, sensor, emitter = np.indices((2, *part.view.flux.shape[1:])).reshape(3, -1)
+        channels = part.view.sensors.channel[sensor]
+        groups.append({'channel': channels, 'emitter': emitter, 'quadrature': quadrature}[name])
+        good = part.whitener.weight > 0
+        squares.append(np.sum((part.white * good) ** 2, axis=0))
+        counts.append(good.sum(axis=0))
+    _, label = np.unique(np.concatenate(groups), return_inverse=True)
+    square, n = (np.bincount(label, np.concatenate(each)) for each in (squares, counts))
+    n = np.maximum(n, 1)
+    statistic = float(np.sum((square / n / noise - 1.0) ** 2 * n / 2))
+    excess = float(np.sum(np.maximum(square - n * noise, 0.0)))
+    probability = float(chdtrc(n.size, statistic))
+    return StructureTest(name, excess / max(float(square.sum()), 1e-300), probability)
+
+
+LAGS = 12
+"""Frames back to which a memory is looked for: half a second at 25 Hz."""
+OUTLYING = 4.5
+"""Standard deviations beyond which a value is not used here: one alone would make a kurtosis."""
+
+
+def not_white(state: State) -> tuple[str, ...]:
+    """Return what the tools' residuals, each over the spread of its own kind, depend on.
+
+    In the words of `docs/interfaces.md`; nothing where they may be called noise.
+    """
+    tools = [part for part in tool_parts(state) if part.white.shape[0] > 2 * LAGS]
+    values = [_scaled(part) for part in tools]
+    pairs = list(zip(tools, values, strict=True))
+    found: list[str] = []
+    if any(_memory(part, v) > decisions.LEAST_CORRELATION for part, v in pairs):
+        found.append('time')
+    if any(_shared(v) > decisions.SHARED for v in values):
+        found += ['channel', 'emitter']
+    with_size = any(_with_size(part, v) > decisions.WITH_SIZE for part, v in pairs)
+    if with_size or (values and abs(_kurtosis(values)) > decisions.NOT_NORMAL):
+        found.append('amplitude')
+    return tuple(found)
+
+
+def _scaled(part: Part) -> Array:
+    """Residuals over the spread of their column; NaN where there is none or it stands out."""
+    good = part.whitener.weight > 0
+    white = np.where(good, part.white, np.nan)
+    count = np.maximum(good.sum(axis=0), 1)
+    size = np.sqrt(np.nansum(white**2, axis=0) / count)
+    out = white / np.where(size > 0, size, 1.0)
+    return np.where(np.abs(out) < OUTLYING, out, np.nan)
+
+
+def _memory(part: Part, values: Array) -> float:
+    """Largest correlation with an earlier frame, over lags and all columns pooled."""
+    step = np.median(np.diff(part.view.time))
+    known = np.nan_to_num(values)
+    most = 0.0
+    for lag in range(1, LAGS + 1):
+        near = np.abs(part.view.time[lag:] - part.view.time[:-lag] - lag * step) < 0.5 * step
+        if near.sum() < LAGS:
+            continue
+        one, other = known[lag:][near], known[:-lag][near]
+        power = np.sqrt(float(np.sum(one**2)) * float(np.sum(other**2)))
+        most = max(most, abs(float(np.sum(one * other))) / max(power, 1e-300))
+    return most
+
+
+def _shared(values: Array) -> float:
+    """Largest eigenvalue of the correlations over Marchenko and Pastur's upper edge."""
+    used = values[:, np.isfinite(values).mean(axis=0) > 0.5]
+    frames, count = used.shape
+    if count < 2 or frames < 8:
+        return 0.0
+    known = np.nan_to_num(used)
+    known = known / np.sqrt(np.maximum(np.mean(known**2, axis=0), 1e-300))
+    gram = known @ known.T if frames < count else known.T @ known
+    largest = float(np.linalg.eigvalsh(gram / frames)[-1])
+    return largest / float(1 + np.sqrt(count / frames)) ** 2
+
+
+def _with_size(part: Part, values: Array) -> float:
+    """Correlation of squared residuals with squared readings, each over its column's mean."""
+    flux = part.view.flux
+    flat = np.concatenate([np.abs(flux).reshape(flux.shape[0], -1) ** 2] * 2, axis=1)
+    known = np.isfinite(values)
+    size = flat / np.maximum(flat.mean(axis=0), 1e-300)
+    a, b = values[known] ** 2, size[known]
+    a, b = a - a.mean(), b - b.mean()
+    power = np.sqrt(float(a @ a) * float(b @ b))
+    return float(float(a @ b) / power) if power > 0 else 0.0
+
+
+def _kurtosis(values: list[Array]) -> float:
+    known = np.concatenate([v[np.isfinite(v)] for v in values])
+    # A normal distribution cut at OUTLYING has a kurtosis of 2.99.
+    return float(np.mean(known**4) / np.mean(known**2) ** 2 - 2.99)

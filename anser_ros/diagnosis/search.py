@@ -17,19 +17,18 @@ from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.choice import (
     at_floor,
     choose,
+    doubtful,
     fluctuation_of,
     left_over,
     moves_or_rests,
     moving_starts,
     taken_from_others,
 )
-from anser_ros.diagnosis.confirm import doubtful
 from anser_ros.diagnosis.engine import ForwardSelection, Score, Scorer, is_covered
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Problem, State
-from anser_ros.diagnosis.structure import noise_scale
-from anser_ros.effects.effect import Family, Term
-from anser_ros.effects.registry import all_effects
+from anser_ros.diagnosis.screening import noise_scale
+from anser_ros.effects.effect import Family, Term, all_effects
 from anser_ros.parallel import in_order, slices
 
 Array = NDArray[np.float64]

@@ -1,1 +1,1 @@
-"""Lists what may be wrong with a session, one file for each effect, and how it is undone."""
+"""Lists what may be wrong with a session, by what it acts on, and how it is undone."""

@@ -1,6 +1,7 @@
 """Defines what every effect and every term offers to the engine that fits and selects them.
 
-Fluxes (`anser_ros.effects.effect`) and poses are two observations; each adds its own stages.
+Fluxes (`anser_ros.effects.effect`) and poses are two observations; each adds its own stages. What
+effects on fluxes know of a session is its apparatus, and the predicted readings of one body.
 """
 
 from collections.abc import Mapping
@@ -11,7 +12,8 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.field.model import EffectRecord
+from anser_ros.field.model import Dipoles, EffectRecord
+from anser_ros.physics.sensor import SensorTable, clusters_of
 
 Array = NDArray[np.float64]
 AnyTerm = TypeVar('AnyTerm', bound='BaseTerm')
@@ -109,3 +111,98 @@ def _short(value: Any) -> str:
     if isinstance(value, (tuple, list)):
         return '[' + ' '.join(_short(v) for v in value) + ']'
     return str(value)
+
+
+@dataclass(frozen=True)
+class Apparatus:
+    """Holds tools, references, emitters and the space that they take up."""
+
+    tools: tuple[SensorTable, ...]  # One table for each tool body
+    references: SensorTable | None  # The sensors that are fixed in fg
+    emitters: int  # Number of emitters, K
+    omega: Array  # (K,), angular drive frequencies, rad/s
+    duration: float  # Length of the session, s
+    illumination: Dipoles  # The emitters' own field, good also beside and below the board
+    # (2, 3), lower and upper corner of the box in which tool sensors were during this session, m,
+    # frame fg: what the data can tell about, not where tools may be (that is
+    # `physics.volume.TrackedVolume`)
+    visited_box: Array
+    board: Array  # (2, 3), lower and upper corner of the field generator, m, frame fg
+
+    @property
+    def tool_channels(self) -> tuple[int, ...]:
+        """Return the channels of all tool sensors, in the tables' order."""
+        return tuple(int(c) for table in self.tools for c in table.channel)
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Return channels of all sensors, those of the tools first."""
+        extra = () if self.references is None else self.references.channel
+        return self.tool_channels + tuple(int(c) for c in extra)
+
+    def clusters(self) -> list[tuple[int, ...]]:
+        """Return the channels of tool sensors that share one centre, two or more of them."""
+        return [
+            tuple(table.channel[rows].tolist())
+            for table in self.tools
+            for rows in clusters_of(table)
+            if rows.size > 1
+        ]
+
+
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class View:
+    """Holds predicted readings of a body's S sensors in F frames, with some active effects."""
+
+    time: Array  # (F,), s since the session's start
+    sensors: SensorTable  # The sensors as the effects say that they are
+    # position, rotation: (F, 3) and (F, 3, 3), pose of the body, m, frame fg
+    position: Array
+    rotation: Array
+    velocity: Array  # (F, 6), m/s and rad/s along the axes of fg, of the body's origin
+    # centres, axes: (F, S, 3), places (m) and unit axes of the sensors, frame fg
+    centres: Array
+    axes: Array
+    linear: ComplexArray  # (F, S, K), flux before offsets and compression, T
+    flux: ComplexArray  # (F, S, K), flux as it is read, T
+    # d_position, d_axis: (F, S, 3, K), derivatives of the flux by the sensor's centre (T/m) and by
+    # its axis vector (T)
+    d_position: ComplexArray
+    d_axis: ComplexArray
+    # (F, S, 3, K), derivative of the flux by a turn of the body about its origin, along fg's axes,
+    # T/rad
+    d_turn: ComplexArray
+    dipoles: Dipoles  # The field that the sensors see, without what moves
+    illumination: Dipoles  # The emitters' own field, as metal sees it
+    omega: Array  # (K,), angular drive frequencies, rad/s
+    is_reference: bool  # Whether the sensors are the references, which are fixed in fg
+
+    def row(self, channel: int) -> int | None:
+        """Return the row of a channel, or None where the body doesn't carry it."""
+        found = np.flatnonzero(self.sensors.channel == channel)
+        return int(found[0]) if found.size else None
+
+    def columns(self, count: int) -> ComplexArray:
+        """Return zeros of shape (F, S, K, count), to be filled with columns."""
+        return np.zeros((*self.flux.shape, count), dtype=complex)
+
+    def frames(self, rows: NDArray[np.int64]) -> 'View':
+        """Return the view of some frames, named by index."""
+        each = (
+            'time', 'position', 'rotation', 'velocity', 'centres', 'axes', 'linear', 'flux',
+            'd_position', 'd_axis', 'd_turn',
+        )  # fmt: skip
+        return replace(self, **{name: getattr(self, name)[rows] for name in each})
+
+    def along(self, field_flux: ComplexArray) -> ComplexArray:
+        """Return fluxes of flattened sensors, shape (F S, K), in the shape (F, S, K)."""
+        return field_flux.reshape(self.flux.shape)
+
+    @property
+    def flat(self) -> tuple[Array, Array, Array]:
+        """Return centres, axes (F S, 3) and lengths (F S,) of every sensor in every frame."""
+        lengths = np.tile(self.sensors.length, self.time.size)
+        return self.centres.reshape(-1, 3), self.axes.reshape(-1, 3), lengths

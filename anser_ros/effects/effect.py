@@ -12,20 +12,23 @@ this package refers to an effect's name or class, or imports its module, except 
 `test/test_effect_names.py` lists with reasons.
 """
 
+import importlib
+import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cache
+from types import ModuleType
 from typing import Any, ClassVar, Literal, Self, TypedDict, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.base import BaseEffect, BaseTerm
+import anser_ros.effects
+from anser_ros.effects.base import Apparatus, BaseEffect, BaseTerm, View
 from anser_ros.effects.base import Remedy as Remedy
-from anser_ros.effects.view import Apparatus, View
 from anser_ros.errors import ModelFileError
-from anser_ros.field.dipoles import Dipoles
-from anser_ros.field.model import EffectRecord
+from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.metal.body import BODIES, COMPACT, ball_modes
 from anser_ros.metal.scattering import Shapes
 from anser_ros.physics.pose_track import PoseTrack
@@ -453,3 +456,29 @@ def both_phases(unit: NDArray[np.inexact]) -> ComplexArray:
 def unit_matrix(size: int) -> ComplexArray:
     """Return the identity of this size as a complex matrix."""
     return np.eye(size, dtype=complex)
+
+
+@cache
+def all_effects() -> dict[str, Effect[Any]]:
+    """Return every effect by its name, in alphabetical order."""
+    return effects_in(anser_ros.effects)
+
+
+def effects_in(package: ModuleType) -> dict[str, Any]:
+    """Return the effects that the modules of a package define, by name in alphabetical order."""
+    found: dict[str, Any] = {}
+    for info in pkgutil.iter_modules(package.__path__):
+        module = importlib.import_module(f'{package.__name__}.{info.name}')
+        for effect in getattr(module, 'EFFECTS', ()):
+            if effect.name in found:
+                raise ValueError(f'two effects are called {effect.name!r}')
+            found[effect.name] = effect
+    return dict(sorted(found.items()))
+
+
+def effect_named(name: str) -> Effect[Any]:
+    """Return the effect with a name; raises `ModelFileError` when there is none."""
+    try:
+        return all_effects()[name]
+    except KeyError:
+        raise ModelFileError(f'model: no effect is called {name!r}') from None

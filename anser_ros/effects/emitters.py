@@ -1,14 +1,215 @@
-"""An emitter is elsewhere, or larger or flatter, than the model has it."""
+"""What is wrong with emitters: strength, its drift, leaking tones, place, size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations, permutations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed
-from anser_ros.effects.view import Apparatus, View
-from anser_ros.field.dipoles import Dipoles, size_parameters, spread_along, symmetry_axis
-from anser_ros.field.model import EffectRecord
+from anser_ros.effects.base import Apparatus, View
+from anser_ros.effects.channels import ComplexGain
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Site,
+    Term,
+    needed,
+    recorded_site,
+    sigmas,
+    unit_matrix,
+)
+from anser_ros.field.model import (
+    Dipoles,
+    EffectRecord,
+    size_parameters,
+    spread_along,
+    symmetry_axis,
+)
+
+
+class CoilGain(ComplexGain):
+    """Is the complex gain of one emitter."""
+
+    name = 'coil_gain'
+    summary = "an emitter's strength is not the calibrated one"
+    units = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        return [Term(self, {'coil': k}, np.zeros(2)) for k in range(apparatus.emitters)]
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        own = view.linear[:, :, term.site['coil']] / (1 + complex(*term.theta))
+        out = view.columns(2)
+        out[:, :, term.site['coil'], 0], out[:, :, term.site['coil'], 1] = own, 1j * own
+        return out
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        matrix = unit_matrix(omega.size)
+        matrix[term.site['coil'], term.site['coil']] = 1 + complex(*term.theta)
+        return matrix[None]
+
+
+PROBED_SHARES = (0.1, 0.5, 2.5)
+"""Time constants of the probe, as shares of the session: from one that has ended early to one that
+is nearly a straight line. Closer ones have nearly parallel columns; fewer miss courses between
+them."""
+
+
+def _shape(time: Array, tau: float) -> Array:
+    return np.asarray(1 - np.exp(-np.maximum(time, 0.0) / tau))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoilDriftTerm(Term):
+    """Holds the drift of one emitter."""
+
+    duration: float = 1.0  # Of the session, s; only the search needs it
+
+
+class CoilDrift(Effect[CoilDriftTerm]):
+    """Multiplies an emitter by 1 + a (1 - exp(-t/tau)); theta is a and log(tau / s)."""
+
+    name = 'coil_drift'
+    summary = "an emitter's strength changes with time"
+    units = {'coil': '1', 'amount': '1', 'tau_s': 's'}
+    plausible = {'amount': (-0.5, 0.5), 'tau_s': (0.5, 1000.0)}
+    remedy = Remedy.FLUX
+    typical = (0.1, 1.6)  # some percent, and a time constant within a factor of five
+    drifts = True
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[CoilDriftTerm]:
+        duration = max(apparatus.duration, 1.0)
+        start, coils = np.array([0.0, np.log(0.5 * duration)]), range(apparatus.emitters)
+        return [CoilDriftTerm(self, {'coil': k}, start, duration=duration) for k in coils]
+
+    def amounts(self, term: CoilDriftTerm) -> NDArray[np.int64]:
+        """Return the amount's index alone: a drift of nothing has any time constant."""
+        return np.array([0])
+
+    def _own(self, term: CoilDriftTerm, view: View) -> ComplexArray:
+        coil, (amount, log_tau) = term.site['coil'], term.theta
+        factor = 1 + amount * _shape(view.time, float(np.exp(log_tau)))
+        return np.asarray(view.linear[:, :, coil] / factor[:, None])
+
+    def columns(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
+        """Return the emitter's flux times the derivatives of the curve."""
+        amount, log_tau = term.theta
+        tau = float(np.exp(log_tau))
+        own, late = self._own(term, view), np.maximum(view.time, 0.0) / tau
+        out = view.columns(2)
+        out[:, :, term.site['coil'], 0] = own * _shape(view.time, tau)[:, None]
+        out[:, :, term.site['coil'], 1] = own * (-amount * late * np.exp(-late))[:, None]
+        return out
+
+    def probe(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
+        """Return the flux of drifts with three different time constants."""
+        own = self._own(term, view)
+        out = view.columns(len(PROBED_SHARES))
+        for i, share in enumerate(PROBED_SHARES):
+            curve = _shape(view.time, share * term.duration)
+            out[:, :, term.site['coil'], i] = own * curve[:, None]
+        return out
+
+    def started(self, term: CoilDriftTerm, solution: Array) -> Sequence[CoilDriftTerm]:
+        """Start with the time constant whose curve comes nearest to the probe's sum."""
+        duration = term.duration
+        time = np.linspace(0.0, duration, 60)
+        curves = [_shape(time, share * duration) for share in PROBED_SHARES]
+        wanted = sum(a * c for a, c in zip(solution, curves, strict=True))
+        misfits = []
+        for tau in duration * np.geomspace(0.03, 5.0, 25):
+            curve = _shape(time, float(tau))
+            amount = float(curve @ wanted / (curve @ curve))
+            misfits.append((float(np.sum((wanted - amount * curve) ** 2)), amount, np.log(tau)))
+        return (term.with_theta(np.array(min(misfits)[1:])),)
+
+    def bounded(self, term: CoilDriftTerm) -> CoilDriftTerm:
+        """Keep the time constant between half a second and a quarter of an hour."""
+        amount, log_tau = term.theta
+        return term.with_theta(np.array([amount, np.clip(log_tau, np.log(0.3), np.log(1500.0))]))
+
+    def emitter_matrix(self, term: CoilDriftTerm, time: Array, omega: Array) -> ComplexArray:
+        amount, log_tau = term.theta
+        matrix = np.repeat(unit_matrix(omega.size)[None], time.size, axis=0)
+        coil = term.site['coil']
+        matrix[:, coil, coil] = 1 + amount * _shape(time, float(np.exp(log_tau)))
+        return matrix
+
+    def record(self, term: CoilDriftTerm, covariance: Array) -> EffectRecord:
+        sigma, tau = sigmas(covariance), float(np.exp(term.theta[1]))
+        return EffectRecord(
+            self.name,
+            {'coil': term.site['coil'], 'amount': float(term.theta[0]), 'tau_s': tau},
+            {'amount': float(sigma[0]), 'tau_s': tau * float(sigma[1])},
+        )
+
+    def term(self, record: EffectRecord) -> CoilDriftTerm:
+        theta = np.array([float(needed(record, 'amount')), np.log(float(needed(record, 'tau_s')))])
+        return CoilDriftTerm(self, self.site_of(record), theta)
+
+
+class CoilCrosstalk(Effect[Term]):
+    """Theta is the real and imaginary share of a one-way leak, or one real share both ways.
+
+    Readings at the second coil's frequency contain a share of the first one's field.
+    """
+
+    name = 'coil_crosstalk'
+    summary = "one emitter's tone leaks into another's"
+    units = {'coils': '1', 'eps': '1', 'eps_quadrature': '1', 'mutual': '1'}
+    plausible = {'eps': (-0.5, 0.5)}
+    remedy = Remedy.FLUX
+    typical = 0.1  # leaks amount to some percent
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        coils = range(apparatus.emitters)
+        one_way: list[Site] = [{'coils': p} for p in permutations(coils, 2)]
+        both: list[Site] = [{'coils': p, 'mutual': True} for p in combinations(coils, 2)]
+        return [
+            Term(self, site, np.zeros(1 if 'mutual' in site else 2)) for site in one_way + both
+        ]
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Return the source emitter's flux, placed in the other emitter's tone."""
+        source, target = term.site['coils']
+        back = np.linalg.inv(self._matrix(term, view.omega.size))
+        own = np.einsum('ab,fsb->fsa', back, view.linear)
+        out = view.columns(term.theta.size)
+        out[:, :, target, 0] = own[:, :, source]
+        if term.site.get('mutual'):
+            out[:, :, source, 0] = own[:, :, target]
+        else:
+            out[:, :, target, 1] = 1j * own[:, :, source]
+        return out
+
+    def _matrix(self, term: Term, emitters: int) -> ComplexArray:
+        source, target = term.site['coils']
+        matrix = unit_matrix(emitters)
+        if term.site.get('mutual'):
+            matrix[target, source] = matrix[source, target] = term.theta[0]
+        else:
+            matrix[target, source] = complex(*term.theta)
+        return matrix
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        return self._matrix(term, omega.size)[None]
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        keys = ('eps', 'eps_quadrature')[: term.theta.size]
+        parameters = {**recorded_site(term), **dict(zip(keys, term.theta.tolist(), strict=True))}
+        sigma = sigmas(covariance).tolist()
+        return EffectRecord(self.name, parameters, dict(zip(keys, sigma, strict=True)))
+
+    def term(self, record: EffectRecord) -> Term:
+        site, eps = self.site_of(record), float(needed(record, 'eps'))
+        if record.parameters.get('mutual'):
+            return Term(self, {**site, 'mutual': True}, np.array([eps]))
+        across = float(record.parameters.get('eps_quadrature', 0.0))
+        return Term(self, site, np.array([eps, across]))
+
 
 GRADIENT_ERROR = 0.07
 """Relative error of what an emitter's shift changes at a reference close to it. Smaller lets
@@ -28,7 +229,6 @@ class CoilMoved(Effect[Term]):
     recorded = {'shift_m': (3, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Return a candidate for every emitter."""
         return [Term(self, {'coil': k}, np.zeros(3)) for k in range(apparatus.emitters)]
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -41,7 +241,6 @@ class CoilMoved(Effect[Term]):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Return the emitter at its new place, less the one at the old."""
         return self._shifted(term, base)
 
     def light(self, term: Term, illumination: Dipoles) -> Dipoles:
@@ -59,7 +258,7 @@ class CoilMoved(Effect[Term]):
         )
 
 
-UNIT = 1e-4
+SIZE_UNIT = 1e-4
 """theta counts second moments in units of (10 mm)^2."""
 
 
@@ -73,7 +272,7 @@ class EmitterSizeTerm(Term):
     @property
     def second_moment_m2(self) -> float:
         """Return the second moment of the whole emitter, m^2."""
-        return self.modelled_m2 + UNIT * float(self.theta[0])
+        return self.modelled_m2 + SIZE_UNIT * float(self.theta[0])
 
 
 class EmitterSize(Effect[EmitterSizeTerm]):
@@ -117,18 +316,16 @@ class EmitterSize(Effect[EmitterSizeTerm]):
 
     def columns(self, term: EmitterSizeTerm, view: View) -> ComplexArray:
         """Return the flux that a unit of second moment adds."""
-        unit = spread_along(view.illumination, term.site['coil'], term.axis, UNIT)
+        unit = spread_along(view.illumination, term.site['coil'], term.axis, SIZE_UNIT)
         return view.along(unit.flux(*view.flat))[..., None]
 
     def sources(
         self, term: EmitterSizeTerm, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Return dipoles on the axis that have the second moment and no moment together."""
-        return spread_along(base, term.site['coil'], term.axis, UNIT * float(term.theta[0]))
+        return spread_along(base, term.site['coil'], term.axis, SIZE_UNIT * float(term.theta[0]))
 
     def record(self, term: EmitterSizeTerm, covariance: Array) -> EffectRecord:
-        """Record the second moment, m^2, and a thin magnet or a flat disc that has it."""
-        sigma_m2 = UNIT * float(np.sqrt(covariance[0, 0]))
+        sigma_m2 = SIZE_UNIT * float(np.sqrt(covariance[0, 0]))
         figures, sigmas = size_parameters(term.second_moment_m2, sigma_m2)
         return EffectRecord(
             self.name,
@@ -142,13 +339,12 @@ class EmitterSize(Effect[EmitterSizeTerm]):
         )
 
     def term(self, record: EffectRecord) -> EmitterSizeTerm:
-        """Read an emitter's second moment, and that of its model, from a record."""
         modelled = float(needed(record, 'model_second_moment_m2'))
-        theta = (float(needed(record, 'second_moment_m2')) - modelled) / UNIT
+        theta = (float(needed(record, 'second_moment_m2')) - modelled) / SIZE_UNIT
         return EmitterSizeTerm(
             self, self.site_of(record), np.array([theta]),
             axis=np.asarray(needed(record, 'axis'), dtype=np.float64), modelled_m2=modelled,
         )  # fmt: skip
 
 
-EFFECTS = CoilMoved(), EmitterSize()
+EFFECTS = CoilGain(), CoilDrift(), CoilCrosstalk(), CoilMoved(), EmitterSize()

@@ -11,6 +11,8 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
+from anser_ros.effects.base import Apparatus, View
+from anser_ros.effects.channels import SensorGain, ToolGain
 from anser_ros.effects.effect import (
     READ_SITE,
     Array,
@@ -24,10 +26,9 @@ from anser_ros.effects.effect import (
     needed,
     recorded_site,
 )
-from anser_ros.effects.gains import CoilGain, SensorGain, ToolGain
+from anser_ros.effects.emitters import CoilGain
 from anser_ros.effects.optical import Registration, TimeOffset
-from anser_ros.effects.sensor_geometry import SensorAxis, SensorPosition
-from anser_ros.effects.view import Apparatus, View
+from anser_ros.effects.sensors import SensorAxis, SensorPosition
 from anser_ros.field.model import EffectRecord
 
 OPEN = 40
@@ -52,7 +53,6 @@ class Fluctuation(Effect[FluctuationTerm]):
         ]
 
     def opened(self, term: FluctuationTerm) -> FluctuationTerm:
-        """Return the term itself, as its spread is found in a fit."""
         return term
 
     def complexity(self, term: FluctuationTerm) -> int:
@@ -146,7 +146,6 @@ class LooseSensorPosition(Fluctuation):
     of = SensorPosition()
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
-        """Return a candidate for every cluster of two channels or more."""
         return [term for term in super().candidates(apparatus) if len(term.site['channels']) > 1]
 
 

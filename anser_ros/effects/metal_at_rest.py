@@ -1,11 +1,18 @@
-"""A metal object or a metal sheet rests near the volume."""
+"""A metal object or a metal sheet rests near the volume.
+
+What its few parameters leave (finer couplings, errors of the illumination) is no effect of its
+own: the remainder belongs to the metal that it refines, so that the corrected field is as good as
+the data allow.
+"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     FROZEN,
     Array,
@@ -21,9 +28,7 @@ from anser_ros.effects.effect import (
     pairs_of,
     sigmas,
 )
-from anser_ros.effects.view import Apparatus, View
-from anser_ros.field.dipoles import Dipoles
-from anser_ros.field.model import EffectRecord
+from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.metal.body import (
     BODIES,
     COMPACT,
@@ -36,7 +41,7 @@ from anser_ros.metal.body import (
     sheet_sizes,
     sheet_sources,
 )
-from anser_ros.metal.scattering import UNIT
+from anser_ros.metal.scattering import UNIT, Shapes
 from anser_ros.physics.constants import MU_0
 
 STEP = 1e-3
@@ -86,7 +91,7 @@ class MetalAtRest(Effect[Term]):
 class StaticMetal(MetalAtRest):
     """Theta is the centre (m), then real and imaginary parts of a simple body's modes.
 
-    The rest of the body's response belongs to its remainder (`anser_ros.effects.metal_remainder`).
+    The rest of the body's response belongs to its remainder (`anser_ros.effects.metal_at_rest`).
     """
 
     name = 'static_metal'
@@ -95,7 +100,6 @@ class StaticMetal(MetalAtRest):
     plausible = {'position_m': (-1.0, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Return a candidate at every place of a grid."""
         none = np.zeros(2 * ball_modes().shape[1])
         return [
             Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, none]))
@@ -103,7 +107,6 @@ class StaticMetal(MetalAtRest):
         ]
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
-        """Return the indices of the modes' amplitudes."""
         return np.arange(3, term.theta.size)
 
     def prior(self, term: Term) -> Array:
@@ -162,13 +165,11 @@ class StaticMetal(MetalAtRest):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Return the dipoles that the emitters induce in the metal, or None without any."""
         if not np.any(term.theta[3:]):
             return None
         return multipoles().sources(term.theta[:3], self._couplings(term), illumination, omega)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the place, m, and the whole polarisability of the metal."""
         total = multipoles().polarisability(self._couplings(term))
         return EffectRecord(
             self.name,
@@ -181,7 +182,6 @@ class StaticMetal(MetalAtRest):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """Read the place, m, and the polarisability by groups of modes from a record."""
         place = np.asarray(needed(record, 'position_m'), dtype=np.float64)
         alpha = np.asarray(needed(record, 'groups'), dtype=np.float64) / UNIT
         return Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, alpha]))
@@ -208,7 +208,6 @@ class ConductivePlate(MetalAtRest):
     plausible = {'z_m': (-1.0, 1.0), 'edge_m': (0.02, 2.0), 'sheet_ohm': (1e-7, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Try heights below the board and above the volume, in two sizes."""
         size = float(np.max(apparatus.board[1, :2] - apparatus.board[0, :2]))
         middle = apparatus.board.mean(axis=0)
         below = apparatus.board[0, 2] - size * np.array([0.08, 0.16, 0.26, 0.4, 0.6])
@@ -251,7 +250,6 @@ class ConductivePlate(MetalAtRest):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Return the loops of the sheet; none where no amount has been set yet."""
         z, edge, x, y, log_ohm = term.theta
         centre, edges = np.array([x, y, z]), np.array([edge, edge])
         return sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, illumination, omega)
@@ -262,7 +260,6 @@ class ConductivePlate(MetalAtRest):
         return view.along(added.flux(*view.flat))
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Return the flux's derivatives, taken by central differences with `DIFFERENCE_STEPS`."""
         if term.held:
             return view.columns(5)
         steps, theta = np.diag(DIFFERENCE_STEPS), term.theta
@@ -274,11 +271,9 @@ class ConductivePlate(MetalAtRest):
         return both_phases(self._flux(term.theta, view)[..., None])
 
     def started(self, term: Term, solution: Array) -> Sequence[Term]:
-        """Return the term of the sheet as it was probed."""
         return (term,)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record height, edge length and centre of the sheet, m, and its resistance, ohm."""
         z, edge, x, y, log_ohm = (float(v) for v in term.theta)
         ohm, rim = float(np.exp(log_ohm)), RIM * edge
         least = [HEIGHT * edge, np.sqrt(2) * rim, rim / np.sqrt(2), rim / np.sqrt(2), OHM]
@@ -295,7 +290,6 @@ class ConductivePlate(MetalAtRest):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """Read height, edge length, centre and sheet resistance from a record."""
         x, y = (float(v) for v in needed(record, 'centre_m'))
         z, edge, ohm = (float(needed(record, key)) for key in ('z_m', 'edge_m', 'sheet_ohm'))
         return Term(self, {}, np.array([z, edge, x, y, np.log(ohm)]))
@@ -303,3 +297,137 @@ class ConductivePlate(MetalAtRest):
 
 STATIC_METAL = StaticMetal()
 EFFECTS = STATIC_METAL, ConductivePlate()
+
+
+GAIN, ASIDE_M, UP_M = 3e-3, 0.2e-3, 0.4e-3
+"""How well an emitter's field is known where metal is and nothing was measured: as if the emitter
+were so much stronger, or so far away. The far side of the board says least about its height."""
+LIGHT_STEP_M = 0.5e-3
+"""Shift (m) of an emitter in the differences that tell what its place does to metal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Couplings:
+    """Combines couplings into fixed modes, each with a complex amplitude."""
+
+    shapes: Shapes
+    centre: Array  # (3,), m
+    modes: Array  # (shapes.size, m), of the size that each is expected to have
+
+    @property
+    def count(self) -> int:
+        """Return the number of parameters: real, then imaginary parts."""
+        return 2 * int(self.modes.shape[1])
+
+    def unit(self, view: View) -> NDArray[np.inexact]:
+        """Return the flux of each mode, (F, S, K, m)."""
+        shapes = self.shapes
+        ears = shapes.received(self.centre, view.centres, view.axes, view.sensors.length)
+        drive = shapes.driven(view.illumination.field(self.centre + shapes.offsets))
+        return shapes.mode_flux(ears, drive, self.modes, view.omega)
+
+    def columns(self, view: View) -> ComplexArray:
+        """Return the flux that a unit of each parameter adds."""
+        return both_phases(self.unit(view))
+
+    def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
+        """Return the dipoles that all modes make together."""
+        couplings = self.modes @ complex_of(theta)
+        return self.shapes.sources(self.centre, couplings, illumination, omega)
+
+
+@dataclass(frozen=True, eq=False)
+class IlluminationChange:
+    """Changes each emitter's strength and place (x, y, z) as they act on metal."""
+
+    metal: Sequence[Term]  # At rest; what answers to the emitters
+    emitters: int
+
+    @property
+    def count(self) -> int:
+        """Return four parameters, a strength and a place, for every emitter."""
+        return 4 * self.emitters
+
+    def _answers(self, illumination: Dipoles, omega: Array) -> list[Dipoles]:
+        """What the metal adds when all emitters are a standard deviation off in one way."""
+        places, out = illumination.positions, []
+        for way, size in zip(np.eye(4), (GAIN, ASIDE_M, ASIDE_M, UP_M), strict=True):
+            if way[0]:
+                light = replace(illumination, moments=GAIN * illumination.moments)
+            else:
+                moments = illumination.moments * (size / LIGHT_STEP_M)
+                light = replace(
+                    illumination, positions=places + LIGHT_STEP_M * way[1:], moments=moments
+                ).joined(replace(illumination, moments=-moments))
+            answer = Dipoles.none(self.emitters)
+            for term in self.metal:
+                added = term.effect.sources(term, light, light, omega)
+                answer = answer if added is None else answer.joined(added)
+            out.append(answer)
+        return out
+
+    def columns(self, view: View) -> ComplexArray:
+        """Return the flux that a unit of each parameter adds."""
+        out = view.columns(self.count)
+        every = np.arange(self.emitters)
+        for way, answer in enumerate(self._answers(view.illumination, view.omega)):
+            flux = view.along(answer.flux(*view.flat))
+            out[:, :, every, way * self.emitters + every] = flux
+        return out
+
+    def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
+        """Return the dipoles of all errors of the light together."""
+        shares = theta.reshape(4, self.emitters)
+        out = Dipoles.none(self.emitters)
+        for share, answer in zip(shares, self._answers(illumination, omega), strict=True):
+            out = out.joined(replace(answer, moments=answer.moments * share))
+        return out
+
+
+RemainderPart = Couplings | IlluminationChange
+"""A linear part of a metal's response, with ``count`` parameters of unit prior size."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RemainderTerm(Term):
+    """Holds a leftover of one metal; theta is the leftover's parameters."""
+
+    parent: tuple[str, str]  # `Term.name_and_site` of the metal
+    leftover: RemainderPart
+
+
+class MetalRemainder(Effect[RemainderTerm]):
+    """Describes the residual of metal at rest by `Couplings` or an `IlluminationChange`."""
+
+    name = 'metal_remainder'
+    summary = 'the residual that a simple metal body leaves'
+    remedy = Remedy.FIELD
+    family = Family.REMAINDER
+
+    def of(self, parent: Term, leftover: RemainderPart) -> RemainderTerm:
+        """Return a leftover of a metal that is at rest, with parameters of zero."""
+        return RemainderTerm(
+            self, {'of': parent.effect.name}, np.zeros(leftover.count),
+            parent=parent.name_and_site, leftover=leftover,
+        )  # fmt: skip
+
+    def belongs(self, term: RemainderTerm, other: Term) -> bool:
+        return term.parent == other.name_and_site
+
+    def columns(self, term: RemainderTerm, view: View) -> ComplexArray | None:
+        return term.leftover.columns(view)
+
+    def sources(
+        self, term: RemainderTerm, base: Dipoles, illumination: Dipoles, omega: Array
+    ) -> Dipoles | None:
+        if not np.any(term.theta):
+            return None
+        return term.leftover.sources(term.theta, illumination, omega)
+
+    def record(self, term: RemainderTerm, covariance: Array) -> EffectRecord:
+        """Record the size only; the parent's record names the metal."""
+        rms = float(np.sqrt(np.mean(term.theta**2)))
+        return EffectRecord(self.name, {'of': term.site['of'], 'rms': rms})
+
+
+REMAINDER = MetalRemainder()

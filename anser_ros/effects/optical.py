@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
@@ -18,7 +19,6 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
 )
-from anser_ros.effects.view import Apparatus, View
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -30,7 +30,6 @@ class OpticalEffect(Effect[TermT]):
     typical: ClassVar[tuple[float, ...]]
 
     def candidates(self, apparatus: Apparatus) -> Sequence[TermT]:
-        """Return one candidate, as all bodies are seen by one tracker."""
         return [self.zero(apparatus)] if apparatus.tools else []
 
     def zero(self, apparatus: Apparatus) -> TermT:
@@ -42,7 +41,6 @@ class OpticalEffect(Effect[TermT]):
         return None if view.is_reference else self.slopes(term, view)
 
     def slopes(self, term: TermT, view: View) -> ComplexArray:
-        """Return the derivative of a tool's flux by the parameters, (F, S, K, q)."""
         raise NotImplementedError
 
 
@@ -72,7 +70,6 @@ class TimeOffset(OpticalEffect[Term]):
         return -flux_rate(view)[..., None]
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        """Return the optical track with its stamps on the fluxes' clock."""
         return replace(track, time=track.time + term.theta[0])
 
 
@@ -92,7 +89,6 @@ class ClockRate(OpticalEffect[Term]):
         return np.stack([rate, rate * view.time[:, None, None]], axis=-1)
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        """Return the optical track with its stamps on the fluxes' clock."""
         return replace(track, time=track.time * (1 + term.theta[1]) + term.theta[0])
 
 
@@ -120,7 +116,6 @@ class Registration(OpticalEffect[Term]):
         return out
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        """Return the optical track as it is in fg."""
         back = Rotation.from_rotvec(term.theta[:3]).inv()
         return PoseTrack(
             track.time,
@@ -155,11 +150,9 @@ class OpticalScale(OpticalEffect[Term]):
         return out
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        """Return the optical track with positions at their true scale, m."""
         return replace(track, position=(track.position + term.theta[1:]) / (1 + term.theta[0]))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Record the scale and the shift."""
         sigma = sigmas(covariance)
         return EffectRecord(
             self.name,
@@ -168,7 +161,6 @@ class OpticalScale(OpticalEffect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """Read the scale and the shift, m, from a record."""
         shift = np.asarray(needed(record, 'shift_m'), dtype=np.float64)
         return Term(self, {}, np.array([float(needed(record, 'scale')) - 1, *shift]))
 
@@ -206,13 +198,10 @@ class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
         return out
 
     def optical(self, term: RegistrationDriftTerm, track: PoseTrack) -> PoseTrack:
-        """Return the optical track with the drift of its frame taken off, in fg."""
         share = (track.time / term.duration)[:, None]
         return replace(track, position=track.position - term.theta[:3] - share * term.theta[3:])
 
     def record(self, term: RegistrationDriftTerm, covariance: Array) -> EffectRecord:
-        """Record the first translation and the velocity."""
-
         def figures(values: Array) -> dict[str, list[float]]:
             velocity = (values[3:] / term.duration).tolist()
             return {'translation_m': values[:3].tolist(), 'velocity_m_per_s': velocity}
@@ -221,7 +210,6 @@ class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
         return EffectRecord(self.name, parameters, figures(sigmas(covariance)))
 
     def term(self, record: EffectRecord) -> RegistrationDriftTerm:
-        """Read the translation, m, and the velocity, m/s, from a record."""
         duration = float(needed(record, 'duration_s'))
         start = np.asarray(needed(record, 'translation_m'), dtype=np.float64)
         way = np.asarray(needed(record, 'velocity_m_per_s'), dtype=np.float64) * duration

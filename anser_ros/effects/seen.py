@@ -1,10 +1,101 @@
-"""Effects that are seen in the residuals, with one number that says how much: noise, outliers."""
+"""Effects that are seen directly, without a parameter to fit: wiring, noise, outliers.
+
+Plugs in wrong sockets are found before the search (`anser_ros.diagnosis.screening`), noise and
+outliers in what it leaves, with one number that says how much.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from anser_ros.effects.effect import Array, Effect, Family, Site, Term, needed, recorded_site
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Family,
+    Remedy,
+    Site,
+    Term,
+    needed,
+    recorded_site,
+    unit_matrix,
+)
 from anser_ros.field.model import EffectRecord
+
+
+class Wiring(Effect[Term]):
+    """Has no parameter: its site, which is all lists of numbers, says what is wired how."""
+
+    family = Family.SEEN
+
+    def term(self, record: EffectRecord) -> Term:
+        return Term(self, self.site_of(record))
+
+
+class SwappedChannels(Wiring):
+    """Reads each of ``channels`` at the place of the one in ``read_as``."""
+
+    name = 'swapped_channels'
+    summary = 'sensors are plugged into each other'
+    units = {'channels': '1', 'read_as': '1'}
+    remedy = Remedy.FLUX
+
+    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+        """Return a permutation; channels of which one is missing stay as they are."""
+        row = {int(c): i for i, c in enumerate(channels)}
+        matrix = unit_matrix(channels.size)
+        if not all(c in row for c in term.site['channels']):
+            return matrix
+        for shown, true in zip(term.site['read_as'], term.site['channels'], strict=True):
+            matrix[row[shown]] = 0.0
+            matrix[row[shown], row[true]] = 1.0
+        return matrix
+
+
+class SwappedCoils(Wiring):
+    """Shows each emitter of ``coils`` in the place of the one in ``read_as``."""
+
+    name = 'swapped_coils'
+    summary = 'emitters are plugged into each other'
+    units = {'coils': '1', 'read_as': '1'}
+    remedy = Remedy.FLUX
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        matrix = unit_matrix(omega.size)
+        for shown, true in zip(term.site['read_as'], term.site['coils'], strict=True):
+            matrix[shown] = 0.0
+            matrix[shown, true] = 1.0
+        return matrix[None]
+
+
+class DeadChannel(Wiring):
+    """Silences channels whose readings are noise; they take no part in anything."""
+
+    name = 'dead_channel'
+    summary = 'a channel receives nothing'
+    units = {'channels': '1'}
+
+    def silenced(self, term: Term) -> tuple[int, ...]:
+        return term.channels
+
+
+class SensorPolarity(Wiring):
+    """Turns the channels' signs round, without a parameter."""
+
+    name = 'sensor_polarity'
+    summary = 'a sensor is wired the other way round'
+    units = {'channels': '1'}
+    remedy = Remedy.FLUX
+
+    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+        signs = np.where(np.isin(channels, term.site['channels']), -1.0, 1.0)
+        return np.diag(signs).astype(complex)
+
+
+SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()
+SENSOR_POLARITY = SensorPolarity()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,12 +116,10 @@ class SeenEffect(Effect[SeenTerm]):
         return next(iter(self.units))
 
     def record(self, term: SeenTerm, covariance: Array) -> EffectRecord:
-        """Record the number, and the channels where not all have the effect."""
         parameters = {self._key: term.amount, **recorded_site(term)}
         return EffectRecord(self.name, parameters, {self._key: term.sigma})
 
     def term(self, record: EffectRecord) -> SeenTerm:
-        """Read the number from a record."""
         return SeenTerm(self, amount=float(needed(record, self._key)))
 
     def seen(self, amount: float, sigma: float, channels: Sequence[int] = ()) -> SeenTerm:
@@ -65,7 +154,6 @@ class LooseContact(Outliers):
 
 
 EXCESS_NOISE, OUTLIERS, LOOSE_CONTACT = ExcessNoise(), Outliers(), LooseContact()
-EFFECTS = EXCESS_NOISE, OUTLIERS, LOOSE_CONTACT
 
 
 def known_share(records: Sequence[EffectRecord]) -> float:
@@ -80,3 +168,14 @@ def known_share(records: Sequence[EffectRecord]) -> float:
 def outliers_of(fraction: float, sigma: float, channels: Sequence[int]) -> SeenTerm:
     """Return outliers in whole frames, or of some channels, which is what a loose contact does."""
     return (LOOSE_CONTACT if channels else OUTLIERS).seen(fraction, sigma, channels)
+
+
+EFFECTS = (
+    SWAPPED_CHANNELS,
+    SWAPPED_COILS,
+    DEAD_CHANNEL,
+    SENSOR_POLARITY,
+    EXCESS_NOISE,
+    OUTLIERS,
+    LOOSE_CONTACT,
+)

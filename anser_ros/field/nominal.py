@@ -151,12 +151,8 @@ def nominal_model(board: Board, tolerances: Tolerances | None = None) -> FieldMo
     """Express the field of a drawn board by dipoles; its tolerances become the model's ``modes``.
 
     The provenance holds ``heldout_relative_rms`` and ``heldout_relative_max``, the misfit relative
-    to a coil's field at points above `LOWEST_M` that took no part in the fit.
-
-    Raises
-    ------
-    FitError
-        When the dipoles miss the field of a coil by more than `LARGEST_MISFIT`.
+    to a coil's field at points above `LOWEST_M` that took no part in the fit. Raises `FitError`
+    when the dipoles miss the field of a coil by more than `LARGEST_MISFIT`.
     """
     coil = _coil_dipoles(board.shape, board.current_a)
     if not coil.misfit < LARGEST_MISFIT:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import Dipoles
 from anser_ros.metal.scattering import UNIT, Shapes
 from anser_ros.physics.constants import MU_0
 

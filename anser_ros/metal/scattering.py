@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import Dipoles
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT, MU_0
 from anser_ros.physics.dipole import GAUSS_OFFSET

@@ -58,12 +58,7 @@ def segment_field(
     """Return the field (P, 3), T, of straight segments that all carry the same current.
 
     It flows from ``starts`` to ``ends`` (M, 3), m; none of the ``points`` (P, 3), m, may lie on a
-    segment.
-
-    Raises
-    ------
-    ValueError
-        When the shapes do not fit together.
+    segment. Raises `ValueError` when the shapes do not fit together.
     """
     first, last = rows_of(starts, 3, 'starts'), rows_of(ends, 3, 'ends')
     at = rows_of(points, 3, 'points')
@@ -82,12 +77,8 @@ def loop_field(
     """Return the field (P, 3), T, of a closed path of straight segments.
 
     The current flows from each of the ``corners`` (M, 3), m, to the next, and from the last to the
-    first; none of the ``points`` (P, 3), m, may lie on the path.
-
-    Raises
-    ------
-    ValueError
-        When an array is not of shape (n, 3).
+    first; none of the ``points`` (P, 3), m, may lie on the path. Raises `ValueError` when an array
+    is not of shape (n, 3).
     """
     path = rows_of(corners, 3, 'corners')
     return segment_field(path, np.roll(path, -1, axis=0), points, current_a)
@@ -161,12 +152,8 @@ def spiral_path(
     The first layer winds inwards, the second outwards, and so on; each has the same number of
     quarter turns. ``side_x_m``, ``side_y_m`` are the outer sides between the centres of the
     tracks, ``pitch_m`` lies between neighbouring turns; the layers are evenly spaced from z = 0
-    down to -``thickness_m``.
-
-    Raises
-    ------
-    SetupError
-        When the turns do not fit inside the sides, or there are more than `MOST_TRACKS` tracks.
+    down to -``thickness_m``. Raises `SetupError` when the turns do not fit inside the sides, or
+    there are more than `MOST_TRACKS` tracks.
     """
     quarters = max(1, round(4 * turns / layers))
     if quarters * layers > MOST_TRACKS:
@@ -274,12 +261,8 @@ def build_board(
 
     ``kind`` is one of `KINDS`; ``geometry`` holds the dimensions that it needs (``turns``,
     ``side_m``, ``pitch_m``, ...; SI units) and ``current_a``, 1 A by default; other keys are
-    ignored. ``centres_m`` (K, 3) are in the frame fg, ``rotations_deg`` (K,) about z.
-
-    Raises
-    ------
-    SetupError
-        When the kind is unknown, a key is missing or out of range, or the lengths differ.
+    ignored. ``centres_m`` (K, 3) are in the frame fg, ``rotations_deg`` (K,) about z. Raises
+    `SetupError` when the kind is unknown, a key is missing or out of range, or the lengths differ.
     """
     if kind not in KINDS:
         raise SetupError(f'emitter: kind {kind!r} is none of {", ".join(sorted(KINDS))}')

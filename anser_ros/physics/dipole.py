@@ -189,26 +189,10 @@ def flux_basis(
 
     This is the coupling matrix M of the article.
 
-    Parameters
-    ----------
-    points : ndarray, shape (P, 3)
-        Sensor centres, m, frame fg.
-    axes : ndarray, shape (P, 3)
-        Unit sensitive axes, frame fg.
-    lengths : ndarray, shape (P,), or None
-        Coil lengths, m; None or 0 for point sensors.
-    positions, directions : ndarray, shape (N, 3)
-        Dipole positions (m) and unit directions, frame fg.
-
-    Returns
-    -------
-    ndarray, shape (P, N)
-        Flux density per moment, T / (A m^2).
-
-    Raises
-    ------
-    ValueError
-        When the shapes do not fit together.
+    Sensor centres ``points`` (m), unit ``axes`` (P, 3) and dipole ``positions`` (m) with unit
+    ``directions`` (N, 3) are in the frame fg; coil ``lengths`` (P,), m, are None or 0 for point
+    sensors. The result (P, N) is the flux density per moment, T / (A m^2). Raises `ValueError`
+    when the shapes do not fit together.
     """
     r, n, spans = _sensors(points, axes, lengths)
     q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
@@ -294,27 +278,11 @@ def flux_jacobian(
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return fluxes with their derivatives by the sensors' positions and axes.
 
-    Parameters
-    ----------
-    points, axes, lengths, positions, directions
-        As for `flux_basis`.
-    moments : ndarray, shape (N, K), complex
-        Dipole magnitudes for each of the K emitters, A m^2.
-
-    Returns
-    -------
-    flux : ndarray, shape (P, K), complex
-        Flux density along each sensor's axis, T.
-    d_position : ndarray, shape (P, 3, K), complex
-        Derivative by the sensor's position, T/m.
-    d_axis : ndarray, shape (P, 3, K), complex
-        Derivative by the components of the axis, T. The axis counts as a free vector, not as a
-        unit vector, and the quadrature points move with it.
-
-    Raises
-    ------
-    ValueError
-        When the shapes do not fit together.
+    Arguments as for `flux_basis`; ``moments`` (N, K), complex, are the dipoles' magnitudes for
+    each of the K emitters, A m^2. Returns the flux density along each sensor's axis (P, K), T, and
+    its derivatives (P, 3, K) by the sensor's position, T/m, and by the components of the axis, T.
+    The axis counts as a free vector, not as a unit one, and the quadrature points move with it.
+    Raises `ValueError` when the shapes do not fit together.
     """
     m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)
     parts = flux_and_slopes(points, axes, lengths, positions, directions, m).view(np.complex128)

@@ -29,12 +29,7 @@ class TrackedVolume:
     """Describes a box, m, frame fg; the default is that over an Anser board.
 
     It is what `over_board` makes of the demo's board (`test/test_setup.py`), for setups whose
-    board cannot be drawn.
-
-    Raises
-    ------
-    TrackingError
-        When the corners make no box.
+    board cannot be drawn. Raises `TrackingError` when the corners make no box.
     """
 
     # low, high: Corners, low < high in x, y and z

@@ -1,4 +1,9 @@
-"""Calibrates recorded sessions of one board by the first engine that accepts them."""
+"""Calibrates recorded sessions of one board by the first engine that accepts them.
+
+A scan in which metal moved, and rested near before and after, is calibrated twice: frames in
+which it moves are left out, but the field of the others contains the resting metal. Its motion
+determines that part (`diagnosis.departure`), which is subtracted before the field is fitted again.
+"""
 
 import functools
 import itertools
@@ -8,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from anser_ros import extensions
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
@@ -21,17 +27,192 @@ from anser_ros.calibration.disturbances import (
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.readings import check_single_coils
-from anser_ros.calibration.result import Calibration, drift_records
+from anser_ros.calibration.result import Calibration, Scan, drift_records
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS
-from anser_ros.errors import FitError
+from anser_ros.diagnosis.departure import KNOWN, Departure, departure
+from anser_ros.diagnosis.problem import Problem, Spread, build_problem
+from anser_ros.effects.correction import tool_view
+from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.nominal_board import NominalBoard
-from anser_ros.sessions.scan_metal import without_resting_metal
-from anser_ros.sessions.session import Session
+from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
 from anser_ros.wire.setup import Setup
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MOTION_MARGIN_S = 1.0
+"""Time (s) before and after a motion that is looked at: it begins before it is seen."""
+FEWEST_STEADY = 10
+"""Frames of the references at rest, of which their steady readings are the mean, at least."""
+FIELD_REACH_M = 0.015
+"""Distance (m) of a coil from where the field was learnt, up to which that is predicted well."""
+UNCERTAINTY_FRAMES = 60
+"""Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
+
+
+@dataclass(frozen=True)
+class RestingMetal:
+    """Holds what metal at rest did to tools' fluxes, (F, S, K) each, T, its error and places."""
+
+    flux: tuple[NDArray[np.complex128], ...]
+    sigma_t: float
+    record: EffectRecord
+
+
+def without_resting_metal(
+    sessions: Sequence[Session],
+    calibration: Calibration,
+    progress: Callable[[str, float], None] | None = None,
+) -> Scan | None:
+    """Return a scan without metal that rested during it; None where there is none to take off."""
+    scan = calibration.scan
+    if scan.sensor_fit is None:
+        return None
+    measurements, start, found = list(scan.measurements), 0, []
+    reported_effects = list(scan.reported_effects)
+    for session in sessions:
+        rows = range(start, start + len(session.tools))
+        start += len(session.tools)
+        spans = [
+            span
+            for row, tool in zip(rows, session.tools, strict=True)
+            for span in spans_of(tool.time, ~scan.sensor_fit.steady[row])
+        ]
+        if not spans or session.reference is None:
+            continue
+        if progress is not None:
+            progress('metal at rest', 0.0)
+        ends = min(s.start_s for s in spans), max(s.end_s for s in spans)
+        metal = _resting(session, calibration, [measurements[row] for row in rows], ends)
+        if metal is None:
+            continue
+        for row, flux in zip(rows, metal.flux, strict=True):
+            whole = measurements[row]
+            usable = whole.usable[:, :, None]
+            measurements[row] = replace(
+                whole, flux=np.where(usable, whole.flux - flux, whole.flux)
+            )
+        found.append(metal)
+        reported_effects = [_completed(record, metal, ends) for record in reported_effects]
+    if not found:
+        return None
+    sigma = float(np.sqrt(np.mean([metal.sigma_t**2 for metal in found])))
+    return replace(
+        scan,
+        measurements=tuple(measurements),
+        reported_effects=tuple(reported_effects),
+        field_sigma_t=sigma,
+    )
+
+
+def _completed(
+    record: EffectRecord, metal: RestingMetal, ends: tuple[float, float]
+) -> EffectRecord:
+    """The record of a span in which this metal moved, with where it rested."""
+    parameters = record.parameters
+    if not ends[0] <= parameters['t_start_s'] <= ends[1]:
+        return record
+    return replace(
+        record,
+        parameters={**metal.record.parameters, **parameters},
+        uncertainty={**record.uncertainty, **metal.record.uncertainty},
+        evidence={**record.evidence, **metal.record.evidence},
+    )
+
+
+def _resting(
+    session: Session,
+    calibration: Calibration,
+    kept: Sequence[Measurements],
+    ends: tuple[float, float],
+) -> RestingMetal | None:
+    """What metal that moves between two times does at rest to the frames that are kept."""
+    begin, end = ends[0] - MOTION_MARGIN_S, ends[1] + MOTION_MARGIN_S
+    problem = _problem(session, calibration, begin, end)
+    if problem is None:
+        return None
+    # Before it moved, or, where it moved from the start, after.
+    first = min(float(tool.time[0]) for tool in session.tools)
+    rest_s = 0.0 if begin > first else problem.apparatus.duration
+    found = departure(problem, rest_s)
+    if found is None or not found.is_predictive:
+        return None
+    flux, variance, power = [], [], []
+    for tool in kept:
+        view = tool_view(tool, (), problem.fields)
+        flux.append(found.term.rest_flux(view))
+        some = np.arange(0, tool.time.size, max(1, tool.time.size // UNCERTAINTY_FRAMES))
+        there, sigma = found.rest_flux(view.frames(some))
+        variance.append(np.mean(sigma**2))
+        power.append(np.mean(np.abs(there) ** 2) / 2.0)
+    if np.mean(variance) > KNOWN**2 * np.mean(power):
+        return None
+    return RestingMetal(tuple(flux), float(np.sqrt(np.mean(variance))), _record(found, power))
+
+
+def _record(found: Departure, power: Sequence[float]) -> EffectRecord:
+    """Where the metal rested and where it came, and how strong it was at rest."""
+    term, rest = found.term, np.array([found.term.rest_s])
+    path = np.linspace(0.0, term.duration, 8 * max(term.knots, 1))
+    way = term.centres(path) - term.centres(rest)
+    farthest = int(np.argmax(np.linalg.norm(way, axis=1)))
+    return EffectRecord(
+        term.effect.name,
+        {
+            'start_m': term.centres(rest)[0].tolist(),
+            'way_m': way[farthest].tolist(),
+            'rest_flux_rms_t': float(np.sqrt(np.mean(power))),
+        },
+        {},
+        {'misfit_before': found.before, 'misfit_after': found.after},
+    )
+
+
+def _problem(
+    session: Session, calibration: Calibration, begin: float, end: float
+) -> Problem | None:
+    """The time between two times as a problem of its own, which starts at zero."""
+    scan, reference, setup = calibration.scan, session.reference, session.setup
+    assert scan.sensor_fit is not None and reference is not None
+    inside = (reference.time >= begin) & (reference.time <= end)
+    if (~inside).sum() < FEWEST_STEADY:
+        return None
+    steady = np.where(reference.valid[..., None], reference.flux, np.nan)[~inside]
+    known = np.isfinite(steady).all(axis=2).any(axis=0)
+    baseline = np.full(steady.shape[1:], np.nan, dtype=np.complex128)
+    baseline[known] = np.nanmean(steady[:, known], axis=0)
+    learnt = cKDTree(np.concatenate([m.placed()[0].reshape(-1, 3) for m in scan.measurements]))
+    tools = [
+        _near(learnt, _between(scan.sensor_fit.errors_of(tool.body).apply(tool), begin, end))
+        for tool in session.tools
+    ]
+    accuracy = replace(scan.accuracy, flux_noise_t=scan.sensor_fit.noise_t)
+    noise = float(np.hypot(scan.sensor_fit.noise_t, calibration.model.flux_error_t))
+    try:
+        return build_problem(
+            tools, _between(reference, begin, end), baseline, calibration.model,
+            NominalBoard.of(setup).model, Spread(noise, accuracy),
+        )  # fmt: skip
+    except DiagnosisError:
+        return None  # too few frames with a pose
+
+
+def _near(learnt: cKDTree, tool: Measurements) -> Measurements:
+    """The frames with a pose in which all coils are near where the field was learnt."""
+    posed = tool.frames(tool.has_pose)
+    distance, _ = learnt.query(posed.placed()[0])
+    return posed.frames((distance < FIELD_REACH_M).all(axis=1))
+
+
+def _between(measurements: Measurements, begin: float, end: float) -> Measurements:
+    """The frames between two times, the first of which becomes zero."""
+    inside = (measurements.time >= begin) & (measurements.time <= end)
+    return shifted(measurements.frames(inside), -begin)
+
 
 Sessions = Sequence[Session]
 
@@ -146,16 +327,6 @@ def _difference(one: Setup, other: Setup) -> str:
     return 'the geometry of the coils'
 
 
-def _engine_for(sessions: Sequence[Session], options: Options) -> Engine:
-    return next(engine for engine in all_engines() if engine.accepts(sessions, options))
-
-
-def is_estimated_jointly(session: Session) -> bool:
-    """Return whether a session has few poses of a body of many sensors, and no drawn emitters."""
-    options = Options(session.setup.accuracy, is_joint=True)
-    return _engine_for([session], options).is_joint
-
-
 def calibrate_sessions(
     sessions: Sequence[Session],
     options: Options,
@@ -169,7 +340,7 @@ def calibrate_sessions(
     compared.
     """
     options = replace(options, accuracy=sessions[0].setup.accuracy)
-    chosen = _engine_for(sessions, options)
+    chosen = next(engine for engine in all_engines() if engine.accepts(sessions, options))
     for engine in () if chosen.is_joint else all_engines():
         if asked := [kind for kind in options.estimate if kind in engine.kinds]:
             raise FitError(f'{", ".join(asked)}: can be determined only from {engine.needs}')

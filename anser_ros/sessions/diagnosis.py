@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import extensions
-from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
-from anser_ros.diagnosis.findings import SCHEMA
-from anser_ros.diagnosis.prepare import build_problem, test_blocks
-from anser_ros.diagnosis.problem import Problem, Spread
+from anser_ros.diagnosis.diagnose import SCHEMA, Diagnosis, diagnose
+from anser_ros.diagnosis.problem import Problem, Spread, build_problem, test_blocks
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord, FieldModel, plain
 from anser_ros.parallel import in_order

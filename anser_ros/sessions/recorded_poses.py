@@ -1,7 +1,10 @@
-"""Compares the poses that live trackers published during a recording with its optical ones."""
+"""Reads what nodes published during a recording: poses, and their reports in ``/diagnostics``.
+
+The poses of live trackers are compared with the optical ones.
+"""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +15,11 @@ from scipy.spatial.transform import Rotation
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.rotations import axis_angles, rotation_angles
+from anser_ros.pose_states import FRAMES_IN, OK
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.session import Session
 from anser_ros.stamps import NANO, stamp_of
+from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
 from anser_ros.wire.recorded import PoseStream, pose_numbers
 from anser_ros.wire.setup import topic_of
 
@@ -98,3 +103,100 @@ def _compared(
         turn = axis_angles(turned[:, :, 2], axes[:, column])
     distance = np.linalg.norm(poses.position[valid] - truth, axis=1)
     return LiveErrors(distance, turn)
+
+
+TOPIC = '/diagnostics'
+WARN = 1
+"""Level of a warning in diagnostic_msgs/DiagnosticStatus."""
+BUSY = {
+    'lags': 'stretches of samples that the simulated unit could not make in time',
+    'dropped_blocks': 'blocks that the simulated unit could not send',
+    'overrun_blocks': 'blocks that the host was too slow to take',
+    'gap_blocks': 'blocks missing in the stream',
+    'windows_skipped': 'windows that the host was too slow for',
+    'windows_lost': 'windows without enough samples',
+    'windows_dropped_samples': 'windows with holes',
+    'frames_skipped': 'frames that the tracker was too slow for',
+    'lost_messages': 'messages that the recorder lost',
+}
+"""Counters that rise when a machine cannot keep up, and what they count."""
+
+
+def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
+    """Return the last values of every status by its name.
+
+    A bag without diagnostics, or one that cannot be read yet, gives an empty mapping.
+    """
+    try:
+        return {
+            status.name: {item.key: item.value for item in status.values}
+            for _, status in _statuses(path)
+        }
+    except BagError:
+        return {}
+
+
+def _statuses(path: str | os.PathLike[str]) -> Iterator[tuple[int, Any]]:
+    """Every status of a recording with its log time, ns."""
+    decoder = MessageDecoder()
+    for raw in iter_messages(path, Salvage()):
+        if raw.topic == TOPIC:
+            for status in decoder.decode(raw).status:
+                yield raw.log_time_ns, status
+
+
+def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
+    """Return the share of poses in state ok among all that a tracker judged; 0 if it judged none.
+
+    Frames that it never saw, because the machine was too slow for them, do not count. The statuses
+    of its sensors and bodies, of `last_words`, are named ``NODE: SENSOR``.
+    """
+    ok = judged = 0
+    for name, values in words.items():
+        if name.startswith(f'{tracker}: '):
+            counts = {key: int(n) for key, n in values.items() if key.startswith(FRAMES_IN)}
+            ok += counts.get(f'{FRAMES_IN}{OK}', 0)
+            judged += sum(counts.values())
+    return ok / judged if judged else 0.0
+
+
+def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
+    """Return when each part of a node first warned: log time, ns, by the part's name.
+
+    The statuses of a node's parts are named ``NODE: PART``. Raises `BagError` when the recording
+    cannot be read.
+    """
+    found: dict[str, int] = {}
+    for log_time_ns, status in _statuses(path):
+        node, _, name = status.name.partition(': ')
+        if node == part_of and name and _level(status) == WARN:
+            found.setdefault(name, log_time_ns)
+    return found
+
+
+def _level(status: Any) -> int:
+    """A level: a ``byte``, which some decoders give as bytes."""
+    level = status.level
+    return level[0] if isinstance(level, bytes) else int(level)
+
+
+def overload(path: str | os.PathLike[str]) -> list[str]:
+    """Return signs, in words, that the machine was too busy for a recording; empty if complete."""
+    signs = []
+    for name, values in last_words(path).items():
+        for key, meaning in BUSY.items():
+            count = int(float(values.get(key) or 0))
+            if count:
+                signs.append(f'{name}: {count} {meaning}')
+    return signs
+
+
+def kept_share(session: Session) -> float:
+    """Return the share of frames with tool readings, of those that their period lets expect."""
+    shares = [0.0]
+    for tool in session.tools:
+        if tool.time.size > 1:
+            period = float(np.median(np.diff(tool.time)))
+            expected = 1 + round(float(tool.time[-1] - tool.time[0]) / period)
+            shares.append(float(np.any(tool.valid, axis=1).sum()) / expected)
+    return min(1.0, max(shares))

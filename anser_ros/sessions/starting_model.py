@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from anser_ros.effects.correction import drifts
-from anser_ros.effects.effect import Remedy
-from anser_ros.effects.registry import effect_named
+from anser_ros.effects.effect import Remedy, effect_named
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import FieldModel, from_document, to_document
 from anser_ros.field.nominal import nominal_model

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.diagnose import diagnose
-from anser_ros.diagnosis.prepare import FEWEST_POSED_FRAMES
-from anser_ros.diagnosis.problem import Problem, State, evaluate, rms
+from anser_ros.diagnosis.problem import FEWEST_POSED_FRAMES, Problem, State, evaluate, rms
 from anser_ros.diagnosis.search import SearchSettings
 from anser_ros.effects.effect import Term
 from anser_ros.field.measurements import Measurements

@@ -34,15 +34,8 @@ class Envelope:
     A busy host on which nothing arrives early for a while thus does not move it. At first the line
     is level; a slope that is still uncertain is shrunk towards zero.
 
-    Parameters
-    ----------
-    time_ns, offset_ns : float
-        Device time of a first record, and how much later it arrived, ns.
-
-    Attributes
-    ----------
-    newest_ns : float
-        Device time of the newest record, ns.
+    ``newest_ns`` is the device time of the newest record, ns, at first that of the record with
+    which it was made.
     """
 
     def __init__(self, time_ns: float, offset_ns: float) -> None:
@@ -165,18 +158,9 @@ class SampleClock:
       or the device lost time. No stamp is good then, until an arrival is in time again, or an
       answer of the device (`bound`) shows which of the two it is.
 
-    Parameters
-    ----------
-    sample_rate_hz : float
-        Samples a second, as the device states it.
-
-    Attributes
-    ----------
-    jumps : int
-        How often the line was started again because it was refuted.
-    confirmed : float
-        Number of the newest sample that an arrival in time, or an answer, has confirmed; -inf
-        before.
+    ``jumps`` counts how often the line was started again because it was refuted; ``confirmed`` is
+    the number of the newest sample that an arrival in time, or an answer, has confirmed (-inf
+    before).
     """
 
     def __init__(self, sample_rate_hz: float) -> None:

@@ -69,12 +69,8 @@ class Demodulator:
 
     `MAINS_HARMONICS` of ``mains_hz`` are fitted as well, without one that falls on a tone. By
     default the phasors' rates of change are fitted where that does not double the variance of the
-    phasors (from 10 ms on with tones 170 Hz apart); ``follow_motion`` says whether.
-
-    Raises
-    ------
-    ParameterError
-        When the window is not 5 to 50 ms long, or too short to separate two tones.
+    phasors (from 10 ms on with tones 170 Hz apart); ``follow_motion`` says whether. Raises
+    `ParameterError` when the window is not 5 to 50 ms long, or too short to separate two tones.
     """
 
     def __init__(
@@ -125,12 +121,8 @@ class Demodulator:
     ) -> ToneFit:
         """Fit the phasors of all tones of all channels to a window's samples (N, C).
 
-        Samples that are not ``present`` (N,) were lost, and their values are ignored.
-
-        Raises
-        ------
-        FitError
-            When the samples that are left do not determine the tones.
+        Samples that are not ``present`` (N,) were lost, and their values are ignored. Raises
+        `FitError` when the samples that are left do not determine the tones.
         """
         solution, bias = self._solution, self._bias
         values = samples.astype(np.float64)
@@ -217,11 +209,8 @@ def _solve(
 ) -> _Solution:
     """Solve the design by singular value decomposition.
 
-    Raises
-    ------
-    FitError
-        When the first `wanted` coefficients are not determined, or with more than `worst_ratio`
-        times the variance of a single tone.
+    Raises `FitError` when the first `wanted` coefficients are not determined, or with more than
+    `worst_ratio` times the variance of a single tone.
     """
     samples, columns = design.shape
     if samples < columns + 1:

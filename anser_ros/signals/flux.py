@@ -52,12 +52,8 @@ class FluxConverter:
     ``frequencies_hz`` (K,) are the drive tones, ``nominal_currents_a`` (K,) the peak currents that
     fluxes are given for. ``sensor_columns`` (S,) are in the order wanted, each with its scale, its
     effective area N A G (negative for a coil wired the other way round) and the delay of its
-    channel. The column of the summed currents has its own scale and delay.
-
-    Raises
-    ------
-    ParameterError
-        When an area or nominal current is zero or not finite.
+    channel. The column of the summed currents has its own scale and delay. Raises `ParameterError`
+    when an area or nominal current is zero or not finite.
     """
 
     def __init__(

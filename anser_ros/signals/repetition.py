@@ -184,24 +184,9 @@ RAILS = np.array([np.iinfo(np.int16).min, np.iinfo(np.int16).max], np.int16)
 class RepetitionWatch:
     """Keeps the last samples of a stream, and finds in them what comes again.
 
-    Parameters
-    ----------
-    columns : int
-        Number of columns, C.
-    sample_rate_hz : float
-        Samples a second and column.
-    tones_hz : ndarray, shape (K,), optional
-        Tones of the signals, Hz: fresh samples are most alike where all of them return together.
-
-    Raises
-    ------
-    ParameterError
-        When there is no column, or the rate is not positive.
-
-    Attributes
-    ----------
-    position : int
-        Samples since the last reset, holes included.
+    ``tones_hz`` (K,) are the tones of the signals, Hz: fresh samples are most alike where all of
+    them return together. ``position`` counts samples since the last reset, holes included. Raises
+    `ParameterError` when there is no column, or the rate is not positive.
     """
 
     def __init__(

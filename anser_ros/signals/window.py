@@ -42,19 +42,8 @@ class TickCheck:
 
     The stamps follow from the samples; ticks only confirm how many blocks were lost.
 
-    Parameters
-    ----------
-    sample_rate_hz, tick_hz : float
-        Samples and ticks a second, as the device states them.
-
-    Attributes
-    ----------
-    trusted : bool
-        Whether ticks may confirm the length of a hole.
-    words : str
-        What is wrong with the ticks, for an operator; empty while nothing is.
-    disagreements : int
-        How often ticks that had agreed did not.
+    ``trusted`` is whether ticks may confirm the length of a hole, ``words`` what is wrong with
+    them (empty while nothing is), and ``disagreements`` how often ticks that had agreed did not.
     """
 
     def __init__(self, sample_rate_hz: float, tick_hz: float) -> None:
@@ -171,15 +160,8 @@ class WindowCutter:
 
     A hop, the way from one window to the next, leaves samples out if it is longer than the window.
 
-    Attributes
-    ----------
-    end_sample : int
-        Number of the sample behind the newest block, since the device began to count.
-
-    Raises
-    ------
-    ParameterError
-        When a length is less than one sample.
+    ``end_sample`` is the number of the sample behind the newest block, since the device began to
+    count. Raises `ParameterError` when a length is less than one sample.
     """
 
     def __init__(
@@ -216,12 +198,8 @@ class WindowCutter:
     def push(self, sequence: int, timestamp_ticks: int, codes: NDArray[np.int16]) -> list[Window]:
         """Add a block of samples (n, C) and return the windows that it completes.
 
-        ``sequence`` is its number modulo 2^32, the ticks are those of its first sample.
-
-        Raises
-        ------
-        ParameterError
-            When the block has another number of channels.
+        ``sequence`` is its number modulo 2^32, the ticks are those of its first sample. Raises
+        `ParameterError` when the block has another number of channels.
         """
         if codes.shape[1] != self._codes.shape[1]:
             raise ParameterError(

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
-from anser_ros.field.dipoles import SymmetryAxis, symmetry_axis
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import FieldModel, SymmetryAxis, symmetry_axis
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.dipole import fill_flux_basis, flux_basis
 from anser_ros.physics.sensor import along_each_axis

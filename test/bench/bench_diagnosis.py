@@ -33,8 +33,7 @@ from injection import (
 )
 
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
-from anser_ros.field.dipoles import Dipoles
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import Dipoles, FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.baseline import baseline_flux
 from anser_ros.sessions.session import Session, load_session

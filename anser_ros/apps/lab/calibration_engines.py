@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.apps.lab.one_place import calibrate_at_one_place, is_at_one_place
-from anser_ros.apps.lab.still import STILL_ONLY, calibrate_still, is_still
+from anser_ros.apps.lab.one_place import calibrate_at_one_place
+from anser_ros.apps.lab.still import STILL_ONLY, calibrate_still
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import PoseWhitener, Progress, pose_precision, pose_terms
@@ -28,23 +28,27 @@ from anser_ros.calibration.readings import (
     check_single_coils,
     fold_of_frames,
     frame_blocks,
+    usable_frames,
+    with_pose,
 )
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN
 from anser_ros.errors import FitError
-from anser_ros.field.dipoles import Dipoles, size_parameters, spread_along
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.model import Dipoles, EffectRecord, FieldModel, size_parameters, spread_along
 from anser_ros.physics.rotations import tilted
 from anser_ros.sessions.calibration import SCAN, Engine, at_constant_strength, generator_of
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 POINT, SIZED = COAXIAL[:2]
 """Layouts of emitters without a size, and of those that have no more than a size."""
+STILL = 5.0
+"""Standard deviations of the optical jitter within which all poses are one place."""
 LEAST_SIGMAS = 5.0
 """Standard deviations, of five blocks, at which a size is reported: chance in one emitter of
 130."""
@@ -184,8 +188,26 @@ def _is_free(sessions: Sequence[Session], options: Options) -> bool:
     return options.layout is None and NominalBoard.of(sessions[0].setup).model is None
 
 
+def is_at_one_place(measurements: Sequence[Measurements], accuracy: Accuracy) -> bool:
+    """Return whether one body with many sensors rested at one place in all frames."""
+    if len(measurements) != 1 or len(measurements[0].sensors) < MANY_SENSORS:
+        return False
+    one = with_pose(measurements[0])
+    if not len(one.time):
+        return False
+    moved = np.ptp(one.position, axis=0).max() > STILL * accuracy.optical_position_m
+    turned = np.abs(one.rotation - one.rotation[0]).max() > STILL * accuracy.optical_rotation_rad
+    return not (moved or turned)
+
+
 def _accepts_one_place(sessions: Sequence[Session], options: Options) -> bool:
     return is_at_one_place(_tools(sessions), options.accuracy) and _is_free(sessions, options)
+
+
+def is_still(measurements: Sequence[Measurements]) -> bool:
+    """Return whether there are few poses of one body with many sensors, and no more."""
+    many = len(measurements) == 1 and len(measurements[0].sensors) >= MANY_SENSORS
+    return many and FEWEST_FRAMES_OF_MANY <= usable_frames(measurements) < FEWEST_SCAN_FRAMES
 
 
 def _accepts_still(sessions: Sequence[Session], options: Options) -> bool:

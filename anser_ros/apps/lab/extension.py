@@ -9,4 +9,4 @@ OFFLINE = {
 ENGINES = ('calibration_engines:ENGINES',)
 DIAGNOSES = ('few_poses',)
 OBSERVERS = ('source_track:SessionSources',)
-EVALUATIONS = ('cli.known_metal_option',)
+EVALUATIONS = ('cli.known_metal',)

@@ -276,14 +276,9 @@ def models_of(path: str | os.PathLike[str]) -> Callable[[PreparedSession], Frame
 class KnownMetalModels(FrameModels):
     """Gives each frame of a session the field with known metal where its tools say that it is.
 
-    The ``summary`` counts the frames in which the metal was followed.
-
-    Raises
-    ------
-    BagError
-        When the session has no tool fluxes.
-    ModelFileError
-        When the metal was learnt at other frequencies than the emitters'.
+    The ``summary`` counts the frames in which the metal was followed. Raises `BagError` when the
+    session has no tool fluxes; `ModelFileError` when the metal was learnt at other frequencies
+    than the emitters'.
     """
 
     def __init__(self, prepared: PreparedSession, known: KnownMetal) -> None:

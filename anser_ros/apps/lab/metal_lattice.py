@@ -310,10 +310,7 @@ def to_document(known: KnownMetal) -> dict[str, Any]:
 def from_document(document: Any) -> KnownMetal:
     """Return metal that was learnt from plain data.
 
-    Raises
-    ------
-    ModelFileError
-        When it is none, with what is wrong.
+    Raises `ModelFileError` when it is none, with what is wrong.
     """
     if not isinstance(document, dict) or document.get('schema') != SCHEMA:
         raise ModelFileError(f'no known metal: its schema must be {SCHEMA!r}')
@@ -379,10 +376,7 @@ def _table(document: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
 def load_known_metal(path: str | os.PathLike[str]) -> KnownMetal:
     """Read a file of metal that was learnt.
 
-    Raises
-    ------
-    ModelFileError
-        With the file's name and what is wrong.
+    Raises `ModelFileError` with the file's name and what is wrong.
     """
     document = read_document(path)
     try:

@@ -106,12 +106,7 @@ def learn_metal(
 
     Every other one of the frames, in the order of time, takes no part, and shows what is left
     unexplained. ``noise_t`` is that of a phasor component of the readings, T; ``report`` is called
-    with the stage and its share done.
-
-    Raises
-    ------
-    FitError
-        When no lattice explains the readings.
+    with the stage and its share done. Raises `FitError` when no lattice explains the readings.
     """
     train, held_out = frames[::2], frames[1::2]
     mean_hz = float(np.exp(np.log(frequencies_hz).mean()))
@@ -311,12 +306,8 @@ def learn(
 ) -> KnownMetal:
     """Learn the metal that moves in a session, and report the stages and their shares done.
 
-    It must have references, a baseline without the metal, and a tool with optical poses.
-
-    Raises
-    ------
-    BagError
-        When the session lacks what is needed, or no rigid piece explains it.
+    It must have references, a baseline without the metal, and a tool with optical poses. Raises
+    `BagError` when the session lacks what is needed, or no rigid piece explains it.
     """
     session = prepared.session
     if session.reference is None or not len(session.reference.sensors):
@@ -348,12 +339,8 @@ def metal_frames(
     """Return at most ``count`` frames, spread evenly over those with metal.
 
     The session must have references, a baseline and optical poses of the tools; ``phase`` (K,) is
-    that of the emitters' fields.
-
-    Raises
-    ------
-    BagError
-        When the session has no metal, or no tool with poses.
+    that of the emitters' fields. Raises `BagError` when the session has no metal, or no tool with
+    poses.
     """
     session = correct(prepared).session
     reference, baseline = session.reference, prepared.baseline

@@ -21,7 +21,7 @@ from anser_ros.calibration.layouts import Generator, Layout
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.population import LEAST_EVIDENCE
-from anser_ros.calibration.readings import FOLDS, MANY_SENSORS, with_pose
+from anser_ros.calibration.readings import FOLDS, with_pose
 from anser_ros.calibration.result import Calibration, Residuals, Scan, with_provenance
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -32,8 +32,6 @@ from anser_ros.settings import Accuracy
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-STILL = 5.0
-"""Standard deviations of the optical jitter within which all poses are one place."""
 NOISY = 5.0
 """Times the median noise from which on a sensor is called noisy: two frames of four emitters make
 such a ratio by chance in no sensor of a thousand."""
@@ -43,18 +41,6 @@ WORDS = 'a three-component dipole for every emitter, place free, and {} of their
 """The layout in words, with the number of dipoles of stray fields."""
 REACH = 0.1
 """How far beyond the sensors' box sources are looked for, as a fraction of its longest side."""
-
-
-def is_at_one_place(measurements: Sequence[Measurements], accuracy: Accuracy) -> bool:
-    """Return whether one body with many sensors rested at one place in all frames."""
-    if len(measurements) != 1 or len(measurements[0].sensors) < MANY_SENSORS:
-        return False
-    one = with_pose(measurements[0])
-    if not len(one.time):
-        return False
-    moved = np.ptp(one.position, axis=0).max() > STILL * accuracy.optical_position_m
-    turned = np.abs(one.rotation - one.rotation[0]).max() > STILL * accuracy.optical_rotation_rad
-    return not (moved or turned)
 
 
 def calibrate_at_one_place(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
-from anser_ros.field.dipoles import SymmetryAxis, symmetry_axis
+from anser_ros.field.model import SymmetryAxis, symmetry_axis
 from anser_ros.physics.dipole import field_basis
 from anser_ros.physics.rotations import nearest_rotation, rotation_of_vector
 from anser_ros.sessions.prepared import PreparedSession, with_truth

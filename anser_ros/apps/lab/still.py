@@ -27,12 +27,8 @@ from anser_ros.calibration.moments import (
 )
 from anser_ros.calibration.population import LEAST_EVIDENCE, OpticalNoise, Posterior
 from anser_ros.calibration.readings import (
-    FEWEST_FRAMES_OF_MANY,
-    FEWEST_SCAN_FRAMES,
-    MANY_SENSORS,
     basis_rows,
     check_measurements,
-    usable_frames,
     usable_weights,
     with_pose,
 )
@@ -66,12 +62,6 @@ FEWEST_PLACED = 4
 as often further from the truth as nearer."""
 POSE_STEPS = 4
 """Gauss-Newton steps of a held-out pose from where it is stated: errors are millimetres."""
-
-
-def is_still(measurements: Sequence[Measurements]) -> bool:
-    """Return whether there are few poses of one body with many sensors, and no more."""
-    many = len(measurements) == 1 and len(measurements[0].sensors) >= MANY_SENSORS
-    return many and FEWEST_FRAMES_OF_MANY <= usable_frames(measurements) < FEWEST_SCAN_FRAMES
 
 
 def calibrate_still(

@@ -39,8 +39,7 @@ HOPELESS_M = 25e-3
 reading makes at least (`POOR_M`)."""
 CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])  # of x y z w: the inverse turn
 UNITS = {
-    **{unit: size for unit, size in LENGTH_M.items() if unit != 'm'}, 'km': 1e3,
-    'inch taken for mm': 25.4, 'mm taken for inch': 1 / 25.4,
+    **LENGTH_M, 'km': 1e3, 'inch taken for mm': 25.4, 'mm taken for inch': 1 / 25.4,
 }  # fmt: skip
 """What a unit of the numbers is in m when they are taken for m, or for what is said."""
 NEAR_UNIT = 0.12  # relative error of a scale that a unit explains; lever arms make as much
@@ -98,9 +97,7 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     """Return the session as it is meant, and the convention by which it is, if that is another.
 
     Raises `PlausibilityError` when hand-eye fits in no reading, or the reference itself is in
-    another unit.
-
-    Raises `DiagnosisError` when there are too few poses.
+    another unit; `DiagnosisError` when there are too few poses.
     """
     if session.reference is None:
         return session, None

@@ -14,7 +14,7 @@ from anser_ros.apps.poses.effect import SMOOTH, PoseMap, Role, effect_of_record,
 from anser_ros.apps.poses.hand_eye import PoseClock
 from anser_ros.apps.poses.sequence import FARTHEST, NO_TURN, PoseSequence
 from anser_ros.calibration.error_map import ErrorMap
-from anser_ros.diagnosis.findings import SCHEMA
+from anser_ros.diagnosis.diagnose import SCHEMA
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord, plain
 
@@ -159,9 +159,8 @@ class CorrectedPose:
 class PoseCorrector:
     """Applies a pose model's offsets, conventions and maps.
 
-    ``document``: as `anser_ros.apps.poses.corrector.to_model` makes it.
-
-    Raises `ModelFileError` when it is no pose model, or a record lacks a parameter.
+    ``document``: as `anser_ros.apps.poses.corrector.to_model` makes it. Raises `ModelFileError`
+    when it is no pose model, or a record lacks a parameter.
     """
 
     def __init__(self, document: Mapping[str, Any]) -> None:

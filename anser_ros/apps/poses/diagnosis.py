@@ -50,7 +50,7 @@ from anser_ros.apps.poses.start import (
     train_blocks,
     untangled,
 )
-from anser_ros.diagnosis.prepare import TEST_EVERY
+from anser_ros.diagnosis.problem import TEST_EVERY
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 import anser_ros.apps.poses.effects as package
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSession
 from anser_ros.effects.base import BaseEffect, BaseTerm
-from anser_ros.effects.effect import sigmas
-from anser_ros.effects.registry import effects_in
+from anser_ros.effects.effect import effects_in, sigmas
 from anser_ros.field.model import EffectRecord
 
 if TYPE_CHECKING:

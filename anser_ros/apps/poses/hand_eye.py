@@ -235,10 +235,8 @@ def fit_hand_eye(
 
     ``session``: with a reference; ``pairs``: whether the poses are static pairs (`as_pairs`),
     which say nothing about clocks; ``progress``: called with the name of the stage and its
-    finished fraction.
-
-    Raises `DiagnosisError` when there is no reference, or too few poses.
-    Raises `PlausibilityError` when the two streams fit in no reading.
+    finished fraction. Raises `DiagnosisError` when there is no reference, or too few poses. Raises
+    `PlausibilityError` when the two streams fit in no reading.
     """
     say = progress or (lambda text, share: None)
     if session.reference is None:

@@ -76,9 +76,8 @@ Found = tuple[dict[str, RawRows], int]
 def read_form(path: Path) -> Found:
     """Read a file of any known form: its rows, and how many lines hold no pose and no marker.
 
-    Lines before the first that has the form, such as a title, are left out.
-
-    Raises `ParameterError` when no form fits, or the file has no row.
+    Lines before the first that has the form, such as a title, are left out. Raises
+    `ParameterError` when no form fits, or the file has no row.
     """
     lines = path.read_text(encoding='utf-8-sig', errors='replace').splitlines()
     lines = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
@@ -222,12 +221,9 @@ def import_poses(
     both together; ``unit``: unit of the tracked positions where the form does not state it
     correctly (`LENGTH_M`); ``quaternion``: how the tracked quaternions are written where it is not
     as usual in their form (`ORDERS`); ``names``: what sensors shall be called, by the names that
-    the files give them.
-
-    Raises `ParameterError` when a file has no known form, an option no known value, numbers of
-    files differ, or names fit no sensor or become the same.
-
-    Raises `PlausibilityError` when quaternions are not of unit length.
+    the files give them. Raises `ParameterError` when a file has no known form, an option no known
+    value, numbers of files differ, or names fit no sensor or become the same. Raises
+    `PlausibilityError` when quaternions are not of unit length.
     """
     for value, known in ((stamps, STAMPS), (unit, LENGTH_M), (quaternion, ORDERS)):
         if value is not None and value not in known:
@@ -370,10 +366,9 @@ def read_pose_session(
 
     ``tracked``: topic of each sensor by the sensor's name; by default all
     ``/tracked/<sensor>/pose``; ``optical``: topic of the reference; by default the only
-    ``/optical/<body>/pose``.
-
-    Raises `BagError` when the bag can't be read, or has no tracked poses, or several references.
-    Raises `PlausibilityError` when quaternions are not of unit length.
+    ``/optical/<body>/pose``. Raises `BagError` when the bag can't be read, or has no tracked
+    poses, or several references. Raises `PlausibilityError` when quaternions are not of unit
+    length.
     """
     name, salvage = os.fspath(path), Salvage()
     streams = published_poses(path, salvage=salvage)

@@ -276,9 +276,8 @@ def search_effects(
     """Add effects one by one, the best first, while each pays for itself; drop what does not.
 
     Where the motion determines no lever arm, turns that go with the place or the velocity, times a
-    lever arm of any length, look like any of them. Only the clocks are tried there.
-
-    Raises `DiagnosisError` when too few poses agree with the reference.
+    lever arm of any length, look like any of them. Only the clocks are tried there. Raises
+    `DiagnosisError` when too few poses agree with the reference.
     """
     fit = with_noise(start)
     agreeing = fit.state.count // 6

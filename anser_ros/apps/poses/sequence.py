@@ -142,9 +142,8 @@ def sequence_of(name: str, time: Array, position: Array, quaternion: Array) -> P
 
     ``time`` (n,): s, in any order; ``position`` (n, 3): m; not finite, or beyond all measure,
     where there is no pose; ``quaternion`` (n, 4): in the order x y z w, of unit length up to
-    rounding; zero or not finite for no pose.
-
-    Raises `PlausibilityError` when quaternions that are no markers are not of unit length.
+    rounding; zero or not finite for no pose. Raises `PlausibilityError` when quaternions that are
+    no markers are not of unit length.
     """
     norm = np.linalg.norm(quaternion, axis=1)
     whole = np.isfinite(position).all(axis=1) & (np.abs(position) < FARTHEST).all(axis=1)

@@ -13,7 +13,7 @@ from anser_ros.apps.poses.fit import PoseFit, robust_fit
 from anser_ros.apps.poses.problem import PoseNoise, PoseProblem, predicted
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSequence, PoseSession, jumping_poses
 from anser_ros.calibration.readings import fold_of_frames
-from anser_ros.diagnosis.prepare import BLOCKS, TEST_EVERY
+from anser_ros.diagnosis.problem import BLOCKS, TEST_EVERY
 from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack

@@ -20,12 +20,10 @@ from anser_ros.calibration.calibrate import Options, fit_scan
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.result import Scan, to_document
 from anser_ros.diagnosis.diagnose import diagnose
-from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Spread
-from anser_ros.effects.registry import effect_named
-from anser_ros.field.dipoles import Dipoles, size_parameters, symmetry_axis
+from anser_ros.diagnosis.problem import Spread, build_problem
+from anser_ros.effects.effect import effect_named
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import FieldModel, size_parameters, symmetry_axis
 from anser_ros.physics.rotations import tangents
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.settings import Accuracy
@@ -69,7 +67,7 @@ DIPOLE = FieldModel(
 
 
 def dipoles_of(model):
-    return Dipoles(model.positions, model.directions, model.moments)
+    return model.dipoles
 
 
 def array_of_sensors(rng):

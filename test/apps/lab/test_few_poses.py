@@ -8,9 +8,9 @@ from test_one_place import NAMES, TONES, resting
 from test_still import CENTRES, recorded
 
 from anser_ros import Model
+from anser_ros.apps.lab import few_poses
 from anser_ros.apps.lab.measured.recipe import write_frames
 from anser_ros.cli.main import main
-from anser_ros.sessions.calibration import is_estimated_jointly
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
@@ -84,7 +84,7 @@ def test_a_helmet_at_rest_has_its_inverted_channels_named(tmp_path):
     stated = {'flux_noise_t': 1e-14, 'optical_position_m': 1e-6, 'optical_rotation_rad': 1e-6}
     places = np.tile([0.0, 0.0, 0.14], (len(NAMES), 1))
     bag = written(tmp_path / 'helmet.mcap', measured, NAMES, TONES, places, stated)
-    assert is_estimated_jointly(load_session(bag))
+    assert few_poses.accepts(load_session(bag))
     document, _ = diagnosed(bag, tmp_path)
     found = {effect['name']: effect['parameters'] for effect in document['effects']}
     assert found['sensor_polarity']['channels'] == turned

@@ -7,7 +7,7 @@ import pytest
 from conftest import REPO, SHARED, needs
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.lab.measured import magnet_patch, magnet_step
+from anser_ros.apps.lab.measured import magnet_patch
 from anser_ros.apps.lab.measured.magnet_patch import (
     UPWARDS,
     Recording,
@@ -40,7 +40,7 @@ def made_up(frames):
 class TestStep:
     @needs_data
     def test_the_session_has_the_robots_poses(self, tmp_path):
-        (path,) = magnet_step.write_sessions(FOLDER, tmp_path)
+        (path,) = magnet_patch.write_step(FOLDER, tmp_path)
         session = load_session(path)
         (tool,) = session.tools
         assert tool.flux.shape == (40, 48, 1) and tool.has_pose.all()
@@ -54,7 +54,7 @@ class TestStep:
             (tmp_path / kind).mkdir()
             document = json.dumps({'heldout_flux_rmse_t': error})
             (tmp_path / kind / 'calibration.json').write_text(document)
-        (row,) = magnet_step.rows(tmp_path, [], tmp_path)
+        (row,) = magnet_patch.step_rows(tmp_path, [], tmp_path)
         assert row.before == pytest.approx(20.0) and row.after == pytest.approx(10.0)
 
 

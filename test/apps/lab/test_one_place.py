@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.lab.calibration_engines import is_at_one_place
 from anser_ros.apps.lab.measured.recipe import vector, write_frames
-from anser_ros.apps.lab.one_place import calibrate_at_one_place, is_at_one_place
+from anser_ros.apps.lab.one_place import calibrate_at_one_place
 from anser_ros.apps.lab.source_calibration import KINDS
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.readings import check_single_coils
 from anser_ros.cli.main import main
-from anser_ros.diagnosis.prepare import build_problem
-from anser_ros.diagnosis.problem import Spread
+from anser_ros.diagnosis.problem import Spread, build_problem
 from anser_ros.errors import DiagnosisError, FitError, SetupError, TrackingError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis

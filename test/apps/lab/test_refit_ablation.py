@@ -9,11 +9,11 @@ from anser_ros.apps.lab.experiments.refit_ablation import (
     FREE,
     FROZEN,
     SHARED,
+    FreeDipoles,
     ablate,
     plot,
     spread_out,
 )
-from anser_ros.apps.lab.free_dipoles import FreeDipoles
 from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import board_of

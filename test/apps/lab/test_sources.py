@@ -17,13 +17,12 @@ from anser_ros.calibration.result import corrections, reported_effects
 from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.diagnosis import decisions, screening
+from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.correction import Correction
-from anser_ros.effects.registry import effect_named
-from anser_ros.effects.view import Apparatus, View
+from anser_ros.effects.effect import effect_named
 from anser_ros.errors import FitError, ModelFileError
-from anser_ros.field.dipoles import symmetry_axis
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.model import EffectRecord, FieldModel, symmetry_axis
 from anser_ros.fingerprint import Identity
 from anser_ros.physics.board import loop_field
 from anser_ros.physics.pose_track import PoseTrack

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.lab.still import PLACEMENT, calibrate_still, is_still
+from anser_ros.apps.lab.calibration_engines import is_still
+from anser_ros.apps.lab.still import PLACEMENT, calibrate_still
 from anser_ros.apps.lab.still_fit import StillFitter
 from anser_ros.apps.lab.still_model import POSE, SmoothBend, StillModel, StillUnknowns
 from anser_ros.calibration.held_out import rms

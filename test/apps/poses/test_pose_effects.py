@@ -12,9 +12,8 @@ from anser_ros.apps.poses.diagnosis import depends_on
 from anser_ros.apps.poses.effect import PoseSetting, Role
 from anser_ros.apps.poses.effects.episodes import PoseMovingMetal
 from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
-from anser_ros.apps.poses.effects.noise import power_law
-from anser_ros.apps.poses.effects.numbers import PoseClockRate
-from anser_ros.apps.poses.effects.stream import ReceiptJitter, stamp_step
+from anser_ros.apps.poses.effects.frames import PoseClockRate
+from anser_ros.apps.poses.effects.stream import ReceiptJitter, power_law, stamp_step
 from anser_ros.apps.poses.fit import is_lever_determined
 from anser_ros.apps.poses.hand_eye import one_clock
 from anser_ros.apps.poses.problem import PoseNoise

@@ -1,10 +1,11 @@
-"""Learn a piece of metal from a recorded session, to follow it in others."""
+"""Learn a piece of metal from a recorded session, to follow it in others by the tools alone."""
 
 import argparse
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from anser_ros.apps.lab.metal_follower import models_of
 from anser_ros.apps.lab.metal_lattice import save_known_metal
-from anser_ros.apps.lab.metal_learning import learn
 from anser_ros.cli.output import (
     Result,
     Tell,
@@ -16,7 +17,8 @@ from anser_ros.cli.output import (
     stated_values,
 )
 from anser_ros.errors import ParameterError
-from anser_ros.sessions.prepared import prepare
+from anser_ros.sessions.follower import FrameModels
+from anser_ros.sessions.prepared import PreparedSession, prepare
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 
@@ -52,6 +54,9 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     model = model_for(args.model, session)
     prepared = prepare(session, model, load_session(args.baseline))
     check_file(args.out)
+    # Loaded here, as each evaluation would pay for it, which asks this module for its option.
+    from anser_ros.apps.lab.metal_learning import learn
+
     known = learn(prepared, args.name.strip(), tell)
     save_known_metal(args.out, known)
     document = {
@@ -68,3 +73,28 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         f"{known.misfit:.1%} of the references' readings are left"
     )
     return Result(document, loss_notes(args.session, session.lost), (words,), (args.out,))
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the option."""
+    parser.add_argument(
+        '--known-metal', type=Path, metavar='FILE',
+        help='metal that anser known_metal has learnt: let the model follow it by the tools, '
+        'without references',
+    )  # fmt: skip
+
+
+def models(
+    args: argparse.Namespace, others: Sequence[str]
+) -> Callable[[PreparedSession], FrameModels] | None:
+    """Return what gives the model of each frame, None where the option is not given.
+
+    Raises `ParameterError` when it is given beside other options that give a model.
+    """
+    if args.known_metal is None:
+        return None
+    if others:
+        raise ParameterError(
+            f'--known-metal follows metal by the tools alone; leave out {", ".join(others)}'
+        )
+    return models_of(args.known_metal)

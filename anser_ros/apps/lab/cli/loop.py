@@ -31,14 +31,15 @@ from anser_ros.errors import AnserError, DiagnosisError, ParameterError, SetupEr
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.recorded_health import (
+from anser_ros.sessions.recorded_poses import (
+    LiveErrors,
     first_warnings,
     kept_share,
     last_words,
+    live_errors,
     ok_share,
     overload,
 )
-from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.sessions.tracked_session import error_statistics
@@ -74,9 +75,8 @@ class LoopFiles(NamedTuple):
 def make_world(folder: Path) -> LoopFiles:
     """Write the demo's setup and model with the loop's tones.
 
-    The field without metal does not depend on the tones, so that the model stays right.
-
-    Raises `SetupError` when the demo's setup has another number of coils than there are tones.
+    The field without metal does not depend on the tones, so that the model stays right. Raises
+    `SetupError` when the demo's setup has another number of coils than there are tones.
     """
     setup = parse_setup(read_config('demo_setup.yaml'))
     if len(setup.emitter.coils) != len(TONES_HZ):
@@ -111,9 +111,8 @@ def record(run: Run) -> Path:
     """Record a run and return the folder of its bag.
 
     The unit is started once all nodes are ready: drifts begin with its first start, which is then
-    the first frame of the recording and of every tracker.
-
-    Raises `DiagnosisError` when a process ends, or no flux arrives in time.
+    the first frame of the recording and of every tracker. Raises `DiagnosisError` when a process
+    ends, or no flux arrives in time.
     """
     ports = Path(tempfile.mkdtemp(prefix='anser_loop_'))
     bag = run.folder / 'bag'

@@ -18,7 +18,6 @@ from anser_ros.apps.lab.measured import (
     anser_board,
     hpi_coils,
     magnet_patch,
-    magnet_step,
     navion,
     transformer,
 )
@@ -31,7 +30,7 @@ from anser_ros.errors import ParameterError
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
-        navion.RECIPE, magnet_patch.RECIPE, magnet_step.RECIPE, hpi_coils.RECIPE,
+        navion.RECIPE, magnet_patch.RECIPE, magnet_patch.STEP_RECIPE, hpi_coils.RECIPE,
         anser_board.RECIPE, transformer.RECIPE,
     )
 }  # fmt: skip

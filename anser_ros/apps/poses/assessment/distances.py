@@ -246,9 +246,8 @@ def rotation_errors(
     """Return errors of the turns from one hole of the ring to the next, as MITK has them.
 
     ``axis`` (3,): direction of the sensor whose turn counts (MITK's rotation vector, for sensors
-    without roll); None: the whole turn.
-
-    Raises `FitError` when there are fewer than two points, or they are in another order.
+    without roll); None: the whole turn. Raises `FitError` when there are fewer than two points, or
+    they are in another order.
     """
     if len(points) < 2:
         raise FitError(
@@ -287,9 +286,8 @@ def single_point(
 ) -> tuple[ErrorGroup, dict[str, IntervalEstimate]]:
     """Return distances of the readings from their mean, mm, and the largest between two, m.
 
-    ``poses``: of the tip, while it stays at one location.
-
-    Raises `FitError` when there are too few readings, or they are of several locations.
+    ``poses``: of the tip, while it stays at one location. Raises `FitError` when there are too few
+    readings, or they are of several locations.
     """
     if poses.size < FEWEST_READINGS:
         raise FitError(f'a point needs at least {FEWEST_READINGS} readings, got {poses.size}')
@@ -322,7 +320,6 @@ def point_to_point(
     """Return errors of all distances between points, mm, and what a rigid fit leaves, m.
 
     ``true`` (n, 3): places of the points on the phantom, m, in any frame, in the same order.
-
     Raises `FitError` when the numbers differ, there are too few, or the order is another one.
     """
     if len(points) != len(true):

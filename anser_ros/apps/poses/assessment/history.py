@@ -155,10 +155,8 @@ def judge(
     """Return the verdict on a session by the history in a folder, or by tolerances alone.
 
     Sessions of the same protocol and body count, but no later ones, and no figure that was an
-    alert or failed in its session. ``tolerances``: largest size by figure.
-
-    Raises `ParameterError` when a tolerance is for an unknown figure, or a file is not of a
-    history.
+    alert or failed in its session. ``tolerances``: largest size by figure. Raises `ParameterError`
+    when a tolerance is for an unknown figure, or a file is not of a history.
     """
     figures = figures_of(found)
     unknown = sorted(set(tolerances) - set(figures))

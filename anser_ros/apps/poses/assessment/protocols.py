@@ -75,9 +75,8 @@ def assess_motion(
     """Return figures of a moving sensor whose frames and clocks are known, and the same by speed.
 
     A late pose is where the tool was, back along its velocity: the error along the velocity over
-    the speed is the latency that remains beside the common offset.
-
-    Raises `FitError` when there are too few poses, or the tool hardly moved.
+    the speed is the latency that remains beside the common offset. Raises `FitError` when there
+    are too few poses, or the tool hardly moved.
     """
     part = found.fit.state.part(sensor)
     used = part.used

@@ -216,9 +216,8 @@ def assess_rest(
 ) -> tuple[dict[str, IntervalEstimate], dict[str, AllanCurve], float]:
     """Return figures by name, Allan deviations by axis, and the share of poses that these are of.
 
-    That are those of the longest evenly spaced stretch.
-
-    Raises `FitError` when there are too few poses, or the tool was moved.
+    That are those of the longest evenly spaced stretch. Raises `FitError` when there are too few
+    poses, or the tool was moved.
     """
     if poses.size < FEWEST_STILL_POSES:
         raise FitError(
@@ -337,9 +336,8 @@ def metal_shifts(
     """Return distance (m) and angle (rad) of each recording's mean pose from that without metal.
 
     Recordings count from 1. The interval is of the distance: the shift's own uncertainty along it
-    (errors that are alike in time count once), and never below zero.
-
-    Raises `FitError` when a recording has too few poses.
+    (errors that are alike in time count once), and never below zero. Raises `FitError` when a
+    recording has too few poses.
     """
     found, wide = {}, float(stats.norm.ppf(0.5 + LEVEL / 2))
     place, turn, *variances = _mean(base)

@@ -111,14 +111,19 @@ def _number(value: float, sigma: float | None) -> str:
 Array = NDArray[np.float64]
 
 GROUPS = 5  # groups of equal numbers of poses by distance, speed and orientation
-HAND_EYE = effect_with(Role.MOUNT).name
 LIMITS = 1.96  # standard deviations within which 95 % of normal differences lie
+
+
+def _parted(document: dict[str, Any]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The frames of each sensor, which are no effects, and what was found."""
+    name, effects = effect_with(Role.MOUNT).name, document['effects']
+    return [e for e in effects if e['name'] == name], [e for e in effects if e['name'] != name]
 
 
 def pose_verdict(document: dict[str, Any]) -> str:
     """State in one paragraph what was found and what stays unexplained."""
     held, rest = document['held_out'], document['unexplained']
-    found = [effect for effect in document['effects'] if effect['name'] != HAND_EYE]
+    _, found = _parted(document)
     before, after = 1e3 * held['position_rmse_before_m'], 1e3 * held['position_rmse_after_m']
     if found:
         names = ', '.join(dict.fromkeys(str(effect['name']) for effect in found))
@@ -215,9 +220,7 @@ def _by_sensor(document: dict[str, Any]) -> Html:
 
 def _effects(document: dict[str, Any]) -> Html:
     rows = []
-    for effect in document['effects']:
-        if effect['name'] == HAND_EYE:
-            continue
+    for effect in _parted(document)[1]:
         evidence = effect['evidence']
         pair = [evidence.get(f'position_rmse_{when}_m') for when in ('without', 'with')]
         rows.append([
@@ -235,7 +238,7 @@ def _effects(document: dict[str, Any]) -> Html:
 def _frames(document: dict[str, Any]) -> Html:
     """The lever arm and mount of each sensor, and the registration, which all of them share."""
     rows, shared = [], []
-    for effect in (e for e in document['effects'] if e['name'] == HAND_EYE):
+    for effect in _parted(document)[0]:
         lever, mount, translation, rotation = (
             _triple(effect['parameters'], effect['uncertainty'], key, scale)
             for key, scale in (

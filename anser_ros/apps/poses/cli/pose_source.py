@@ -62,11 +62,9 @@ def live_poses(
     topic: str, seconds: float, progress: Callable[[str, float], None]
 ) -> AssessedPoses:
     """Return poses of a topic of the running graph, received for some seconds from the first one
-    on.
-
-    Raises `ParameterError` when the time is not one that can be waited, `BagError` when there is
-    no pose on the topic, `MissingPackageError` when there is no ROS, `PlausibilityError` when the
-    positions cannot be in metres.
+    on. Raises `ParameterError` when the time is not one that can be waited, `BagError` when there
+    is no pose on the topic, `MissingPackageError` when there is no ROS, `PlausibilityError` when
+    the positions cannot be in metres.
     """
     if not 0.0 < seconds <= LONGEST_LOOK_S:
         raise ParameterError(f'--seconds must be in (0, {LONGEST_LOOK_S:g}], got {seconds:g}')

@@ -98,7 +98,6 @@ class FieldDistortion(PoseEffect):
     role = Role.MAP
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
-        """Try each degree, for all sensors together and for each alone."""
         alone = setting.sensors if len(setting.sensors) > 1 else ()
         # One scale of all sensors is the reference's as well as the tracker's.
         return [
@@ -126,7 +125,6 @@ class FieldDistortion(PoseEffect):
         return PoseTerm(self, site, np.zeros(3 * _count(site))) if site['degree'] > 1 else None
 
     def is_scale(self, term: PoseTerm) -> bool:
-        """Return whether the map is of degree zero, which only that of one sensor is."""
         return int(term.site['degree']) == 0
 
     def covers(self, term: PoseTerm, candidate: PoseTerm) -> bool:
@@ -199,7 +197,6 @@ class FieldDistortion(PoseEffect):
         return added
 
     def corrected(self, term: PoseTerm, sensor: str, position: Array) -> Array:
-        """Return positions with the map's shift added, m."""
         return position + self.shift(term, position) if term.acts_on(sensor) else position
 
     def record(self, term: PoseTerm, covariance: Array) -> EffectRecord:
@@ -254,7 +251,6 @@ class FieldDistortion(PoseEffect):
         )
 
     def term(self, record: EffectRecord) -> PoseTerm:
-        """Read the map's coefficients, mm, from a record."""
         keys = ('sensor', 'degree', 'lowest', 'centre_m', 'size_m')
         site = cast(PoseSite, {k: record.parameters[k] for k in keys if k in record.parameters})
         theta = np.asarray(needed(record, 'coefficients_mm'), dtype=np.float64)

@@ -1,29 +1,32 @@
-"""A sensor's axis, place or length is not the surveyed one."""
+"""A sensor's axis, place or length is not the surveyed one; or all have errors, each its own."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
     Effect,
+    Family,
     Remedy,
     Site,
     Term,
     needed,
     recorded_site,
     sigmas,
+    unit_matrix,
     whole_numbers,
 )
-from anser_ros.effects.view import Apparatus, View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.rotations import tangents, tilted
-from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.sensor import SensorTable, clusters_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +48,6 @@ class SensorAxis(Effect[SensorAxisTerm]):
     typical = 0.1  # tilts are some degrees
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
-        """Try every single tool sensor, and every cluster as a whole."""
         axes = {
             int(c): tuple(float(v) for v in a)
             for table in apparatus.tools
@@ -85,7 +87,6 @@ class SensorAxis(Effect[SensorAxisTerm]):
         return out
 
     def table(self, term: SensorAxisTerm, sensors: SensorTable) -> SensorTable:
-        """Return the table with the sensors' true axes."""
         axis = sensors.axis.copy()
         if 'channel' in term.site:
             for row in np.flatnonzero(sensors.channel == term.site['channel']):
@@ -101,7 +102,6 @@ class SensorAxis(Effect[SensorAxisTerm]):
         return np.asarray(tilted(surveyed[None], term.theta[None])[0])
 
     def record(self, term: SensorAxisTerm, covariance: Array) -> EffectRecord:
-        """Record tilt and true axis, or the cluster's rotation."""
         if 'channel' not in term.site:
             turn, sigma = (np.degrees(v).tolist() for v in (term.theta, sigmas(covariance)))
             parameters = {**recorded_site(term), 'rotation_deg': turn}
@@ -120,7 +120,6 @@ class SensorAxis(Effect[SensorAxisTerm]):
         )
 
     def term(self, record: EffectRecord) -> SensorAxisTerm:
-        """Read a sensor's true axis, or the cluster's rotation, from a record."""
         if 'channels' in record.parameters:
             theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
             channels = whole_numbers(record.parameters['channels'])
@@ -157,7 +156,6 @@ class PlacedElsewhere(Effect[Term]):
         return out
 
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
-        """Return the table with those sensors shifted by the offset, m."""
         rows = self.rows(term, sensors)[:, None]
         return sensors.with_geometry(position=sensors.position + rows * term.theta)
 
@@ -170,7 +168,6 @@ class SensorPosition(PlacedElsewhere):
     units = {'channels': '1', 'offset_m': 'm'}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Try single sensors and clusters of bodies that carry more than those."""
         groups: list[tuple[int, ...]] = []
         for table in apparatus.tools:
             if len(table) > 1:
@@ -192,7 +189,6 @@ class LeverArm(PlacedElsewhere):
     units = {'offset_m': 'm', 'body': '1'}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Return a candidate for every body that has sensors."""
         bodies = [table.body[0] for table in apparatus.tools if len(table)]
         return [Term(self, {'body': body}, np.zeros(3)) for body in bodies]
 
@@ -201,7 +197,7 @@ class LeverArm(PlacedElsewhere):
         return np.array([body == term.site['body'] for body in sensors.body])
 
 
-UNIT = 1e-4
+SIZE_UNIT = 1e-4
 """theta counts squared lengths in units of (10 mm)^2."""
 
 
@@ -227,7 +223,6 @@ class SensorSize(Effect[SensorSizeTerm]):
     typical = 10.0  # coils have up to a few centimetres
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorSizeTerm]:
-        """Return a candidate for all coils of each body that has sensors."""
         found = []
         for table in apparatus.tools:
             if len(table):
@@ -242,7 +237,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         if view.is_reference or not rows.any():
             return None
         centres, axes, lengths = view.flat
-        longer = np.sqrt(lengths**2 + UNIT)
+        longer = np.sqrt(lengths**2 + SIZE_UNIT)
         pick = np.tile(rows, view.time.size)
         difference = np.zeros((centres.shape[0], view.omega.size), dtype=complex)
         places, ways, flux = centres[pick], axes[pick], view.dipoles.flux
@@ -251,23 +246,21 @@ class SensorSize(Effect[SensorSizeTerm]):
 
     def bounded(self, term: SensorSizeTerm) -> SensorSizeTerm:
         """Keep the squared length of every coil from becoming negative."""
-        smallest = -min(v**2 for v in term.surveyed.values()) / UNIT
+        smallest = -min(v**2 for v in term.surveyed.values()) / SIZE_UNIT
         return term.with_theta(np.maximum(term.theta, smallest))
 
     def table(self, term: SensorSizeTerm, sensors: SensorTable) -> SensorTable:
-        """Return the table with the coils at their fitted lengths, m."""
         length = sensors.length.copy()
         for row, channel in enumerate(sensors.channel.tolist()):
             if channel in term.surveyed:
-                squared = term.surveyed[channel] ** 2 + UNIT * term.theta[0]
+                squared = term.surveyed[channel] ** 2 + SIZE_UNIT * term.theta[0]
                 length[row] = np.sqrt(max(squared, 0.0))
         return sensors.with_geometry(length=length)
 
     def record(self, term: SensorSizeTerm, covariance: Array) -> EffectRecord:
-        """Record the length (root mean square over the coils)."""
         base = float(np.mean(np.square(list(term.surveyed.values()))))
-        length = float(np.sqrt(max(base + UNIT * term.theta[0], 0.0)))
-        sigma = UNIT * float(np.sqrt(covariance[0, 0])) / (2 * max(length, 1e-4))
+        length = float(np.sqrt(max(base + SIZE_UNIT * term.theta[0], 0.0)))
+        sigma = SIZE_UNIT * float(np.sqrt(covariance[0, 0])) / (2 * max(length, 1e-4))
         parameters = {
             'length_m': length,
             'channels': list(term.surveyed),
@@ -276,13 +269,207 @@ class SensorSize(Effect[SensorSizeTerm]):
         return EffectRecord(self.name, parameters, {'length_m': sigma})
 
     def term(self, record: EffectRecord) -> SensorSizeTerm:
-        """Read the coils' length from a record."""
         channels = self.site_of(record)['channels']
         surveyed = record.parameters.get('surveyed_length_m') or [0.0] * len(channels)
         base = float(np.mean(np.square(surveyed)))
-        theta = (float(needed(record, 'length_m')) ** 2 - base) / UNIT
+        theta = (float(needed(record, 'length_m')) ** 2 - base) / SIZE_UNIT
         lengths = dict(zip(channels, (float(v) for v in surveyed), strict=True))
         return SensorSizeTerm(self, {}, np.array([theta]), surveyed=lengths)
 
 
-EFFECTS = SensorAxis(), SensorPosition(), LeverArm(), SensorSize()
+LEAST_SHARED = 0.5
+"""Share of the gains' variance in common from which on the channels at one place are one sensor:
+coils that are wound one by one have next to none, the axes of a chip nearly all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpreadTerm(Term):
+    """Holds a population: theta is the values of its channels, one channel after the other."""
+
+    members: tuple[int, ...]  # Their channels
+    spread: float  # Standard deviation of the population, in the values' unit
+    # Share of the population's variance that the channels at one place have in common
+    shared: float = 0.0
+    # Which value each channel has, where several have one: row of the values by member. Empty
+    # where each has its own.
+    groups: tuple[int, ...] = ()
+
+    @property
+    def values(self) -> Array:
+        """Return the parameters as a table with a row for each channel."""
+        if self.groups:
+            return self.theta.reshape(max(self.groups) + 1, -1)[list(self.groups)]
+        return self.theta.reshape(len(self.members), -1)
+
+    def of(self, channels: NDArray[np.generic]) -> Array:
+        """Return the values of listed channels, a row each; zero for one that is no member."""
+        out = np.zeros((len(channels), self.values.shape[1]))
+        place = {channel: row for row, channel in enumerate(self.members)}
+        for row, channel in enumerate(channels.tolist()):
+            if channel in place:
+                out[row] = self.values[place[channel]]
+        return out
+
+
+MANY = 12
+"""Places of sensors from which on a population is looked for by a diagnosis; of fewer, each sensor
+that is off is named by itself."""
+
+
+class SensorSpread(Effect[SpreadTerm]):
+    """Is found by a calibration, which has every channel in many poses; a model carries it.
+
+    A diagnosis estimates which gains the sensors at one place share.
+    """
+
+    family = Family.SEEN
+    plausible = {'spread': (0.0, 0.3)}
+    # the values of a faultless channel; empty where they are zeros, as many as a record has
+    faultless: ClassVar[tuple[float, ...]] = ()
+
+    def record(self, term: SpreadTerm, covariance: Array) -> EffectRecord:
+        sigma = term.with_theta(sigmas(covariance)).values.tolist()
+        values = (term.values + (self.faultless or 0.0)).tolist()
+        return EffectRecord(
+            self.name,
+            {
+                'spread': term.spread, 'channels': list(term.members), 'values': values,
+                'uncertainty': sigma, **({'shared': term.shared} if term.shared else {}),
+            },
+            {'values': sigma},
+        )  # fmt: skip
+
+    def term(self, record: EffectRecord) -> SpreadTerm:
+        channels = self.site_of(record)['channels']
+        values = np.asarray(needed(record, 'values'), dtype=np.float64)
+        width = len(self.faultless) or (values.shape[1] if values.ndim == 2 else 2)
+        if values.shape != (len(channels), width) or len(set(channels)) != len(channels):
+            raise ModelFileError(
+                f'model: {record.name} needs {width} values for each of its '
+                f'{len(channels)} channels, got {values.shape}'
+            )
+        theta = (values - (self.faultless or 0.0)).ravel()
+        spread = float(record.parameters.get('spread', 0.0))
+        shared = float(record.parameters.get('shared', 0.0))
+        return SpreadTerm(self, {}, theta, members=channels, spread=spread, shared=shared)
+
+
+class SensorGainSpread(SensorSpread):
+    """Values are real part less one and imaginary part of each channel's gain."""
+
+    name = 'sensor_gain_spread'
+    summary = 'every channel has a gain of its own'
+    family = Family.STEADY
+    units = {'spread': '1', 'channels': '1', 'values': '1'}
+    remedy = Remedy.FLUX
+    typical = 0.05  # gains of a kind are within some percent of each other
+    parts = ('in phase', 'quadrature')
+    faultless = (1.0, 0.0)
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[SpreadTerm]:
+        """Return a term of each body with many sensors; those at one place share a gain."""
+        out = []
+        for table in apparatus.tools:
+            places = clusters_of(table)
+            if len(places) < MANY or len(places) == len(table):
+                continue
+            groups = np.zeros(len(table), dtype=np.int64)
+            for number, rows in enumerate(places):
+                groups[rows] = number
+            out.append(
+                SpreadTerm(
+                    self, {'body': table.body[0]}, np.zeros(2 * len(places)),
+                    members=tuple(table.channel.tolist()), spread=0.0, shared=1.0,
+                    groups=tuple(groups.tolist()),
+                )
+            )  # fmt: skip
+        return out
+
+    def columns(self, term: SpreadTerm, view: View) -> ComplexArray | None:
+        if not term.groups or view.is_reference:
+            return None
+        out, found = view.columns(term.theta.size), False
+        gains = 1.0 + term.values[:, 0] + 1j * term.values[:, 1]
+        for channel, group, gain in zip(term.members, term.groups, gains, strict=True):
+            row = view.row(channel)
+            if row is not None:
+                found = True
+                own = view.linear[:, row] / gain
+                out[:, row, :, 2 * group], out[:, row, :, 2 * group + 1] = own, 1j * own
+        return out if found else None
+
+    def record(self, term: SpreadTerm, covariance: Array) -> EffectRecord:
+        """Record it as any population; the spread is that of the gains that were found."""
+        width = float(np.std(term.theta[0::2])) if term.groups else term.spread
+        return super().record(replace(term, spread=width), covariance)
+
+    def channel_matrix(self, term: SpreadTerm, channels: NDArray[np.int64]) -> ComplexArray | None:
+        parts = term.of(channels)
+        return np.asarray(unit_matrix(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
+
+    def gain_changes(self, term: SpreadTerm, sensors: SensorTable) -> Array | None:
+        """Return a change for each place; sensors at one place have their gains in common.
+
+        One session cannot show how far a gain changes until the next. The differences among
+        sensors of a kind give the natural size of such a change; the axes of one chip change
+        together.
+        """
+        if term.shared < LEAST_SHARED:
+            return None
+        members = np.isin(sensors.channel, term.members)
+        places = [rows[members[rows]] for rows in clusters_of(sensors)]
+        places = [rows for rows in places if rows.size]
+        out = np.zeros((len(places), len(sensors)))
+        for row, channels in enumerate(places):
+            out[row, channels] = np.sqrt(term.shared) * term.spread
+        return out
+
+
+class SensorAxisSpread(SensorSpread):
+    """Values are the tilts (rad) of each axis along its two tangents (`physics.rotations`)."""
+
+    name = 'sensor_axis_spread'
+    summary = "every sensor's axis is a little off"
+    units = {'spread': 'rad', 'channels': '1', 'values': 'rad'}
+    remedy = Remedy.SENSORS
+    parts = ('first tangent', 'second tangent')
+    faultless = (0.0, 0.0)
+
+    def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
+        return sensors.with_geometry(axis=tilted(sensors.axis, term.of(sensors.channel)))
+
+
+class SensorPlaceSpread(SensorSpread):
+    """Values are the shifts (m) of each sensor in its body's frame."""
+
+    name = 'sensor_place_spread'
+    summary = 'every sensor sits a little off its surveyed place'
+    units = {'spread': 'm', 'channels': '1', 'values': 'm'}
+    remedy = Remedy.SENSORS
+    parts = ('x', 'y', 'z')
+    faultless = (0.0, 0.0, 0.0)
+
+    def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
+        return sensors.with_geometry(position=sensors.position + term.of(sensors.channel))
+
+
+class SensorPickupSpread(SensorSpread):
+    """Values are the real and imaginary part of each emitter's phasor in each channel, T."""
+
+    name = 'sensor_pickup_spread'
+    summary = 'a constant phasor of its own is added to every channel'
+    units = {'spread': 'T', 'channels': '1', 'values': 'T'}
+    plausible = {'spread': (0.0, 1.0)}
+    remedy = Remedy.FLUX
+
+    def offset(
+        self, term: SpreadTerm, channels: NDArray[np.int64], emitters: int
+    ) -> ComplexArray | None:
+        parts = term.of(channels)
+        return np.asarray(parts[:, 0::2] + 1j * parts[:, 1::2])
+
+
+EFFECTS = (
+    SensorAxis(), SensorPosition(), LeverArm(), SensorSize(),
+    SensorGainSpread(), SensorAxisSpread(), SensorPlaceSpread(), SensorPickupSpread(),
+)  # fmt: skip
