@@ -25,7 +25,18 @@ from anser_ros.cli.output import (
     terminal_table,
     write_files,
 )
-from anser_ros.cli.page import Html, heading, page, picture, table, top
+from anser_ros.cli.page import (
+    WIDE,
+    Html,
+    heading,
+    legend_below,
+    page,
+    picture,
+    save,
+    spell_out,
+    table,
+    top,
+)
 from anser_ros.cli.sessions import (
     add_session_kinds,
     named_kind,
@@ -37,7 +48,6 @@ from anser_ros.cli.sessions import (
 )
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pictures import WIDE, legend_below, save, spell_out
 from anser_ros.sessions.evaluation_files import recording_of, to_document, write_tables
 from anser_ros.sessions.follower import parse_references, with_references
 from anser_ros.sessions.session import Session, load_session

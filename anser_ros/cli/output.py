@@ -285,7 +285,7 @@ def write_files(folder: Path | None, contents: Mapping[str, Any]) -> tuple[Path,
         elif isinstance(content, dict):
             written[-1].write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
         else:
-            from anser_ros.pictures import save
+            from anser_ros.cli.page import save
 
             save(content, written[-1])
     return tuple(written)
