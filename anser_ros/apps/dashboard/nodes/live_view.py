@@ -10,15 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.nodes import traces
 from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime.diagnostics import LastStatus
-from anser_ros.nodes.traces import (
-    LONGEST_OPTICAL_GAP_S,
-    OpticalTrace,
-    latency_of,
-    middle,
-    targets_of,
-)
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
@@ -62,13 +56,13 @@ class LiveView:
     ) -> None:
         self.setup, self.namespace = setup, namespace
         self.statuses = {} if statuses is None else statuses
-        self.targets = targets_of(setup)
+        self.targets = traces.targets_of(setup)
         self.bodies = {target.body for target in self.targets}
         count = len(self.targets)
         self._received_s = np.full(count, -np.inf)
         self._pose = np.full((count, POSE), np.nan)
         self._covariance = np.full((count, 3, 3), np.nan)
-        self._optical = {body: OpticalTrace() for body in self.bodies}
+        self._optical = {body: traces.OpticalTrace() for body in self.bodies}
         self._recent: list[tuple[int, float, Array]] = []
         self._came = np.zeros(count)
         self._latency_s: list[float] = []
@@ -96,7 +90,7 @@ class LiveView:
         self._covariance[number] = values[POSE:].reshape(6, 6)[:3, :3]
         self._received_s[number] = time.monotonic()
         if sent_ns:
-            self._latency_s.append(latency_of(1e-9 * sent_ns, stamp_s))
+            self._latency_s.append(traces.latency_of(1e-9 * sent_ns, stamp_s))
         self._recent.append((number, stamp_s, values[:3]))
 
     def take_optical(self, body: str, received: Iterable[tuple[bytes, Mapping[str, int]]]) -> None:
@@ -179,7 +173,7 @@ class LiveView:
                 continue
             numbers = np.array([item[0] for item in here])
             place, turn, _ = optical.at(
-                np.array([item[1] for item in here]), LONGEST_OPTICAL_GAP_S
+                np.array([item[1] for item in here]), traces.LONGEST_OPTICAL_GAP_S
             )
             offset = np.array([self.targets[n].position_m for n in numbers])
             truth = place + np.einsum('nij,nj->ni', turn, offset)
@@ -202,9 +196,9 @@ class LiveView:
         columns = zip(*points, strict=True) if points else ((),) * 3
         error, residual, tracked = (np.array(values)[..., :coils] for values in columns)
         return {
-            'tracked_percent': known(100.0 * middle(tracked, np.mean)),
-            'error_mm': known(1e3 * middle(error, _rms)),
-            'residual_pt': known(1e12 * middle(residual, _rms)),
+            'tracked_percent': known(100.0 * traces.middle(tracked, np.mean)),
+            'error_mm': known(1e3 * traces.middle(error, _rms)),
+            'residual_pt': known(1e12 * traces.middle(residual, _rms)),
         }
 
 
