@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from anser_ros.api.calibration import CalibrationResult, calibrate
     from anser_ros.api.diagnosis import DiagnosisResult, diagnose
     from anser_ros.api.model import Model
-    from anser_ros.api.recording import write_session
-    from anser_ros.api.setup import load_setup
+    from anser_ros.api.recording import load_setup, write_session
     from anser_ros.api.tracking import TrackedPoses, TrackingResult, track
     from anser_ros.sessions.session import Session, load_session
     from anser_ros.wire.setup import Setup
@@ -28,7 +27,7 @@ _HOMES = {
     'calibrate': 'api.calibration',
     'diagnose': 'api.diagnosis',
     'load_session': 'sessions.session',
-    'load_setup': 'api.setup',
+    'load_setup': 'api.recording',
     'track': 'api.tracking',
     'write_session': 'api.recording',
 }

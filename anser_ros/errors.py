@@ -1,7 +1,11 @@
 """Defines every error that this package raises on purpose: one root, one child a kind of cause.
 
-A message is one clear line that names the rule and what was found instead.
+A message is one clear line that names the rule and what was found instead; so is that of the
+parser of command lines.
 """
+
+import argparse
+from typing import NoReturn
 
 
 class AnserError(Exception):
@@ -50,3 +54,11 @@ class DiagnosisError(AnserError):
 
 class PlausibilityError(AnserError):
     """Data contradict their own units, clocks or conventions."""
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Ends with exit code 2 and one line on stderr, without the usage of a page or more."""
+
+    def error(self, message: str) -> NoReturn:
+        """State what is wrong and where the usage is, and exit."""
+        self.exit(2, f'{self.prog}: {" ".join(message.split())} (usage: {self.prog} --help)\n')

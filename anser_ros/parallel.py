@@ -1,10 +1,13 @@
-"""Shares independent pieces of work among threads, with results that are the same bit by bit.
+"""Shares this machine: work among threads, and names that one process has at a time.
 
-Pieces are the same for any number of threads, and results are taken in their order. Threads help
-if the pieces are compiled code or large arrays, which let other threads run meanwhile.
+Pieces of work are the same for any number of threads, and results are taken in their order, so
+they are the same bit by bit. Threads help if the pieces are compiled code or large arrays, which
+let other threads run meanwhile.
 """
 
+import hashlib
 import os
+import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -74,3 +77,19 @@ def slices_of(whole: slice, size: int) -> list[slice]:
     """Return the slices of a slice of known ends, each but the last of one size."""
     starts = range(whole.start, whole.stop, size)
     return [slice(start, min(start + size, whole.stop)) for start in starts]
+
+
+def hold(name: str) -> socket.socket | None:
+    """Take a name, and return what holds it until it is closed; None when another one has it.
+
+    The name is that of a socket without a file (Linux): the system gives it back when the process
+    ends, however it does, and users of any name see each other's.
+    """
+    holder = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        # A path may be longer than a socket's name.
+        holder.bind(f'\0anser_ros_{hashlib.sha256(name.encode()).hexdigest()}')
+    except OSError:
+        holder.close()
+        return None
+    return holder

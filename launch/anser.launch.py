@@ -11,9 +11,10 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.parameter_descriptions import ParameterValue
 
+from anser_ros.apps.dashboard.extension import LIVE_VIEW
+from anser_ros.apps.slicer.extension import OPENIGTLINK
 from anser_ros.cli.commands import NODES
 from anser_ros.nodes.runtime.parameters import checked
-from anser_ros.wire.tcp_ports import LIVE_VIEW, OPENIGTLINK
 from anser_ros.wire.text_files import config_path
 
 PACKAGE = 'anser_ros'

@@ -17,7 +17,7 @@ from anser_ros.errors import BagError, FitError, ParameterError, SetupError
 MODULES = (
     pytest.param('calibration', marks=pytest.mark.long),
     pytest.param('diagnosis', marks=pytest.mark.long),
-    'model', 'recording', 'setup', 'tracking',
+    'model', 'recording', 'tracking',
 )  # fmt: skip
 # A meta path hook in whose presence nothing of ROS can be imported.
 NO_ROS = """

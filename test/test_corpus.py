@@ -3,7 +3,6 @@
 `corpus/` holds small files by what reads them; a file that once did harm is added there.
 """
 
-import socket
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,6 @@ from anser_ros.effects.correction import Correction
 from anser_ros.effects.effect import all_effects
 from anser_ros.errors import AnserError, ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.nodes.openigtlink import IgtlServer
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.wire.protocols import FrameReader
@@ -128,29 +126,6 @@ def test_effects_with_parameters_that_make_no_sense(value):
         for parameters in ({}, dict.fromkeys(keys, value)):
             record = EffectRecord(name, parameters)
             harmless(lambda record=record: Correction.of((record,), SENSORS, (1e3, 2e3)), name)
-
-
-def heard(client, server):
-    """What a client gets of a server that says the same again and again."""
-    for _ in range(100):
-        server.send(b'pose')
-        try:
-            return client.recv(4)
-        except TimeoutError:
-            continue
-    return b''
-
-
-def test_whatever_a_client_says_to_openigtlink():
-    server = IgtlServer('127.0.0.1', 0, lambda header: b'answer')
-    try:
-        for path in files('igtl'):
-            with socket.create_connection(('127.0.0.1', server.port), timeout=60.0) as client:
-                client.sendall(path.read_bytes())
-                client.settimeout(0.05)
-                assert heard(client, server) == b'pose', path
-    finally:
-        server.close()
 
 
 def test_an_effect_that_is_none_is_named():

@@ -8,7 +8,7 @@ import sys
 import pytest
 from conftest import REPO
 
-from anser_ros.api.setup import load_setup
+from anser_ros.api.recording import load_setup
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.effects.effect import all_effects
 from anser_ros.physics.board import KINDS

@@ -13,7 +13,7 @@ import yaml
 from conftest import REPO
 
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
-from anser_ros.cli.missing import PYPI
+from anser_ros.cli.main import PYPI
 
 PACKAGE = ElementTree.parse(REPO / 'package.xml')
 LEFT_OUT = shutil.ignore_patterns('.*', 'build', 'install', 'log', 'out', '*.egg-info', 'test')

@@ -11,7 +11,6 @@ import pytest
 from conftest import REPO
 
 from anser_ros.cli import main as cli
-from anser_ros.cli import missing
 from anser_ros.cli.commands import NODES, OFFLINE
 
 OPTIONAL = {'tf2_msgs', 'launch', 'launch_ros'}
@@ -91,16 +90,16 @@ def test_package_xml_has_what_rosdep_knows():
 def test_what_rosdep_does_not_know_is_asked_for_where_it_is_needed(monkeypatch, capsys):
     """A package that only PyPI has is missing on an installation by rosdep alone."""
     needed = required() - set(ROSDEP) - {SETUPTOOLS}
-    assert needed <= set(missing.PYPI.values()) <= needed | optional()
-    assert set(missing.NEEDED) <= set(NODES)
-    assert {name for names in missing.NEEDED.values() for name in names} <= set(missing.PYPI)
-    found = missing.find_spec
-    monkeypatch.setattr(missing, 'find_spec', lambda name: name != 'mcap' and found(name))
+    assert needed <= set(cli.PYPI.values()) <= needed | optional()
+    assert set(cli.NEEDED) <= set(NODES)
+    assert {name for names in cli.NEEDED.values() for name in names} <= set(cli.PYPI)
+    found = cli.find_spec
+    monkeypatch.setattr(cli, 'find_spec', lambda name: name != 'mcap' and found(name))
     assert cli.main(['recorder']) == 2
     said = capsys.readouterr().err
     assert said == 'anser recorder: mcap is not installed: pip install mcap\n'
-    missing.check('tracker')
-    monkeypatch.setattr(missing, 'find_spec', lambda name: name != 'rclpy' and found(name))
+    cli.check_packages('tracker')
+    monkeypatch.setattr(cli, 'find_spec', lambda name: name != 'rclpy' and found(name))
     for command in (['tracker', '--help'], ['demo'], ['pivot', '--live', '--topic', '/pose']):
         assert cli.main(command) == 2
         said = capsys.readouterr().err
@@ -138,16 +137,16 @@ def import_without(packages, modules):
 
 @pytest.mark.processes
 def test_all_other_nodes_start_without_it():
-    names = [name for name in NODES if name not in missing.NEEDED]
+    names = [name for name in NODES if name not in cli.NEEDED]
     assert {'acquisition', 'field_model', 'tracker', 'watcher', 'monitor'} <= set(names)
-    import_without(missing.PYPI, [NODES[name][0] for name in names])
+    import_without(cli.PYPI, [NODES[name][0] for name in names])
 
 
 @pytest.mark.processes
 def test_what_a_single_step_needs_is_not_needed_to_read_the_help():
     """A command is imported for its help; bags' own packages nearly every command needs."""
     bags = ('mcap', 'mcap_ros2', 'zstandard')
-    few = [name for name in missing.PYPI if name not in bags]
+    few = [name for name in cli.PYPI if name not in bags]
     assert {'allantools', 'dask', 'distributed'} <= set(few)
     import_without(few, [module for module, _ in OFFLINE.values()])
 

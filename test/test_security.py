@@ -1,4 +1,4 @@
-"""The SROS2 policy is what the nodes really have on the graph, and servers listen to this host."""
+"""The SROS2 policy is what the nodes really have on the graph."""
 
 import os
 import re
@@ -9,11 +9,6 @@ import pytest
 from conftest import REPO
 
 from anser_ros.cli.commands import COMPOSED, NODES
-from anser_ros.nodes.openigtlink import OpenIGTLinkParameters
-
-
-def test_servers_listen_to_this_host_only():
-    assert OpenIGTLinkParameters.host == '127.0.0.1'
 
 
 def test_every_node_of_an_installation_has_an_enclave_and_the_page_names_it():

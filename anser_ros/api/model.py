@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from anser_ros.api.setup import SetupSource, load_setup
+from anser_ros.api.recording import SetupSource, load_setup
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model

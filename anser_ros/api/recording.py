@@ -1,19 +1,56 @@
-"""Makes a session of your own arrays, checked against the setup and written to an MCAP bag."""
+"""Makes setup documents and sessions of what a script has: plain data, YAML text, files,
+arrays.
+"""
 
 import os
 import time as clock
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import ArrayLike, NDArray
 
-from anser_ros.api.setup import SetupSource, load_setup
-from anser_ros.errors import ParameterError
+from anser_ros.errors import ParameterError, SetupError
 from anser_ros.stamps import NANO
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import optical_topic, unit_quaternions
-from anser_ros.wire.setup import Setup, dump_setup
+from anser_ros.wire.setup import Setup, dump_setup, parse_setup
+from anser_ros.wire.text_files import read_text
+
+SetupSource = Setup | Mapping[str, Any] | str | os.PathLike[str]
+
+
+def load_setup(source: SetupSource) -> Setup:
+    """Check a setup document (``docs/setup.md`` explains every key).
+
+    Parameters
+    ----------
+    source : Setup, mapping, str or path
+        The document as plain data, as YAML text, or a `pathlib.Path` of a file that holds it.
+
+    Raises
+    ------
+    SetupError
+        With the rule that is broken and the key where it is, or when the file cannot be read.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from anser_ros import load_setup
+    >>> setup = load_setup(Path('config/demo_setup.yaml'))
+    >>> setup.bodies, len(setup.tool_sensors), len(setup.reference_sensors)
+    (('tool_a',), 9, 32)
+    """
+    if isinstance(source, Setup):
+        return source
+    if isinstance(source, Mapping):
+        return parse_setup(yaml.safe_dump(dict(source), sort_keys=False))
+    if isinstance(source, str):
+        return parse_setup(source)
+    return parse_setup(read_text(source, SetupError))
+
 
 Array = NDArray[np.float64]
 

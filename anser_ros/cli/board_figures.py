@@ -12,9 +12,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from numpy.typing import ArrayLike, NDArray
 
-from anser_ros.cli.page import legend_under
+from anser_ros.cli.page import legend_under, spell_out
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.pictures import spell_out
 from anser_ros.refit.clouds import Region
 from anser_ros.refit.design import Design
 from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume

@@ -12,23 +12,12 @@ from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration, to_document
 from anser_ros.calibration.sensor_parameters import KINDS
+from anser_ros.cli import output
 from anser_ros.cli.calibration_figures import (
     choice_figure,
     population_figure,
     population_table,
     populations,
-)
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_json,
-    add_stated_values,
-    check_file,
-    loss_notes,
-    make_folder,
-    stated_values,
-    terminal_table,
-    write_files,
 )
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.field.model import EffectRecord
@@ -52,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     words = 'folder for calibration.json and choice.png, made if missing'
     parser.add_argument('--report', type=Path, help=words)
     add_options(parser)
-    add_json(parser, 'calibration.json on stdout')
+    output.add_json(parser, 'calibration.json on stdout')
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +63,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--damping', type=float, help='damping of the moments; chosen by held-out error by default'
     )
-    add_stated_values(parser, 'accuracy')
+    output.add_stated_values(parser, 'accuracy')
 
 
 def _layer(text: str) -> Layout:
@@ -95,17 +84,17 @@ def _kinds(text: str) -> tuple[str, ...]:
     return kinds
 
 
-def work(args: argparse.Namespace, tell: Tell) -> Result:
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Calibrate with the sessions of the arguments, into their files.
 
     Raises `FitError` when the drawing of the board is the better model, and that is not forced.
     """
-    stated = stated_values(args)
+    stated = output.stated_values(args)
     options = _options(args)
     sessions = [load_session(path).with_stated(stated) for path in args.sessions]
     check_same_board(sessions)
-    check_file(args.out)
-    make_folder(args.report)
+    output.check_file(args.out)
+    output.make_folder(args.report)
     calibration = calibrate_sessions(sessions, options, tell)
     document = to_document(calibration)
     if args.report is not None:
@@ -113,7 +102,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
             'choice.png': choice_figure(calibration),
             'populations.png': population_figure(calibration.scan.corrections),
         }
-        write_files(args.report, {'calibration.json': document, **figures})
+        output.write_files(args.report, {'calibration.json': document, **figures})
     if not calibration.better_than_nominal and not args.force:
         raise FitError(
             f'no model written: its held-out error {document["heldout_flux_rmse_t"]:.3g} T is '
@@ -121,8 +110,11 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
             '--force writes it'
         )
     save_model(args.out, calibration.model)
-    lost = [loss_notes(path, one.lost) for path, one in zip(args.sessions, sessions, strict=True)]
-    return Result(
+    lost = [
+        output.loss_notes(path, one.lost)
+        for path, one in zip(args.sessions, sessions, strict=True)
+    ]
+    return output.Result(
         document,
         (*sum(lost, ()), *document['unobservable'], *document['contradictions']),
         (_table(calibration, document), *_populations(calibration)),
@@ -154,7 +146,7 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     rows += [(effect.name, _parameters(effect)) for effect in calibration.model.effects]
     for effect in calibration.scan.reported_effects:
         rows.append((f'{effect.name}, not in the model', _parameters(effect)))
-    return terminal_table(['', ''], rows, title='calibration', show_header=False)
+    return output.terminal_table(['', ''], rows, title='calibration', show_header=False)
 
 
 def _parameters(effect: EffectRecord) -> str:
@@ -167,7 +159,7 @@ def _populations(calibration: Calibration) -> Iterator[Table]:
     for record in populations(calibration.scan.corrections):
         head, rows = population_table([record])
         names = [name.removeprefix(f'{record.name} ') for name in head]
-        yield terminal_table(names, rows, title=record.name)
+        yield output.terminal_table(names, rows, title=record.name)
 
 
 def _short(value: Any) -> str:

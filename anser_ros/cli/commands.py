@@ -27,7 +27,6 @@ _NODES = {
     'tracker': 'fluxes to poses with covariance',
     'recorder': 'records the topics into an MCAP bag',
     'replay': 'publishes a bag again: replay BAG [--rate R] [--loop]',
-    'openigtlink': 'serves the poses to 3D Slicer as OpenIGTLink',
     'cu_simulator': 'a control unit behind a pseudo-terminal',
     'monitor': 'a live table of sensors, rates and latencies',
     'watcher': 'names the effects that the model lacks, live in /diagnostics',

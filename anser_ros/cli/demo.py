@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import extensions
-from anser_ros.cli import missing
 from anser_ros.cli.commands import COMPOSED, NODES
+from anser_ros.cli.main import check_packages
 from anser_ros.cli.output import add_json, add_out, make_new_folder
 from anser_ros.cli.processes import LAST_DOMAIN, VARIABLE, Supervisor, own_domain, tail
 from anser_ros.cli.warm_up import compile_kernels
@@ -84,7 +84,7 @@ def draw(results: Results, path: Path) -> None:
     """Write the picture: true and tracked path from above and from the side, error over time."""
     from matplotlib.figure import Figure
 
-    from anser_ros.pictures import save
+    from anser_ros.cli.page import save
 
     figure = Figure(figsize=(12, 7), layout='constrained')
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.6))
@@ -246,7 +246,7 @@ def run(args: argparse.Namespace) -> int:
     if not 1.0 <= args.rate <= 200.0:
         raise ParameterError(f'--rate must be 1 to 200 Hz, got {args.rate:g}')
     for node in ('recorder', *_asked(args)):
-        missing.check(node)
+        check_packages(node)
     stopped: list[int] = []
     before = {
         number: signal.signal(number, lambda got, _: stopped.append(got))

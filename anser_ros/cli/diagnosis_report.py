@@ -23,19 +23,21 @@ from anser_ros.cli.diagnosis_words import (
 from anser_ros.cli.page import (
     AFTER,
     BEFORE,
+    WIDE,
     details,
     heading,
+    legend_beside,
     legend_under,
     page,
     paragraph,
     picture,
+    spell_out,
     table,
     top,
 )
 from anser_ros.diagnosis.problem import Part, State, tool_parts
 from anser_ros.diagnosis.search import Candidate
 from anser_ros.field.model import EffectRecord
-from anser_ros.pictures import WIDE, legend_beside, spell_out
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 
 Array = NDArray[np.float64]

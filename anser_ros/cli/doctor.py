@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from rich.markup import escape
 
 from anser_ros.cli.commands import NODES
-from anser_ros.cli.missing import OPTIONAL, PYPI, ROS_REMEDY
+from anser_ros.cli.main import OPTIONAL, PYPI, ROS_REMEDY
 from anser_ros.cli.output import Result, Tell, add_json, terminal_table
 from anser_ros.errors import ParameterError
 

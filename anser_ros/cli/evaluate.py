@@ -12,20 +12,20 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from anser_ros import extensions
+from anser_ros.cli import output
 from anser_ros.cli.commands import SESSION_KINDS
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_json,
-    add_session_options,
-    loss_notes,
-    make_folder,
-    number,
-    stated_values,
-    terminal_table,
-    write_files,
+from anser_ros.cli.page import (
+    WIDE,
+    Html,
+    heading,
+    legend_below,
+    page,
+    picture,
+    save,
+    spell_out,
+    table,
+    top,
 )
-from anser_ros.cli.page import Html, heading, page, picture, table, top
 from anser_ros.cli.sessions import (
     add_session_kinds,
     named_kind,
@@ -37,7 +37,6 @@ from anser_ros.cli.sessions import (
 )
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pictures import WIDE, legend_below, save, spell_out
 from anser_ros.sessions.evaluation_files import recording_of, to_document, write_tables
 from anser_ros.sessions.follower import parse_references, with_references
 from anser_ros.sessions.session import Session, load_session
@@ -219,8 +218,8 @@ def error_rows(document: Mapping[str, Any]) -> list[list[str]]:
             f'source seen from {name}' if group == 'sources' else name,
             str(row['n']),
             f'{row["tracked_fraction"]:.1%}',
-            *(number(row[f'position_{key}_m'], 1e3) for key in ('rmse', 'prc95')),
-            *(number(row[f'orientation_{key}_rad'], DEGREES) for key in ('rmse', 'prc95')),
+            *(output.number(row[f'position_{key}_m'], 1e3) for key in ('rmse', 'prc95')),
+            *(output.number(row[f'orientation_{key}_rad'], DEGREES) for key in ('rmse', 'prc95')),
         ]
         for group in ('sensors', 'bodies', 'sources')
         for name, row in document.get(group, {}).items()
@@ -246,12 +245,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'it, and summary.csv and summary.html summarise them',
     )  # fmt: skip
     add_options(parser)
-    add_json(parser, 'evaluation.json, or the summary, on stdout')
+    output.add_json(parser, 'evaluation.json, or the summary, on stdout')
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options that hold for every session."""
-    add_session_options(parser)
+    output.add_session_options(parser)
     parser.add_argument(
         '--refit', action='store_true', help='let the model follow the reference sensors'
     )
@@ -277,13 +276,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_session_kinds(parser)
 
 
-def work(args: argparse.Namespace, tell: Tell) -> Result:
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Evaluate the session of the arguments into its folder; several one after the other."""
     if len(args.sessions) == 1:
         args.session = args.sessions[0]
         return _one(args, tell)
     runs = runs_of('evaluate', args)
-    make_folder(args.out)
+    output.make_folder(args.out)
     outcomes = []
     for count, one in enumerate(runs):
         tell('evaluating', count / len(runs))
@@ -291,15 +290,15 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     return summed_up('evaluate', outcomes, args.out)
 
 
-def _one(args: argparse.Namespace, tell: Tell) -> Result:
+def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     given = [f'--{name.replace("_", "-")}' for name in ALONE if getattr(args, name)]
     ways = [way.models(args, given) for way in extensions.loaded('EVALUATIONS')]
     models = next((way for way in ways if way is not None), None)
     if kind := named_kind(args):
-        done: Result = kind.evaluate(args, tell)
+        done: output.Result = kind.evaluate(args, tell)
         return done
     need_model(args)
-    session = load_session(args.session).with_stated(stated_values(args))
+    session = load_session(args.session).with_stated(output.stated_values(args))
     if args.witnesses and not args.refit:
         raise ParameterError('--witnesses extends the refit; it needs --refit')
     if args.references is not None:
@@ -308,27 +307,27 @@ def _one(args: argparse.Namespace, tell: Tell) -> Result:
         session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None
-    make_folder(args.out)
+    output.make_folder(args.out)
     evaluation = track_session(
         session, model, TrackerSettings(gate=args.gate), baseline=baseline, refit=args.refit,
         in_phase=args.in_phase, witnesses=args.witnesses, models=models,
         progress=lambda share: tell('tracking', share),
     )  # fmt: skip
     document = {**to_document(evaluation), 'recording': recording_of(session)}
-    written = list(write_files(args.out, {'evaluation.json': document}))
+    written = list(output.write_files(args.out, {'evaluation.json': document}))
     written += write_tables(args.out, evaluation)
     written += write_figures(
         evaluation, document, args.out, session=args.session, model=args.model,
         jitter_m=session.setup.accuracy.optical_position_m,
     )[-1:]  # fmt: skip
-    shown: list[Any] = [terminal_table(ERRORS_HEAD, error_rows(document))]
+    shown: list[Any] = [output.terminal_table(ERRORS_HEAD, error_rows(document))]
     if 'refit' in document:
         shown.append(_refit_line(document['refit'], models is None))
     notes = (
-        *snapshot_notes(args.model, model), *loss_notes(args.session, session.lost),
+        *snapshot_notes(args.model, model), *output.loss_notes(args.session, session.lost),
         *(_few_notes(session) if args.refit else ()),
     )  # fmt: skip
-    return Result(document, notes, tuple(shown), tuple(written))
+    return output.Result(document, notes, tuple(shown), tuple(written))
 
 
 def _few_notes(session: Session) -> tuple[str, ...]:

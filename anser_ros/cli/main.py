@@ -1,7 +1,8 @@
 """Runs the console script `anser` with one verb per command; each is also a ROS executable.
 
 A node is started by exec of its own module, so that this layer never loads rclpy; an offline
-command is imported only when it is the one asked for. `commands` lists both.
+command is imported only when it is the one asked for. `commands` lists both. What needs a package
+that is not installed, ROS among them, says so in a line.
 """
 
 import argparse
@@ -11,14 +12,14 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
-from anser_ros.cli import missing
+from anser_ros import extensions
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.cli.output import remove_empty_folders
-from anser_ros.errors import AnserError
-from anser_ros.one_line_parser import OneLineParser
+from anser_ros.errors import AnserError, OneLineParser
 from anser_ros.parallel import ONE_THREAD, cores, shared_among
 
 # Exit codes, as docs/interfaces.md has them.
@@ -59,7 +60,7 @@ def _dispatch(arguments: list[str]) -> int:
     name, rest = arguments[0].replace('-', '_'), arguments[1:]
     if name in NODES or name in COMPOSED:
         try:
-            missing.check(name)
+            check_packages(name)
         except AnserError as error:
             print(f'anser {name}: {_one_line(error)}', file=sys.stderr)
             return EXIT_BAD_INPUT
@@ -138,8 +139,8 @@ def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
     except BrokenPipeError:
         raise
     except Exception as error:  # noqa: BLE001 - the outermost place: whatever is left is a defect
-        if isinstance(error, ModuleNotFoundError) and missing.is_known(error.name):
-            return EXIT_BAD_INPUT, None, missing.words_of(str(error.name))
+        if isinstance(error, ModuleNotFoundError) and may_be_missing(error.name):
+            return EXIT_BAD_INPUT, None, missing_words(str(error.name))
         # A file that is not there or can't be written is the caller's input, not a defect.
         if isinstance(error, OSError) and error.filename is not None:
             return EXIT_BAD_INPUT, None, f'{error.filename}: {error.strerror}'
@@ -157,6 +158,52 @@ def _usage() -> str:
     ):  # fmt: skip
         lines += ['', title, *(f'  {name:<14} {words}' for name, (_, words) in group.items())]
     return '\n'.join(lines)
+
+
+PYPI = {
+    'allantools': 'allantools',
+    'dask': 'dask',
+    'distributed': 'distributed',
+    'mcap': 'mcap',
+    'mcap_ros2': 'mcap-ros2-support',
+    'zstandard': 'zstandard',
+    'nicegui': 'nicegui',
+}
+"""Modules without a key of rosdep, and what they are called on PyPI."""
+OPTIONAL = ('dask', 'distributed', 'nicegui')
+"""Of these, what only `anser batch` and the live view in a browser need."""
+ROS = 'rclpy'
+"""Module that every node needs, and that pip does not install with this package."""
+ROS_REMEDY = 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
+NEEDED = {
+    'recorder': ('mcap',),
+    'replay': ('mcap', 'mcap_ros2', 'zstandard'),
+    **{node: needed for table in extensions.tables('NEEDED') for node, needed in table.items()},
+}
+"""Nodes that do nothing without one of these packages; all others need ROS alone."""
+
+
+class MissingPackageError(AnserError):
+    """A package that is needed here is not installed."""
+
+
+def check_packages(node: str) -> None:
+    """Raise `MissingPackageError` where a node lacks a package."""
+    for module in (ROS, *NEEDED.get(node, ())):
+        if not find_spec(module):
+            raise MissingPackageError(missing_words(module))
+
+
+def may_be_missing(module: str | None) -> bool:
+    """Return whether a module is of a package that may be missing."""
+    return module is not None and module.split('.')[0] in PYPI
+
+
+def missing_words(module: str) -> str:
+    """Return what is missing, with its remedy; the module may be one inside a package."""
+    package = module.split('.')[0]
+    remedy = ROS_REMEDY if package == ROS else f'pip install {PYPI.get(package, package)}'
+    return f'{package} is not installed: {remedy}'
 
 
 if __name__ == '__main__':

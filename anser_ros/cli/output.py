@@ -183,14 +183,12 @@ class _Remaining:
             self._stage, self._past = stage, []
         if not self._past or share > self._past[-1][0]:
             self._past.append((share, now_s))
-        done, since_s = next(one for one in reversed(self._past) if self._is_early(one, share))
+        early = (one for one in reversed(self._past) if one[0] <= 0.5 * share)
+        done, since_s = next(early, self._past[0])
         took_s = now_s - since_s
         if share < LEAST_DONE or took_s < LEAST_S or share <= done:
             return ''
         return f'about {took_s * (1.0 - share) / (share - done):.0f} s left'
-
-    def _is_early(self, one: tuple[float, float], share: float) -> bool:
-        return one[0] <= 0.5 * share or one is self._past[0]
 
 
 class _Lines:
@@ -285,7 +283,7 @@ def write_files(folder: Path | None, contents: Mapping[str, Any]) -> tuple[Path,
         elif isinstance(content, dict):
             written[-1].write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
         else:
-            from anser_ros.pictures import save
+            from anser_ros.cli.page import save
 
             save(content, written[-1])
     return tuple(written)

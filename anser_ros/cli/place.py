@@ -10,18 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.cli import output
 from anser_ros.cli.board_figures import places_figure
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_json,
-    add_out,
-    add_stated_values,
-    make_folder,
-    stated_values,
-    terminal_table,
-    write_files,
-)
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Excitation, Region, region_of
@@ -82,28 +72,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--metal', default=','.join(KINDS), help=words)
     words = 'pose error that each metal causes while it is not compensated (%(default)s)'
     parser.add_argument('--error-mm', type=float, default=5.0, help=words)
-    add_out(parser)
-    add_stated_values(parser, 'accuracy', 'refit')
-    add_json(parser, f'{DOCUMENT} on stdout')
+    output.add_out(parser)
+    output.add_stated_values(parser, 'accuracy', 'refit')
+    output.add_json(parser, f'{DOCUMENT} on stdout')
 
 
-def work(args: argparse.Namespace, tell: Tell) -> Result:
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Propose places for the setup of the arguments."""
     kinds = [kind.strip() for kind in args.metal.split(',')]
     if not set(kinds) <= set(KINDS):
         raise ParameterError(f'--metal {args.metal}: must be some of {", ".join(KINDS)}')
     if not (np.isfinite(args.error_mm) and args.error_mm > 0.0):
         raise ParameterError(f'--error-mm must be positive, got {args.error_mm}')
-    setup = parse_setup(read_config(args.setup)).with_stated(stated_values(args))
+    setup = parse_setup(read_config(args.setup)).with_stated(output.stated_values(args))
     found = propose(setup, args.references, args.origin, kinds, 1e-3 * args.error_mm, tell)
-    make_folder(args.out)
+    output.make_folder(args.out)
     document = to_document(found, args.origin)
     figure = places_figure(found.candidates, found.region, found.designs, found.random)
-    written = write_files(
+    written = output.write_files(
         args.out, {DOCUMENT: document, FIGURE: figure, TABLE: _table_of(document['places'])}
     )
     head = ['references', 'expected error mm', 'random places mm (best to worst)']
-    return Result(document, (), (terminal_table(head, _rows(document)),), written)
+    return output.Result(document, (), (output.terminal_table(head, _rows(document)),), written)
 
 
 def propose(

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from anser_ros.errors import ParameterError
-from anser_ros.held_names import hold
+from anser_ros.parallel import hold
 
 VARIABLE = 'ROS_DOMAIN_ID'
 LAST_DOMAIN = 101

@@ -11,18 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
+from anser_ros.cli import output
 from anser_ros.cli.board_figures import setup_figure
-from anser_ros.cli.output import (
-    Result,
-    add_json,
-    add_list,
-    add_out,
-    add_stated_values,
-    make_folder,
-    say,
-    stated_values,
-    write_files,
-)
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.settings import sections_of
@@ -364,36 +354,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'anser setup config/demo_setup.yaml --out picture/ (checks and draws it)'
     )
     parser.add_argument('document', nargs='?', help='a setup document to check and draw')
-    add_out(parser, f'{DOCUMENT} and {PICTURE}')
+    output.add_out(parser, f'{DOCUMENT} and {PICTURE}')
     words = 'the Anser v1 board, or the kind of its coils'
     parser.add_argument('--board', choices=[ANSER, *GEOMETRY], help=words)
     kinds = '; '.join(f'{kind}: {", ".join(keys)}' for kind, keys in GEOMETRY.items())
     words = f'geometry of emitter coils, SI units: {kinds}'
-    add_list(parser, '--geometry', metavar='KEY=VALUE', help=words)
+    output.add_list(parser, '--geometry', metavar='KEY=VALUE', help=words)
     words = 'an emitter coil: centre in mm, turn about z in degrees, tone in Hz; may be repeated'
-    add_list(parser, '--coil', metavar='X,Y,Z,TURN,TONE', help=words)
+    output.add_list(parser, '--coil', metavar='X,Y,Z,TURN,TONE', help=words)
     words = f'emitter coils: {",".join(COIL_COLUMNS)}'
     parser.add_argument('--coils', type=Path, metavar='CSV', help=words)
     words = (
         'a sensor coil: position in mm in the frame of its body, which is fg for a reference '
         'coil; the axis is x, -x, ... or three numbers with blanks; may be repeated'
     )
-    add_list(parser, '--sensor', metavar='CHANNEL,NAME,BODY,X,Y,Z,AXIS[,LENGTH]', help=words)
+    output.add_list(
+        parser, '--sensor', metavar='CHANNEL,NAME,BODY,X,Y,Z,AXIS[,LENGTH]', help=words
+    )
     words = f'sensor coils: {",".join(SENSOR_COLUMNS)}[,length_mm]; may be repeated'
-    add_list(parser, '--sensors', type=Path, metavar='CSV', help=words)
+    output.add_list(parser, '--sensors', type=Path, metavar='CSV', help=words)
     parser.add_argument('--rate', type=float, default=50.0, help='flux windows a second (50)')
     parser.add_argument(
         '--volume', metavar='X,Y,Z,X,Y,Z',
         help='two corners of the tracked volume, mm; by default above the board, by its size',
     )  # fmt: skip
-    add_stated_values(parser, 'accuracy', 'refit', 'tools')
-    add_json(parser, 'the written files and the advice as JSON')
+    output.add_stated_values(parser, 'accuracy', 'refit', 'tools')
+    output.add_json(parser, 'the written files and the advice as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     parts = [args.board, args.geometry, args.coil, args.coils, args.sensor, args.sensors]
-    make_folder(args.out)
+    output.make_folder(args.out)
     if args.document is None and (args.out / DOCUMENT).exists():
         raise ParameterError(
             f'{args.out / DOCUMENT} is there already, perhaps with tips and changes by hand: give '
@@ -431,7 +423,7 @@ def _document(args: argparse.Namespace) -> Document:
     rows = [*args.sensor, *(row for path in args.sensors for row in rows_of(path, SENSOR_COLUMNS))]
     volume = None if args.volume is None else numbers_of(args.volume, 6, '--volume')
     sensors = [sensor_of(row) for row in rows]
-    return document_of(emitter, sensors, args.rate, volume, stated_values(args))
+    return document_of(emitter, sensors, args.rate, volume, output.stated_values(args))
 
 
 def _geometry(entries: list[str]) -> dict[str, float]:
@@ -448,13 +440,15 @@ def _write(args: argparse.Namespace, text: str, setup: Setup) -> int:
         board_of(setup)
     advice = advice_on(setup)
     own = {} if args.document else {DOCUMENT: text}
-    written = write_files(args.out, {**own, PICTURE: setup_figure(setup)})
+    written = output.write_files(args.out, {**own, PICTURE: setup_figure(setup)})
     words = (
         f'{len(setup.emitter.coils)} emitter coils, {len(setup.reference_sensors)} reference '
         f'coils, tools: {", ".join(setup.bodies) or "none"}'
     )
     document = {'schema': RESULT, 'files': list(map(str, written)), 'advice': advice}
-    say('setup', Result(document, tuple(advice), (words,), written), as_json=args.json)
+    output.say(
+        'setup', output.Result(document, tuple(advice), (words,), written), as_json=args.json
+    )
     return 0
 
 

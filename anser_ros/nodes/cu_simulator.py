@@ -21,27 +21,10 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
+from anser_ros.simulation import line, world
 from anser_ros.simulation.control_unit import BLOCK_SAMPLES, ControlUnit, FrontEnd, Piece
 from anser_ros.simulation.effects import NONE as NO_EFFECT
 from anser_ros.simulation.effects import Drawn, draw
-from anser_ros.simulation.line import (
-    FAULTS,
-    NONE,
-    OVERRUN,
-    SATURATION,
-    UNPLUG,
-    FaultInjector,
-    PseudoPort,
-)
-from anser_ros.simulation.world import (
-    Approach,
-    MetalBody,
-    World,
-    board_source,
-    manufactured,
-    steel_disc,
-    tool_paths,
-)
 from anser_ros.stamps import set_stamp
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.recorded import optical_topic
@@ -110,7 +93,7 @@ class CuSimulatorParameters:
     path_phase_rad: float = parameter(
         0.0, "phase at which the tools' paths begin; another value gives another path", minimum=0.0
     )
-    fault: str = parameter(NONE, 'fault of the line', choices=FAULTS, live=True)
+    fault: str = parameter(line.NONE, 'fault of the line', choices=line.FAULTS, live=True)
     fault_period_s: float = parameter(
         5.0, 'from one fault to the next, s', minimum=0.1, maximum=3600.0, live=True
     )
@@ -143,14 +126,14 @@ class CuSimulator(AnserNode):
         self._effects = drawn.effects
         real = functools.reduce(lambda made, effect: effect.setup(made), drawn.effects, setup)
         if table.board_seed:
-            made = manufactured(real, np.random.default_rng(table.board_seed))
+            made = world.manufactured(real, np.random.default_rng(table.board_seed))
         else:
             made = real
         self._begin_ns = time.monotonic_ns()
         self._stream_begin_s = math.inf
         self._metal = [*_metal(table, lambda: self._stream_begin_s), *drawn.metal]
-        paths = tool_paths(setup.bodies, table.path_phase_rad)
-        self._world = World(real, board_source(made), paths=paths, metal=self._metal)
+        paths = world.tool_paths(setup.bodies, table.path_phase_rad)
+        self._world = world.World(real, world.board_source(made), paths=paths, metal=self._metal)
         self._world.flux(0.0)  # loads the kernels now, not while samples are due
         front = FrontEnd(
             table.sample_rate_hz, noise_codes=table.noise_codes, current_drift=table.current_drift
@@ -165,8 +148,8 @@ class CuSimulator(AnserNode):
         )
         self._least_late_ns = math.inf
         self._rng = np.random.default_rng(table.seed + 1)
-        self._injector = FaultInjector(table.fault, table.fault_period_s, table.seed)
-        self._port = PseudoPort(Path(table.link))
+        self._injector = line.FaultInjector(table.fault, table.fault_period_s, table.seed)
+        self._port = line.PseudoPort(Path(table.link))
         self._publishers_of = {
             body: self.create_publisher(
                 PoseStamped, optical_topic(body, table.optical), qos.STREAM
@@ -209,7 +192,7 @@ class CuSimulator(AnserNode):
         unit = self._unit
         now_s = self._elapsed_s()
         self._plug(now_s)
-        unit.overload(self._injector.lasts(now_s, SATURATION))
+        unit.overload(self._injector.lasts(now_s, line.SATURATION))
         answers = unit.receive(self._port.read()) if self._due_s(unit.samples) >= now_s else []
         if unit.streaming and self._stream_begin_s == math.inf:
             self._stream_begin_s = now_s
@@ -230,7 +213,7 @@ class CuSimulator(AnserNode):
 
     def _send(self, pieces: list[Piece], now_s: float) -> None:
         arriving = self._injector.apply(pieces, now_s)
-        if self._injector.lasts(now_s, OVERRUN):
+        if self._injector.lasts(now_s, line.OVERRUN):
             for _ in filter(lambda piece: piece.is_block, arriving):
                 self._unit.drop()
             arriving = [piece for piece in arriving if not piece.is_block]
@@ -239,7 +222,7 @@ class CuSimulator(AnserNode):
             self.count('dropped_blocks')
 
     def _plug(self, now_s: float) -> None:
-        out = self._injector.lasts(now_s, UNPLUG)
+        out = self._injector.lasts(now_s, line.UNPLUG)
         if out and self._port.plugged:
             self.count('unplugged')
             self._port.unplug()
@@ -265,7 +248,7 @@ class CuSimulator(AnserNode):
 
     def on_parameters(self, old: Any, new: Any) -> None:
         """Switch to the fault that the new parameters name."""
-        self._injector = FaultInjector(new.fault, new.fault_period_s, new.seed)
+        self._injector = line.FaultInjector(new.fault, new.fault_period_s, new.seed)
 
     def status(self) -> Status:
         """Return the state of the simulated control unit."""
@@ -290,14 +273,14 @@ def _write_effect(path: Path, drawn: Drawn) -> None:
         raise ParameterError(f'cannot write {path}: {error.strerror}') from error
 
 
-def _metal(table: CuSimulatorParameters, begin_s: Callable[[], float]) -> list[MetalBody]:
+def _metal(table: CuSimulatorParameters, begin_s: Callable[[], float]) -> list[world.MetalBody]:
     """The disc, on a path that begins when `begin_s` says."""
     if not table.metal:
         return []
     if len(table.metal_near_m) != 3:
         raise ParameterError(f'metal_near_m needs 3 numbers, got {len(table.metal_near_m)}')
     x, y, z = table.metal_near_m
-    path = Approach(
+    path = world.Approach(
         far_m=(x, y, z - 0.52),
         near_m=(x, y, z),
         start_s=table.metal_start_s,
@@ -305,7 +288,9 @@ def _metal(table: CuSimulatorParameters, begin_s: Callable[[], float]) -> list[M
         stay_s=table.metal_stay_s,
         period_s=table.metal_period_s,
     )
-    return [steel_disc(lambda time_s: path(time_s - begin_s()), radius_m=table.metal_radius_m)]
+    return [
+        world.steel_disc(lambda time_s: path(time_s - begin_s()), radius_m=table.metal_radius_m)
+    ]
 
 
 def _pose(frame_id: str, stamp_ns: int, position: np.ndarray, rotation: np.ndarray) -> PoseStamped:

@@ -96,18 +96,22 @@ class PoseTrace:
     sigma_m: list[float] = field(default_factory=list)
     latency_s: list[float] = field(default_factory=list)
 
-    def errors(self, optical: PoseTrack, since: int = 0) -> tuple[Array, Array]:
-        """Return distance (m) and angle (rad) to the truth of the poses from number `since` on,
-        NaN where the optical track does not reach.
+    def distances(self, optical: PoseTrack, since: int = 0) -> tuple[Array, Array]:
+        """Return distances (m) to the truth of the poses from number `since` on, NaN where the
+        optical track does not reach, and the true axes.
         """
         stamps = np.array(self.stamp_s[since:])
         if not stamps.size:
-            return np.zeros(0), np.zeros(0)
+            return np.zeros(0), np.zeros((0, 3))
         position, rotation, _ = optical.at(stamps, LONGEST_OPTICAL_GAP_S)
         true_position = position + rotation @ np.array(self.target.position_m)
-        true_axis = rotation @ np.array(self.target.axis)
         away = np.linalg.norm(np.array(self.position[since:]) - true_position, axis=1)
-        return away, axis_angles(np.array(self.axis[since:]), true_axis)
+        return away, rotation @ np.array(self.target.axis)
+
+    def errors(self, optical: PoseTrack) -> tuple[Array, Array]:
+        """Return distances (m) and angles (rad) of all poses to the truth, as `distances`."""
+        away, axes = self.distances(optical)
+        return away, axis_angles(np.array(self.axis).reshape(-1, 3), axes)
 
 
 @dataclass(frozen=True)
@@ -144,7 +148,7 @@ class Traces:
             error = float('nan')
             if count and track is not None:
                 # the last poses may be newer than the last optical one
-                error = middle(trace.errors(track, max(0, since - 5))[0])
+                error = middle(trace.distances(track, max(0, since - 5))[0])
             position = trace.position[-1] if count else (float('nan'),) * 3
             sigma, latency = middle(trace.sigma_m[since:]), middle(trace.latency_s[since:])
             rows.append(Row(name, position, sigma, error, count / elapsed_s, latency))

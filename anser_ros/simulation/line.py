@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from anser_ros.errors import PortError
-from anser_ros.held_names import hold
+from anser_ros.parallel import hold
 from anser_ros.simulation.control_unit import Piece
 
 NONE = 'none'

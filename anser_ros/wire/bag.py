@@ -23,15 +23,8 @@ from mcap_ros2.decoder import DecoderFactory
 
 from anser_ros.errors import BagError, LayoutError, SetupError
 from anser_ros.stamps import stamp_of
+from anser_ros.wire import recorded
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
-from anser_ros.wire.recorded import (
-    Bag,
-    PoseStream,
-    RecordedFluxes,
-    optical_stem,
-    pose_numbers,
-    unit_quaternions,
-)
 from anser_ros.wire.setup import parse_setup
 
 _BROKEN = (
@@ -222,7 +215,7 @@ class _Collector:
                 self.setups.append(str(self.decoder.decode(raw).data))
             elif raw.topic.endswith(('/tool/flux', '/reference/flux')):
                 self._add_flux(raw)
-            elif optical_stem(raw.topic) and raw.type_name == POSE_TYPE:
+            elif recorded.optical_stem(raw.topic) and raw.type_name == POSE_TYPE:
                 self._add_pose(raw)
         except (BagError, LayoutError, AttributeError, TypeError, ValueError) as error:
             self.refused[f'{raw.topic}: {error}'] += 1
@@ -243,14 +236,14 @@ class _Collector:
 
     def _add_pose(self, raw: RawMessage) -> None:
         message = self.decoder.decode(raw)
-        numbers = pose_numbers(message.pose)
-        values = (*numbers[:3], *unit_quaternions(numbers[3:]).tolist())
+        numbers = recorded.pose_numbers(message.pose)
+        values = (*numbers[:3], *recorded.unit_quaternions(numbers[3:]).tolist())
         if not np.isfinite(values).all():
             raise LayoutError('a pose with values not finite or a quaternion not of unit length')
-        body = optical_stem(raw.topic)
+        body = recorded.optical_stem(raw.topic)
         self.poses.setdefault(body, []).append((stamp_of(message), values))
 
-    def flux_stream(self, which: str) -> RecordedFluxes | None:
+    def flux_stream(self, which: str) -> recorded.RecordedFluxes | None:
         frames: dict[int, FluxPoints] = {}
         n_emitters = Counter(points.flux.shape[1] for _, points in self.flux[which])
         for stamp, points in self.flux[which]:
@@ -271,15 +264,15 @@ class _Collector:
             points = frames[stamp]
             rows = np.searchsorted(channels, points.channel)
             flux[f, rows], flags[f, rows] = points.flux, points.flags
-        return RecordedFluxes(stamps, channels, flags, flux)
+        return recorded.RecordedFluxes(stamps, channels, flags, flux)
 
-    def pose_streams(self) -> dict[str, PoseStream]:
+    def pose_streams(self) -> dict[str, recorded.PoseStream]:
         streams = {}
         for body, rows in self.poses.items():
             unique = dict(rows)
             stamps = np.array(sorted(unique), dtype=np.int64)
             values = np.array([unique[stamp] for stamp in stamps.tolist()])
-            streams[body] = PoseStream(stamps, values[:, :3], values[:, 3:])
+            streams[body] = recorded.PoseStream(stamps, values[:, :3], values[:, 3:])
         return streams
 
 
@@ -293,7 +286,7 @@ def _rename_words(topics: Mapping[str, str]) -> str:
     return f'; if {", ".join(others)} are fluxes: {words}'
 
 
-def read_bag(path: str | os.PathLike[str]) -> Bag:
+def read_bag(path: str | os.PathLike[str]) -> recorded.Bag:
     """Read a recorded session; raises `BagError`, also without a setup or without fluxes."""
     salvage, collector = Salvage(), _Collector()
     for raw in iter_messages(path, salvage):
@@ -310,13 +303,13 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
         reasons = ''.join(f'; {text}' for text in list(collector.refused)[:1])
         reasons = reasons or _rename_words(collector.topics)
         raise BagError(f'{os.fspath(path)}: the bag has no readable flux{reasons}')
-    return Bag(
+    return recorded.Bag(
         os.fspath(path), setup, text, tool, reference, collector.pose_streams(),
         dict(collector.refused), salvage.lost,
     )  # fmt: skip
 
 
-def read_fluxes(path: str | os.PathLike[str]) -> dict[str, RecordedFluxes]:
+def read_fluxes(path: str | os.PathLike[str]) -> dict[str, recorded.RecordedFluxes]:
     """Return the fluxes of a bag that need not have a setup, by ``tool`` and ``reference``."""
     collector = _Collector()
     for raw in iter_messages(path, Salvage()):

@@ -15,7 +15,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, Self
 
 import numpy as np
@@ -244,12 +243,7 @@ class BagWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             self.close()
         finally:
@@ -279,14 +273,10 @@ class BagWriter:
             self._schemas[type_name] = self._writer.register_schema(
                 type_name, SchemaEncoding.ROS2, definition.encode()
             )
+        profiles = plain_yaml([dict(profile) for profile in qos])
+        metadata = {'offered_qos_profiles': profiles, 'topic_type_hash': type_hash}
         channel: int = self._writer.register_channel(
-            name,
-            'cdr',
-            self._schemas[type_name],
-            {
-                'offered_qos_profiles': plain_yaml([dict(profile) for profile in qos]),
-                'topic_type_hash': type_hash,
-            },
+            name, 'cdr', self._schemas[type_name], metadata
         )
         self.record.topics[channel] = TopicRecord(name, type_name, type_hash, tuple(qos))
         self._draft = None

@@ -228,24 +228,12 @@ def _text(raw: memoryview) -> str:
 
 def _encode_hello(hello: Hello) -> bytes:
     device = hello.device.encode('utf-8')[:255]
-    parts = [
-        _HELLO.pack(
-            hello.minor,
-            hello.sample_rate_hz,
-            hello.tick_hz,
-            hello.block_samples,
-            len(hello.channels),
-            len(hello.frequencies_hz),
-            len(device),
-        ),
-        device,
-    ]
-    parts += [_CHANNEL.pack(c.number, c.kind, 0, c.full_scale) for c in hello.channels]
-    parts += [
-        _COIL.pack(frequency, current)
-        for frequency, current in zip(hello.frequencies_hz, hello.currents_a, strict=True)
-    ]
-    return b''.join(parts)
+    rates = hello.sample_rate_hz, hello.tick_hz, hello.block_samples
+    counts = len(hello.channels), len(hello.frequencies_hz), len(device)
+    channels = [_CHANNEL.pack(c.number, c.kind, 0, c.full_scale) for c in hello.channels]
+    tones = zip(hello.frequencies_hz, hello.currents_a, strict=True)
+    coils = [_COIL.pack(frequency, current) for frequency, current in tones]
+    return b''.join([_HELLO.pack(hello.minor, *rates, *counts), device, *channels, *coils])
 
 
 def _decode_hello(raw: memoryview) -> Hello:
@@ -255,21 +243,14 @@ def _decode_hello(raw: memoryview) -> Hello:
     end = coil_start + n_coils * _COIL.size
     if len(raw) < end:
         raise FrameError(f'hello of {len(raw)} bytes announces {end}')
-    channels = [
+    channels = tuple(
         Channel(number, ChannelKind(kind), full_scale)
         for number, kind, _, full_scale in _CHANNEL.iter_unpack(raw[start:coil_start])
-    ]
-    coils = list(_COIL.iter_unpack(raw[coil_start:end]))
-    hello = Hello(
-        _text(raw[_HELLO.size : start]),
-        rate,
-        tick,
-        block,
-        tuple(channels),
-        tuple(frequency for frequency, _ in coils),
-        tuple(current for _, current in coils),
-        minor,
     )
+    coils = list(_COIL.iter_unpack(raw[coil_start:end]))
+    tones, currents = (tuple(coil[i] for coil in coils) for i in (0, 1))
+    device = _text(raw[_HELLO.size : start])
+    hello = Hello(device, rate, tick, block, channels, tones, currents, minor)
     check_hello(hello)
     return hello
 
@@ -289,22 +270,13 @@ def _decode_samples(raw: memoryview) -> SampleBlock:
 
 
 def _encode_status(status: DeviceStatus) -> bytes:
-    return _STATUS.pack(
-        status.state,
-        0,
-        int(status.flags),
-        status.uptime_ticks,
-        status.dropped_blocks,
-        status.refused_records,
-        status.temperature_deg_c,
-    )
+    counts = status.uptime_ticks, status.dropped_blocks, status.refused_records
+    return _STATUS.pack(status.state, 0, int(status.flags), *counts, status.temperature_deg_c)
 
 
 def _decode_status(raw: memoryview) -> DeviceStatus:
-    state, _, flags, uptime, dropped, refused, temperature = _STATUS.unpack_from(raw)
-    return DeviceStatus(
-        DeviceState(state), StatusFlag(flags & 31), uptime, dropped, refused, temperature
-    )
+    state, _, flags, *rest = _STATUS.unpack_from(raw)
+    return DeviceStatus(DeviceState(state), StatusFlag(flags & 31), *rest)
 
 
 def _encode_reply(reply: Reply) -> bytes:

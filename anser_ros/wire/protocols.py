@@ -12,29 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from anser_ros.errors import FrameError, PortError
-from anser_ros.wire.frames import (
-    CRC,
-    HEADER,
-    MAGIC,
-    MAX_PAYLOAD,
-    OVERHEAD,
-    TYPE_OF,
-    VERSION,
-    Hello,
-    Identify,
-    Payload,
-    Record,
-    Reply,
-    ReplyCode,
-    SampleBlock,
-    SetFrequencies,
-    Start,
-    check_hello,
-    decode_payload,
-    encode,
-    header_check,
-    knows,
-)
+from anser_ros.wire import frames
 
 _SHORTEST_PAYLOAD = 4096
 """Bytes that are waited for at least: a status with its text is longer than small blocks."""
@@ -63,7 +41,7 @@ class FrameReader:
     hold back the records behind it; before a hello it waits for ``max_payload`` bytes.
     """
 
-    def __init__(self, max_payload: int = MAX_PAYLOAD) -> None:
+    def __init__(self, max_payload: int = frames.MAX_PAYLOAD) -> None:
         self._longest = self.max_payload = max_payload
         self.counters = FrameCounters()
         self.last_refusal = ''
@@ -78,15 +56,15 @@ class FrameReader:
         """Return names and values of the counters, in the order of declaration."""
         return dict(vars(self.counters))
 
-    def feed(self, data: bytes) -> list[Record]:
+    def feed(self, data: bytes) -> list[frames.Record]:
         """Take bytes as they come and return the records that they complete."""
         buffer = self._pending + data if self._pending else bytes(data)
         view = memoryview(buffer)
-        records: list[Record] = []
+        records: list[frames.Record] = []
         counters = self.counters
         position = 0
         while True:
-            start = buffer.find(MAGIC, position)
+            start = buffer.find(frames.MAGIC, position)
             if start < 0:
                 keep = _magic_prefix(buffer, position)
                 counters.skipped_bytes += len(buffer) - keep - position
@@ -94,23 +72,25 @@ class FrameReader:
                 break
             counters.skipped_bytes += start - position
             position = start
-            if len(buffer) - start < HEADER.size:
+            if len(buffer) - start < frames.HEADER.size:
                 break
-            _, version, number, length, tag, check = HEADER.unpack_from(buffer, start)
-            if check != header_check(view[start : start + 10]) or length > self.max_payload:
+            _, version, number, length, tag, check = frames.HEADER.unpack_from(buffer, start)
+            if check != frames.header_check(view[start : start + 10]) or length > self.max_payload:
                 counters.bad_header += 1
                 position = self._skip(start)
                 continue
-            end = start + OVERHEAD + length
+            end = start + frames.OVERHEAD + length
             if len(buffer) < end:
                 break
-            body_end = end - CRC.size
-            if zlib.crc32(view[start:body_end]) != CRC.unpack_from(buffer, body_end)[0]:
+            body_end = end - frames.CRC.size
+            if zlib.crc32(view[start:body_end]) != frames.CRC.unpack_from(buffer, body_end)[0]:
                 counters.bad_crc += 1
                 position = self._skip(start)
                 continue
             position = end
-            record = self._decode(version, number, tag, view[start + HEADER.size : body_end])
+            record = self._decode(
+                version, number, tag, view[start + frames.HEADER.size : body_end]
+            )
             if record is not None:
                 records.append(record)
         self._pending = buffer[position:]
@@ -120,30 +100,32 @@ class FrameReader:
         self.counters.skipped_bytes += 1
         return start + 1
 
-    def _decode(self, version: int, number: int, tag: int, body: memoryview) -> Record | None:
-        if version != VERSION:
+    def _decode(
+        self, version: int, number: int, tag: int, body: memoryview
+    ) -> frames.Record | None:
+        if version != frames.VERSION:
             self.counters.wrong_version += 1
-            self.last_refusal = f'protocol version {version}, this is version {VERSION}'
+            self.last_refusal = f'protocol version {version}, this is version {frames.VERSION}'
             return None
-        if not knows(number):
+        if not frames.knows(number):
             self.counters.unknown_type += 1
             return None
         try:
-            payload = decode_payload(number, body)
+            payload = frames.decode_payload(number, body)
         except FrameError as error:
             self.counters.bad_payload += 1
             self.last_refusal = str(error)
             return None
-        if isinstance(payload, Hello):
+        if isinstance(payload, frames.Hello):
             self.max_payload = max(_SHORTEST_PAYLOAD, payload.samples_size())
         self.counters.records += 1
-        return Record(payload, tag)
+        return frames.Record(payload, tag)
 
 
 def _magic_prefix(buffer: bytes, position: int) -> int:
     """Return how many bytes at the end of the buffer may begin a record's magic number."""
-    for length in range(min(len(MAGIC) - 1, len(buffer) - position), 0, -1):
-        if buffer.endswith(MAGIC[:length]):
+    for length in range(min(len(frames.MAGIC) - 1, len(buffer) - position), 0, -1):
+        if buffer.endswith(frames.MAGIC[:length]):
             return length
     return 0
 
@@ -153,7 +135,7 @@ class RecordReader(Protocol):
 
     last_refusal: str
 
-    def feed(self, data: bytes) -> list[Record]:
+    def feed(self, data: bytes) -> list[frames.Record]:
         """Take bytes as they come and return the records that they complete.
 
         It must not raise, whatever the bytes are: an exception closes the port, which is opened
@@ -174,15 +156,15 @@ class SerialProtocol:
     make_reader: Callable[[], RecordReader]  # returns a new `RecordReader`
     # bytes of a command (`records.Identify`, `SetFrequencies`, `Start`, `Stop`) with a tag that
     # its reply repeats. A command that the unit does not have is no bytes
-    encode: Callable[[Payload, int], bytes]
+    encode: Callable[[frames.Payload, int], bytes]
 
     @property
     def sets_tones(self) -> bool:
         """Return whether the host can change the unit's tones."""
-        return bool(self.encode(SetFrequencies((1.0,)), 1))
+        return bool(self.encode(frames.SetFrequencies((1.0,)), 1))
 
 
-def records_of(reader: RecordReader, data: bytes) -> list[Record]:
+def records_of(reader: RecordReader, data: bytes) -> list[frames.Record]:
     """Return the records that a reader completes with these bytes.
 
     Raises `PortError` when the reader fails, or gives a hello that no receiver could use.
@@ -190,15 +172,15 @@ def records_of(reader: RecordReader, data: bytes) -> list[Record]:
     try:
         records = reader.feed(data)
         for record in records:
-            if isinstance(record.payload, Hello):
-                check_hello(record.payload)
+            if isinstance(record.payload, frames.Hello):
+                frames.check_hello(record.payload)
     except Exception as error:
         words = ' '.join(str(error).split())
         raise PortError(f'the frame reader failed: {type(error).__name__}: {words}') from error
     return records
 
 
-ANSER = SerialProtocol(FrameReader, encode)
+ANSER = SerialProtocol(FrameReader, frames.encode)
 """Version 1 of the protocol of `docs/cu_protocol.md`."""
 
 PROTOCOLS = {'anser': ANSER}
@@ -227,7 +209,7 @@ class StreamControl:
     def __init__(self, frequencies_hz: tuple[float, ...], *, set_frequencies: bool = True) -> None:
         self._wanted = frequencies_hz
         self._may_set = set_frequencies
-        self.hello: Hello | None = None
+        self.hello: frames.Hello | None = None
         self.refusal = ''
         self.started = False
         self._refused = False
@@ -250,12 +232,12 @@ class StreamControl:
         """Return whether the control unit drives the tones of the setup document."""
         return self.hello is not None and self._agree(self.hello)
 
-    def take(self, record: Record, arrival_ns: int) -> None:
+    def take(self, record: frames.Record, arrival_ns: int) -> None:
         """Take in a received record."""
         payload = record.payload
-        if isinstance(payload, SampleBlock):
+        if isinstance(payload, frames.SampleBlock):
             self._last_block_ns = arrival_ns
-        elif isinstance(payload, Hello):
+        elif isinstance(payload, frames.Hello):
             if self.tones_agree and payload != self.hello:
                 self._doubted_ns = arrival_ns
             self.hello = payload
@@ -263,29 +245,29 @@ class StreamControl:
                 self.refusal = ''
             elif not self._may_set or self._refused:
                 self.refusal = self.refusal or _disagreement(self._wanted, payload)
-        elif isinstance(payload, Reply) and payload.code is ReplyCode.OK:
-            if payload.command == TYPE_OF[Start]:
+        elif isinstance(payload, frames.Reply) and payload.code is frames.ReplyCode.OK:
+            if payload.command == frames.TYPE_OF[frames.Start]:
                 self.started = True
                 self._last_block_ns = arrival_ns
-        elif isinstance(payload, Reply):
+        elif isinstance(payload, frames.Reply):
             self.refusal = f'the control unit refused: {payload.code.name.lower()} {payload.text}'
-            if payload.command == TYPE_OF[SetFrequencies]:
+            if payload.command == frames.TYPE_OF[frames.SetFrequencies]:
                 self._refused = True
 
-    def due(self, now_ns: int) -> Payload | None:
+    def due(self, now_ns: int) -> frames.Payload | None:
         """Return the command to send now, None when nothing is due."""
-        command: Payload
+        command: frames.Payload
         pause_ns = _REPEAT_NS
         if self.hello is None:
-            command = Identify()
+            command = frames.Identify()
         elif not self._agree(self.hello):
             if not self._may_set or self._refused:
                 return None
-            command = SetFrequencies(self._wanted)
+            command = frames.SetFrequencies(self._wanted)
         elif not self.started or now_ns - self._last_block_ns > _REPEAT_NS:
-            command = Start()
+            command = frames.Start()
         elif self._doubted_ns is not None and now_ns - self._doubted_ns < _DOUBT_NS:
-            command, pause_ns = Identify(), _ASK_NS
+            command, pause_ns = frames.Identify(), _ASK_NS
         else:
             return None
         if now_ns - self._last_sent.get(type(command), -pause_ns) < pause_ns:
@@ -293,14 +275,14 @@ class StreamControl:
         self._last_sent[type(command)] = now_ns
         return command
 
-    def _agree(self, hello: Hello) -> bool:
+    def _agree(self, hello: frames.Hello) -> bool:
         return len(hello.frequencies_hz) == len(self._wanted) and all(
             abs(have - want) <= _TONE_TOLERANCE_HZ
             for have, want in zip(hello.frequencies_hz, self._wanted, strict=True)
         )
 
 
-def _disagreement(wanted: tuple[float, ...], hello: Hello) -> str:
+def _disagreement(wanted: tuple[float, ...], hello: frames.Hello) -> str:
     have = ', '.join(f'{tone:g}' for tone in hello.frequencies_hz)
     want = ', '.join(f'{tone:g}' for tone in wanted)
     return f'the control unit drives {have} Hz, but the setup requires {want} Hz'

@@ -1,5 +1,7 @@
 """States what this application adds to the core; `anser_ros.extensions` describes the tables."""
 
+LIVE_VIEW = 8642
+"""TCP port of the page, which no registered service has."""
 NODES = {
     'dashboard': 'a live view in the browser, with the loop of record, diagnose and correct',
 }
@@ -8,6 +10,6 @@ PASSIVE = ('dashboard',)
 DEMO = {
     'dashboard': (
         'serve the live view to a browser, too',
-        'live view: http://127.0.0.1:8642/',  # as `wire.tcp_ports` has it
+        f'live view: http://127.0.0.1:{LIVE_VIEW}/',
     ),
 }

@@ -108,7 +108,7 @@ class AnserNode(Node):
         super().create_timer(DIAGNOSTICS_PERIOD_S, timer, clock=self.steady_clock)
         if self.HAS_KERNELS:
             # Numba is half of the start of a node that has none.
-            from anser_ros.nodes.runtime.kernel_start import wait_for_kernels
+            from anser_ros.kernel_cache import wait_for_kernels
 
             trouble = wait_for_kernels(self._say_starting)
             if trouble:

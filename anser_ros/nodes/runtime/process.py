@@ -19,12 +19,11 @@ from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from anser_ros.errors import AnserError, ParameterError
+from anser_ros.errors import AnserError, OneLineParser, ParameterError
 from anser_ros.nodes.runtime import parameters
 from anser_ros.nodes.runtime.handover import Handover
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.runtime.parameters import complaints, names_for
-from anser_ros.one_line_parser import OneLineParser
 from anser_ros.wire.text_files import config_path
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8

@@ -183,14 +183,6 @@ class TestDocument:
             parse_setup(with_tips(text, {'tool_a': self.SPEC}))
 
 
-def test_slicer_gets_the_tip_as_a_body():
-    from anser_ros.nodes import openigtlink as igtl
-
-    setup = parse_setup(DEMO).with_tips({'tool_a': TestDocument.SPEC})
-    table = igtl.OpenIGTLinkParameters(coils=False)
-    assert set(igtl.devices_of(setup, table)) == {'tool_a', 'tool_a/tip'}
-
-
 def test_the_command_writes_the_tip_and_refuses_in_a_line(tmp_path, capsys):
     poses, tip, _ = pivoting(9)
     setup = Path(tmp_path / 'setup.yaml')

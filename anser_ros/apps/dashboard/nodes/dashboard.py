@@ -18,13 +18,13 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from anser_ros.apps.dashboard.extension import LIVE_VIEW
 from anser_ros.apps.dashboard.nodes.view_source import ViewSource, polling_node
 from anser_ros.errors import AnserError
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.wire.tcp_ports import LIVE_VIEW
 
 TRIGGERS = ('recorder/start', 'recorder/stop', 'field_model/set_baseline')
 MODEL_FILE, BASELINE_FILE = 'model_file', 'baseline_file'

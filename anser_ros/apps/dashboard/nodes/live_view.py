@@ -10,15 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.nodes import traces
 from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime.diagnostics import LastStatus
-from anser_ros.nodes.traces import (
-    LONGEST_OPTICAL_GAP_S,
-    OpticalTrace,
-    latency_of,
-    middle,
-    targets_of,
-)
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
@@ -62,14 +56,14 @@ class LiveView:
     ) -> None:
         self.setup, self.namespace = setup, namespace
         self.statuses = {} if statuses is None else statuses
-        self.targets = targets_of(setup)
+        self.targets = traces.targets_of(setup)
         self.bodies = {target.body for target in self.targets}
         count = len(self.targets)
         self._received_s = np.full(count, -np.inf)
         self._pose = np.full((count, POSE), np.nan)
         self._covariance = np.full((count, 3, 3), np.nan)
-        self._optical = {body: OpticalTrace() for body in self.bodies}
-        self._recent: list[tuple[int, float, Array]] = []
+        self._optical = {body: traces.OpticalTrace() for body in self.bodies}
+        self._recent = [traces.PoseTrace(target) for target in self.targets]
         self._came = np.zeros(count)
         self._latency_s: list[float] = []
         self._since_s = time.monotonic()
@@ -96,8 +90,9 @@ class LiveView:
         self._covariance[number] = values[POSE:].reshape(6, 6)[:3, :3]
         self._received_s[number] = time.monotonic()
         if sent_ns:
-            self._latency_s.append(latency_of(1e-9 * sent_ns, stamp_s))
-        self._recent.append((number, stamp_s, values[:3]))
+            self._latency_s.append(traces.latency_of(1e-9 * sent_ns, stamp_s))
+        self._recent[number].stamp_s.append(stamp_s)
+        self._recent[number].position.append(tuple(values[:3]))
 
     def take_optical(self, body: str, received: Iterable[tuple[bytes, Mapping[str, int]]]) -> None:
         """Take a body's optical poses."""
@@ -170,25 +165,14 @@ class LiveView:
 
     def _errors(self) -> Array:
         """Root mean square distance of the last poses from the optical ones, m."""
-        squares, counts = np.zeros(len(self.targets)), np.zeros(len(self.targets))
-        recent, self._recent = self._recent, []
-        for body, trace in self._optical.items():
-            here = [item for item in recent if self.targets[item[0]].body == body]
-            optical = trace.track()
-            if not here or optical is None:
-                continue
-            numbers = np.array([item[0] for item in here])
-            place, turn, _ = optical.at(
-                np.array([item[1] for item in here]), LONGEST_OPTICAL_GAP_S
-            )
-            offset = np.array([self.targets[n].position_m for n in numbers])
-            truth = place + np.einsum('nij,nj->ni', turn, offset)
-            away = np.linalg.norm(np.array([item[2] for item in here]) - truth, axis=1)
-            good = np.isfinite(away)
-            np.add.at(squares, numbers[good], away[good] ** 2)
-            np.add.at(counts, numbers[good], 1)
-        return np.sqrt(np.divide(squares, counts, out=np.full_like(squares, np.nan),
-                                 where=counts > 0))  # fmt: skip
+        optical = {body: trace.track() for body, trace in self._optical.items()}
+        found = np.full(len(self.targets), np.nan)
+        for number, recent in enumerate(self._recent):
+            track = optical[recent.target.body]
+            if track is not None:
+                found[number] = traces.middle(recent.distances(track)[0], _rms)
+        self._recent = [traces.PoseTrace(target) for target in self.targets]
+        return found
 
     def figures(self, since_s: float = -math.inf) -> dict[str, float | None]:
         """Return how well it went lately, not before a time (of ``time.time``), over all coils.
@@ -202,9 +186,9 @@ class LiveView:
         columns = zip(*points, strict=True) if points else ((),) * 3
         error, residual, tracked = (np.array(values)[..., :coils] for values in columns)
         return {
-            'tracked_percent': known(100.0 * middle(tracked, np.mean)),
-            'error_mm': known(1e3 * middle(error, _rms)),
-            'residual_pt': known(1e12 * middle(residual, _rms)),
+            'tracked_percent': known(100.0 * traces.middle(tracked, np.mean)),
+            'error_mm': known(1e3 * traces.middle(error, _rms)),
+            'residual_pt': known(1e12 * traces.middle(residual, _rms)),
         }
 
 

@@ -20,9 +20,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.cli import missing
 from anser_ros.cli.demo import FROZEN_TRACKER, PATIENCE_S, in_namespace, simulated_unit
 from anser_ros.cli.demo import node_command as node
+from anser_ros.cli.main import check_packages
 from anser_ros.cli.output import add_json, add_out, make_new_folder, say_written, write_files
 from anser_ros.cli.processes import LAST_DOMAIN, Supervisor, own_domain, tail
 from anser_ros.cli.warm_up import compile_kernels
@@ -372,7 +372,7 @@ def run(args: argparse.Namespace) -> int:
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
     _check_arguments(args, seed)
-    missing.check('recorder')
+    check_packages('recorder')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     # A ROS system that runs already must neither receive nor be received by what is simulated
     # here.

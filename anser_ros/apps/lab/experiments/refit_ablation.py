@@ -214,7 +214,7 @@ def plot(rows: Sequence[AblationRow], path: Path, titles: Mapping[str, str] | No
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-    from anser_ros.pictures import legend_below, save
+    from anser_ros.cli.page import legend_below, save
 
     sessions = list(dict.fromkeys(row.session for row in rows))
     figure = Figure(figsize=(4.2 * len(sessions), 3.9), layout='constrained')

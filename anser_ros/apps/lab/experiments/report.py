@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from anser_ros.apps.lab.experiments import recordings
 from anser_ros.apps.lab.experiments.recordings import HEAD_DISTANCES_CM, MATERIALS, checkerboard
 from anser_ros.apps.lab.experiments.study import SensorErrors, Study
+from anser_ros.cli.page import legend_below, save
 from anser_ros.field.model import FieldModel
-from anser_ros.pictures import legend_below, save
 from anser_ros.sessions.session import Session
 
 Array = NDArray[np.float64]

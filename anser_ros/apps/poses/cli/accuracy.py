@@ -50,10 +50,18 @@ from anser_ros.cli.output import (
     terminal_table,
     write_files,
 )
-from anser_ros.cli.page import heading, page, paragraph, picture, table, top
+from anser_ros.cli.page import (
+    heading,
+    legend_below,
+    legend_beside,
+    page,
+    paragraph,
+    picture,
+    table,
+    top,
+)
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pictures import legend_below, legend_beside
 from anser_ros.wire.text_files import numbers_of, read_rows
 
 SEED = 1

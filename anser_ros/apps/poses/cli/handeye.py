@@ -29,10 +29,9 @@ from anser_ros.cli.output import (
     terminal_table,
     write_files,
 )
-from anser_ros.cli.page import heading, listed, page, paragraph, picture, table, top
+from anser_ros.cli.page import heading, legend_beside, listed, page, paragraph, picture, table, top
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pictures import legend_beside
 
 SCHEMA = 'anser_handeye/1'
 Array = NDArray[np.float64]

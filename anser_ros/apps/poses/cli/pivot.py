@@ -21,9 +21,8 @@ from anser_ros.cli.output import (
     terminal_table,
     write_files,
 )
-from anser_ros.cli.page import page, picture, table, top
+from anser_ros.cli.page import legend_beside, page, picture, table, top
 from anser_ros.errors import FitError, ParameterError, SetupError
-from anser_ros.pictures import legend_beside
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.setup_values import SCHEMA, UPPER, TipSpec, dump_tips, with_tips
 from anser_ros.wire.text_files import read_text

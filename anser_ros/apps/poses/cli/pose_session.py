@@ -40,15 +40,16 @@ from anser_ros.cli.page import (
     Html,
     details,
     heading,
+    legend_below,
     page,
     paragraph,
     picture,
+    spell_out,
     table,
     top,
 )
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pictures import legend_below, spell_out
 from anser_ros.sessions.tracked_session import error_statistics
 
 UNSHOWN = ('centre_m', 'size_m', 'lowest', 'middle_s', 'degree', 'strain')

@@ -11,7 +11,7 @@ import numpy as np
 
 from anser_ros.apps.poses.assessment.source import AssessedPoses, PoseSource
 from anser_ros.apps.poses.sequence import PoseSession, sequence_of
-from anser_ros.cli import missing
+from anser_ros.cli.main import check_packages
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.sessions.plausibility import check_positions
 from anser_ros.wire.setup_values import read_tips
@@ -68,7 +68,7 @@ def live_poses(
     """
     if not 0.0 < seconds <= LONGEST_LOOK_S:
         raise ParameterError(f'--seconds must be in (0, {LONGEST_LOOK_S:g}], got {seconds:g}')
-    missing.check('tracker')
+    check_packages('tracker')
     code = f'from anser_ros.apps.poses.nodes.pose_look import main; main({topic!r}, {seconds!r})'
     rows: list[list[float]] = []
     with subprocess.Popen(

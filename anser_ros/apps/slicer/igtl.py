@@ -6,7 +6,7 @@ is what the oldest clients read; version 2 adds metadata.
 
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,8 +47,7 @@ def _crc_table() -> tuple[int, ...]:
 _TABLE = _crc_table()
 
 
-@dataclass(frozen=True)
-class Header:
+class Header(NamedTuple):
     """Holds what stands before a message: version, type, device, and the length of its body."""
 
     version: int
@@ -57,8 +56,7 @@ class Header:
     body_bytes: int
 
 
-@dataclass(frozen=True)
-class Tracked:
+class Tracked(NamedTuple):
     """Holds one instrument of TDATA: name, position, m, and quaternion x y z w."""
 
     name: str
@@ -161,9 +159,7 @@ def transform(
 ) -> bytes:
     """Pack a pose, shape (3,), m, and (4,), x y z w, that may be used: TransformStatus is OK."""
     metadata = {TRANSFORM_STATUS: 'OK'} if version > 1 else None
-    return message(
-        'TRANSFORM', device, stamp_s, _matrix(position_m, quaternion_xyzw), metadata
-    )  # fmt: skip
+    return message('TRANSFORM', device, stamp_s, _matrix(position_m, quaternion_xyzw), metadata)
 
 
 def string(device: str, stamp_s: float, text: str) -> bytes:

@@ -21,6 +21,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import String
 
+from anser_ros.apps.slicer import igtl
+from anser_ros.apps.slicer.extension import OPENIGTLINK
 from anser_ros.errors import AnserError, ParameterError, PortError
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
@@ -28,10 +30,8 @@ from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import STALE_AFTER_S, parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.pose_states import OK, STALE
-from anser_ros.wire import igtl
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 from anser_ros.wire.setup_values import tip_name
-from anser_ros.wire.tcp_ports import OPENIGTLINK
 
 # A client that takes nothing for so long is dropped.
 SEND_TIMEOUT_S = 2.0
@@ -437,7 +437,7 @@ def check_templates(table: OpenIGTLinkParameters) -> None:
 def devices_of(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
     """Return the device of each body, of its tip and, where they are wanted, of each coil.
 
-    Raises `ParameterError` as `anser_ros.wire.igtl.device_names`.
+    Raises `ParameterError` as `anser_ros.apps.slicer.igtl.device_names`.
     """
     named = {}
     for coil in setup.tool_sensors if table.coils else ():

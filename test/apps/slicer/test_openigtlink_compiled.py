@@ -6,10 +6,9 @@ import threading
 from pathlib import Path
 
 import pytest
-from conftest import REPO
 
-from anser_ros.nodes.openigtlink import IgtlServer
-from anser_ros.wire import igtl
+from anser_ros.apps.slicer import igtl
+from anser_ros.apps.slicer.nodes.openigtlink import IgtlServer
 
 HEADERS = Path('/usr/include/openigtlink')
 HALF = 0.5**0.5
@@ -22,7 +21,7 @@ def client(tmp_path_factory):
     if compiler is None or not HEADERS.is_dir():
         pytest.skip('no g++ or no headers (apt install g++ libopenigtlink-dev)')
     path = tmp_path_factory.mktemp('igtl') / 'client'
-    source = REPO / 'test' / 'igtl' / 'client.cpp'
+    source = Path(__file__).with_name('client.cpp')
     command = [compiler, '-w', f'-I{HEADERS}', str(source), '-o', str(path), '-lOpenIGTLink']
     done = subprocess.run([*command, '-lpthread'], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -5,6 +5,7 @@ import re
 import socket
 import struct
 import time
+from pathlib import Path
 
 import numpy as np
 import pyigtl
@@ -16,8 +17,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
-from anser_ros.errors import ParameterError, PortError
-from anser_ros.nodes.openigtlink import (
+from anser_ros.apps.slicer import igtl
+from anser_ros.apps.slicer.nodes.openigtlink import (
     MOST_CLIENTS,
     IgtlServer,
     OpenIGTLink,
@@ -25,8 +26,9 @@ from anser_ros.nodes.openigtlink import (
     check_templates,
     devices_of,
 )
-from anser_ros.wire import igtl
+from anser_ros.errors import ParameterError, PortError
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.setup_values import TipSpec
 
 pytestmark = pytest.mark.light
 
@@ -298,6 +300,10 @@ def take(client):
     return header.kind, header.device, body
 
 
+def test_it_listens_to_this_host_only():
+    assert OpenIGTLinkParameters.host == '127.0.0.1'
+
+
 class TestNames:
     def named(self, text=SETUP, **values):
         return devices_of(parse_setup(text), OpenIGTLinkParameters(**values))
@@ -309,6 +315,11 @@ class TestNames:
         }
         with pytest.raises(ParameterError, match=r'body_name may have \{body\}'):
             check_templates(OpenIGTLinkParameters(body_name='{tool}'))
+
+    def test_the_tip_of_a_stylus_is_a_body(self):
+        setup = parse_setup(SETUP).with_tips({'tool_a': TipSpec((0.01, -0.02, -0.15), (0.0,) * 6)})
+        table = OpenIGTLinkParameters(coils=False)
+        assert set(devices_of(setup, table)) == {'tool_a', 'tool_a/tip'}
 
     def test_two_devices_of_one_name_are_refused(self):
         with pytest.raises(ParameterError, match="both become the device 'pen'"):
@@ -336,3 +347,26 @@ def test_the_bytes_are_those_of_the_protocol():
         assert ours == other.pack()
     text = pyigtl.StringMessage('stale', timestamp=1.0, device_name='pen/state')
     assert igtl.string('pen/state', 1.0, 'stale') == text.pack()
+
+
+def heard(client, server):
+    """What a client gets of a server that says the same again and again."""
+    for _ in range(100):
+        server.send(b'pose')
+        try:
+            return client.recv(4)
+        except TimeoutError:
+            continue
+    return b''
+
+
+def test_whatever_a_client_says():
+    server = IgtlServer('127.0.0.1', 0, answer)
+    try:
+        for path in sorted(Path(__file__).with_name('corpus').iterdir()):
+            with socket.create_connection(('127.0.0.1', server.port), timeout=60.0) as client:
+                client.sendall(path.read_bytes())
+                client.settimeout(0.05)
+                assert heard(client, server) == b'pose', path
+    finally:
+        server.close()
