@@ -78,9 +78,3 @@ def test_whitening_frame_by_frame_is_the_product_of_its_matrices():
     plain = plain - white.basis @ (white.inner @ (white.basis.transpose(0, 2, 1) @ plain))
     np.testing.assert_allclose(white(values), plain, rtol=1e-12)
     np.testing.assert_allclose(white(values[..., 0]), plain[..., 0], rtol=1e-12)
-
-
-def test_no_dipoles_make_no_field():
-    none = np.zeros((0, 3))
-    field = dipole_field(np.ones((5, 3)), none, none, np.zeros((0, 4), dtype=complex))
-    np.testing.assert_array_equal(field, np.zeros((5, 3, 4)))

@@ -101,14 +101,6 @@ def test_a_port_speaks_another_protocol(wire, port):
     assert wire.read() == f'go {tag}\n'.encode()
 
 
-def test_a_unit_without_the_command_is_not_asked_for_other_tones():
-    assert PROTOCOLS['anser'].sets_tones and not TOY.sets_tones
-    control = StreamControl((7000.0,), set_frequencies=TOY.sets_tones)
-    control.take(Record(HELLO), 1_000_000_000)
-    assert control.due(1_100_000_000) is None
-    assert 'but the setup requires 7000 Hz' in control.refusal
-
-
 def test_a_reader_that_fails_closes_the_port_and_it_is_opened_again(wire, port, monkeypatch):
     wire.write(line('done', 'a verb that no command has', 1))
     assert wait(lambda: port.counters.reader_failures == 1)

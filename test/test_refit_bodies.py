@@ -1,14 +1,11 @@
 """Compact bodies as hypotheses: found where they are, by an evidence that is the dense one."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from refit_world import anser_world, metal_block, metal_flux, volume_points
 from scipy.stats import multivariate_normal
 
 from anser_ros.physics.dipole import flux_basis
-from anser_ros.refit import hypotheses as slots_module
 from anser_ros.refit.clouds import BODY_RADIUS, Region, bodies
 from anser_ros.refit.tables import REMAINDER, BodySearch, body_factor
 
@@ -106,22 +103,3 @@ def test_slots_follow_metal_that_moves_and_are_emptied_by_a_reset(refit):
     # The same readings give the same model again, whatever was seen before.
     once, again = follow(refit, BESIDE), follow(refit, BESIDE)
     np.testing.assert_array_equal(once.model.moments, again.model.moments)
-
-
-@pytest.mark.long
-def test_a_body_that_comes_again_is_not_worked_out_again(refit, monkeypatch):
-    """The last ones are kept, and there are no more of them than are said to be."""
-    follow(refit, BESIDE)
-    bank, slots = refit._bank()
-    monkeypatch.setattr(slots_module, 'MOST_BODIES', 2)
-    monkeypatch.setattr(slots, '_known', {})
-    asked = []
-    tables = SimpleNamespace(body_prior=asked.append)
-    monkeypatch.setattr(slots, '_tables', tables)
-    monkeypatch.setattr(bank, 'eigenbasis', lambda prior: object())
-    first = slots._eigenbasis(5)
-    slots._eigenbasis(7)
-    assert slots._eigenbasis(5) is first
-    slots._eigenbasis(9)  # takes the place of 7, which was asked for longest ago
-    assert slots._eigenbasis(5) is first and set(slots._known) == {5, 9}
-    assert asked == [5, 7, 9]

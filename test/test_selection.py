@@ -16,7 +16,6 @@ from anser_ros.calibration.layout_fit import (
     LayoutPlacer,
     Regions,
     ScaledNominal,
-    emitter_gains,
 )
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.readings import FOLDS, fold_of_frames
@@ -77,15 +76,6 @@ def test_a_fold_holds_whole_cells_and_every_frame(rng):
         assert len(set(both[key == value])) == 1
 
 
-def test_neighbouring_cells_are_of_other_folds():
-    line = np.linspace(0, 1, 25)
-    x, y = np.meshgrid(line, line)
-    fold = fold_of_frames([np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)])[0]
-    lattice = fold.reshape(25, 25)[2::5, 2::5]
-    assert (lattice[1:] != lattice[:-1]).all()
-    assert (lattice[:, 1:] != lattice[:, :-1]).all()
-
-
 def test_frames_at_one_place_can_not_be_held_out():
     with pytest.raises(FitError, match='got 1: all frames are at one place'):
         fold_of_frames([np.zeros((30, 3))])
@@ -121,11 +111,6 @@ def test_the_drawn_board_is_expressed_by_any_layer(world):
     assert rms(model.flux(points, axes) - truth) < 3e-3 * rms(truth)
 
 
-def test_gains_of_the_drawn_board_are_found(world):
-    gains = emitter_gains(drawn(world, 0.5 + 0.1j), [world.measurements])
-    assert np.allclose(gains * (0.5 + 0.1j), 1.0, atol=2e-3)
-
-
 def test_the_choice_is_neither_too_coarse_nor_undamped(world):
     thin = thin_frames([world.measurements])
     folds = fold_of_frames([m.position for m in thin])
@@ -151,13 +136,6 @@ def test_selection_finds_a_prior_and_is_deterministic(world, monkeypatch):
     assert len(runs[0].candidates) > 10
 
 
-def test_thinning_is_even_and_bounded(world, monkeypatch):
-    monkeypatch.setattr(selection, 'MOST_ROWS', 200)
-    thin = thin_frames([world.measurements, world.measurements])
-    assert sum(m.flux.shape[0] * m.flux.shape[1] for m in thin) <= 212
-    assert (np.diff(thin[0].time) == thin[0].time[1]).all()
-
-
 @pytest.fixture(scope='module')
 def calibrated(world):
     return calibrate(world, world.measurements, nominal=drawn(world, 1.02))
@@ -172,11 +150,6 @@ def test_calibration_reaches_the_noise_and_says_so(world, calibrated):
     points, axes = inside()
     true_error = rms(calibrated.model.flux(points, axes) - world.flux(points, axes))
     assert true_error < 1e-3 * rms(world.flux(points, axes))
-
-
-@pytest.mark.long
-def test_held_out_error_is_no_smaller_than_the_fit(calibrated):
-    assert rms(calibrated.held_out.error) > calibrated.residuals.rmse_t
 
 
 @pytest.mark.parametrize(
@@ -219,13 +192,6 @@ def test_two_boards_are_told_apart(world):
     other = scene(np.random.default_rng(4), side=9)
     with pytest.raises(FitError, match='different boards'):
         calibrate(world, world.measurements, other.measurements, options=LAYER)
-
-
-def test_two_sessions_of_one_board_agree(world):
-    halves = [world.measurements.frames(np.arange(start, 81, 2)) for start in (0, 1)]
-    found = calibrate(world, *halves, options=LAYER)
-    assert found.n_measurements == 81 * 6
-    assert found.model.provenance['sessions'] == ['one', 'two']
 
 
 @pytest.mark.long

@@ -11,7 +11,6 @@ import yaml
 from refit_world import anser_world
 from test_setup import document
 
-from anser_ros.calibration.moments import pose_precision
 from anser_ros.cli import calibrate, diagnose, evaluate
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.field_model import FieldModelParameters
@@ -231,11 +230,6 @@ class TestEffect:
             if name.startswith('optical'):
                 assert (spread.accuracy.pose_jitter > 1.2 * usual.accuracy.pose_jitter).any()
         assert usual.reference_change == 0.01
-
-    def test_the_calibration(self):
-        usual = pose_precision(Accuracy())
-        wide = pose_precision(Accuracy(optical_position_m=0.7e-3, optical_rotation_rad=4e-3))
-        np.testing.assert_allclose(usual / wide, 100.0)
 
 
 class TestCommands:
