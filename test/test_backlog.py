@@ -59,3 +59,10 @@ def test_what_is_said_has_the_share_and_the_load(monkeypatch):
     assert too_slow(20, 30) == said
     assert too_slow(1, 300).startswith('computer too slow: less than 1 % of')
     assert too_slow(0, 50) == ''
+
+
+def test_one_slow_frame_says_nothing():
+    one = backlog(0.02, 0.002)
+    one.worked(2.0)
+    assert not one.is_hopeless(0.3)
+    assert not Backlog().is_hopeless(5.0)

@@ -1,6 +1,5 @@
 """`anser diagnose` on simulated bags: a clean one passes, a wrong gain is named and mended."""
 
-import itertools
 import json
 import re
 from pathlib import Path
@@ -27,14 +26,13 @@ HELD_OUT = {
 }  # fmt: skip
 
 
-def rewritten(name: str, path: Path, gain: float = 1.0, step: int = 1) -> Path:
-    """A shipped session: every so many frames, and one channel's readings too small."""
+def rewritten(name: str, path: Path, gain: float) -> Path:
+    """A shipped session with one channel's readings too small."""
     bag = read_bag(BAGS / f'{name}.mcap')
     with SessionWriter(path) as writer:
         writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
         gains = np.where(bag.tool.channel == CHANNEL, gain, 1.0)[:, None]
-        frames = zip(bag.tool.stamp_ns.tolist(), bag.tool.flux, strict=True)
-        for stamp, flux in itertools.islice(frames, 0, None, step):
+        for stamp, flux in zip(bag.tool.stamp_ns.tolist(), bag.tool.flux, strict=True):
             writer.write_readings(bag.setup.tool_sensors, stamp, flux * gains)
         for body, track in bag.optical.items():
             for stamp, position, quaternion in zip(
@@ -78,14 +76,6 @@ def test_a_wrong_gain_is_named_and_the_model_corrects_it(tmp_path):
     assert 'http' not in page.replace('http-equiv', '')
     again = run(bag, tmp_path / 'again', tmp_path / 'out' / 'model.yaml')
     assert again['effects'] == [], 'the corrected model leaves nothing to find'
-
-
-@pytest.mark.long
-@pytest.mark.parametrize('name', sorted(path.stem for path in BAGS.glob('*.mcap')))
-def test_what_is_said_of_any_shipped_session_is_short(name, tmp_path, capsys):
-    run(rewritten(name, tmp_path / 'thinned.mcap', step=5), tmp_path / 'out')
-    said = [line for line in capsys.readouterr().out.split('\n') if 'residual on' in line]
-    assert len(said) == 1 and 100 < len(said[0]) < MOST_CHARACTERS
 
 
 def test_the_session_needs_poses(tmp_path, capsys):

@@ -18,7 +18,7 @@ from anser_ros.sessions.baseline import baseline_flux
 from anser_ros.sessions.evaluation_files import to_document
 from anser_ros.sessions.follower import RefitSummary, parse_references, with_references
 from anser_ros.sessions.session import load_session
-from anser_ros.sessions.starting_model import load_model, model_for
+from anser_ros.sessions.starting_model import load_model
 from anser_ros.sessions.tracked_session import Evaluation, track_session
 from anser_ros.tracking.estimate import TrackerSettings
 
@@ -73,16 +73,6 @@ def test_without_a_gate_no_pose_is_withheld_for_what_the_model_lacks(model):
         assert {e.state for e in series.estimates} <= {'ok', 'outside_volume'}
         assert series.ok.mean() > 0.9
         assert np.nanmax(series.position_error) > 1e-3
-
-
-def test_without_a_gate_a_drawn_board_has_its_figures_in_the_lab(shared):
-    bag = shared / 'sessions' / 'paper' / 'collimator_midplane_tool_b.mcap'
-    session = load_session(bag)
-    settings = TrackerSettings(gate=math.inf)
-    evaluation = track_session(session, model_for('nominal', session), settings)
-    for series in (*evaluation.sensors.values(), *evaluation.bodies.values()):
-        assert series.ok.all()
-        assert 5e-3 < np.sqrt(np.nanmean(series.position_error**2)) < 50e-3
 
 
 @pytest.mark.long

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anser_ros.diagnosis.problem import Whitener
-from anser_ros.parallel import cores, in_order, shared_among, slices
+from anser_ros.parallel import in_order, shared_among
 from anser_ros.physics.dipole import dipole_field, flux_jacobian
 
 
@@ -39,16 +39,6 @@ def test_an_error_of_a_piece_is_the_caller_s_and_the_number_is_as_before():
         in_order(lambda piece: 1 / piece, [1, 0, 2])
     names = in_order(lambda _: threading.current_thread().name, range(3))
     assert set(names) == {threading.current_thread().name}
-
-
-def test_slices_are_all_rows_once():
-    assert [list(range(10))[part] for part in slices(10, 4)] == [
-        [0, 1, 2, 3],
-        [4, 5, 6, 7],
-        [8, 9],
-    ]
-    assert slices(0, 4) == []
-    assert cores() >= 1
 
 
 def test_fields_and_whitened_values_are_the_same_bit_by_bit_for_any_number_of_threads():

@@ -100,17 +100,6 @@ def test_no_baseline_is_taken_while_metal_moves():
         check_steady(window_of(world, lambda share: share * metal).frames)
 
 
-def test_the_order_of_channels_does_not_matter_and_strange_ones_are_passed_over(refit):
-    world, rng = anser_world(), np.random.default_rng(4)
-    flux = world.baseline + world.metal(HEAD) + world.noise(rng)
-    first = refit.update(STEP_NS, world.references.channel, flux)
-    refit.reset()
-    order = rng.permutation(len(flux))
-    channels = np.concatenate([[7], world.references.channel[order]])
-    second = refit.update(STEP_NS, channels, np.concatenate([flux[:1], flux[order]]))
-    np.testing.assert_allclose(first.model.moments, second.model.moments, rtol=1e-12)
-
-
 @pytest.mark.long
 def test_any_number_of_emitters():
     world = three_coil_world()
@@ -148,10 +137,11 @@ def test_a_drawing_of_another_board_is_not_believed(refit):
     def shuffled(points):
         return world.board.field(points)[:, ::-1]
 
-    other_way = LiveRefit(world.model, world.references, world.baseline, drawing=shuffled)
+    few = anser_world(8)
+    other_way = LiveRefit(few.model, few.references, few.baseline, drawing=shuffled)
     assert other_way._tables.excitation.source == 'model'
-    result = run(other_way, world, world.metal(HEAD))
-    assert share_left(world, result.model, HEAD) < 0.3
+    result = run(other_way, few, few.metal(HEAD))
+    assert share_left(few, result.model, HEAD) < 0.3
     with pytest.raises(FitError, match='the drawing makes fields'):
         LiveRefit(world.model, world.references, world.baseline, drawing=other.board.field)
 

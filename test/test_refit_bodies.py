@@ -17,11 +17,11 @@ STRONG = -6000.0 + 800.0j
 
 @pytest.fixture(scope='module')
 def refit():
-    return anser_world(24).refit()
+    return anser_world().refit()
 
 
 def follow(refit, points, frames=6, seed=1):
-    world, rng = anser_world(24), np.random.default_rng(seed)
+    world, rng = anser_world(), np.random.default_rng(seed)
     change = metal_flux(
         world.board, points, world.references.position, world.references.axis, STRONG
     )
@@ -73,7 +73,7 @@ def test_approximate_evidence_is_that_of_its_own_normal_distribution():
 
 @pytest.mark.long
 def test_metal_beside_the_volume_is_found_corrected_and_honest(refit):
-    world, result = anser_world(24), follow(refit, BESIDE)
+    world, result = anser_world(), follow(refit, BESIDE)
     best = max(result.weights, key=result.weights.get)
     assert best.startswith('body')
     assert np.linalg.norm(result.metal.centroid - BESIDE.mean(axis=0)) < 0.04
@@ -96,9 +96,9 @@ def test_slots_follow_metal_that_moves_and_are_emptied_by_a_reset(refit):
     )
     assert len(before) == len(after) == 3 and not before & after
     refit.reset()
-    flux = anser_world(24).baseline
-    result = refit.update(1, anser_world(24).references.channel, flux)
-    assert result.model is anser_world(24).model
+    flux = anser_world().baseline
+    result = refit.update(1, anser_world().references.channel, flux)
+    assert result.model is anser_world().model
     assert not any('body' in name for name in result.weights)
     # The same readings give the same model again, whatever was seen before.
     once, again = follow(refit, BESIDE), follow(refit, BESIDE)

@@ -134,15 +134,6 @@ def test_too_few_references_mean_the_calibrated_model_and_say_so(refit):
     assert result.left_out == world.references.name[3:]
 
 
-def test_a_frame_with_lost_samples_leaves_no_trace(refit):
-    world = anser_world()
-    flags = np.full(len(world.baseline), 4)
-    before = run(refit, world, world.metal(HEAD))
-    assert run(refit, world, world.metal(HEAD), 1, 5, 10, flags=flags).state == 'few_references'
-    after = run(refit, world, world.metal(HEAD), 1, 6, 11)
-    assert (after.state, after.left_out) == (before.state, ())
-
-
 @pytest.mark.long
 def test_a_reference_without_a_baseline_takes_no_part():
     world = anser_world()

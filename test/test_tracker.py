@@ -154,6 +154,18 @@ def test_a_dead_emitter_is_named_and_the_others_go_on(rng, silence):
     assert 'coil0, coil2, coil5; 5 emitters are left, 6 needed' in found['tool_a'].reason
 
 
+def test_a_cold_start_and_a_model_swap_with_a_dead_emitter(rng):
+    tracker = Tracker(MODEL, TOOL)
+    for i in range(5):
+        position, rotation = random_pose(rng)
+        flux = fluxes(MODEL, TOOL, position, rotation, rng)
+        flux[:, 3] = 0.0
+        found = one_frame(tracker, flux, (i + 1) * 10**10)
+        assert np.linalg.norm(found['tool_a'].position - position) < 5e-4
+        tracker = tracker.with_model(replace(MODEL, moments=MODEL.moments * (1 + 1e-9 * i)))
+    assert tracker.counters['cold_starts'] == 45
+
+
 @pytest.mark.filterwarnings('error')
 def test_what_is_not_used_is_counted_by_its_kind(rng):
     tracker = Tracker(MODEL, TOOL)
