@@ -376,3 +376,18 @@ def shared_tables() -> Iterator[None]:
 
     with tables_made_once():
         yield
+
+
+@pytest.fixture(scope='module')
+def module_refit(shared_tables: None) -> Any:
+    """Return a refit of the module, whose geometry is worked out once."""
+    from refit_world import anser_world
+
+    return anser_world().refit()
+
+
+@pytest.fixture
+def refit(module_refit: Any) -> Any:
+    """Return the module's refit, which has seen nothing."""
+    module_refit.reset()
+    return module_refit

@@ -9,8 +9,7 @@ from tracking_world import certain_model
 
 from anser_ros.integrity.model_age import ModelAge
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.pose_states import OF_MODEL, REFERENCES_DOUBTFUL, REFERENCES_LOST, Withheld, code_of
-from anser_ros.pose_states import state_of as state_of_code
+from anser_ros.pose_states import REFERENCES_LOST, Withheld
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.sessions.tracked_session import track_session
@@ -79,12 +78,6 @@ def test_the_same_answer_again_replaces_the_first():
     age.answered(1, model_with_metal(0.0))
     age.answered(1, again := model_with_metal(0.1))
     assert age.at(1).model is again is age.at(2).model
-
-
-def test_states_and_codes():
-    assert [state_of_code(code_of(state)) for state in ('', *OF_MODEL)] == ['', *OF_MODEL]
-    assert state_of_code(999) == OF_MODEL[-1]
-    assert code_of(REFERENCES_DOUBTFUL) != code_of(REFERENCES_LOST)
 
 
 @pytest.mark.long

@@ -30,41 +30,27 @@ class Log:
         self.queue.add_frame(FIRST_NS + n * STEP_NS, n, now_s, WAIT_S)
 
 
-def test_every_frame_gets_the_model_of_its_own_instant():
-    log = Log()
-    log.queue.add_model(5, 'base', 0.0)
-    for n in range(4):  # the tool's frame comes first
-        log.frame(n)
-        assert log.queue.waiting and len(log.tracked) == n
-        log.say(n)
-    for n in range(4, 8):  # the references' frame comes first
-        log.say(n)
-        log.frame(n)
-    assert log.tracked == [(n, n) for n in range(8)]
+ORDERS = {
+    'tools first': [0, 'm0', 1, 'm1', 2, 'm2', 3, 'm3'],
+    'references first': ['m0', 0, 'm1', 1, 'm2', 2, 'm3', 3],
+    'a tracker that has fallen behind': ['m0', 0, 'm1', 'm2', 'm3', 1, 2, 3],
+    'frames in a burst': ['m0', 0, 1, 2, 3, 'm1', 'm2', 'm3'],
+}
+
+
+@pytest.mark.parametrize('order', ORDERS.values(), ids=ORDERS)
+def test_every_frame_gets_the_model_of_its_own_instant(order):
+    log, frames, models = Log(), set(), set()
+    for event in order:
+        if isinstance(event, int):
+            log.frame(event)
+            frames.add(event)
+        else:
+            log.say(int(event[1:]))
+            models.add(int(event[1:]))
+        assert log.tracked == [(n, n) for n in sorted(frames & models)]
+        assert bool(log.queue.waiting) == bool(frames - models)
     assert log.queue.late == 0
-
-
-def test_models_of_later_instants_wait():
-    """A tracker that has fallen behind takes no model from the future."""
-    log = Log()
-    log.say(0)
-    log.frame(0)
-    for n in (1, 2, 3):
-        log.say(n)
-    for n in (1, 2, 3):
-        log.frame(n)
-    assert log.tracked == [(0, 0), (1, 1), (2, 2), (3, 3)]
-
-
-def test_frames_in_a_burst_wait_side_by_side():
-    log = Log()
-    log.say(0)
-    for n in range(5):
-        log.frame(n)
-    assert log.tracked == [(0, 0)]
-    for n in range(1, 5):
-        log.say(n)
-    assert log.tracked == [(n, n) for n in range(5)]
 
 
 def test_no_answer_delays_a_few_frames_and_then_none():

@@ -10,6 +10,7 @@ from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.recorded import unit_quaternions
 
 START = 1_700_000_000_000_000_000
 STEP = 40_000_000
@@ -187,3 +188,16 @@ def test_a_chunk_that_declares_too_much_is_never_unpacked(whole, tmp_path, monke
     with pytest.raises(BagError, match='no message can be read'):
         list(iter_messages(whole, salvage))
     assert salvage.lost
+
+
+def test_rounded_ones_are_brought_to_unit_length():
+    true = np.random.default_rng(1).normal(size=(200, 4))
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    mended = unit_quaternions(np.round(true, 2))
+    np.testing.assert_allclose(np.linalg.norm(mended, axis=1), 1.0, rtol=1e-12)
+    assert np.abs(mended - true).max() < 0.011
+
+
+def test_other_numbers_are_none():
+    given = [[0.0, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0], [10.0, 20.0, 30.0, 0.0]]
+    assert np.isnan(unit_quaternions(given)).all()

@@ -6,15 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refit_world import anser_world, metal_block, three_coil_world
+from tracking_world import triaxial_tool
 
 from anser_ros.errors import BagError, FitError
 from anser_ros.field.model import ReferenceReadings
+from anser_ros.frames.intake import Intake
 from anser_ros.integrity.clean_references import (
     change_without_gains,
     check_as_calibrated,
     check_as_drawn,
     check_steady,
 )
+from anser_ros.refit.frame import ReadingWindow
 from anser_ros.sessions.baseline import baseline_flux, check_clean, clean_flux, readings_of
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
@@ -105,3 +108,39 @@ def test_a_recording_with_metal_is_no_baseline():
     near = np.where(np.arange(8) < 4, 1.0, 1.0 + 0.02 * sensors.axis[:, :1]) * flux
     with pytest.raises(FitError, match='those of the calibration'):
         check_clean(kept, sensors, near, SIGMA_T, clean.setup)
+
+
+TOOL = triaxial_tool()
+CHANNELS = TOOL.channel
+STEP_NS = 20_000_000
+
+
+def test_baseline_window():
+    window, intake = ReadingWindow(TOOL, 8, 0.1), Intake(CHANNELS)
+    with pytest.raises(FitError, match='needs 3 frames'):
+        window.mean()
+    flux = 1e-3 * (np.arange(72.0).reshape(9, 8) + 1j)
+    flags = np.zeros(9, int)
+    for i in range(10):
+        noisy = flux + (1e-3 if i % 2 else -1e-3)
+        noisy[0] = np.nan
+        flags[1] = 1 if i < 8 else 0
+        window.add(intake.judge((i + 1) * STEP_NS, CHANNELS[::-1], noisy[::-1], flags[::-1]))
+    assert window.full
+    assert len(window) == 6, 'only the last tenth of a second'
+    mean = window.mean()
+    assert np.isnan(mean[0]).all()
+    assert np.isnan(mean[1]).all(), 'flagged in most frames'
+    np.testing.assert_allclose(mean[2:], flux[2:])
+    window.add(intake.judge(1, CHANNELS, flux, flags))
+    assert len(window) == 1, 'a jump back starts anew'
+    assert not window.full
+    with pytest.raises(FitError, match='8 emitters'):
+        window.add(intake.judge(1, CHANNELS, flux[:, :3], flags))
+    with pytest.raises(FitError, match='positive'):
+        ReadingWindow(TOOL, 8, 0.0)
+    dead = ReadingWindow(TOOL, 8, 1.0)
+    for i in range(4):
+        dead.add(intake.judge(i + 1, CHANNELS, np.full((9, 8), np.nan, complex), flags))
+    with pytest.raises(FitError, match='no reference'):
+        dead.mean()

@@ -1,29 +1,10 @@
-"""The thresholds of the diagnosis stand in one module, and every named number says why it is so.
-
-Every file's syntax tree is walked.
-"""
+"""Every named number says why it is so."""
 
 import ast
 from pathlib import Path
 
 from conftest import REPO
-from source_trees import nodes_of, tree_of
-
-DECISIONS = REPO / 'anser_ros' / 'diagnosis' / 'decisions.py'
-ELSEWHERE = {
-    'EXPLAINED': 'asked by a calibration about its own scan',
-    'NEAR_NOISE': 'the same',
-    'SETTLED': 'ends a fit',
-    'FEWEST_POSED_FRAMES': 'what a diagnosis needs at all',
-    'MARGIN_S': 'frames that take part',
-    'NEW_MODES_M': 'when the shapes of metal are made anew',
-    'LEAST_INFORMATION': 'modes of metal that only take time',
-    'MOST_COLUMNS': 'terms that are refitted with a candidate',
-    'FEWEST_CELL_VALUES': 'cells that have a mean',
-    'LAGS': 'how far back a memory is looked for',
-    'OUTLYING': 'values that are left out of a kurtosis',
-}
-"""Numbers that are compared with something where they stand, and judge no explanation."""
+from source_trees import tree_of
 
 
 def is_number(node: ast.expr) -> bool:
@@ -55,16 +36,3 @@ def test_each_named_number_is_explained():
         for name, (line, words) in numbers(path).items():
             beside = any(' # ' in f' {lines[at]}' for at in (line - 2, line - 1))
             assert words or beside, f'{path}:{line}: state unit, reason and choice of {name}'
-
-
-def test_thresholds_stand_in_one_module():
-    """`docs/diagnosis.md` says so; the exceptions are listed here, each with its reason."""
-    found = set()
-    for path in (REPO / 'anser_ros' / 'diagnosis').glob('*.py'):
-        own = set() if path == DECISIONS else set(numbers(path))
-        compared = [
-            leaf for n in nodes_of(path) if isinstance(n, ast.Compare) for leaf in ast.walk(n)
-        ]
-        used = {leaf.id for leaf in compared if isinstance(leaf, ast.Name)} & own
-        found |= used
-    assert found == set(ELSEWHERE)

@@ -33,14 +33,6 @@ def test_exact_for_the_signal_that_it_models(milliseconds):
     assert fit.noise.max() < 1e-3, 'energies cancel to a thousandth of a code'
 
 
-def test_phase_convention_is_exp_plus_jwt():
-    time_s = (np.arange(801) - 400) / RATE
-    fit = Demodulator(RATE, TONES[:1], 801).demodulate(
-        np.cos(2 * np.pi * 6000 * time_s + 0.3)[:, None]
-    )
-    assert np.angle(fit.phasors[0, 0]) == pytest.approx(0.3, abs=1e-12)
-
-
 @pytest.mark.parametrize(('milliseconds', 'motion'), [(5, False), (20, True), (20, False)])
 def test_stated_noise_is_the_noise(milliseconds, motion):
     samples = round(RATE * milliseconds / 1e3)

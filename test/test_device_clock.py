@@ -153,15 +153,6 @@ class TestFaults:
         line.run(0.01)
         assert line.good[-1] and line.worst_s < 1e-3 and line.clock.jumps == 0
 
-    def test_how_late_a_line_is_can_be_read(self):
-        line = Line().run(5.0)
-        for _ in range(2000):
-            line.sample += BLOCK
-            line.now_s += 1e-3
-            line.clock.observe(line.sample, int(SECOND * (101.2 + line.now_s)))
-        assert line.clock.state is ClockState.LATE and line.clock.wants_answer
-        assert line.clock.lateness_s == pytest.approx(1.2, abs=1e-2)
-
     @pytest.mark.parametrize('lost_s', [0.008, 0.05, 1.2])
     def test_time_that_the_device_lost_is_found_by_an_answer(self, lost_s):
         line = Line().run(5.0)

@@ -146,15 +146,3 @@ def test_the_walk_sees_special_cases_and_nothing_else():
         assert list(special_cases(ast.walk(ast.parse(text)))), text
     text = '"""An outliers\' pickup."""\nisinstance(x, Measurements)\ntype(x) is int\ny = "metal"'
     assert not list(special_cases(ast.walk(ast.parse(text))))
-
-
-def test_the_walk_sees_imports_of_effects():
-    for text in (
-        'from anser_ros.effects.coil_moved import COIL_MOVED',
-        'from anser_ros.effects import coil_moved',
-        'import anser_ros.effects.coil_moved as moved',
-        'def f():\n    from anser_ros.effects.coil_moved import CoilMoved',
-        'from anser_ros.apps.poses.effects.coil_moved import CoilMoved',
-        'from anser_ros.apps.poses.effects import coil_moved',
-    ):
-        assert list(imports_of_effects(ast.walk(ast.parse(text)))) == ['coil_moved'], text

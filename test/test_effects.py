@@ -9,7 +9,7 @@ from effects_scene import candidates, in_force, undrawn
 
 from anser_ros.effects.channels import compressed
 from anser_ros.effects.correction import Correction, reference_view, tool_view
-from anser_ros.effects.effect import Effect, Family, Remedy, Term, all_effects, effect_named
+from anser_ros.effects.effect import Family, Remedy, Term, all_effects, effect_named
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
@@ -204,11 +204,3 @@ def test_compression_keeps_small_signals_and_meets_its_third_order():
     phase = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     wanted = 2 * np.mean(np.tanh(0.3 * np.cos(phase)) * np.cos(phase))
     assert compressed(one, 1.0, 'tanh')[0, 0].real == pytest.approx(wanted, rel=1e-6)
-
-
-def test_the_base_effect_changes_nothing(problem):
-    tool = problem.tools[0]
-    term = Term(Effect())
-    view = tool_view(tool, [term], problem.fields)
-    np.testing.assert_array_equal(view.flux, tool_view(tool, [], problem.fields).flux)
-    assert replace(term, site={'channel': 3}).label == ' (channel 3)'

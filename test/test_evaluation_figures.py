@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from anser_ros.cli import evaluate as figures
+from anser_ros.cli.calibration_figures import population_figure, population_table, populations
+from anser_ros.field.model import EffectRecord
 from anser_ros.pose_states import OK
 from anser_ros.sessions.evaluation_files import to_document
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries
@@ -38,24 +40,6 @@ def evaluation():
     return Evaluation(sensors, {'a': series('a', 3.0, rng)}, 1e-3)
 
 
-def test_errors_and_lost_frames_over_time(evaluation):
-    upper, lower = figures.over_time(evaluation).axes
-    x = upper.lines[0].get_xydata()
-    np.testing.assert_allclose(x[:, 0], 0.02 * np.arange(FRAMES), atol=1e-6)
-    np.testing.assert_allclose(x[:, 1], 1e3 * evaluation.sensors['a/x'].position_error)
-    assert [len(line.get_xdata()) for line in lower.lines] == [0, 2, 0] and not lower.texts
-    plt.close('all')
-
-
-def test_the_place_of_every_pose_has_its_error(evaluation):
-    above = figures.over_space(evaluation).axes[0].collections[0]
-    places, colours = above.get_offsets(), above.get_array()
-    assert len(places) == 2 * FRAMES - 2
-    np.testing.assert_allclose(places[5], [5.0, 0.0], atol=1e-9)
-    assert colours[5] == pytest.approx(1e3 * evaluation.sensors['a/x'].position_error[5])
-    plt.close('all')
-
-
 def test_sigma_that_is_too_small_shows(evaluation):
     """Of half-normal errors 68 % lie within a sigma; of ones three times as large, 26 %."""
     left, right = figures.against_sigma(evaluation).axes
@@ -84,3 +68,46 @@ def test_the_page_holds_all_figures(evaluation, tmp_path):
     blind = PoseSeries('a', evaluation.bodies['a'].estimates, nothing, nothing)
     seen = Evaluation({'a': blind}, {}, 1e-3)
     assert not figures.write_figures(seen, document, tmp_path / 'none', session='', model='')
+
+
+def record(name, values, channels=(0, 1, 2)):
+    sigma = np.full(np.shape(values), 1e-4).tolist()
+    return EffectRecord(
+        name, {'spread': 2e-3, 'channels': list(channels), 'values': values, 'uncertainty': sigma}
+    )
+
+
+GAINS = record('sensor_gain_spread', [[1.002, 0.001], [0.999, 0.0], [1.0, -0.003]])
+PLACES = record('sensor_place_spread', [[1e-4, 0.0, -2e-4], [0.0, 3e-5, 0.0]], (1, 4))
+PICKUP = record('sensor_pickup_spread', [[3e-9, 4e-9, 0.0, 0.0], [0.0] * 4, [1e-9] * 4])
+SINGLE = EffectRecord('sensor_gain', {'channel': 3, 'gain': 1.1})
+
+
+def test_every_channel_has_its_values_and_their_sigma():
+    head, rows = population_table([GAINS, SINGLE, PLACES])
+    assert head[1] == 'sensor_gain_spread in phase, %'
+    assert head[-1] == 'sensor_place_spread z, mm'
+    assert [row[0] for row in rows] == ['0', '1', '2', '4']
+    assert rows[0][1:4] == ['0.2000 ± 0.0100', '0.1000 ± 0.0100', '']
+    assert rows[1][3:] == ['0.1000 ± 0.1000', '0.0000 ± 0.1000', '-0.2000 ± 0.1000']
+
+
+def test_many_values_of_a_channel_are_summed_up():
+    head, rows = population_table([PICKUP])
+    assert head == ['channel', 'sensor_pickup_spread rms, nT']
+    assert rows[0][1].startswith('2.5000 ±')
+
+
+def test_the_picture_has_a_panel_for_each_population():
+    figure = population_figure([GAINS, SINGLE, PLACES])
+    try:
+        titles = [panel.get_title() for panel in figure.axes]
+        assert titles == ['sensor_gain_spread: 0.2 %', 'sensor_place_spread: 2 mm']
+    finally:
+        plt.close(figure)
+
+
+def test_without_a_population_there_is_nothing_to_show():
+    assert populations([SINGLE]) == []
+    assert population_table([SINGLE])[1] == []
+    assert population_figure([SINGLE]) is None

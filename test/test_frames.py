@@ -74,10 +74,6 @@ def test_document_shows_the_bytes_that_the_code_writes():
     assert raw == encode(STATUS)
 
 
-def test_crc_is_the_documented_one():
-    assert zlib.crc32(b'123456789') == 0xCBF43926
-
-
 def test_records_come_whole_from_any_cut_of_the_stream():
     raw = b''.join(encode(payload) for payload in PAYLOADS)
     for step in (1, 7, 64, len(raw)):

@@ -53,12 +53,6 @@ def test_conductor_against_the_bessel_series(frequency):
     assert alpha.imag < 0, 'an induced moment lags'
 
 
-def test_polarisability_scales_with_volume_at_fixed_skin_depth_ratio():
-    first = polarisability(0.01, 1e7, 1.0, 4e3)
-    second = polarisability(0.02, 1e7, 1.0, 1e3)
-    assert second == pytest.approx(8 * first, rel=1e-12)
-
-
 def test_the_series_and_the_closed_form_meet():
     edge = (SMALL / RADIUS) ** 2 / MU_0
     below, above = sphere_polarisability(RADIUS, 1.0, 1.0, edge * np.array([0.99999, 1.00001]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anser_ros.diagnosis.problem import Whitener
-from anser_ros.parallel import cores, in_order, shared_among, slices
+from anser_ros.parallel import in_order, shared_among
 from anser_ros.physics.dipole import dipole_field, flux_jacobian
 
 
@@ -41,16 +41,6 @@ def test_an_error_of_a_piece_is_the_caller_s_and_the_number_is_as_before():
     assert set(names) == {threading.current_thread().name}
 
 
-def test_slices_are_all_rows_once():
-    assert [list(range(10))[part] for part in slices(10, 4)] == [
-        [0, 1, 2, 3],
-        [4, 5, 6, 7],
-        [8, 9],
-    ]
-    assert slices(0, 4) == []
-    assert cores() >= 1
-
-
 def test_fields_and_whitened_values_are_the_same_bit_by_bit_for_any_number_of_threads():
     rng = np.random.default_rng(3)
     points, axes = rng.normal(size=(1300, 3)) + [0, 0, 3], rng.normal(size=(1300, 3))
@@ -78,9 +68,3 @@ def test_whitening_frame_by_frame_is_the_product_of_its_matrices():
     plain = plain - white.basis @ (white.inner @ (white.basis.transpose(0, 2, 1) @ plain))
     np.testing.assert_allclose(white(values), plain, rtol=1e-12)
     np.testing.assert_allclose(white(values[..., 0]), plain[..., 0], rtol=1e-12)
-
-
-def test_no_dipoles_make_no_field():
-    none = np.zeros((0, 3))
-    field = dipole_field(np.ones((5, 3)), none, none, np.zeros((0, 4), dtype=complex))
-    np.testing.assert_array_equal(field, np.zeros((5, 3, 4)))

@@ -103,19 +103,6 @@ def test_closed_paths_have_neither_curl_nor_divergence():
     assert np.abs(gradient - gradient.swapaxes(2, 3)).max() < 1e-6 * size
 
 
-def test_an_open_path_does_have_curl():
-    """Why paths are closed: no dipole can stand for this."""
-    start, end = np.array([[0.0, 0, 0]]), np.array([[0.03, 0, 0]])
-    point = np.array([[0.01, 0.02, 0.05]])
-    gradient = np.array(
-        [
-            (segment_field(start, end, point + s) - segment_field(start, end, point - s))[0]
-            for s in 1e-6 * np.eye(3)
-        ]
-    )
-    assert np.abs(gradient - gradient.T).max() > 0.1 * np.abs(gradient).max()
-
-
 def test_the_anser_spiral_as_public_sources_describe_it():
     """25 turns on two layers, about 101 tracks; a cheap model is 25.15 loops of 61.5 mm."""
     path = spiral_path(0.07, 0.07, 0.00075, 25, 2, 0.0016)

@@ -20,7 +20,6 @@ from anser_ros.sessions.plausibility import (
     LENGTH_UNITS,
     check_points,
     plausible_tools,
-    unit_words,
 )
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
@@ -214,10 +213,3 @@ def test_points_of_an_error_map():
         check_points(1e3 * tracked, 1e3 * true)
     with pytest.raises(PlausibilityError, match='all 30 true positions are the same'):
         check_points(tracked, np.tile(true[:1], (30, 1)))
-
-
-def test_units_are_told_by_their_size():
-    assert unit_words(850.0, LENGTH_UNITS) == 'millimetres'
-    assert unit_words(2.0e6, FLUX_UNITS) == 'microtesla'
-    assert unit_words(5.0, LENGTH_UNITS) == unit_words(0.0, LENGTH_UNITS) == ''
-    assert unit_words(float('inf'), FLUX_UNITS) == ''

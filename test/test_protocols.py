@@ -19,7 +19,7 @@ from anser_ros.wire.frames import (
     Start,
 )
 from anser_ros.wire.port import ControlUnitPort, PortState
-from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol, StreamControl
+from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol
 
 VERBS = {Identify: 'who', Start: 'go'}
 """The commands that the toy unit has; its tones are fixed."""
@@ -101,14 +101,6 @@ def test_a_port_speaks_another_protocol(wire, port):
     assert wire.read() == f'go {tag}\n'.encode()
 
 
-def test_a_unit_without_the_command_is_not_asked_for_other_tones():
-    assert PROTOCOLS['anser'].sets_tones and not TOY.sets_tones
-    control = StreamControl((7000.0,), set_frequencies=TOY.sets_tones)
-    control.take(Record(HELLO), 1_000_000_000)
-    assert control.due(1_100_000_000) is None
-    assert 'but the setup requires 7000 Hz' in control.refusal
-
-
 def test_a_reader_that_fails_closes_the_port_and_it_is_opened_again(wire, port, monkeypatch):
     wire.write(line('done', 'a verb that no command has', 1))
     assert wait(lambda: port.counters.reader_failures == 1)
@@ -122,22 +114,8 @@ def test_a_reader_that_fails_closes_the_port_and_it_is_opened_again(wire, port, 
     assert receive(port, 1) == [HELLO]
 
 
-def test_the_stream_is_started_by_the_same_rules(wire, port):
-    control = StreamControl(TONES)
-    port.send(control.due(1_000_000_000))
-    assert wire.read() == b'who 1\n'
-    wire.write(line('hello'))
-    for payload in receive(port, 1):
-        control.take(Record(payload), 1_100_000_000)
-    port.send(control.due(1_200_000_000))
-    assert wire.read() == b'go 2\n'
-    wire.write(line('done', 'go', 2))
-    for payload in receive(port, 1):
-        control.take(Record(payload), 1_300_000_000)
-    assert control.started
-
-
 def test_the_acquisition_knows_every_protocol():
+    assert PROTOCOLS['anser'].sets_tones and not TOY.sets_tones
     rule = AcquisitionParameters.__dataclass_fields__['protocol'].metadata['rule']
     assert set(rule.choices) == set(PROTOCOLS)
     assert AcquisitionParameters().protocol in PROTOCOLS

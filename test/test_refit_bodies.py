@@ -1,14 +1,11 @@
 """Compact bodies as hypotheses: found where they are, by an evidence that is the dense one."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from refit_world import anser_world, metal_block, metal_flux, volume_points
 from scipy.stats import multivariate_normal
 
 from anser_ros.physics.dipole import flux_basis
-from anser_ros.refit import hypotheses as slots_module
 from anser_ros.refit.clouds import BODY_RADIUS, Region, bodies
 from anser_ros.refit.tables import REMAINDER, BodySearch, body_factor
 
@@ -20,11 +17,11 @@ STRONG = -6000.0 + 800.0j
 
 @pytest.fixture(scope='module')
 def refit():
-    return anser_world(24).refit()
+    return anser_world().refit()
 
 
 def follow(refit, points, frames=6, seed=1):
-    world, rng = anser_world(24), np.random.default_rng(seed)
+    world, rng = anser_world(), np.random.default_rng(seed)
     change = metal_flux(
         world.board, points, world.references.position, world.references.axis, STRONG
     )
@@ -76,7 +73,7 @@ def test_approximate_evidence_is_that_of_its_own_normal_distribution():
 
 @pytest.mark.long
 def test_metal_beside_the_volume_is_found_corrected_and_honest(refit):
-    world, result = anser_world(24), follow(refit, BESIDE)
+    world, result = anser_world(), follow(refit, BESIDE)
     best = max(result.weights, key=result.weights.get)
     assert best.startswith('body')
     assert np.linalg.norm(result.metal.centroid - BESIDE.mean(axis=0)) < 0.04
@@ -99,29 +96,10 @@ def test_slots_follow_metal_that_moves_and_are_emptied_by_a_reset(refit):
     )
     assert len(before) == len(after) == 3 and not before & after
     refit.reset()
-    flux = anser_world(24).baseline
-    result = refit.update(1, anser_world(24).references.channel, flux)
-    assert result.model is anser_world(24).model
+    flux = anser_world().baseline
+    result = refit.update(1, anser_world().references.channel, flux)
+    assert result.model is anser_world().model
     assert not any('body' in name for name in result.weights)
     # The same readings give the same model again, whatever was seen before.
     once, again = follow(refit, BESIDE), follow(refit, BESIDE)
     np.testing.assert_array_equal(once.model.moments, again.model.moments)
-
-
-@pytest.mark.long
-def test_a_body_that_comes_again_is_not_worked_out_again(refit, monkeypatch):
-    """The last ones are kept, and there are no more of them than are said to be."""
-    follow(refit, BESIDE)
-    bank, slots = refit._bank()
-    monkeypatch.setattr(slots_module, 'MOST_BODIES', 2)
-    monkeypatch.setattr(slots, '_known', {})
-    asked = []
-    tables = SimpleNamespace(body_prior=asked.append)
-    monkeypatch.setattr(slots, '_tables', tables)
-    monkeypatch.setattr(bank, 'eigenbasis', lambda prior: object())
-    first = slots._eigenbasis(5)
-    slots._eigenbasis(7)
-    assert slots._eigenbasis(5) is first
-    slots._eigenbasis(9)  # takes the place of 7, which was asked for longest ago
-    assert slots._eigenbasis(5) is first and set(slots._known) == {5, 9}
-    assert asked == [5, 7, 9]

@@ -312,12 +312,3 @@ def test_priors_are_the_covariance_of_their_own_draws(world, parts, response):
     assert np.abs((across - priors[0].transfer) / scale).max() < 6.0 / np.sqrt(count)
     np.testing.assert_allclose(exact, exact.T, atol=1e-12)
     assert np.linalg.eigvalsh(exact).min() > -1e-10
-
-
-def test_sources_are_the_posterior_mean_of_a_third_of_the_trace(bank, parts, readings):
-    seen = bank.evaluate(readings, NOISE)
-    found = bank.sources(seen, 1)
-    prior = parts[4][0]
-    assert found.shape == (len(prior.cloud.positions), 2)
-    weights = bank.bases[1] @ bank.coefficients(seen, 1)
-    np.testing.assert_allclose(found, prior.coupling.T @ weights)

@@ -12,9 +12,7 @@ from anser_ros.tracking.rigid import (
     common_factor,
     solve_body,
     start_from_coils,
-    start_from_grid,
 )
-from anser_ros.tracking.seed import build_grid
 from anser_ros.tracking.solve import RealField, bounded_inverse
 
 SEED = 41
@@ -115,18 +113,6 @@ def test_start_from_the_coils_own_poses(rng):
     np.testing.assert_allclose(start[1], rotation, atol=1e-12)
     assert start_from_coils(COILS.subset([0]), points[:1], axes[:1], np.ones(1)) is None
     assert start_from_coils(COILS.subset([]), points[:0], axes[:0], np.ones(0)) is None
-
-
-def test_start_from_the_grid_alone(rng):
-    """For few emitters, when no coil has a pose of its own."""
-    grid = build_grid(FIELD, np.full(WIDTH, NOISE_T), TrackedVolume(), 0.04)
-    for _ in range(10):
-        position, rotation = random_pose(rng)
-        flux = fluxes(MODEL, TOOL, position, rotation, rng)
-        starts = start_from_grid(grid, FIELD, COILS, real(flux))
-        best = min((solve(flux, *start) for start in starts), key=lambda s: s.chi2)
-        assert np.linalg.norm(best.position - position) < 1e-3
-        np.testing.assert_allclose(best.rotation, rotation, atol=5e-3)
 
 
 def test_what_is_observable():

@@ -1,9 +1,8 @@
 """Each stage of `evaluate` and `diagnose` alone: what it takes, what it gives, what it refuses."""
 
-import csv
 import json
 import pickle
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +22,9 @@ from anser_ros.sessions.diagnosis import (
     track_held_out,
 )
 from anser_ros.sessions.diagnosis import to_document as diagnosis_document
-from anser_ros.sessions.evaluation_files import POSE_COLUMNS, write_tables
-from anser_ros.sessions.evaluation_files import to_document as evaluation_document
 from anser_ros.sessions.follower import ModelFollower
-from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.prepared import correct, prepare
-from anser_ros.sessions.session import empty_session, frames_of, load_session
+from anser_ros.sessions.session import frames_of, load_session
 from anser_ros.sessions.starting_model import FOUND_ON, date_drifts, load_model, save_model
 from anser_ros.sessions.tracked_session import metrics, pose_series, track
 
@@ -59,13 +55,6 @@ def metal():
     return load_session(ROOT / 'bags' / 'metal.mcap')
 
 
-def beginning(session, frames):
-    """The first frames of a session."""
-    tools = tuple(tool.frames(np.arange(frames)) for tool in session.tools)
-    reference = session.reference.frames(np.arange(frames))
-    return replace(session, tools=tools, reference=reference)
-
-
 def with_gain(session):
     """The session with one channel's readings too small."""
     (tool,) = session.tools
@@ -79,37 +68,12 @@ def knowing_the_gain(model):
 
 
 class TestPrepare:
-    def test_works_out_what_follows_from_session_and_model(self, moving, model, factory):
-        prepared = prepare(moving, model, factory)
-        assert prepared.sensors.name == moving.tools[0].sensors.name
-        assert prepared.baseline.path == factory.path
-        assert prepared.baseline.flux.shape == (len(moving.reference.sensors), 8)
-        assert np.isfinite(prepared.baseline.flux).all()
-        assert prepared.nominal.board.names == model.emitters
-        assert not prepared.correction.terms and not prepared.recorded_drift
-        with pytest.raises(FrozenInstanceError):
-            prepared.model = model
-
     def test_another_board_is_refused(self, moving, model, factory):
         other = replace(model, emitters=tuple(f'other{k}' for k in range(8)))
         with pytest.raises(ModelFileError, match='other0'):
             prepare(moving, other)
         with pytest.raises(ModelFileError, match='other0'):
             prepare(moving, model).with_model(other)
-
-    def test_an_empty_session_is_prepared_as_a_recorded_one(self, moving, model, factory):
-        empty = empty_session(moving.setup, 'nowhere')
-        assert empty.tools[0].flux.shape == (0, 9, 8) and empty.reference.time.size == 0
-        early, late = prepare(empty, model, factory), prepare(moving, model, factory)
-        assert np.array_equal(early.baseline.flux, late.baseline.flux)
-        assert early.sensors.name == late.sensors.name
-
-    def test_the_nominal_model_is_made_once(self, moving, model):
-        prepared = prepare(moving, model)
-        drawn = prepared.nominal.model
-        assert drawn.emitters == model.emitters
-        assert prepared.with_session(beginning(moving, 2)).nominal.model is drawn
-        assert NominalBoard(None).model is None and NominalBoard(None).field is None
 
     def test_a_drift_holds_on_the_session_that_it_is_dated_by(self, moving, model):
         drift = EffectRecord('coil_drift', {'coil': 1, 'amount': 0.01, 'tau_s': 5.0})
@@ -128,10 +92,6 @@ class TestCorrect:
         flux = correct(prepared).session.tools[0].flux
         np.testing.assert_allclose(flux, moving.tools[0].flux, rtol=1e-12)
 
-    def test_without_effects_all_stays(self, moving, model):
-        prepared = prepare(moving, model)
-        assert correct(prepared).session.tools[0] is moving.tools[0]
-
 
 class TestTrack:
     def test_frames_come_in_order_with_all_sensors(self, metal):
@@ -143,21 +103,6 @@ class TestTrack:
         assert np.array_equal(first.flux, metal.tools[0].flux[0])
         assert (first.in_phase().flux.imag == 0.0).all()
 
-    def test_tracked_compared_and_written(self, moving, model, tmp_path):
-        prepared = prepare(beginning(moving, 5), model)
-        evaluation = track(prepared)
-        series = evaluation.sensors | evaluation.bodies
-        assert {len(one.estimates) for one in series.values()} == {5}
-        assert set(series) == {*prepared.sensors.name, 'tool_a'}
-        assert evaluation.refit is None and evaluation.seconds_per_frame > 0.0
-        assert max(np.max(s.position_error) for s in evaluation.sensors.values()) < 1e-3
-        assert (
-            json.loads(json.dumps(evaluation_document(evaluation)))['bodies']['tool_a']['n'] == 5
-        )
-        write_tables(tmp_path, evaluation)
-        rows = list(csv.DictReader((tmp_path / 'poses.csv').read_text().splitlines()))
-        assert tuple(rows[0]) == POSE_COLUMNS and len(rows) == 9 * 5
-
     def test_nothing_to_compare_has_no_figures(self):
         figures = metrics(pose_series('tool_a/0/x', (), np.empty((0, 3)), np.empty((0, 3))))
         assert figures['n'] == 0 and figures['position_rmse_m'] is None
@@ -168,18 +113,6 @@ class TestTrack:
 
 
 class TestFollow:
-    @pytest.mark.long
-    def test_the_model_follows_metal_frame_by_frame(self, metal, model, factory):
-        follower = ModelFollower(prepare(metal, model, factory))
-        frames = [frame for frame in frames_of(metal) if frame.reference is not None]
-        standings = [follower.at(frame) for frame in frames[:3]]
-        assert all(s.model.emitters == model.emitters and s.withheld is None for s in standings)
-        assert sum(follower.summary.states.values()) == 3
-        silent = replace(frames[3], reference=None)
-        assert follower.at(silent).withheld is None
-        late = replace(silent, stamp_ns=silent.stamp_ns + 10**9)
-        assert follower.at(late).withheld.state == 'references_lost'
-
     def test_what_is_missing_is_said(self, metal, model, factory):
         with pytest.raises(BagError, match='--baseline'):
             ModelFollower(prepare(metal, model))
@@ -208,59 +141,15 @@ def problem(prepared):
     return problem_of(correct(prepared))
 
 
-@pytest.fixture(scope='module')
-def screened(problem):
-    return saved(screen(problem))
-
-
-@pytest.fixture(scope='module')
-def search(screened):
-    return saved(search_screened(screened, LIGHT))
-
-
-@pytest.fixture(scope='module')
-def confirmed(screened, search):
-    return saved(confirm(screened, search, LIGHT))
-
-
-@pytest.fixture(scope='module')
-def found(screened, search, confirmed, model):
-    return saved(conclude(screened, search, confirmed, model))
-
-
 class TestDiagnose:
-    """The stages in their order, each with what the one before it gave, from a file."""
-
-    def test_problem(self, prepared, problem):
+    def test_what_a_problem_is_made_of(self, prepared, problem):
         assert problem.tools[0].time.size == prepared.session.tools[0].has_pose.sum()
         assert problem.references is None, 'without a baseline the references have no say'
         assert problem.spread == spread_of(prepared)
         with pytest.raises(DiagnosisError, match='needs tool fluxes'):
             problem_of(prepared.with_session(replace(prepared.session, tools=())))
 
-    def test_screen(self, screened, problem):
-        assert screened.known == ()
-        assert screened.whole.tools[0].time.size == problem.tools[0].time.size
-        held = np.isin(screened.training(100).blocks[0], held_out_blocks())
-        assert held.size and not held.any()
-
-    @pytest.mark.long
-    def test_search(self, search):
-        assert [term.effect.name for term in search.fit.terms] == ['sensor_gain']
-
-    @pytest.mark.long
-    def test_confirm(self, confirmed):
-        assert [term.effect.name for term in confirmed.fit.terms] == ['sensor_gain']
-        assert confirmed.refused == ()
-
-    @pytest.mark.long
-    def test_conclude(self, found):
-        (finding,) = found.findings
-        assert finding.record.parameters['channel'] == CHANNEL
-        assert finding.record.parameters['gain'] == pytest.approx(GAIN, abs=1e-3)
-        assert found.flux_rms_after_t < 0.1 * found.flux_rms_before_t
-
-    def test_held_out_part(self, prepared, problem):
+    def test_the_held_out_part_is_tracked_from_the_first_frame_on(self, prepared, problem):
         part = held_out_part(prepared.session, problem)
         (blocks,) = problem.blocks
         times = problem.tools[0].time[np.isin(blocks, held_out_blocks())]
@@ -268,7 +157,23 @@ class TestDiagnose:
         assert set(part.reference.time.tolist()) <= set(part.tools[0].time.tolist())
 
     @pytest.mark.long
-    def test_track_held_out_and_document(self, prepared, problem, found, tmp_path):
+    def test_each_stage_takes_what_the_one_before_it_gave_from_a_file(
+        self, prepared, problem, model, tmp_path
+    ):
+        screened = saved(screen(problem))
+        assert screened.known == ()
+        held = np.isin(screened.training(100).blocks[0], held_out_blocks())
+        assert held.size and not held.any()
+        search = saved(search_screened(screened, LIGHT))
+        confirmed = saved(confirm(screened, search, LIGHT))
+        for fit in (search.fit, confirmed.fit):
+            assert [term.effect.name for term in fit.terms] == ['sensor_gain']
+        assert confirmed.refused == ()
+        found = saved(conclude(screened, search, confirmed, model))
+        (finding,) = found.findings
+        assert finding.record.parameters['channel'] == CHANNEL
+        assert finding.record.parameters['gain'] == pytest.approx(GAIN, abs=1e-3)
+        assert found.flux_rms_after_t < 0.1 * found.flux_rms_before_t
         unseen = prepared.with_session(held_out_part(prepared.session, problem))
         before, after = track_held_out(unseen, found)
         assert after.position_rmse_m < 0.2e-3 < before.position_rmse_m

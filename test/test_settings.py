@@ -11,7 +11,6 @@ import yaml
 from refit_world import anser_world
 from test_setup import document
 
-from anser_ros.calibration.moments import pose_precision
 from anser_ros.cli import calibrate, diagnose, evaluate
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.field_model import FieldModelParameters
@@ -201,22 +200,6 @@ class TestEffect:
         less = VALUES['error_modes'].default - OTHER['error_modes']
         assert len(one.modes) - len(other.update(1, channels, flux).model.modes) == less
 
-    def test_the_refit_counts_references_and_frames(self, world, usual):
-        channels, flux = world.references.channel, world.baseline
-        few = self.with_settings(usual, min_references=len(world.references) + 1)
-        assert few.update(1, channels, flux).state == 'few_references'
-        brief = self.with_settings(usual, average_frames=1, hold_frames=3, persistence=0.5)
-        assert brief._average.longest == 1
-        brief._watch.exclude(0)
-        for _ in range(3):
-            assert brief._watch.excluded[0]
-            brief._watch.agreed(0, True)
-            brief._watch.readmit()
-        assert not brief._watch.excluded[0]
-        usual.reset()
-        odds = [refit.update(1, channels, flux).log_odds for refit in (usual, brief)]
-        assert odds[0] != odds[1]
-
     def test_the_diagnosis(self):
         session = load_session(BAGS / 'moving.mcap')
         model = model_for('nominal', session)
@@ -231,11 +214,6 @@ class TestEffect:
             if name.startswith('optical'):
                 assert (spread.accuracy.pose_jitter > 1.2 * usual.accuracy.pose_jitter).any()
         assert usual.reference_change == 0.01
-
-    def test_the_calibration(self):
-        usual = pose_precision(Accuracy())
-        wide = pose_precision(Accuracy(optical_position_m=0.7e-3, optical_rotation_rad=4e-3))
-        np.testing.assert_allclose(usual / wide, 100.0)
 
 
 class TestCommands:

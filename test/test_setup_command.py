@@ -3,14 +3,12 @@
 import io
 import json
 import sys
+from pathlib import Path
 
-import numpy as np
 import pytest
+import yaml
 from conftest import REPO
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from anser_ros.cli.board_figures import Label, name_points
 from anser_ros.cli.main import main
 from anser_ros.cli.setup import GEOMETRY, coil_of, document_of, emitter_of, text_of
 from anser_ros.physics.board import KINDS
@@ -130,19 +128,64 @@ def test_a_folder_that_takes_no_file_is_found_before_the_work(capsys):
         assert 'nothing can be written into /proc' in capsys.readouterr().err
 
 
-def test_names_of_close_points_cover_neither_each_other_nor_the_points():
-    figure = Figure(figsize=(5, 4), layout='constrained')
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set(xlim=(-0.2, 0.2), ylim=(-0.2, 0.2))
-    places = np.random.default_rng(3).normal(0, 0.02, (14, 2))
-    labels = [Label(f'coil {k}', tuple(at), (0.1, 0.0)) for k, at in enumerate(places.tolist())]
-    figure.draw_without_rendering()
-    name_points(axes, labels, places, 6.0)
-    figure.draw_without_rendering()
-    boxes = [text.get_window_extent() for text in axes.texts if text.get_text()]
-    assert len(boxes) == len(labels)
-    for k, box in enumerate(boxes):
-        assert not any(box.overlaps(other) for other in boxes[:k])
-        assert not any(box.contains(*at) for at in axes.transData.transform(places))
-        assert axes.get_window_extent().contains(*box.min)
+CONFIG = Path(__file__).resolve().parents[1] / 'config'
+FILES = ('anser.rviz', 'foxglove_layout.json')
+TWO_TOOLS = """
+schema: anser_setup/1
+frame_id: fg
+flux_rate_hz: 50
+flux_unit: T
+emitter:
+  kind: square_spiral_pcb
+  turns: 25
+  side_m: 0.07
+  pitch_m: 0.00075
+  layers: 2
+  thickness_m: 0.0016
+  current_a: 0.1
+  coils:
+  - {name: a, centre_m: [0.2, 0.0, 0.0], rotation_deg: 0.0, frequency_hz: 20500.0}
+sensors:
+- {channel: 1, name: pen/tip, body: pen, position_m: [0, 0, 0], axis: [1, 0, 0]}
+- {channel: 2, name: probe/0/x, body: probe, position_m: [0, 0, 0], axis: [1, 0, 0]}
+- {channel: 3, name: probe/0/z, body: probe, position_m: [0, 0, 0], axis: [0, 0, 1]}
+"""
+
+
+def test_the_files_of_config_are_those_of_the_demo(tmp_path):
+    """`anser views demo_setup.yaml --out config` writes them."""
+    assert main(['views', str(CONFIG / 'demo_setup.yaml'), '--out', str(tmp_path)]) == 0
+    for name in FILES:
+        assert (tmp_path / name).read_text() == (CONFIG / name).read_text(), name
+
+
+def test_another_board_in_another_namespace(tmp_path, capsys):
+    (tmp_path / 'two.yaml').write_text(TWO_TOOLS)
+    command = ['views', str(tmp_path / 'two.yaml'), '--out', str(tmp_path), '--json']
+    options = ['--namespace', 'or/left', '--optical', '/left/optical', '--frame-prefix', 'left_']
+    assert main([*command, *options]) == 0
+    assert len(json.loads(capsys.readouterr().out)['files']) == 2
+    rviz, foxglove = ((tmp_path / name).read_text() for name in FILES)
+    manager, layout = yaml.safe_load(rviz)['Visualization Manager'], json.loads(foxglove)
+    shown = {d['Topic']['Value']: d for d in manager['Displays'] if 'Topic' in d}
+    assert set(shown) == set(layout['configById']['3D!tool']['topics']) == {
+        '/or/left/probe/pose_with_covariance', '/left/optical/pen/pose',
+        '/left/optical/probe/pose', '/or/left/pen/tip/pose', '/or/left/probe_0/x/pose',
+        '/or/left/probe_0/z/pose', '/or/left/field_model', '/or/left/reference/flux',
+        '/or/left/metal',
+    }  # fmt: skip
+    assert shown['/or/left/pen/tip/pose']['Enabled'], 'the only coil of its body'
+    assert not shown['/or/left/probe_0/x/pose']['Enabled']
+    assert shown['/or/left/metal']['Class'] == 'rviz_default_plugins/MarkerArray'
+    assert shown['/or/left/metal']['Topic']['Durability Policy'] == 'Transient Local'
+    assert not any(word in rviz + foxglove for word in ('tool_a', '/anser', '"anser/'))
+    assert manager['Global Options']['Fixed Frame'] == 'left_fg'
+    grid = manager['Displays'][0]
+    assert grid['Plane Cell Count'] * grid['Cell Size'] == pytest.approx(0.5)
+
+
+def test_a_namespace_that_is_none(tmp_path, capsys):
+    command = ['views', 'demo_setup.yaml', '--out', str(tmp_path), '--namespace']
+    for name in ('', 'a b', '1x', 'a//b'):
+        assert main([*command, name]) == 2
+        assert 'is not a namespace' in capsys.readouterr().err

@@ -12,14 +12,12 @@ from anser_ros.calibration.result import (
     contradiction_words,
     corrections,
     reported_effects,
-    undetermined_words,
 )
 from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.physics.rotations import tangents
 from anser_ros.settings import Accuracy
 
 pytestmark = pytest.mark.long
@@ -161,18 +159,6 @@ def test_what_the_data_do_not_tell_stays_at_zero(dirty):
     assert np.allclose(free.values, 1e-4 * noise, rtol=1e-6)
 
 
-def test_what_a_scan_cannot_tell_is_said(dirty):
-    _, found, _ = dirty
-    assert not found.undetermined
-    population = Population(found.parameters)
-    nothing = Likelihood(np.zeros((47, 47)), np.zeros(47))
-    assert set(population.undetermined(nothing)) == set(KINDS)
-    lines = undetermined_words(replace(found, undetermined={'lever_arm': 0.004}))
-    assert lines == (
-        'lever_arm: the scan determines it only to 4 mm; the value of the setup is kept',
-    )
-
-
 def test_references_say_when_metal_moved():
     rng = np.random.default_rng(3)
     steady = scene(rng, side=20)
@@ -191,17 +177,9 @@ def test_references_say_when_metal_moved():
     assert not unsteady_references(quiet).any()
 
 
-def test_tangents_are_across():
-    axes = np.random.default_rng(8).normal(size=(5, 3))
-    axes /= np.linalg.norm(axes, axis=1)[:, None]
-    pair = tangents(axes)
-    assert np.allclose(np.einsum('stj,sj->st', pair, axes), 0)
-    assert np.allclose(np.einsum('stj,suj->stu', pair, pair), np.eye(2))
-
-
 def test_sessions_that_say_different_things_of_a_sensor_are_told(dirty):
     told, whole, _ = dirty
-    halves = [told.frames(np.arange(0, 250)), told.frames(np.arange(250, 500))]
+    halves = [told.frames(np.arange(0, 160)), told.frames(np.arange(250, 410))]
     changed = halves[1].flux.copy()
     changed[:, 4] *= 1.01
     other = replace(halves[1], flux=changed)

@@ -232,26 +232,6 @@ def test_hostile_fluxes_never_make_a_pose(rng):
         assert all(e.state != 'ok' for e in found.values()), size
 
 
-def test_noise_scale_is_a_running_mean_that_one_frame_can_not_break():
-    scale = NoiseScale()
-    assert scale.value == 1.0
-    for _ in range(500):
-        scale.add(4.0)
-    assert scale.value == pytest.approx(4.0, rel=1e-2)
-    scale.add(1e9)
-    assert scale.value < 4.2
-    assert scale.of_frame(5.0, 2.0, 2.2, 0.0, False) == scale.value
-    assert scale.of_frame(50.0, 2.0, 2.2, 0.0, False) == pytest.approx(168.0, rel=0.02)
-    assert scale.of_frame(5.0, 2.0, 2.2, 0.0, True) == pytest.approx(scale.value + 12.0, rel=0.02)
-    assert scale.of_frame(5.0, 2.0, 2.2, 1.0, False) == pytest.approx(4 * scale.value)
-    quiet = NoiseScale()
-    for _ in range(500):
-        quiet.add(0.5)
-    assert quiet.of_frame(0.9, 2.0, 2.2, 0.0, False) == quiet.value
-    assert quiet.of_frame(1.5, 2.0, 2.2, 0.0, False) > 4.0 * quiet.value, 'unusual for this sensor'
-    assert quiet.of_frame(0.9, 2.0, 2.2, 0.0, True) == 1.0, 'what the model states stays'
-
-
 def test_a_misfit_that_lasts_from_frame_to_frame_is_no_noise(rng):
     noisy, wrong, among_metal = NoiseScale(), NoiseScale(), NoiseScale()
     misfit = np.sqrt(11.0 / 16.0) * rng.choice([-1.0, 1.0], 16)

@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refit_world import NOISE_T, anser_world, metal_block, metal_flux
+from tracking_world import triaxial_tool
 
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError
-from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
-from anser_ros.refit.tables import RefitTables
 from anser_ros.refit.witness import (
     CONTRADICTION_S,
     CoilErrors,
@@ -36,16 +35,7 @@ METAL = metal_block([0.03, -0.02, -0.09], [0.1, 0.12, 0.06])
 pytestmark = pytest.mark.usefixtures('shared_tables')
 
 
-def tool(count: int = 9) -> SensorTable:
-    """Three clusters of three coils."""
-    return SensorTable(
-        channel=np.arange(count),
-        name=tuple(f'tool/{i}' for i in range(count)),
-        body=('tool',) * count,
-        position=np.repeat([[0, 0, -0.03], [0, 0, 0], [0, 0, 0.03]], 3, axis=0).astype(float),
-        axis=np.tile(np.eye(3), (3, 1)),
-        length=np.zeros(count),
-    )
+TOOL = triaxial_tool('tool')
 
 
 @pytest.fixture(scope='module')
@@ -64,7 +54,7 @@ def few(world) -> LiveRefit:
 
 def flux_at(world, place, metal=METAL):
     """The tool's fluxes (S, K) with its axes along those of fg, and its coils' places."""
-    at, axes = tool().placed(place, np.eye(3))
+    at, axes = TOOL.placed(place, np.eye(3))
     flux = world.model.flux(at, axes).astype(complex)
     return (flux if metal is None else flux + metal_flux(world.board, metal, at, axes)), at, axes
 
@@ -96,24 +86,8 @@ def followed(world, witnesses: bool, gain=None, off_m: float = 0.0):
             share.append(np.linalg.norm(left) / np.linalg.norm(change))
         noise = NOISE_T * (rng.normal(size=(9, 8)) + 1j * rng.normal(size=(9, 8)))
         told = place + off_m * rng.normal(size=3)
-        refit.witnessed([ToolReading(tool(), gain[:, None] * flux + noise, told, np.eye(3))])
+        refit.witnessed([ToolReading(TOOL, gain[:, None] * flux + noise, told, np.eye(3))])
     return float(np.mean(share)), refit
-
-
-@pytest.mark.long
-def test_who_is_made_ready_works_out_no_cloud_later(world, monkeypatch):
-    refit = few(world)
-    made, one_by_one = [], RefitTables.reduced
-    monkeypatch.setattr(
-        RefitTables, 'reduced', lambda t, prior: made.append(prior.name) or one_by_one(t, prior)
-    )
-    refit.enable_witnesses(NOISE_T, ready=True)
-    clouds = [prior.name for prior in refit._tables.priors]
-    assert made == clouds and len(clouds) > 10
-    monkeypatch.setattr(f'{__name__}.few', lambda _: refit)
-    monkeypatch.setattr(refit, 'enable_witnesses', lambda _: None)
-    followed(world, witnesses=True)
-    assert not set(made[len(clouds) :]) & set(clouds)
 
 
 @pytest.fixture(scope='module')
@@ -138,7 +112,7 @@ def test_metal_that_has_left_is_forgotten(world):
         states.append(result.state)
         flux, _, _ = flux_at(world, way(frame), None)
         noise = NOISE_T * (rng.normal(size=(9, 8)) + 1j * rng.normal(size=(9, 8)))
-        refit.witnessed([ToolReading(tool(), flux + noise, way(frame), np.eye(3))])
+        refit.witnessed([ToolReading(TOOL, flux + noise, way(frame), np.eye(3))])
     assert states[-1] == 'frozen'
 
 
@@ -156,7 +130,7 @@ def test_a_step_of_the_tool_is_no_metal(world):
     place, step = way(0), np.array([1e-4, -5e-5, 8e-5])
     flux, _, _ = flux_at(world, place + step, None)
     rows = linearised(
-        ToolReading(tool(), flux, place, np.eye(3)), world.model, world.model.moments,
+        ToolReading(TOOL, flux, place, np.eye(3)), world.model, world.model.moments,
         np.full(8, 1.0 / NOISE_T, dtype=complex),
     )  # fmt: skip
     pose = rows.pose.real
@@ -167,7 +141,7 @@ def test_a_step_of_the_tool_is_no_metal(world):
 
 def test_the_errors_of_coils_have_the_sigma_that_they_say():
     rng, tools = np.random.default_rng(2), ToolSettings()
-    table = tool(3)
+    table = TOOL.select(np.arange(3))
     scale = np.tile([tools.tool_coil_gain] * 2 + [tools.tool_coil_position_m] * 3
                     + [tools.tool_coil_axis_rad] * 2, 3)  # fmt: skip
     scores = []

@@ -38,7 +38,8 @@ from anser_ros.apps.dashboard.server import (
     PageServer,
     token_for,
 )
-from anser_ros.cli import demo, missing
+from anser_ros.apps.lab.experiments.recordings import missing
+from anser_ros.cli import demo
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.nodes.field_model import FieldModelNode

@@ -10,7 +10,7 @@ from refit_world import anser_world
 sys.path.append(str(REPO / 'test' / 'bench'))
 
 from bench_bound import marginal
-from bound_block import BALL, Block, block_points
+from bound_block import Block, block_points
 
 from anser_ros.refit.clouds import excitation_for
 
@@ -42,22 +42,6 @@ def test_derivatives_by_answers_are_those_of_the_readings(scene):
             wanted = (moved[0] - moved[1]).ravel() / (2.0 * step)
             off = np.abs(columns[:, kind + point] - wanted).max()
             assert off < 1e-6 * np.abs(wanted).max()
-
-
-def test_a_block_in_a_model_reads_as_the_block_itself(scene):
-    excitation, tilt, answer, coils, model = scene
-    block = Block(answer, tilt)
-    own = block.read(PLACE, excitation, *coils) * excitation.phase
-    added = block.in_field(PLACE, excitation, model).flux(*coils) - model.flux(*coils)
-    np.testing.assert_allclose(added, own, atol=1e-9 * np.abs(own).max())
-
-
-def test_a_point_alone_answers_as_a_ball_does(scene):
-    excitation, tilt, answer, _, _ = scene
-    lone = np.where(np.arange(len(answer)) == 5, -1.0, 0.0).astype(complex)
-    points, moments = Block(lone, tilt).moments(PLACE, excitation)
-    driving = excitation.field(points[5:6])[0]
-    np.testing.assert_allclose(moments[:, 5], -BALL * driving)
 
 
 def test_what_is_open_besides_only_takes_information_away():

@@ -23,7 +23,7 @@ from anser_ros.diagnosis.diagnose import diagnose
 from anser_ros.diagnosis.problem import Spread, build_problem
 from anser_ros.effects.effect import effect_named
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import FieldModel, size_parameters, symmetry_axis
+from anser_ros.field.model import FieldModel, symmetry_axis
 from anser_ros.physics.rotations import tangents
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.settings import Accuracy
@@ -176,18 +176,6 @@ def test_the_size_is_named_beside_the_gain_of_a_sensor():
 
 def test_an_emitter_that_is_drawn_is_no_candidate():
     assert not EFFECT.candidates(board_world(frames=60).problem().apparatus)
-
-
-def test_sizes_of_either_sign_have_a_source_that_they_are_of():
-    long, sigma = size_parameters(LONG.second_moment_m2, 1e-7)
-    assert long['length_m'] == pytest.approx(np.sqrt(12 * LONG.second_moment_m2))
-    assert sigma['length_m'] == pytest.approx(
-        np.sqrt(12 * (LONG.second_moment_m2 + 1e-7)) - long['length_m'], rel=0.01
-    )
-    flat, _ = size_parameters(-(0.006**2) / 4, 0.0)
-    assert flat['diameter_m'] == pytest.approx(0.012)
-    none, sigma = size_parameters(0.0, 1e-6)
-    assert none['length_m'] == 0.0 and sigma['length_m'] == pytest.approx(np.sqrt(12e-6))
 
 
 @pytest.mark.long

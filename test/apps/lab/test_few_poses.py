@@ -7,7 +7,7 @@ import pytest
 from test_one_place import NAMES, TONES, resting
 from test_still import CENTRES, recorded
 
-from anser_ros import Model
+from anser_ros.api.model import Model
 from anser_ros.apps.lab import few_poses
 from anser_ros.apps.lab.measured.recipe import write_frames
 from anser_ros.cli.main import main

@@ -9,7 +9,6 @@ from anser_ros.apps.lab.experiments import recordings as article
 from anser_ros.apps.lab.experiments.recordings import (
     HEAD_DISTANCES_CM,
     NAMES,
-    Raster,
     checkerboard,
     given_recordings,
     missing,
@@ -25,7 +24,6 @@ from anser_ros.apps.lab.experiments.study import (
     field_errors,
     outer_planes,
     position_bound,
-    statistics,
     track,
 )
 from anser_ros.apps.lab.measured import anser_board
@@ -151,24 +149,12 @@ def test_report_and_figures_say_simulated(study, tmp_path):
     assert f'{article.TABLE_2_MM["data-driven"]["Y"]["RMSE"]:.2f}' in text
 
 
-@pytest.mark.long
-def test_the_document_is_plain(study):
-    document = json.loads(json.dumps(study.results.document()))
-    assert document['schema'] == 'anser_paper/1'
-    assert 'own' in document['origin']
-
-
 def test_the_bound_shrinks_with_the_noise(recordings):
     session = recordings.load('midplane_tool_b')
     model = article_model(recordings.load('factory_tool_a'))
     one, two = (position_bound(session.tools[0], model, noise) for noise in (30e-12, 60e-12))
     assert np.allclose(two, 2 * one)
     assert (one > 5e-6).all()
-
-
-def test_errors_of_nothing_are_nothing():
-    assert np.isnan(statistics(np.full(3, np.nan))['RMSE'])
-    assert statistics(np.array([3.0, 4.0]))['RMSE'] == pytest.approx(np.sqrt(12.5))
 
 
 def test_corrected_errors_keep_what_was_not_tracked(recordings):
@@ -216,9 +202,3 @@ def test_error_map_command(tmp_path, capsys):
     assert 'needs the columns' in capsys.readouterr().err
     (tmp_path / 'none.csv').write_text(header)
     assert main(['error_map', str(tmp_path / 'none.csv'), '--out', str(tmp_path)]) == 2
-
-
-def test_a_raster_is_the_same_every_time():
-    raster = Raster(5, 0.2, 0.15)
-    assert np.array_equal(raster(7.0)[0], raster(7.0)[0])
-    assert abs(raster(0.0)[0] - [-0.1, -0.1, 0.15]).max() <= 0.004

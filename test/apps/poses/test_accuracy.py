@@ -2,7 +2,6 @@
 
 import json
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from pose_world import World, write_tum
@@ -23,14 +22,10 @@ from anser_ros.apps.poses.assessment.history import (
     FAIL,
     NOTE,
     PASS,
-    EarlierFigure,
-    SessionVerdict,
     judged,
 )
-from anser_ros.apps.poses.assessment.intervals import IntervalEstimate
-from anser_ros.apps.poses.assessment.protocols import Assessment, assess_motion
+from anser_ros.apps.poses.assessment.protocols import assess_motion
 from anser_ros.apps.poses.assessment.rest import StillPoint, metal_shifts, still_points
-from anser_ros.apps.poses.cli.accuracy import control_chart
 from anser_ros.apps.poses.hand_eye import fit_hand_eye
 from anser_ros.apps.poses.importing import write_pose_session
 from anser_ros.apps.poses.sequence import sequence_of
@@ -321,32 +316,6 @@ class TestControl:
         assert code == 2 and "no figure 'speed'" in words
         (history / 'z.json').write_text('{}')
         assert 'not an entry of a history' in session(12, 2e-4)[1]
-
-    def test_the_chart_shows_every_session_with_its_state_and_all_limits(self):
-        figures = {'position_jitter_rms_m': 3e-4, 'orientation_jitter_rms_rad': 1e-3}
-        found = Assessment(
-            'rest', 'pen', ('a.mcap',), 10**18,
-            {name: IntervalEstimate(value) for name, value in figures.items()},
-        )  # fmt: skip
-        states = (PASS, NOTE, ALERT, FAIL, PASS)
-        past = tuple(
-            EarlierFigure(10**17 + k, 3e-4 + 1e-6 * k, state) for k, state in enumerate(states)
-        )
-        first, second = figures
-        verdict = judged(3e-4, [one.value for one in past] * 2, 5e-4)
-        session = SessionVerdict(
-            PASS, {first: verdict, second: judged(1e-3, [])}, 5, {first: past}
-        )
-        chart = control_chart(found, session)
-        (panel,) = chart.axes  # no earlier session has the other one
-        shown = [len(marks.get_offsets()) for marks in panel.collections]
-        assert shown == [3, 1, 1, 1], 'of pass, note, alert and fail, this session among them'
-        levels = [line.get_ydata()[0] for line in panel.lines if len(set(line.get_ydata())) == 1]
-        limits = verdict.limits
-        off = (0.0, -limits.note, limits.note, -limits.alert, limits.alert)
-        assert levels[:5] == pytest.approx([1e3 * (limits.mean + d) for d in off])
-        assert levels[5] == pytest.approx(0.5), 'the tolerance, in mm'
-        plt.close(chart)
 
 
 class TestCommand:

@@ -1,6 +1,5 @@
 """Single parts of the diagnosis of poses, each against what it has to be by definition."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,18 +7,17 @@ import pytest
 from pose_world import FRAME, SHIFT, World
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.poses.diagnosis import depends_on
+from anser_ros.apps.poses.cli.pose_session import sizes
 from anser_ros.apps.poses.effect import PoseSetting, Role
 from anser_ros.apps.poses.effects.episodes import PoseMovingMetal
 from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
 from anser_ros.apps.poses.effects.frames import PoseClockRate
 from anser_ros.apps.poses.effects.stream import ReceiptJitter, power_law, stamp_step
-from anser_ros.apps.poses.fit import is_lever_determined
 from anser_ros.apps.poses.hand_eye import one_clock
 from anser_ros.apps.poses.problem import PoseNoise
 from anser_ros.apps.poses.search import doubt, with_noise
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSession, sequence_of
-from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, started
+from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -72,13 +70,6 @@ def test_poses_are_thinned_out_of_step_with_a_poll(poses_a_step):
     late = stamp - taken
     assert 500 < kept.size <= 900
     assert late[kept].mean() == pytest.approx(late.mean(), abs=0.03 * step)
-
-
-def test_at_rest_nothing_depends_on_speed():
-    session = World(7, sensors=1).session()
-    problem = pose_problem(session)
-    still = replace(problem, path=replace(problem.path, is_at_rest=True))
-    assert 'speed' not in depends_on(still.state(started(still, 0.0)))
 
 
 @pytest.mark.parametrize('shared', [True, False])
@@ -167,8 +158,8 @@ def episodes_of(spans, *, returns=False, shared_m=0.0):
     sensors = []
     for k in range(3):
         residual = 3e-4 * rng.normal(size=(time.size, 6)) + shared
-        for first, last, sizes in spans:
-            residual[(time > first) & (time < last), 0] += sizes[k]
+        for first, last, pulls in spans:
+            residual[(time > first) & (time < last), 0] += pulls[k]
         view = SimpleNamespace(sensor=f'sensor_{k}', time=time, measured=place)
         every = np.ones(time.size, dtype=bool)
         sensors.append(SimpleNamespace(view=view, residual=residual, used=every, out=~every))
@@ -240,10 +231,27 @@ def test_recordings_at_rest_one_after_the_other_are_compared_whole():
     assert fit.state.rms()[0] < 1e-3
 
 
-def test_a_short_motion_with_little_error_gives_no_lever_arm():
-    world = World(6, duration=12.0, sensors=1)
-    world.noise_m, slow = 5e-5, world._turn
-    world._turn = lambda time: 0.06 * slow(time)
-    problem = pose_problem(world.session())
-    fit = with_noise(first_fit(problem, coarse_offset(problem), False))
-    assert not is_lever_determined(fit.state.parts[0], 0.0).any()
+@pytest.mark.parametrize(
+    ('parameters', 'sigmas', 'lines'),
+    [
+        (
+            {'offset_s': 0.03005, 'middle_s': 7.0}, {'offset_s': 5.8e-5},
+            ['offset: 30.050 ± 0.058 ms'],
+        ),
+        ({'rate_ppm': -1118.2}, {'rate_ppm': 38.4}, ['rate: -1118 ± 38 ppm']),
+        ({'scale': 1.01532}, {'scale': 0.0012}, ['scale: 1.0153 ± 0.0012']),
+        (
+            {'kind': 'linear', 'degree': 1, 'rms_m': 0.002, 'coefficients_mm': [1.0] * 30},
+            {'rms_m': 1e-4}, ['kind: linear', 'rms: 2.00 ± 0.10 mm'],
+        ),
+        (
+            {'rms_s': 0.0069, 'by_sensor': {'tip': 0.0071}}, {'rms_s': 0.0002},
+            ['rms: 6.90 ± 0.20 ms', 'by sensor: tip 7.10 ms'],
+        ),
+        ({'fraction': 0.02, 'by_sensor': {'tip': 3}}, {}, ['share: 2.00 %', 'by sensor: tip 3']),
+        ({'t_start_s': 6.73, 'sensors': ['tip']}, {'t_start_s': 0.5},
+         ['start: 6.7 s', 'sensors: [tip]']),
+    ],
+)  # fmt: skip
+def test_sizes_are_told_in_the_units_of_a_clinic(parameters, sigmas, lines):
+    assert [line.replace('\xa0', ' ') for line in sizes(parameters, sigmas)] == lines
