@@ -55,6 +55,11 @@ def kernel(function: Any = None, **options: Any) -> Any:
         return numba.njit(function, error_model='numpy', **options)
 
 
+def inlined(function: Any) -> Any:
+    """Mark a function that is compiled as a part of each kernel that calls it, never alone."""
+    return numba.njit(function, inline='always')
+
+
 @functools.cache
 def kept_folder() -> Path | None:
     """Return the folder of the kernels as their sources are now; None where it cannot be made."""

@@ -123,7 +123,8 @@ def kernels() -> dict[str, Dispatcher]:
     """Return all kernels of the modules that have been imported, by name."""
     modules = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
     found = [v for module in modules for v in vars(module).values() if isinstance(v, Dispatcher)]
-    return {f'{k.py_func.__module__}.{k.py_func.__qualname__}': k for k in found}
+    alone = [k for k in found if 'inline' not in k.targetoptions]
+    return {f'{k.py_func.__module__}.{k.py_func.__qualname__}': k for k in alone}
 
 
 def main(part: str) -> int:

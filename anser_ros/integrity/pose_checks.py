@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from anser_ros.kernel_cache import kernel
+from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.stamps import NANO
 
@@ -195,7 +195,7 @@ class SurveyErrors:
     gain: float
 
 
-@kernel
+@inlined
 def _add_product(rows, covariance, total):  # type: ignore[no-untyped-def]
     """Add ``rows covariance rows^T`` of rows (m, n) to a matrix (m, m)."""
     for i in range(rows.shape[0]):
@@ -207,7 +207,7 @@ def _add_product(rows, covariance, total):  # type: ignore[no-untyped-def]
                 total[i, j] += part * rows[j, b]
 
 
-@kernel
+@inlined
 def _squared_distance(covariance, apart):  # type: ignore[no-untyped-def]
     """Return ``apart^T covariance^-1 apart`` by Cholesky's factor, which is written over both."""
     total = 0.0

@@ -25,7 +25,7 @@ import numpy as np
 
 from anser_ros.frames.faults import STUCK_CODE
 from anser_ros.frames.intake import Frame
-from anser_ros.kernel_cache import kernel
+from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.stamps import NANO
 
 SILENT_S = 1.0
@@ -152,7 +152,7 @@ HOPELESS = -60.0
 """Logarithm of the odds of one comparison below which the rest of it is not worked out."""
 
 
-@kernel
+@inlined
 def _fill_terms(now, least, terms):  # type: ignore[no-untyped-def]
     """Write what makes the odds of a repetition of ``now`` (K,): a place and four numbers a row.
 

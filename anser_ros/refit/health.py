@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.integrity.pose_checks import STREAM_GAP_S
-from anser_ros.refit.kernels import fill_left_out, fill_without
+from anser_ros.refit.kernels import fill_without
 from anser_ros.refit.posterior import STRENGTHS, Bank, FrameEvidence, log_sum, median
 from anser_ros.stamps import NANO
 
@@ -35,16 +35,15 @@ def left_out(bank: Bank, seen: FrameEvidence, hypothesis: int) -> tuple[Array, A
     freedom; then measured minus predicted (S, K, 2), in noise units.
     """
     precision, _ = bank.precision(seen.noise)
-    n, (real, imaginary) = len(bank.rows), seen.strength[hypothesis].argmax(axis=1).tolist()
-    chi2 = np.empty(n // bank.width)
-    residual = np.empty((len(chi2), bank.width, 2))
-    fill_left_out(
-        bank.analysis[hypothesis * n : (hypothesis + 1) * n], seen.projected[hypothesis],
-        precision[hypothesis, real], precision[hypothesis, imaginary],
-        bank.coil_covariances(seen.noise, hypothesis, real),
-        bank.coil_covariances(seen.noise, hypothesis, imaginary), chi2, residual,
-    )  # fmt: skip
-    return chi2, residual
+    n, tops = len(bank.rows), seen.strength[hypothesis].argmax(axis=1).tolist()
+    scaled = seen.projected[hypothesis] * precision[hypothesis, tops].T.astype(np.float64)
+    weighted = bank.analysis[hypothesis * n : (hypothesis + 1) * n].T @ scaled
+    weighted = weighted.reshape(-1, bank.width, 2)
+    residual = np.empty_like(weighted)
+    for part, top in enumerate(tops):
+        blocks = bank.coil_covariances(seen.noise, hypothesis, top)
+        residual[..., part] = (blocks @ weighted[..., part, None])[..., 0]
+    return (weighted * residual).sum(axis=(1, 2)), residual
 
 
 def evidence_without(

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from anser_ros.kernel_cache import kernel
+from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 
 FAST = {'reassoc', 'contract', 'nsz'}
@@ -26,7 +26,7 @@ def fill_products(matrix, columns, out):  # type: ignore[no-untyped-def]
         out[i, 0], out[i, 1] = first, second
 
 
-@kernel(fastmath=FAST)
+@inlined
 def _fill_probabilities(curve, probability):  # type: ignore[no-untyped-def]
     """Write the weights of log likelihoods (A,) and return the logarithm of their mean."""
     top, total = curve[0], 0.0
@@ -101,37 +101,7 @@ def fill_scores(directions, white, inside, rest, log_det, scores):  # type: igno
         scores[body] += _fill_probabilities(curve[1], probability)
 
 
-@kernel(fastmath=FAST)
-def fill_left_out(  # type: ignore[no-untyped-def]
-    analysis, projected, real_precision, imaginary_precision, real_block, imaginary_block, chi2,
-    residual,
-):  # fmt: skip
-    """Write how far each coil is from what the others predict; see `left_out`.
-
-    ``analysis`` (n, n): a row an eigenvector; ``projected`` (n, 2); blocks (S, K, K).
-    """
-    n, width = projected.shape[0], real_block.shape[1]
-    weighted = np.zeros((2, n))
-    for i in range(n):
-        real = float(projected[i, 0]) * real_precision[i]
-        imaginary = float(projected[i, 1]) * imaginary_precision[i]
-        for j in range(n):
-            weighted[0, j] += real * analysis[i, j]
-            weighted[1, j] += imaginary * analysis[i, j]
-    for s in range(chi2.shape[0]):
-        chi2[s] = 0.0
-        for part in range(2):
-            block = real_block[s] if part == 0 else imaginary_block[s]
-            own = weighted[part, s * width : (s + 1) * width]
-            for k in range(width):
-                total = 0.0
-                for j in range(width):
-                    total += block[k, j] * own[j]
-                residual[s, k, part] = total
-                chi2[s] += own[k] * total
-
-
-@kernel(fastmath=FAST)
+@inlined
 def _fill_block(rows, precision, weighted, block):  # type: ignore[no-untyped-def]
     """Write ``rows diag(precision) rows^T`` of rows (m, n) into the lower half of (m, m).
 
@@ -155,7 +125,7 @@ def _fill_block(rows, precision, weighted, block):  # type: ignore[no-untyped-de
             block[also, s], block[also, beside] = third, fourth
 
 
-@kernel(fastmath=FAST)
+@inlined
 def _fill_gains(rows, width, projected, precision, weighted, block, columns, gains):  # type: ignore[no-untyped-def]
     """Write by how much a log likelihood grows without the first coil, the first two, and so on.
 

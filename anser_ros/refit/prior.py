@@ -139,7 +139,8 @@ class _Sources:
     def covariance(self, first: Array, second: Array) -> Array:
         """Return the covariance (R1, K, R2, K) of the readings of two sets of rows (R, M, 3)."""
         mine, theirs = self.along(first), self.along(second)
-        out = self.response.isotropic * self._product(mine, theirs)
+        product = self._product(mine, theirs)
+        out = self.response.isotropic * product
         if self.response.upright > 0.0:
             out += self.response.upright * self._product(self.upright(first), self.upright(second))
         if self.response.tensor > 0.0:
@@ -153,9 +154,7 @@ class _Sources:
                     out[:, k, :, j] += 0.5 * self.response.tensor * block
                     if j != k:
                         out[:, j, :, k] += 0.5 * self.response.tensor * block
-                for j in range(self.width):
-                    block = (mine[:, j] * self.volumes) @ theirs[:, k].T
-                    out[:, k, :, j] += 0.5 * self.response.tensor * block
+            out += 0.5 * self.response.tensor * product.swapaxes(1, 3)
         return out
 
     def _product(self, first: Array, second: Array) -> Array:

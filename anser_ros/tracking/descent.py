@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from anser_ros.kernel_cache import kernel
+from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import fill_coil_basis
 from anser_ros.physics.rotations import fill_tangent
 
@@ -30,7 +30,7 @@ TRUSTED_CHI2, TRUSTED_MOVE_M, TRUSTED_TURN = 0.03, 50e-6, 1e-3
 what a sixth of a sigma leaves, of second order, is less than a thousandth of a sigma."""
 
 
-@kernel
+@inlined
 def _whiten(flux, model, whitening, residual, white):  # type: ignore[no-untyped-def]
     """Row 0 of ``white``: residual; rows 1 to 6: the flux's derivatives. Returns chi-square.
 
@@ -61,7 +61,7 @@ def _whiten(flux, model, whitening, residual, white):  # type: ignore[no-untyped
     return chi2
 
 
-@kernel
+@inlined
 def _normal_equations(white, axis, tangent, full, normal, gradient):  # type: ignore[no-untyped-def]
     """``full`` (6, 6) by position and free axis; ``normal``, ``gradient`` in the tangent plane."""
     fill_tangent(axis, tangent)
@@ -125,7 +125,7 @@ def damped_step(normal, gradient, damping, factor, step):  # type: ignore[no-unt
     return True
 
 
-@kernel
+@inlined
 def limit_step(step):  # type: ignore[no-untyped-def]
     """Shorten a step to the largest move and turn that the local model is trusted for.
 
@@ -147,7 +147,7 @@ def limit_step(step):  # type: ignore[no-untyped-def]
     return move < TRUSTED_MOVE_M and turn < TRUSTED_TURN
 
 
-@kernel
+@inlined
 def _advance(  # type: ignore[no-untyped-def]
     position, axis, tangent, normal, gradient, step, low, high, new_position, new_axis
 ):  # fmt: skip
@@ -181,28 +181,49 @@ def descend(  # type: ignore[no-untyped-def]
     ``found`` (S, 3): chi-square, evaluations used, whether it converged.
     """
     width = fluxes.shape[1]
-    basis = np.empty((1, 7, dipoles.shape[1]))
-    white, trial_white, trial_residual = (
-        np.empty((7, width)),
-        np.empty((7, width)),
-        np.empty(width),
-    )
+    basis, white, trial_residual = (
+        np.empty((1, 7, dipoles.shape[1])), np.empty((7, width)), np.empty(width)
+    )  # fmt: skip
     tangent, step, factor = np.empty((2, 3)), np.empty(5), np.empty((5, 5))
     normal, gradient, trial_position, trial_axis = (
         np.empty((5, 5)), np.empty(5), np.empty(3), np.empty(3)
     )  # fmt: skip
     for s in range(positions.shape[0]):
-        position, axis, flux, weights = positions[s], axes[s], fluxes[s], whitening[s]
-        full, residual = normals[s], residuals[s]
-        length = lengths[s : s + 1]
-        fill_coil_basis(position.reshape(1, 3), axis.reshape(1, 3), length, dipoles, basis)
-        chi2 = _whiten(flux, np.dot(basis[0], moments), weights, residual, white)
-        _normal_equations(white, axis, tangent, full, normal, gradient)
-        used, damping, growth, converged = 1, FIRST_DAMPING, 2.0, False
-        while used < budget and not converged and damping <= MOST_DAMPING:
-            if not damped_step(normal, gradient, damping, factor, step):
-                damping = max(10.0 * damping, 1e-8)
-                continue
+        position, axis, residual = positions[s], axes[s], residuals[s]
+        for i in range(3):
+            trial_position[i], trial_axis[i] = position[i], axis[i]
+        chi2, promised, used = 0.0, 0.0, 0
+        damping, growth, converged = FIRST_DAMPING, 2.0, False
+        while True:
+            fill_coil_basis(
+                trial_position.reshape(1, 3), trial_axis.reshape(1, 3), lengths[s : s + 1],
+                dipoles, basis,
+            )  # fmt: skip
+            used += 1
+            model = np.dot(basis[0], moments)
+            trial = _whiten(fluxes[s], model, whitening[s], trial_residual, white)
+            if used == 1 or trial <= chi2:
+                if used > 1:
+                    gain = (chi2 - trial) / max(promised, 1e-300)
+                    damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
+                    growth = 2.0
+                    converged = chi2 - trial < CONVERGED_CHI2 + 1e-9 * chi2
+                chi2 = trial
+                for k in range(width):
+                    residual[k] = trial_residual[k]
+                for i in range(3):
+                    position[i], axis[i] = trial_position[i], trial_axis[i]
+                _normal_equations(white, axis, tangent, normals[s], normal, gradient)
+            else:
+                damping = max(damping * growth, LEAST_RAISED)
+                growth *= 2.0
+            has_step = False
+            while used < budget and not (converged or has_step) and damping <= MOST_DAMPING:
+                has_step = damped_step(normal, gradient, damping, factor, step)
+                if not has_step:
+                    damping = max(10.0 * damping, 1e-8)
+            if not has_step:
+                break
             short = limit_step(step)
             promised = _advance(
                 position, axis, tangent, normal, gradient, step, low, high, trial_position,
@@ -212,26 +233,7 @@ def descend(  # type: ignore[no-untyped-def]
             if negligible or (short and promised < TRUSTED_CHI2):
                 chi2 -= promised
                 converged = True
-            else:
-                fill_coil_basis(
-                    trial_position.reshape(1, 3), trial_axis.reshape(1, 3), length, dipoles, basis
-                )
-                used += 1
-                model = np.dot(basis[0], moments)
-                trial = _whiten(flux, model, weights, trial_residual, trial_white)
-                if not trial <= chi2:
-                    damping = max(damping * growth, LEAST_RAISED)
-                    growth *= 2.0
-                    continue
-                gain = (chi2 - trial) / max(promised, 1e-300)
-                damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
-                growth = 2.0
-                converged = chi2 - trial < CONVERGED_CHI2 + 1e-9 * chi2
-                chi2 = trial
-                white, trial_white = trial_white, white
-                for k in range(width):
-                    residual[k] = trial_residual[k]
-                _normal_equations(white, trial_axis, tangent, full, normal, gradient)
-            for i in range(3):
-                position[i], axis[i] = trial_position[i], trial_axis[i]
+                for i in range(3):
+                    position[i], axis[i] = trial_position[i], trial_axis[i]
+                break
         found[s, 0], found[s, 1], found[s, 2] = chi2, used, converged

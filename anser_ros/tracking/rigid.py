@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from anser_ros.errors import TrackingError
-from anser_ros.kernel_cache import kernel
+from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import dipole_field, fill_coil_basis
 from anser_ros.physics.rotations import nearest_rotation
 from anser_ros.tracking.descent import (
@@ -31,7 +31,7 @@ from anser_ros.tracking.seed import SeedGrid
 from anser_ros.tracking.solve import Array, RealField
 
 
-@kernel
+@inlined
 def _look(  # type: ignore[no-untyped-def]
     pose, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments, basis
 ):  # fmt: skip
@@ -71,7 +71,7 @@ def _look(  # type: ignore[no-untyped-def]
     return products[0, 0] - shared[0, 0]
 
 
-@kernel
+@inlined
 def _advance(  # type: ignore[no-untyped-def]
     position, rotation, information, gradient, step, low, high, new_position, new_rotation
 ):  # fmt: skip
@@ -122,22 +122,35 @@ def descend_body(  # type: ignore[no-untyped-def]
     basis, size = np.empty((flux.shape[0], 7, dipoles.shape[1])), flux.size
     step, factor = np.empty(6), np.empty((6, 6))
     pose = (
-        position, rotation, np.empty(flux.shape), np.empty((7, size)), np.empty((6, 6)),
-        np.empty(6),
-    )  # fmt: skip
-    trial = (
         np.empty(3), np.empty((3, 3)), np.empty(flux.shape), np.empty((7, size)),
         np.empty((6, 6)), np.empty(6),
     )  # fmt: skip
-    chi2 = _look(
-        pose, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments, basis
-    )
-    used, damping, converged = 1, FIRST_DAMPING, False
-    place = pose[:2]
-    while used < budget and not converged and damping < 1e10:
-        if not damped_step(pose[4], pose[5], damping, factor, step):
-            damping = max(10.0 * damping, LEAST_RAISED)
-            continue
+    trial = (
+        position, rotation, np.empty(flux.shape), np.empty((7, size)), np.empty((6, 6)),
+        np.empty(6),
+    )  # fmt: skip
+    chi2, promised, used, damping, converged = 0.0, 0.0, 0, FIRST_DAMPING, False
+    while True:
+        trial_chi2 = _look(
+            trial, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments, basis
+        )
+        used += 1
+        if used == 1 or trial_chi2 <= chi2:
+            if used > 1:
+                fall = chi2 - trial_chi2
+                converged = fall < CONVERGED_CHI2 + 1e-9 * chi2
+                damping *= 0.1 if fall > 0.5 * promised else 0.5
+            chi2 = trial_chi2
+            pose, trial = trial, pose
+        else:
+            damping = max(5.0 * damping, LEAST_RAISED)
+        place, has_step = pose[:2], False
+        while used < budget and not (converged or has_step) and damping < 1e10:
+            has_step = damped_step(pose[4], pose[5], damping, factor, step)
+            if not has_step:
+                damping = max(10.0 * damping, LEAST_RAISED)
+        if not has_step:
+            break
         short = limit_step(step)
         promised = _advance(
             pose[0], pose[1], pose[4], pose[5], step, low, high, trial[0], trial[1]
@@ -147,19 +160,6 @@ def descend_body(  # type: ignore[no-untyped-def]
             chi2 -= promised
             converged, place = True, trial[:2]
             break
-        trial_chi2 = _look(
-            trial, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments, basis
-        )
-        used += 1
-        fall = chi2 - trial_chi2
-        if fall >= 0.0:
-            converged = fall < CONVERGED_CHI2 + 1e-9 * chi2
-            damping *= 0.1 if fall > 0.5 * promised else 0.5
-            chi2 = trial_chi2
-            pose, trial = trial, pose
-            place = pose[:2]
-        else:
-            damping = max(5.0 * damping, LEAST_RAISED)
     return chi2, used, converged, place[0], place[1], pose[2], pose[3], pose[4]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
-from anser_ros.kernel_cache import kernel
+from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import dipole_field, fill_fields
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.physics.volume import TrackedVolume
@@ -35,7 +35,7 @@ NEAR = 1e-4
 """A relative fall of chi-square below this ends the descent: the joint one does the rest."""
 
 
-@kernel
+@inlined
 def _turn(field, flux, axis, tangent, plane, residual):  # type: ignore[no-untyped-def]
     """Best small turn of the axis in a given whitened field (3, 2K); returns chi-square after it.
 
@@ -96,7 +96,7 @@ def _turn(field, flux, axis, tangent, plane, residual):  # type: ignore[no-untyp
     return chi2
 
 
-@kernel
+@inlined
 def _look(  # type: ignore[no-untyped-def]
     position, axis, flux, inverse_sigma, dipoles, moments, basis, tangent, plane, residual, normal,
     gradient,
