@@ -19,6 +19,8 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.physics.rotations import nearest_rotation
 
+Mask = NDArray[np.bool_]
+
 Array = NDArray[np.float64]
 
 PAUSE_S = 2.0
@@ -339,8 +341,6 @@ def first_cost(fit: PoseFit) -> float:
         total += float(np.median(far[part.used])) if part.used.any() else 0.0
     return total / max(len(fit.state.parts), 1)
 
-
-Mask = NDArray[np.bool_]
 
 FAR, FITS = 8.0, 0.25
 """Distance of a pose from its own prediction, in spreads, from which it may be another sensor's,

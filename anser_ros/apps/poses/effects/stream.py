@@ -15,6 +15,8 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S
 from anser_ros.sessions.plausibility import FROZEN_S
 
+Mask = NDArray[np.bool_]
+
 Array = NDArray[np.float64]
 
 FEWEST_STALE = 0.02
@@ -287,8 +289,6 @@ class QuantisedStamps(PoseEffect):
         values = {'step_s': step, 'rms_s': rms}
         return [EffectRecord(self.name, values, sigma, {'likelihood_gain': gain})]
 
-
-Mask = NDArray[np.bool_]
 
 NOISIER = 2.0
 """Factor over the other sensors' median noise from which a sensor's is named; sensors of one kind
