@@ -74,7 +74,9 @@ def pose_problem(session: PoseSession) -> PoseProblem:
             track = _resting(reference, list(sensors.values()))
             path = OpticalPath.through(track, is_at_rest=True)
     kept = {
-        name: poses for name, poses in kept.items() if _seen(poses, path) >= FEWEST_HAND_EYE_POSES
+        name: poses
+        for name, poses in kept.items()
+        if np.count_nonzero(path.at(poses.time)[3]) >= FEWEST_HAND_EYE_POSES
     }
     if not kept:
         raise DiagnosisError(
@@ -108,10 +110,6 @@ def is_at_rest(poses: PoseSequence) -> bool:
 
 def _extent(values: Array) -> float:
     return float(np.linalg.norm(np.ptp(np.percentile(values, [10, 90], axis=0), axis=0)))
-
-
-def _seen(poses: PoseSequence, path: OpticalPath) -> int:
-    return int(np.count_nonzero(path.at(poses.time)[3]))
 
 
 def _thinned(poses: PoseSequence) -> PoseSequence:

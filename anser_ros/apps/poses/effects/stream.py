@@ -126,7 +126,8 @@ class PoseOutliers(PoseEffect):
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return one record of the outlying poses of all sensors."""
         found = _leaping(residuals.session.reference)
-        outs = [_alone(sensing, residuals) for sensing in residuals.sensors]
+        # Those of an episode are off together.
+        outs = [s.out & ~in_episode(s, residuals) for s in residuals.sensors]
         out = np.concatenate(outs)
         used = np.concatenate([s.used for s in residuals.sensors])
         count = int(np.count_nonzero(out))
@@ -165,11 +166,6 @@ def _leaping(reference: PoseSequence | None) -> list[EffectRecord]:
     values = {'fraction': share, 'stream': reference.name}
     sigma = float(np.sqrt(share / away.size))
     return [EffectRecord(PoseOutliers.name, values, {'fraction': sigma})]
-
-
-def _alone(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.bool_]:
-    """Poses of a sensor that stand out, less those of an episode, which are off together."""
-    return np.asarray(sensing.out & ~in_episode(sensing, residuals))
 
 
 def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
