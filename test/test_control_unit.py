@@ -180,13 +180,13 @@ class TestEffects:
     def test_compression(self):
         clean = self.codes()
         limit = 5.0 * np.abs(clean[:, 20]).max() / 32768
-        bent = self.codes(effects.CompressingAmplifier(20, limit))
+        bent = self.codes(effects.compressing(20, limit))
         ratio = np.abs(bent[:, 20]).max() / np.abs(clean[:, 20]).max()
         assert ratio == pytest.approx(np.tanh(1.0), abs=1e-3)
 
     def test_loose_contact(self):
         clean = self.codes()
-        loose = self.codes(effects.LooseSensor(20, share=0.5, period_s=0.02, rest=0.0))
+        loose = self.codes(effects.loose(20, share=0.5, period_s=0.02, rest=0.0))
         assert np.abs(loose[:400, 20]).max() == 0
         assert np.array_equal(loose[400:800], clean[400:800])
 
@@ -194,7 +194,7 @@ class TestEffects:
         clean = self.codes()
         swung = self.codes(effects.GainRipple(0.1, 0.4))
         assert np.abs(swung[-1, 20] - 1.1 * clean[-1, 20]) <= 1
-        scaled = self.codes(effects.ChannelGain(20, 0.5))
+        scaled = self.codes(effects.with_gain(20, 0.5))
         assert np.abs(scaled[:, 20] - 0.5 * clean[:, 20]).max() <= 1
 
     def test_drift_begins_with_the_first_start(self):
@@ -216,7 +216,7 @@ class TestEffects:
 
     def test_what_is_small_is_lost_behind_a_crossover(self):
         clean = self.codes()
-        crossed = self.codes(effects.CrossoverAmplifier(20, 0.02))
+        crossed = self.codes(effects.crossing_over(20, 0.02))
         volts = clean[:, 20] * 5.0 / 32768
         expected = clean[:, 20] - 0.02 * np.tanh(volts / 0.02) * 32768 / 5.0
         assert np.abs(crossed[:, 20] - expected).max() <= 2

@@ -39,6 +39,8 @@ from anser_ros.effects.effect import Family, Remedy, Term
 from anser_ros.effects.seen import EXCESS_NOISE, known_share, outliers_of
 from anser_ros.field.model import Dipoles, EffectRecord, FieldModel
 
+Array = NDArray[np.float64]
+
 SCHEMA = 'anser_diagnosis/1'
 """Name of the document's layout (`docs/interfaces.md`), which stands in it."""
 
@@ -75,9 +77,6 @@ def plain_finding(term: Term, without: float) -> Finding:
     record = term.effect.record(term, np.zeros((0, 0)))
     evidence = {'summary': term.effect.summary, 'remedy': term.effect.remedy.value}
     return Finding(replace(record, evidence=evidence), None, without)
-
-
-Array = NDArray[np.float64]
 
 
 def outlier_findings(

@@ -21,6 +21,8 @@ from anser_ros.parallel import in_order, slices, slices_of
 from anser_ros.physics.dipole import field_basis, flux_basis
 from anser_ros.settings import Accuracy
 
+Mask = NDArray[np.bool_]
+
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
@@ -137,9 +139,6 @@ class Whitener:
 
         in_order(work, slices(len(out), FRAMES_A_THREAD))
         return out.reshape(values.shape)
-
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

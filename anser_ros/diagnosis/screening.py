@@ -12,6 +12,8 @@ from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, tool_par
 from anser_ros.effects.effect import Family, Site, Term
 from anser_ros.effects.seen import DEAD_CHANNEL, SENSOR_POLARITY, SWAPPED_CHANNELS, SWAPPED_COILS
 
+ComplexArray = NDArray[np.complex128]
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -92,9 +94,6 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
 def clean_start(problem: Problem) -> Problem:
     """Return the problem without what stands out before anything is explained."""
     return without_outliers(problem, evaluate(problem, ()))
-
-
-ComplexArray = NDArray[np.complex128]
 
 
 def wiring_faults(problem: Problem) -> list[Term]:

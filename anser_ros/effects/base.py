@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
+ComplexArray = NDArray[np.complex128]
+
 Array = NDArray[np.float64]
 AnyTerm = TypeVar('AnyTerm', bound='BaseTerm')
 
@@ -148,9 +150,6 @@ class Apparatus:
             for rows in clusters_of(table)
             if rows.size > 1
         ]
-
-
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)

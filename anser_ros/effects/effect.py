@@ -34,6 +34,8 @@ from anser_ros.metal.scattering import Shapes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 
+ComplexArray = NDArray[np.complex128]
+
 Array = NDArray[np.float64]
 
 
@@ -93,8 +95,6 @@ class Term(BaseTerm):
         one = (int(self.site['channel']),) if 'channel' in self.site else ()
         return (*one, *(int(c) for c in self.site.get('channels', ())))
 
-
-ComplexArray = NDArray[np.complex128]
 
 LARGEST = 10.0
 """Prior standard deviation of the amplitudes of a simple body's modes, in units of 1e-4 m^3

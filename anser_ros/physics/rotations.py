@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from anser_ros.kernel_cache import kernel
 
+Array = NDArray[np.float64]
+
 
 @kernel
 def fill_tangent(n, t):  # type: ignore[no-untyped-def]
@@ -46,9 +48,6 @@ def tilted(axes: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np.f
     """Return unit axes (S, 3) stepped by ``tilt`` (S, 2), rad, along their `tangents`."""
     out = axes + np.einsum('st,stj->sj', tilt, tangents(axes))
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
-
-
-Array = NDArray[np.float64]
 
 
 def axis_angles(first: Array, second: Array) -> Array:

@@ -24,6 +24,8 @@ from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, metrics
 from anser_ros.wire.text_files import read_rows, read_text
 
+Array = NDArray[np.float64]
+
 SCHEMA = 'anser_evaluation/1'
 """Name of the document's layout, which stands in every such document."""
 
@@ -109,7 +111,6 @@ def _pose_rows(group: Mapping[str, PoseSeries], columns: Sequence[str]) -> list[
     return rows
 
 
-Array = NDArray[np.float64]
 Key = tuple[int, str]
 
 BLOCK_NS = 1_000_000_000

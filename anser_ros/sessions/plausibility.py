@@ -22,6 +22,8 @@ from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.wire.recorded import optical_stem
 from anser_ros.wire.setup import Setup, topic_of
 
+Array = NDArray[np.float64]
+
 LENGTH_M = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'inch': 0.0254}
 """Metres in a unit of length."""
 LENGTH_UNITS: Mapping[str, float] = {'millimetres': 1e3, 'centimetres': 1e2, 'inches': 1 / 0.0254}
@@ -45,8 +47,6 @@ def unit_words(ratio: float, units: Mapping[str, float]) -> str:
     nearest = min(apart, key=lambda name: apart[name])
     return nearest if apart[nearest] < math.log(CLOSE) else ''
 
-
-Array = NDArray[np.float64]
 
 MOST_FRAMES = 40
 """Frames that are looked at, evenly over the recording: enough for shares, and quick."""

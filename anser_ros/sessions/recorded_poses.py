@@ -169,15 +169,11 @@ def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]
     found: dict[str, int] = {}
     for log_time_ns, status in _statuses(path):
         node, _, name = status.name.partition(': ')
-        if node == part_of and name and _level(status) == WARN:
+        level = status.level  # a ``byte``, which some decoders give as bytes
+        level = level[0] if isinstance(level, bytes) else int(level)
+        if node == part_of and name and level == WARN:
             found.setdefault(name, log_time_ns)
     return found
-
-
-def _level(status: Any) -> int:
-    """A level: a ``byte``, which some decoders give as bytes."""
-    level = status.level
-    return level[0] if isinstance(level, bytes) else int(level)
 
 
 def overload(path: str | os.PathLike[str]) -> list[str]:

@@ -20,6 +20,8 @@ from anser_ros.wire.points import STALE, FluxPoints
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes, unit_quaternions
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
 
+ComplexArray = NDArray[np.complex128]
+
 MOST_NOISE_T = 1e-3
 """Noise, T, from which on a setup's statement is a mistake: emitters make microtesla at most."""
 MOST_STAMP_SIGMA_S = 0.1
@@ -187,9 +189,6 @@ def _no_fluxes(sensors: SensorTable, emitters: int) -> RecordedFluxes:
         np.zeros(0, dtype=np.int64), sensors.channel, np.zeros((0, count), dtype=np.int64),
         np.zeros((0, count, emitters), dtype=complex),
     )  # fmt: skip
-
-
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)

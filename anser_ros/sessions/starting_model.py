@@ -174,14 +174,13 @@ def _bodies_of(model: FieldModel, setup: Setup) -> set[str]:
     found = set()
     for effect in model.effects:
         parameters = effect.parameters
-        channels = [parameters.get('channel'), *_listed(parameters.get('channels'))]
+        several = parameters.get('channels')
+        channels = [
+            parameters.get('channel'), *(several if isinstance(several, list | tuple) else ())
+        ]  # fmt: skip
         found |= {s.body for s in setup.sensors if s.channel in channels}
         found |= {s.body for s in setup.sensors if s.body == parameters.get('body')}
     return found
-
-
-def _listed(value: object) -> list[object]:
-    return list(value) if isinstance(value, list | tuple) else []
 
 
 def check_fits(model: FieldModel, session: Session) -> None:

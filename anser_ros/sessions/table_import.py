@@ -35,6 +35,8 @@ from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
 from anser_ros.wire.text_files import read_text, read_yaml
 
+Array = NDArray[Any]
+
 REFERENCE = re.compile(r'^\s*([^\[\]]+?)\s*(?:\[([\d\s,]+)\])?\s*$')
 """A column: a name, and where that is an array of more dimensions, the further indices."""
 ENDINGS = ('.csv', '.npy', '.npz', '.mat')
@@ -150,8 +152,6 @@ FLUX_T = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'pT': 1e-12}
 """Tesla in a unit of flux density."""
 ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
 """Where x, y, z, w stand in a quaternion of that order."""
-
-Array = NDArray[Any]
 
 
 def import_tables(document: Path, out: Path) -> dict[str, int]:

@@ -66,64 +66,44 @@ class RawChannelCrosstalk(RawEffect):
 
 @dataclass(frozen=True)
 class OneSensor(RawEffect):
-    """Changes the voltages of one sensor, at its column in the order of the setup."""
+    """Changes the voltages of one sensor, at its column in the order of the setup.
 
-    column: int
-
-    def volts(self, time_s: Array, volts: Array) -> Array:
-        changed = volts.copy()
-        changed[:, self.column] = self.changed(time_s, volts[:, self.column])
-        return changed
-
-    def changed(self, time_s: Array, volts: Array) -> Array:
-        """Return the sensor's voltages (n,), V."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class CompressingAmplifier(OneSensor):
-    """Saturates one sensor's amplifier: v becomes ``limit * tanh(v / limit)``."""
-
-    limit_v: float
-
-    def changed(self, time_s: Array, volts: Array) -> Array:
-        return np.asarray(self.limit_v * np.tanh(volts / self.limit_v))
-
-
-@dataclass(frozen=True)
-class CrossoverAmplifier(OneSensor):
-    """Distorts one sensor by crossover: v becomes ``v - dead * tanh(v / dead)``.
-
-    The diagnosis has no such effect. The weaker all tones are, the larger is the lost fraction.
+    ``changed`` takes times (n,), s, and the sensor's voltages (n,), V, and returns the latter.
     """
 
-    dead_v: float
+    column: int
+    changed: Callable[[Array, Array], Array]
 
-    def changed(self, time_s: Array, volts: Array) -> Array:
-        return np.asarray(volts - self.dead_v * np.tanh(volts / self.dead_v))
-
-
-@dataclass(frozen=True)
-class LooseSensor(OneSensor):
-    """Loosens a sensor's contact: periodically its voltage drops to a small remainder."""
-
-    share: float = 0.1  # fraction of the time in which the contact is open
-    rest: float = 0.02  # factor of the voltage at an open contact
-    period_s: float = 0.7  # from one opening to the next, s
-
-    def changed(self, time_s: Array, volts: Array) -> Array:
-        is_open = (time_s / self.period_s) % 1.0 < self.share
-        return np.where(is_open, volts * self.rest, volts)
+    def volts(self, time_s: Array, volts: Array) -> Array:
+        out = volts.copy()
+        out[:, self.column] = self.changed(time_s, volts[:, self.column])
+        return out
 
 
-@dataclass(frozen=True)
-class ChannelGain(OneSensor):
-    """Makes the gain of one channel wrong."""
+def compressing(column: int, limit_v: float) -> OneSensor:
+    """Return an amplifier that saturates: v becomes ``limit * tanh(v / limit)``."""
+    return OneSensor(column, lambda _, volts: limit_v * np.tanh(volts / limit_v))
 
-    gain: float
 
-    def changed(self, time_s: Array, volts: Array) -> Array:
-        return volts * self.gain
+def crossing_over(column: int, dead_v: float) -> OneSensor:
+    """Return crossover distortion, which no diagnosis knows: v becomes ``v - dead * tanh(v /
+    dead)``, so that of weak tones a larger fraction is lost.
+    """
+    return OneSensor(column, lambda _, volts: volts - dead_v * np.tanh(volts / dead_v))
+
+
+def loose(column: int, share: float, period_s: float, rest: float = 0.02) -> OneSensor:
+    """Return a contact that is open for a share of each period; a rest of the voltage stays."""
+
+    def changed(time_s: Array, volts: Array) -> Array:
+        return np.where((time_s / period_s) % 1.0 < share, volts * rest, volts)
+
+    return OneSensor(column, changed)
+
+
+def with_gain(column: int, gain: float) -> OneSensor:
+    """Return a channel whose gain is wrong."""
+    return OneSensor(column, lambda _, volts: volts * gain)
 
 
 @dataclass(frozen=True)
@@ -276,7 +256,7 @@ def _sensor_gain(unit: Unit, rng: np.random.Generator) -> Drawn:
     column, sensor = _tool_sensor(unit, rng)
     gain = float(1 + rng.choice([-1, 1]) * rng.uniform(0.01, 0.04))
     parameters = {'channel': sensor.channel, 'gain': gain, 'phase_deg': 0.0}
-    return _known('sensor_gain', parameters, ChannelGain(column, gain))
+    return _known('sensor_gain', parameters, with_gain(column, gain))
 
 
 def _saturation(unit: Unit, rng: np.random.Generator) -> Drawn:
@@ -287,7 +267,7 @@ def _saturation(unit: Unit, rng: np.random.Generator) -> Drawn:
     area_m2 = unit.channels.areas_m2([sensor.channel])[0]
     full_scale_t = float(limit_v / (2 * np.pi * area_m2 * np.mean(unit.setup.frequencies_hz)))
     parameters = {'channel': sensor.channel, 'full_scale_t': full_scale_t, 'limit_v': limit_v}
-    return _known('saturation', parameters, CompressingAmplifier(column, limit_v))
+    return _known('saturation', parameters, compressing(column, limit_v))
 
 
 def _coil_drift(unit: Unit, rng: np.random.Generator) -> Drawn:
@@ -302,7 +282,7 @@ def _loose_contact(unit: Unit, rng: np.random.Generator) -> Drawn:
     column, sensor = _tool_sensor(unit, rng)
     share, period_s = float(rng.uniform(0.04, 0.1)), float(rng.uniform(0.6, 1.2))
     parameters = {'channels': [sensor.channel], 'share': share, 'period_s': period_s}
-    effects = (LooseSensor(column, share, period_s=period_s),)
+    effects = (loose(column, share, period_s),)
     return Drawn('loose_contact', parameters, effects, answers=('loose_contact', 'outliers'))
 
 
@@ -318,7 +298,7 @@ def _crossover(unit: Unit, rng: np.random.Generator) -> Drawn:
     column, sensor = _tool_sensor(unit, rng)
     dead_v = float(rng.uniform(0.01, 0.03))
     parameters = {'channel': sensor.channel, 'dead_v': dead_v}
-    return Drawn('crossover', parameters, (CrossoverAmplifier(column, dead_v),))
+    return Drawn('crossover', parameters, (crossing_over(column, dead_v),))
 
 
 CATALOGUE: dict[str, Callable[[Unit, np.random.Generator], Drawn]] = {

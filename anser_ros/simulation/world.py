@@ -19,6 +19,8 @@ from anser_ros.physics.dipole import GAUSS_OFFSET, flux_basis
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
 
+ComplexArray = NDArray[np.complex128]
+
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
 """A position (3,), m, and a rotation matrix (3, 3) from the body's frame to fg."""
@@ -86,9 +88,6 @@ class Approach:
         smooth = share * share * (3 - 2 * share)
         far, near = np.array(self.far_m), np.array(self.near_m)
         return far + smooth * (near - far), np.eye(3)
-
-
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)

@@ -257,3 +257,9 @@ ENGINES = (
 )
 """In their order: a body of many sensors at one place, at a few poses, and any scan, with the
 sizes of emitters without a drawing."""
+
+
+def is_estimated_jointly(session: Session) -> bool:
+    """Return whether a session has few poses of a body of many sensors, and no drawn emitters."""
+    options = Options(session.setup.accuracy, is_joint=True)
+    return any(engine.is_joint and engine.accepts([session], options) for engine in ENGINES)

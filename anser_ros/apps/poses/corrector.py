@@ -18,6 +18,8 @@ from anser_ros.diagnosis.diagnose import SCHEMA
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord, plain
 
+Array = NDArray[np.float64]
+
 MODEL_SCHEMA = 'anser_pose_model/1'
 """Name of the layout of a model of poses."""
 
@@ -134,8 +136,6 @@ def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
         'effects': effects,
     }
 
-
-Array = NDArray[np.float64]
 
 OK, OUTSIDE, NO_POSE, UNKNOWN = 'ok', 'outside_support', 'no_pose', 'unknown_sensor'
 """States of a corrected pose: what is published is in one of the first two."""

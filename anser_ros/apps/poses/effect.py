@@ -232,12 +232,6 @@ class NumberEffect(PoseEffect):
 
     key = ''
     base, factor = 0.0, 1.0
-    spread = 1.0
-    """Standard deviation of theta before anything is measured."""
-
-    def prior(self, term: PoseTerm) -> Array:
-        """Return the standard deviation of theta before anything is measured, shape (1,)."""
-        return np.full(1, self.spread)
 
     def record(self, term: PoseTerm, covariance: Array) -> EffectRecord:
         """Return the number and its standard deviation, and the term's site."""

@@ -27,6 +27,8 @@ from anser_ros.effects.effect import needed, sigmas
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
 
+Array = NDArray[np.float64]
+
 AGREE_S = 3.0
 """Time about a session's start or middle, s, at which clocks count as agreeing: programs set
 clocks when they start, and a rate by regression is about the middle."""
@@ -88,9 +90,6 @@ def one_clock(records: Sequence[EffectRecord], duration: float) -> list[EffectRe
 
 def _is(record: EffectRecord, role: Role) -> bool:
     return effect_of_record(record).role is role
-
-
-Array = NDArray[np.float64]
 
 
 def records_of(
@@ -164,25 +163,6 @@ TILT_NEEDED_DEG = 20.0  # what is asked for where a lever arm is open
 
 
 @dataclass(frozen=True)
-class SensorFrames:
-    """Holds place and mount of one sensor on the body with what is known of them."""
-
-    lever_m: Array  # (3,), m, body's frame; NaN where the motion does not determine it
-    lever_sigma_m: Array  # (3,)
-    # (3, 3), rotation from the sensor's frame to the body's; None where it is not determined.
-    mount: Array | None
-    mount_sigma_rad: Array  # (3,)
-    # Poses that took part, of those that could be compared with an optical pose; the others
-    # contradict them.
-    n: int
-    n_compared: int
-    # Distance (m) and angle (rad) that are left, root mean square, on those that took part.
-    rms: tuple[float, float]
-    # The same on all of the fifth of the recording that took no part in a fit of its own.
-    held_out: tuple[float, float]
-
-
-@dataclass(frozen=True)
 class HandEye:
     """Holds what two streams of poses have between them."""
 
@@ -200,7 +180,10 @@ class HandEye:
     offset_s: tuple[float, float] | None
     rate_ppm: tuple[float, float] | None
     middle_s: float  # s since the recording's start; 0 without a rate
-    sensors: dict[str, SensorFrames]
+    # Of each sensor lever arm and mount, None or NaN where the motion does not determine them; how
+    # many poses took part (`n`) of those that could be compared, as the others contradict them;
+    # and what is left on these, and on the fifth of the recording that took no part.
+    sensors: dict[str, dict[str, Any]]
     # What the recording does not determine, and what it would take, in words.
     undetermined: tuple[str, ...]
     fit: PoseFit
@@ -302,11 +285,16 @@ def _described(
         lever = [np.nan if v is None else float(v) for v in record.parameters['lever_arm_m']]
         sigma = sigmas(fit.covariance_of(index))
         known = bool(np.all(sigma[3:] < LEAST_KNOWN_RAD))
-        sensors[name] = SensorFrames(
-            np.array(lever), sigma[:3], frames.mount if known else None, sigma[3:],
-            int(np.count_nonzero(part.used)), len(part.used), fit.state.rms(name),
-            held_out.get(name, (np.nan, np.nan)),
-        )  # fmt: skip
+        vector, quaternion = turn_of(frames.mount) if known else (None, None)
+        left, unseen = fit.state.rms(name), held_out.get(name, (np.nan, np.nan))
+        sensors[name] = {
+            'lever_arm_m': np.array(lever), 'lever_arm_sigma_m': sigma[:3],
+            'mount_rotation_deg': vector, 'mount_rotation_sigma_deg': np.rad2deg(sigma[3:]),
+            'mount_quaternion_xyzw': quaternion,
+            'n': int(np.count_nonzero(part.used)), 'n_compared': len(part.used),
+            'position_rmse_m': left[0], 'orientation_rmse_rad': left[1],
+            'heldout_position_rmse_m': unseen[0], 'heldout_orientation_rmse_rad': unseen[1],
+        }  # fmt: skip
         words += _open_lever(name, np.array(lever), part.view.turn[part.used])
         if not known:
             words.append(f'{name}: its mount, known to {np.rad2deg(sigma[3:].max()):.0f} deg only')
@@ -333,6 +321,12 @@ def _described(
         session, convention, frames.rotation, sigma[3:], place, sigma[:3], offset, rate, middle,
         sensors, tuple(words), fit,
     )  # fmt: skip
+
+
+def turn_of(rotation: Array) -> tuple[Array, Array]:
+    """Return a rotation matrix as a rotation vector, degrees, and a quaternion x y z w."""
+    turn = Rotation.from_matrix(rotation)
+    return np.rad2deg(turn.as_rotvec()), turn.as_quat()
 
 
 def _open_lever(name: str, lever: Array, turn: Array) -> list[str]:

@@ -31,6 +31,8 @@ from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN, PER
 from anser_ros.diagnosis.engine import ForwardSelection, Scorer, is_covered
 from anser_ros.errors import DiagnosisError
 
+Array = NDArray[np.float64]
+
 LEAST_EXPLAINED = 0.015
 """Share of the sum of squares that an effect must explain on unseen blocks: errors of trackers are
 alike over seconds and centimetres, and any smooth course takes a trace of them."""
@@ -206,8 +208,6 @@ def _slower(fit: PoseFit, factor: float) -> PoseFit:
     terms = [t.with_theta(factor * t.theta) if t.role is Role.FILTER else t for t in fit.terms]
     return fit_poses(fit.state.problem, terms, 3)
 
-
-Array = NDArray[np.float64]
 
 POSES_A_PARAMETER = 6
 """Poses that a parameter needs: neighbours in time are hardly new. More leave metal unnamed on a

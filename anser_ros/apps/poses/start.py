@@ -19,6 +19,8 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.physics.rotations import nearest_rotation
 
+Mask = NDArray[np.bool_]
+
 Array = NDArray[np.float64]
 
 PAUSE_S = 2.0
@@ -72,7 +74,9 @@ def pose_problem(session: PoseSession) -> PoseProblem:
             track = _resting(reference, list(sensors.values()))
             path = OpticalPath.through(track, is_at_rest=True)
     kept = {
-        name: poses for name, poses in kept.items() if _seen(poses, path) >= FEWEST_HAND_EYE_POSES
+        name: poses
+        for name, poses in kept.items()
+        if np.count_nonzero(path.at(poses.time)[3]) >= FEWEST_HAND_EYE_POSES
     }
     if not kept:
         raise DiagnosisError(
@@ -106,10 +110,6 @@ def is_at_rest(poses: PoseSequence) -> bool:
 
 def _extent(values: Array) -> float:
     return float(np.linalg.norm(np.ptp(np.percentile(values, [10, 90], axis=0), axis=0)))
-
-
-def _seen(poses: PoseSequence, path: OpticalPath) -> int:
-    return int(np.count_nonzero(path.at(poses.time)[3]))
 
 
 def _thinned(poses: PoseSequence) -> PoseSequence:
@@ -339,8 +339,6 @@ def first_cost(fit: PoseFit) -> float:
         total += float(np.median(far[part.used])) if part.used.any() else 0.0
     return total / max(len(fit.state.parts), 1)
 
-
-Mask = NDArray[np.bool_]
 
 FAR, FITS = 8.0, 0.25
 """Distance of a pose from its own prediction, in spreads, from which it may be another sensor's,

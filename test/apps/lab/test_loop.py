@@ -25,7 +25,7 @@ from anser_ros.effects.channels import FLUX, VOLTAGE
 from anser_ros.effects.effect import all_effects, effect_named
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.recorded_poses import ok_share
-from anser_ros.simulation.effects import CATALOGUE, CompressingAmplifier, draw
+from anser_ros.simulation.effects import CATALOGUE, compressing, draw
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import read_config
@@ -141,7 +141,7 @@ def test_a_compressing_amplifier_is_what_the_catalogue_calls_saturation():
     time_s = np.arange(4000) / SAMPLE_RATE_HZ
     waves = np.exp(1j * (time_s[:, None] * omega + rng.uniform(0, 2 * np.pi, omega.size)))
     volts = (waves @ (amplitude * weights)).real[:, None]
-    bent = CompressingAmplifier(0, limit).volts(time_s, volts)[:, 0]
+    bent = compressing(0, limit).volts(time_s, volts)[:, 0]
     seen = 2 * np.abs(waves.conj().T @ bent) / time_s.size / weights
     effect = effect_named('saturation')
     for sees, tolerance in ((VOLTAGE, 0.05), (FLUX, None)):

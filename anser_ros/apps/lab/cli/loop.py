@@ -218,15 +218,17 @@ def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
     if truth['name'] == 'none':
         return WRONG if names else ''
     if answers and names and set(names) <= set(answers):
-        same = all(_same_site(truth['parameters'], e['parameters']) for e in diagnosis['effects'])
+        put_in = truth['parameters']
+        same = all(
+            effect['parameters'].get(key, put_in[key]) == put_in[key]
+            for effect in diagnosis['effects']
+            for key in SITES
+            if key in put_in
+        )
         return NAMED if same else WRONG
     if not names:
         return UNEXPLAINED if unexplained else MISSED
     return PARTLY if unexplained and not answers else WRONG
-
-
-def _same_site(truth: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
-    return all(found[key] == truth[key] for key in SITES if key in truth and key in found)
 
 
 def parameter_errors(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:

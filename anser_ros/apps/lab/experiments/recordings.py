@@ -31,6 +31,8 @@ from anser_ros.simulation.world import (
 from anser_ros.wire.setup import SensorSpec, Setup, parse_setup
 from anser_ros.wire.text_files import config_path
 
+Array = NDArray[np.float64]
+
 STATISTICS = ('RMSE', 'ME', 'PRC50', 'PRC95')
 SENSORS = ('Y', 'Z')
 
@@ -155,8 +157,6 @@ def checkerboard(session: Session) -> tuple[Session, Session]:
     )
     return training, test
 
-
-Array = NDArray[np.float64]
 
 STATIC = Accuracy(flux_noise_t=STATIC_NOISE_T)
 """Errors of a tool at rest; the noise is half of a single window's."""

@@ -40,7 +40,7 @@ from anser_ros.physics.rotations import axis_angles, tangents
 from anser_ros.sessions.calibration import calibrate_sessions, generator_of
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import NOMINAL, model_for
-from anser_ros.sessions.tracked_session import track_session
+from anser_ros.sessions.tracked_session import error_statistics, track_session
 from anser_ros.simulation.recording import STATIC_NOISE_T
 
 Array = NDArray[np.float64]
@@ -156,15 +156,9 @@ class SensorErrors:
 
 def statistics(errors: Array) -> dict[str, float]:
     """Return the article's four figures of errors, or NaN without any finite error."""
-    good = errors[np.isfinite(errors)]
-    if good.size == 0:
-        return dict.fromkeys(STATISTICS, float('nan'))
-    return {
-        'RMSE': float(np.sqrt(np.mean(good**2))),
-        'ME': float(good.mean()),
-        'PRC50': float(np.percentile(good, 50)),
-        'PRC95': float(np.percentile(good, 95)),
-    }
+    found = error_statistics('', '', errors[np.isfinite(errors)]).values()
+    values = (np.nan if value is None else value for value in found)
+    return dict(zip(STATISTICS, values, strict=True))
 
 
 def track(session: Session, model: FieldModel, in_phase: bool = False) -> dict[str, SensorErrors]:

@@ -64,14 +64,14 @@ from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.wire.text_files import numbers_of, read_rows
 
+Array = NDArray[np.float64]
+
 SEED = 1
 """Seed of the resamples, so that the same recordings give the same intervals."""
 NO_DATE_NS = 10**18
 """Stamp, ns, before which a recording does not say when it was made: it would be of 2001."""
 OPTICAL_TRUTH = 'optical'
 COLORS = {'pass': 'green', 'note': 'yellow', 'alert': 'magenta', 'fail': 'red'}
-
-Array = NDArray[np.float64]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,12 +16,12 @@ from anser_ros.errors import FitError, ParameterError, PlausibilityError
 from anser_ros.sessions.plausibility import check_points
 from anser_ros.wire.text_files import numbers_of, read_fiducials, read_rows
 
+Array = NDArray[np.float64]
+
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')
 TRUE = ('true_x_m', 'true_y_m', 'true_z_m')
 MARKUPS = '.fcsv'
-
-Array = NDArray[np.float64]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

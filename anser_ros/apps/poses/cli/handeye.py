@@ -9,14 +9,13 @@ import numpy as np
 import yaml
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.assessment.source import PoseSource, is_bag, read_poses
 from anser_ros.apps.poses.cli.import_poses import add_form_options
 from anser_ros.apps.poses.cli.pose_session import add_topic_options, load_poses
 from anser_ros.apps.poses.convention import reading_words
 from anser_ros.apps.poses.corrector import as_document
-from anser_ros.apps.poses.hand_eye import HandEye, SensorFrames, fit_hand_eye
+from anser_ros.apps.poses.hand_eye import HandEye, fit_hand_eye, turn_of
 from anser_ros.apps.poses.importing import import_poses
 from anser_ros.apps.poses.sequence import PoseSession, missing_words
 from anser_ros.cli.output import (
@@ -115,7 +114,7 @@ def _session(args: argparse.Namespace) -> PoseSession:
 
 def to_document(found: HandEye) -> dict[str, Any]:
     """Return the result as plain data; null if it is not determined."""
-    vector, quaternion = _turn(found.rotation)
+    vector, quaternion = turn_of(found.rotation)
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = found.rotation, found.translation_m
     offset, rate = (pair or (None, None) for pair in (found.offset_s, found.rate_ppm))
@@ -135,31 +134,10 @@ def to_document(found: HandEye) -> dict[str, Any]:
             'rate_sigma_ppm': rate[1],
             'middle_s': found.middle_s,
         },
-        'sensors': {name: _sensor(one) for name, one in found.sensors.items()},
+        'sensors': found.sensors,
         'undetermined': found.undetermined,
         'convention': None if found.convention is None else found.convention.parameters,
     })  # fmt: skip
-
-
-def _sensor(one: SensorFrames) -> dict[str, Any]:
-    vector, quaternion = (None, None) if one.mount is None else _turn(one.mount)
-    return {
-        'lever_arm_m': one.lever_m,
-        'lever_arm_sigma_m': one.lever_sigma_m,
-        'mount_rotation_deg': vector,
-        'mount_rotation_sigma_deg': np.rad2deg(one.mount_sigma_rad),
-        'mount_quaternion_xyzw': quaternion,
-        'n': one.n, 'n_compared': one.n_compared,
-        'position_rmse_m': one.rms[0], 'orientation_rmse_rad': one.rms[1],
-        'heldout_position_rmse_m': one.held_out[0],
-        'heldout_orientation_rmse_rad': one.held_out[1],
-    }  # fmt: skip
-
-
-def _turn(rotation: Array) -> tuple[Array, Array]:
-    """A rotation matrix as a rotation vector, degrees, and a quaternion x y z w."""
-    turn = Rotation.from_matrix(rotation)
-    return np.rad2deg(turn.as_rotvec()), turn.as_quat()
 
 
 def left_out_words(document: dict[str, Any]) -> list[str]:

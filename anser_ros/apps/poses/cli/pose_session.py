@@ -52,6 +52,8 @@ from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.tracked_session import error_statistics
 
+Array = NDArray[np.float64]
+
 UNSHOWN = ('centre_m', 'size_m', 'lowest', 'middle_s', 'degree', 'strain')
 """Parameters that tell how a map or a course is written, and not what it does."""
 SCALES = {'s': (1e3, 'ms'), 'm': (1e3, 'mm'), 'rad': (180 / math.pi, 'deg'), 'deg': (1.0, 'deg'),
@@ -108,8 +110,6 @@ def _number(value: float, sigma: float | None) -> str:
     decimals = 1 - math.floor(math.log10(size))
     return f'{value:.{min(max(decimals, 0), MOST_DECIMALS)}f}'
 
-
-Array = NDArray[np.float64]
 
 GROUPS = 5  # groups of equal numbers of poses by distance, speed and orientation
 LIMITS = 1.96  # standard deviations within which 95 % of normal differences lie

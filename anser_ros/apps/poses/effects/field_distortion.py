@@ -96,6 +96,7 @@ class FieldDistortion(PoseEffect):
     remedy = Remedy.SENSORS
     blocks_in_space = True
     role = Role.MAP
+    typical = 5.0  # mm at the rms distance
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         alone = setting.sensors if len(setting.sensors) > 1 else ()
@@ -145,10 +146,6 @@ class FieldDistortion(PoseEffect):
         site.pop('lowest', None)
         site.pop('sensor', None)
         return PoseTerm(self, site, np.zeros(3 * _count(site)))
-
-    def prior(self, term: PoseTerm) -> Array:
-        """Return a prior spread of 5 mm at the rms distance."""
-        return np.full(term.theta.size, 5.0)
 
     def _derivative(self, term: PoseTerm, position: Array) -> Array:
         """What each parameter moves positions (n, 3) by, shape (n, 3, q), m."""

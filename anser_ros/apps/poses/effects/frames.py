@@ -25,6 +25,8 @@ from anser_ros.apps.poses.sequence import OpticalPath, filtered
 from anser_ros.effects.base import Remedy
 from anser_ros.field.model import EffectRecord
 
+Array = NDArray[np.float64]
+
 
 class FrameConvention(PoseEffect):
     """States how a stream's numbers are meant, as `anser_ros.apps.poses.convention` finds out."""
@@ -41,8 +43,6 @@ class SwappedSensors(PoseEffect):
     summary = 'two sensors are exchanged'
     role = Role.SWAP
 
-
-Array = NDArray[np.float64]
 
 FREE = 1e3
 """Prior standard deviation, m and rad, of frames: nothing is known of them before."""
@@ -74,13 +74,11 @@ class FrameTerm(PoseTerm):
 class _Frame(PoseEffect):
     """Theta is a translation (m) and a turn (rad)."""
 
+    typical = FREE  # nothing is known of the frame before
+
     def at_frame(self, site: PoseSite, place: Array, turn: Array) -> PoseTerm:
         """Return the frame with a turn of zero from a rotation matrix."""
         return FrameTerm(self, site, np.array([*place, 0, 0, 0]), start=turn)
-
-    def prior(self, term: PoseTerm) -> Array:
-        """Return a wide prior, as nothing is known of the frame before."""
-        return np.full(6, FREE)
 
     def bounded(self, term: PoseTerm) -> PoseTerm:
         frame = _frame(term)
@@ -181,7 +179,7 @@ class PoseTimeOffset(NumberEffect):
     remedy = Remedy.OPTICAL
     role = Role.OFFSET
     key = 'offset_s'
-    spread = 0.3  # s: offsets are some tenths of a second
+    typical = 0.3  # s: offsets are some tenths of a second
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         own = [PoseTerm(self, {'sensor': s}, np.zeros(1)) for s in setting.sensors]
@@ -208,7 +206,7 @@ class PoseClockRate(NumberEffect):
     remedy = Remedy.OPTICAL
     role = Role.RATE
     key, factor = 'rate_ppm', 1e3
-    spread = 2.0  # rates err by some parts in a thousand
+    typical = 2.0  # rates err by some parts in a thousand
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         middle = setting.start + 0.5 * setting.duration
@@ -237,7 +235,7 @@ class PoseOpticalScale(NumberEffect):
     blocks_in_space = True
     role = Role.SCALE
     key, base, factor = 'scale', 1.0, 1e-3
-    spread = 30.0  # scales are off by some percent
+    typical = 30.0  # scales are off by some percent
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         return [PoseTerm(self, {}, np.zeros(1))]
@@ -275,7 +273,7 @@ class TrackerLag(NumberEffect):
     remedy = Remedy.NONE
     role = Role.FILTER
     key = 'tau_s'
-    spread = 0.1  # s: lags are some tenths of a second
+    typical = 0.1  # s: lags are some tenths of a second
 
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         return [PoseTerm(self, {}, np.array([tau])) for tau in TAUS_S]

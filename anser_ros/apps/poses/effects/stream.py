@@ -15,6 +15,8 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S
 from anser_ros.sessions.plausibility import FROZEN_S
 
+Mask = NDArray[np.bool_]
+
 Array = NDArray[np.float64]
 
 FEWEST_STALE = 0.02
@@ -124,7 +126,8 @@ class PoseOutliers(PoseEffect):
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return one record of the outlying poses of all sensors."""
         found = _leaping(residuals.session.reference)
-        outs = [_alone(sensing, residuals) for sensing in residuals.sensors]
+        # Those of an episode are off together.
+        outs = [s.out & ~in_episode(s, residuals) for s in residuals.sensors]
         out = np.concatenate(outs)
         used = np.concatenate([s.used for s in residuals.sensors])
         count = int(np.count_nonzero(out))
@@ -163,11 +166,6 @@ def _leaping(reference: PoseSequence | None) -> list[EffectRecord]:
     values = {'fraction': share, 'stream': reference.name}
     sigma = float(np.sqrt(share / away.size))
     return [EffectRecord(PoseOutliers.name, values, {'fraction': sigma})]
-
-
-def _alone(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.bool_]:
-    """Poses of a sensor that stand out, less those of an episode, which are off together."""
-    return np.asarray(sensing.out & ~in_episode(sensing, residuals))
 
 
 def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
@@ -287,8 +285,6 @@ class QuantisedStamps(PoseEffect):
         values = {'step_s': step, 'rms_s': rms}
         return [EffectRecord(self.name, values, sigma, {'likelihood_gain': gain})]
 
-
-Mask = NDArray[np.bool_]
 
 NOISIER = 2.0
 """Factor over the other sensors' median noise from which a sensor's is named; sensors of one kind
