@@ -90,7 +90,9 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     Raises `FitError` when the drawing of the board is the better model, and that is not forced.
     """
     stated = output.stated_values(args)
-    options = _options(args)
+    if not 0.0 <= (args.damping or 0.0) < math.inf:
+        raise ParameterError(f'damping must not be negative, got {args.damping:g}')
+    options = Options(layout=args.dipoles, damping=args.damping, estimate=args.estimate)
     sessions = [load_session(path).with_stated(stated) for path in args.sessions]
     check_same_board(sessions)
     output.check_file(args.out)
@@ -110,22 +112,13 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
             '--force writes it'
         )
     save_model(args.out, calibration.model)
-    lost = [
-        output.loss_notes(path, one.lost)
-        for path, one in zip(args.sessions, sessions, strict=True)
-    ]
+    lost = [note for one in sessions for note in output.loss_notes(one.path, one.lost)]
     return output.Result(
         document,
-        (*sum(lost, ()), *document['unobservable'], *document['contradictions']),
+        (*lost, *document['unobservable'], *document['contradictions']),
         (_table(calibration, document), *_populations(calibration)),
         tuple(filter(None, (args.out, args.report))),
     )
-
-
-def _options(args: argparse.Namespace) -> Options:
-    if not 0.0 <= (args.damping or 0.0) < math.inf:
-        raise ParameterError(f'damping must not be negative, got {args.damping:g}')
-    return Options(layout=args.dipoles, damping=args.damping, estimate=args.estimate)
 
 
 def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
