@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from diagnosis_world import world
 
-from anser_ros.cli.diagnosis_report import course
+from anser_ros.cli.diagnose import course
 from anser_ros.cli.diagnosis_words import MOST_CHARACTERS, paths, short_ones, value_text, verdict
 from anser_ros.diagnosis.problem import evaluate
 from anser_ros.effects.metal_path import StraightPath

@@ -11,8 +11,7 @@ from std_msgs.msg import String
 
 from anser_ros.apps.dashboard import watch as watching
 from anser_ros.apps.dashboard.nodes.watcher import Watcher, WatcherParameters
-from anser_ros.apps.dashboard.watch import OPTICAL, RIGID, Watch
-from anser_ros.apps.dashboard.window import LIVE, SlidingWindow
+from anser_ros.apps.dashboard.watch import LIVE, OPTICAL, RIGID, SlidingWindow, Watch
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
 from anser_ros.nodes.runtime import qos

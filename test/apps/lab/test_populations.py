@@ -3,7 +3,7 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
-from anser_ros.cli.calibration_figures import population_figure, population_table, populations
+from anser_ros.cli.calibrate import population_figure, population_table, populations
 from anser_ros.field.model import EffectRecord
 
 

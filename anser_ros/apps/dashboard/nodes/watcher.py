@@ -14,8 +14,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros import extensions
-from anser_ros.apps.dashboard.watch import Sighting, Watch
-from anser_ros.apps.dashboard.window import LIVE, SlidingWindow
+from anser_ros.apps.dashboard.watch import LIVE, Sighting, SlidingWindow, Watch
 from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
 from anser_ros.nodes.operator_words import (
