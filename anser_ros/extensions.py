@@ -13,7 +13,7 @@ an object in it; it is loaded when the core uses it. Tables that are not stated 
 - ``DIAGNOSES``: modules that diagnose sessions of their kind, see `sessions.diagnosis.other_way`.
 - ``OBSERVERS``: what else is tracked in a session, see `sessions.tracked_session.SessionObserver`.
 - ``EVALUATIONS``: modules that add options to `anser evaluate`, see `cli.evaluate`.
-- ``STREAMS``: what the watcher can watch besides fluxes, by the parameter that asks for it.
+- ``STREAMS``: what a watcher can watch besides fluxes, by the parameter that asks for it.
 - ``PASSIVE``: nodes for which no source waits.
 """
 

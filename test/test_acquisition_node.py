@@ -15,7 +15,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros.errors import PortError, SetupError
-from anser_ros.nodes.acquisition_stream import FluxStream, StreamOptions
+from anser_ros.nodes.acquisition_stream import FluxStream
 from anser_ros.nodes.runtime import qos
 from anser_ros.simulation.control_unit import Piece
 from anser_ros.simulation.line import FaultInjector, PseudoPort
@@ -28,7 +28,7 @@ from anser_ros.wire.text_files import read_config
 SETUP = parse_setup(read_config('demo_setup.yaml'))
 CHANNELS = parse_channels(read_config('demo_channels.yaml'))
 NUMBERS = [sensor.channel for sensor in SETUP.sensors]
-OPTIONS = StreamOptions(0.02, 50.0)
+OPTIONS = (0.02, 50.0)
 LASTING_S = {'unplug': 2.0, 'wrong_baud': 5.0}
 """From these faults on the period is longer, s: they last for half of it at most."""
 
@@ -235,7 +235,7 @@ class TestStream:
             codes[5, 2] = 32767
             codes[:, 4] = 17
 
-        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         first, second = self.frames(stream, 40, edit, skip={25})
         assert first.tool.flags.tolist() == [0, 0, SATURATED, 0, STALE, 0, 0, 0, 0]
         assert (second.flags & DROPPED).all()
@@ -251,7 +251,7 @@ class TestStream:
             k = next(blocks)
             codes[:, column] = self.codes(k if k < 40 else 10 + (k - 40) % 30)[:, column]
 
-        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         frames = self.frames(stream, 100, edit)
         stale = np.array([frame.flags & STALE > 0 for frame in frames])
         rows = slice(None) if column == 41 else [column]
@@ -261,7 +261,7 @@ class TestStream:
         assert not frames[-1].repeats
 
     def test_a_unit_that_repeats_itself_moves_no_clock(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         stream.restart(10**12)
         frames = []
         for k in range(400):
@@ -286,7 +286,7 @@ class TestStream:
         ],
     )
     def test_ticks_move_no_stamps(self, ticks, words):
-        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         frames = self.frames(stream, 200, ticks=ticks)
         assert len(frames) == 10
         times = np.array([frame.host_ns for frame in frames]) - 10**12
@@ -295,7 +295,7 @@ class TestStream:
         assert stream.ticks.disagreements == bool(words)
 
     def test_a_late_window_waits_and_is_withheld(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         assert len(self.frames(stream, 100)) == 5
 
         def push(k, late_ms):
@@ -310,7 +310,7 @@ class TestStream:
 
     def test_windows_that_are_skipped_are_counted_and_cost_no_later_one(self):
         """A too slow computer takes the newest; what it passes over is not demodulated."""
-        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         stream.restart(10**12)
         frames = []
         for k in range(100):
@@ -322,7 +322,7 @@ class TestStream:
         assert (stream.counters.windows, stream.counters.windows_skipped) == (2, 3)
 
     def test_a_frame_that_waits_is_looked_after_with_every_block(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         self.frames(stream, 100)
         assert stream.blocks_wanted == 20
         for k in range(100, 120):
@@ -330,7 +330,7 @@ class TestStream:
         assert stream.waiting and stream.blocks_wanted == 1
 
     def test_a_restarted_stream_has_new_stamps(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         assert len(self.frames(stream, 110)) == 5
         frames = []
         for k in range(40):
@@ -342,19 +342,19 @@ class TestStream:
         assert frame.host_ns == pytest.approx(2 * 10**12 + 10**7, abs=10**5)
 
     def test_missing_channels_are_named(self):
-        stream = FluxStream(hello(NUMBERS[:-3]), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(NUMBERS[:-3]), SETUP, CHANNELS, *OPTIONS)
         assert [s.name for s in stream.missing] == ['ref/14/1', 'ref/15/0', 'ref/15/1']
         assert len(stream.sensors) == 38
 
     def test_blocks_of_another_width_are_left_alone(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         assert stream.push(SampleBlock(0, 0, self.codes(columns=5)), 1) == []
 
     def test_refusals(self):
         with pytest.raises(SetupError, match='none of the channels'):
-            FluxStream(hello([500]), SETUP, CHANNELS, OPTIONS)
+            FluxStream(hello([500]), SETUP, CHANNELS, *OPTIONS)
         with pytest.raises(SetupError, match='drives 2 coils'):
-            FluxStream(hello(tones=(6000.0, 7000.0)), SETUP, CHANNELS, OPTIONS)
+            FluxStream(hello(tones=(6000.0, 7000.0)), SETUP, CHANNELS, *OPTIONS)
 
 
 def test_pseudo_port_leaves_foreign_files_alone(tmp_path):

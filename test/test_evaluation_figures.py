@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from anser_ros.cli import evaluate as figures
-from anser_ros.cli.calibration_figures import population_figure, population_table, populations
+from anser_ros.cli.calibrate import population_figure, population_table, populations
 from anser_ros.field.model import EffectRecord
 from anser_ros.pose_states import OK
 from anser_ros.sessions.evaluation_files import to_document

@@ -16,7 +16,6 @@ from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.field_model import FieldModelParameters
 from anser_ros.nodes.runtime.parameters import stated_by
 from anser_ros.nodes.tracker import TrackerParameters
-from anser_ros.nodes.watcher import WatcherParameters
 from anser_ros.refit.prior import UPRIGHT, build_prior
 from anser_ros.sessions.diagnosis import spread_of
 from anser_ros.sessions.prepared import prepare
@@ -265,7 +264,6 @@ class TestNodes:
                 FieldModelParameters,
                 {*VALUES} - {*SECTIONS['tools'], *OPTICAL, 'stamp_sigma_s'},
             ),
-            (WatcherParameters, {*SECTIONS['accuracy']} - {'stamp_sigma_s'}),
             (
                 TrackerParameters,
                 {'flux_noise_t', 'stamp_sigma_s', 'references_age_s', *SECTIONS['tools']},

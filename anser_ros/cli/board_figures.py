@@ -210,17 +210,14 @@ def _sensors(
         together[end[0], end[1]].append(row)
     labels = []
     for end, rows in together.items():
-        words = [_words(sensors[row], names) for row in rows]
+        coils = [sensors[row] for row in rows]
+        words = [f'{c.name} ({c.channel})' if names else str(c.channel) for c in coils]
         away = axis[rows[0]] if np.abs(axis[rows[0]]).max() > LEVEL else np.zeros(2)
         labels.append(Label('\n'.join(words), end, tuple((size * away).tolist())))
     panel.update_datalim(ends)
     panel.margins(0.4 if names else 0.1)
     panel.autoscale_view()
     return labels, np.vstack([_along(np.stack(one)) for one in zip(place, ends, strict=True)])
-
-
-def _words(sensor: SensorSpec, name: bool) -> str:
-    return f'{sensor.name} ({sensor.channel})' if name else str(sensor.channel)
 
 
 PLACE_ARROW = 0.15

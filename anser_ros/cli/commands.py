@@ -29,7 +29,6 @@ _NODES = {
     'replay': 'publishes a bag again: replay BAG [--rate R] [--loop]',
     'cu_simulator': 'a control unit behind a pseudo-terminal',
     'monitor': 'a live table of sensors, rates and latencies',
-    'watcher': 'names the effects that the model lacks, live in /diagnostics',
 }
 _COMPOSED = {
     'live': 'acquisition, field_model and tracker in one process, for the least latency',

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from anser_ros import extensions
-from anser_ros.cli import output
+from anser_ros.cli import output, sessions
 from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.cli.page import (
     WIDE,
@@ -25,15 +25,6 @@ from anser_ros.cli.page import (
     spell_out,
     table,
     top,
-)
-from anser_ros.cli.sessions import (
-    add_session_kinds,
-    named_kind,
-    need_model,
-    perform,
-    runs_of,
-    snapshot_notes,
-    summed_up,
 )
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
@@ -273,7 +264,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='largest residual of a pose, in units of the expected one; inf withholds none (only '
         'to see the error that a wrong model would cause)',
     )  # fmt: skip
-    add_session_kinds(parser)
+    sessions.add_session_kinds(parser)
 
 
 def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
@@ -281,23 +272,23 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     if len(args.sessions) == 1:
         args.session = args.sessions[0]
         return _one(args, tell)
-    runs = runs_of('evaluate', args)
+    runs = sessions.runs_of('evaluate', args)
     output.make_folder(args.out)
     outcomes = []
     for count, one in enumerate(runs):
         tell('evaluating', count / len(runs))
-        outcomes.append(perform(one))
-    return summed_up('evaluate', outcomes, args.out)
+        outcomes.append(sessions.perform(one))
+    return sessions.summed_up('evaluate', outcomes, args.out)
 
 
 def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     given = [f'--{name.replace("_", "-")}' for name in ALONE if getattr(args, name)]
     ways = [way.models(args, given) for way in extensions.loaded('EVALUATIONS')]
     models = next((way for way in ways if way is not None), None)
-    if kind := named_kind(args):
+    if kind := sessions.named_kind(args):
         done: output.Result = kind.evaluate(args, tell)
         return done
-    need_model(args)
+    sessions.need_model(args)
     session = load_session(args.session).with_stated(output.stated_values(args))
     if args.witnesses and not args.refit:
         raise ParameterError('--witnesses extends the refit; it needs --refit')
@@ -324,7 +315,8 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     if 'refit' in document:
         shown.append(_refit_line(document['refit'], models is None))
     notes = (
-        *snapshot_notes(args.model, model), *output.loss_notes(args.session, session.lost),
+        *sessions.snapshot_notes(args.model, model),
+        *output.loss_notes(args.session, session.lost),
         *(_few_notes(session) if args.refit else ()),
     )  # fmt: skip
     return output.Result(document, notes, tuple(shown), tuple(written))

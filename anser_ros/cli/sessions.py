@@ -143,22 +143,16 @@ def _evaluation(document: Mapping[str, Any]) -> Row:
     return row
 
 
-def _diagnosis(document: Mapping[str, Any]) -> Row:
-    fraction = document['unexplained']['fraction']
-    return {**document['held_out'], **_names(document), 'unexplained_fraction': fraction}
-
-
-def _calibration(document: Mapping[str, Any]) -> Row:
-    return {**document, **_names(document)}
-
-
-def _names(document: Mapping[str, Any]) -> Row:
-    return {'effects': ' '.join(dict.fromkeys(one['name'] for one in document['effects']))}
+def _found(document: Mapping[str, Any]) -> Row:
+    names = ' '.join(dict.fromkeys(one['name'] for one in document['effects']))
+    fraction = document.get('unexplained', {}).get('fraction')
+    found = {'effects': names, 'unexplained_fraction': fraction}
+    return {**document, **document.get('held_out', {}), **found}
 
 
 COMMANDS: dict[str, tuple[tuple[Column, ...], Callable[[Mapping[str, Any]], Row], str]] = {
-    'calibrate': (CALIBRATION, _calibration, 'calibration.json'),
-    'diagnose': (DIAGNOSIS, _diagnosis, 'report.html'),
+    'calibrate': (CALIBRATION, _found, 'calibration.json'),
+    'diagnose': (DIAGNOSIS, _found, 'report.html'),
     'evaluate': (EVALUATION, _evaluation, 'evaluation.html'),
 }
 """Of each command its columns, how its document becomes a row, and its file to look at."""

@@ -19,7 +19,6 @@ from anser_ros.nodes.acquisition_status import (
     Interval,
     RecentFaults,
     clock_troubles,
-    clock_values,
     device_words,
     emitter_statuses,
     sensor_statuses,
@@ -29,7 +28,6 @@ from anser_ros.nodes.acquisition_stream import (
     FluxFrame,
     FluxStream,
     MeasuredAccuracy,
-    StreamOptions,
     WallClock,
 )
 from anser_ros.nodes.runtime import qos
@@ -286,8 +284,8 @@ class Acquisition(AnserNode):
     def _new_stream(self, hello: Hello) -> FluxStream:
         table = self.parameters
         rate_hz = table.rate_hz or self._setup.flux_rate_hz
-        options = StreamOptions(table.window_s, rate_hz, table.mains_hz)
-        return FluxStream(hello, self._setup, self._calibration, options)
+        timing = table.window_s, rate_hz, table.mains_hz
+        return FluxStream(hello, self._setup, self._calibration, *timing)
 
     def _publish_setup(self, setup: Setup) -> None:
         text = dump_setup(setup)
@@ -355,7 +353,9 @@ class Acquisition(AnserNode):
         totals = self._past.copy()
         if stream is not None:
             totals.update(self._stream_counters(stream))
-            values |= clock_values(stream)
+            clock = stream.clock
+            values |= {'clock': clock.state.value, 'lateness_s': clock.lateness_s}
+            values['stamp_sigma_s'] = clock.sigma_s
         values['system_clock_set'] = self._wall_clock.sets
         values |= totals
         if device is not None:

@@ -169,16 +169,6 @@ def clock_troubles(stream: FluxStream) -> list[tuple[Level, str]]:
     return found
 
 
-def clock_values(stream: FluxStream) -> dict[str, object]:
-    """Return state, lateness and uncertainty of the clock, s."""
-    clock = stream.clock
-    return {
-        'clock': clock.state.value,
-        'lateness_s': clock.lateness_s,
-        'stamp_sigma_s': clock.sigma_s,
-    }
-
-
 def emitter_statuses(coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame) -> list[Status]:
     """Return a status with amplitude, noise and current of each emitter."""
     window = frame.window

@@ -104,15 +104,6 @@ class WaitingFrames:
         self._queue.clear()
 
 
-@dataclass(frozen=True)
-class StreamOptions:
-    """States how to demodulate: window and rate, and what to fit besides the tones."""
-
-    window_s: float
-    rate_hz: float
-    mains_hz: float = 0.0
-
-
 class FluxStream:
     """Turns samples into fluxes; it is made again for every hello that differs from the one
     before.
@@ -130,8 +121,9 @@ class FluxStream:
     """
 
     def __init__(
-        self, hello: Hello, setup: Setup, calibration: ChannelCalibration, options: StreamOptions
-    ) -> None:
+        self, hello: Hello, setup: Setup, calibration: ChannelCalibration, window_s: float,
+        rate_hz: float, mains_hz: float = 0.0,
+    ) -> None:  # fmt: skip
         if len(hello.frequencies_hz) != len(setup.emitter.coils):
             raise SetupError(
                 f'the control unit drives {len(hello.frequencies_hz)} coils, '
@@ -150,14 +142,12 @@ class FluxStream:
         self.tones_hz = np.array(hello.frequencies_hz)
         self.nominal_a = _nominal_currents(setup, hello)
         rate = hello.sample_rate_hz
-        window = round(options.window_s * rate)
-        hop = max(1, round(rate / options.rate_hz))
+        window = round(window_s * rate)
+        hop = max(1, round(rate / rate_hz))
         self.rate_hz = rate / hop
         self._sample_rate_hz = rate
         self._block_samples = hello.block_samples
-        self._demodulator = Demodulator(
-            rate, self.tones_hz, window, mains_hz=options.mains_hz or None
-        )
+        self._demodulator = Demodulator(rate, self.tones_hz, window, mains_hz=mains_hz or None)
         self._current_column = [c.kind for c in hello.channels].index(ChannelKind.CURRENT)
         self._columns = np.array([columns[s.channel] for s in self.sensors])
         self._converter = self._converter_of(hello, calibration)

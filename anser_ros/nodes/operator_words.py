@@ -57,37 +57,10 @@ def _loss(one: LastStatus, flux_rate_hz: float) -> str:
 
 if TYPE_CHECKING:  # words must not load the kernels
     from anser_ros.field.model import EffectRecord
-    from anser_ros.sessions.watch import Sighting
 
 SITES = ('channel', 'channels', 'coil', 'coils', 'body', 'sensor', 'stream')
 MOST_FIGURE_TEXT = 60
 """Characters of a figure beyond which it is left to the values: a line is read at a glance."""
-
-
-def words_of(seen: 'Sighting') -> str:
-    """Return what was seen as one line for an operator."""
-    size = f'residual {1e12 * seen.flux_rms_t:.0f} pT, {seen.excess**0.5:.1f} x the expected one'
-    if seen.findings:
-        left = f'{seen.excess_left**0.5:.1f} x with it corrected'
-        return f'{findings_words(seen.findings)}; {size}, {left}'
-    if seen.is_clear:
-        return f'nothing found; {size}'
-    cause = seen.remark or 'no known effect explains it'
-    depends = f', it depends on {", ".join(seen.depends_on)}' if seen.depends_on else ''
-    return f'{size}; {cause}{depends}'
-
-
-def values_of(seen: 'Sighting') -> dict[str, object]:
-    """Return the figures of what was seen, by name."""
-    return {
-        'compared_with': seen.truth,
-        'frames_compared': seen.frames,
-        'flux_rms_t': seen.flux_rms_t,
-        'excess': seen.excess,
-        'excess_left': seen.excess_left,
-        'findings': titles_of(seen.findings),
-        'depends_on': ', '.join(seen.depends_on),
-    }
 
 
 def findings_words(findings: Sequence['EffectRecord']) -> str:

@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import serial
 from serial.tools import list_ports
@@ -140,17 +141,12 @@ class PortCounters:
     received_bytes: int = 0
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Holds records that were received together, in the order of the stream.
-
-    Times are those of the monotonic host clock right after the read of each, and of the last one.
-    There is no record when the connection began, or ended and is not ``connected``.
+class Batch(NamedTuple):
+    """Holds records that were received together, in the order of the stream, with the times of the
+    monotonic host clock right after the read of each; none when the connection began or ended.
     """
 
-    arrival_ns: int
-    records: tuple[Record, ...]
-    connected: bool = True
+    records: tuple[Record, ...] = ()
     arrivals_ns: tuple[int, ...] = ()
 
 
@@ -221,11 +217,6 @@ class ControlUnitPort:
             if self._held_blocks >= blocks:
                 self._hand_over()
 
-    @property
-    def has_more(self) -> bool:
-        """Return whether records have come that the receiver has not got yet."""
-        return bool(self._held) or not self._queue.empty()
-
     def get(self, timeout_s: float) -> Batch | None:
         """Wait for the next batch and return it, or None when none arrived in time."""
         try:
@@ -273,7 +264,7 @@ class ControlUnitPort:
             self._reader.reset()
             self._next_sequence = None
             self._commands.clear()
-            self._queue.put(Batch(time.monotonic_ns(), ()))
+            self._queue.put(Batch())
             try:
                 self._read(port)
             except PortError as error:
@@ -287,7 +278,7 @@ class ControlUnitPort:
             finally:
                 close_line(port)
                 self._hand_over()
-                self._queue.put(Batch(time.monotonic_ns(), (), connected=False))
+                self._queue.put(Batch())
             wait = pause if time.monotonic() - opened > longest else min(2 * wait, longest)
             self._stopping.wait(wait)
         self.state = PortState.CLOSED
@@ -353,8 +344,7 @@ class ControlUnitPort:
         """Queue what is held; a receiver that never reads gets no more than records fit."""
         with self._holding:
             if self._held and self._queue.qsize() < 2 * self._queue_blocks:
-                arrivals_ns = tuple(self._arrivals_ns)
-                self._queue.put(Batch(arrivals_ns[-1], tuple(self._held), arrivals_ns=arrivals_ns))
+                self._queue.put(Batch(tuple(self._held), tuple(self._arrivals_ns)))
             self._held, self._arrivals_ns, self._held_blocks = [], [], 0
 
     def _count_gap(self, sequence: int) -> None:

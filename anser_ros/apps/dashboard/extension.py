@@ -4,9 +4,10 @@ LIVE_VIEW = 8642
 """TCP port of the page, which no registered service has."""
 NODES = {
     'dashboard': 'a live view in the browser, with the loop of record, diagnose and correct',
+    'watcher': 'names the effects that the model lacks, live in /diagnostics',
 }
 NEEDED = {'dashboard': ('nicegui',)}
-PASSIVE = ('dashboard',)
+PASSIVE = ('dashboard', 'watcher')
 DEMO = {
     'dashboard': (
         'serve the live view to a browser, too',

@@ -39,7 +39,6 @@ from anser_ros.apps.dashboard.server import (
     token_for,
 )
 from anser_ros.cli import demo
-from anser_ros.cli import main as cli_main
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.nodes.field_model import FieldModelNode
@@ -139,7 +138,7 @@ def test_the_address_for_other_machines_has_the_name_of_this_one(tmp_path):
 
 
 def test_what_is_missing_is_said_in_a_line(monkeypatch, capsys):
-    monkeypatch.setattr(cli_main, 'find_spec', lambda name: name != 'nicegui')
+    monkeypatch.setattr('anser_ros.cli.main.find_spec', lambda name: name != 'nicegui')
     assert main(['dashboard']) == 2
     said = capsys.readouterr().err
     assert said == 'anser dashboard: nicegui is not installed: pip install nicegui\n'

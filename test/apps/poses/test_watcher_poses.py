@@ -11,11 +11,11 @@ from pose_world import World
 from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.dashboard.nodes.watcher import Watcher
 from anser_ros.apps.poses.live_look import PoseWatch, frozen_streams
 from anser_ros.apps.poses.sequence import REFERENCE, PoseWindow
 from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.watcher import Watcher
 
 SECOND_NS = 1_000_000_000
 LENGTH_S = 12.0

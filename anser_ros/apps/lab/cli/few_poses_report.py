@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from anser_ros.apps.lab.few_poses import FewPosesDiagnosis, residual_power
 from anser_ros.apps.lab.still import PLACEMENT
-from anser_ros.cli.diagnosis_report import effects_section, population_sections
+from anser_ros.cli.diagnose import effects_section, population_sections
 from anser_ros.cli.diagnosis_words import LONGEST, flux_unit, held_out_rows, verdict
 from anser_ros.cli.page import (
     AFTER,

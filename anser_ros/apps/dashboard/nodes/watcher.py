@@ -14,9 +14,16 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros import extensions
+from anser_ros.apps.dashboard.watch import LIVE, Sighting, SlidingWindow, Watch
 from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
-from anser_ros.nodes.operator_words import figures_of, plain_text, title_of, values_of, words_of
+from anser_ros.nodes.operator_words import (
+    figures_of,
+    findings_words,
+    plain_text,
+    title_of,
+    titles_of,
+)
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.incoming import pose_numbers
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
@@ -26,9 +33,8 @@ from anser_ros.nodes.streams.clouds import read_frame
 from anser_ros.nodes.streams.one_source import OneSource, sender_words, setup_source
 from anser_ros.pose_states import TWO_SOURCES
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.session import LIVE, SlidingWindow, empty_session, load_session
+from anser_ros.sessions.session import empty_session, load_session
 from anser_ros.sessions.starting_model import NOMINAL, load_model, model_for
-from anser_ros.sessions.watch import Sighting, Watch
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import parse_setup
@@ -189,8 +195,31 @@ class FluxStreams:
             return None
         return partial(self.watch.look, session, self.window.first_ns)
 
-    words = staticmethod(words_of)
-    values = staticmethod(values_of)
+    def words(self, seen: Sighting) -> str:
+        """Return what was seen as one line for an operator."""
+        size = (
+            f'residual {1e12 * seen.flux_rms_t:.0f} pT, {seen.excess**0.5:.1f} x the expected one'
+        )
+        if seen.findings:
+            left = f'{seen.excess_left**0.5:.1f} x with it corrected'
+            return f'{findings_words(seen.findings)}; {size}, {left}'
+        if seen.is_clear:
+            return f'nothing found; {size}'
+        cause = seen.remark or 'no known effect explains it'
+        depends = f', it depends on {", ".join(seen.depends_on)}' if seen.depends_on else ''
+        return f'{size}; {cause}{depends}'
+
+    def values(self, seen: Sighting) -> dict[str, object]:
+        """Return the figures of what was seen, by name."""
+        return {
+            'compared_with': seen.truth,
+            'frames_compared': seen.frames,
+            'flux_rms_t': seen.flux_rms_t,
+            'excess': seen.excess,
+            'excess_left': seen.excess_left,
+            'findings': titles_of(seen.findings),
+            'depends_on': ', '.join(seen.depends_on),
+        }
 
 
 def streams_of(node: 'Watcher', table: WatcherParameters) -> Streams:
