@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import rclpy.node
 import yaml
+from conftest import REPO
 
 from anser_ros.cli.commands import NODES
 from anser_ros.errors import ParameterError
@@ -18,7 +19,7 @@ from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.settings import VALUES
 from anser_ros.wire.setup import parse_setup, topic_of
 
-CONFIG = Path(__file__).resolve().parents[1] / 'config'
+CONFIG = REPO / 'config'
 DOCUMENTS = sorted(CONFIG.glob('*.yaml'))
 PACKAGE = CONFIG.parent / 'anser_ros'
 NODE_FILES = [*PACKAGE.glob('nodes/**/*.py'), *PACKAGE.glob('apps/*/nodes/*.py')]

@@ -1,17 +1,4 @@
-"""Moments at poses that jitter.
-
-| what                                   | must agree with                                  |
-|----------------------------------------|--------------------------------------------------|
-| triangular factor, Gram factor         | numpy's least squares; whatever the blocks       |
-| damping, prior                         | least squares with explicit further rows         |
-| slopes of the flux by a pose           | central differences                              |
-| most probable step                     | the jitter that was put in, to its posterior     |
-| fit at corrected poses                 | the true field, closer than plain least squares  |
-| estimated noise                        | the noise put in                                 |
-| predictive chi-square                  | one, at the true field                           |
-| start at another fit's poses           | that fit's moments, at once, and leaves it alone |
-| gross outliers                         | the fit without them                             |
-"""
+"""Moments at poses that jitter."""
 
 from dataclasses import replace
 

@@ -3,11 +3,11 @@
 import argparse
 from copy import copy
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from conftest import REPO
 from refit_world import anser_world
 from test_setup import document
 
@@ -41,7 +41,7 @@ from anser_ros.wire.setup import dump_setup, parse_setup
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 
-BAGS = Path(__file__).resolve().parents[1] / 'bags'
+BAGS = REPO / 'bags'
 OTHER = {
     'flux_noise_t': 1.5e-10, 'optical_position_m': 0.3e-3, 'optical_rotation_rad': 2e-3,
     'reference_position_m': 1e-3, 'reference_axis_rad': 0.02, 'reference_gain': 0.02,
@@ -156,8 +156,6 @@ class TestStating:
 
 @pytest.mark.long
 class TestEffect:
-    """Each value, set to another, changes what it should."""
-
     def with_settings(self, usual, **values):
         """The refit with other settings that its tables do not depend on."""
         other = copy(usual)
@@ -222,7 +220,6 @@ class TestCommands:
         [('evaluate', VALUES), ('diagnose', VALUES), ('calibrate', SECTIONS['accuracy'])],
     )
     def test_the_session_has_what_is_stated(self, name, used, monkeypatch, tmp_path):
-        """From the command line to the session that all stages work on."""
         module = {'evaluate': evaluate, 'diagnose': diagnose, 'calibrate': calibrate}[name]
         target = {'evaluate': 'track_session', 'calibrate': 'calibrate_sessions'}
         seen = []

@@ -3,7 +3,6 @@
 import io
 import json
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
@@ -128,7 +127,7 @@ def test_a_folder_that_takes_no_file_is_found_before_the_work(capsys):
         assert 'nothing can be written into /proc' in capsys.readouterr().err
 
 
-CONFIG = Path(__file__).resolve().parents[1] / 'config'
+CONFIG = REPO / 'config'
 FILES = ('anser.rviz', 'foxglove_layout.json')
 TWO_TOOLS = """
 schema: anser_setup/1

@@ -95,8 +95,6 @@ def known(learnt) -> KnownMetal:
 
 @pytest.mark.long
 class TestLearning:
-    """What is learnt of the lump, and of what nothing is."""
-
     def test_it_tells_where_the_lump_was_and_what_drove_it(self, learnt):
         said, known = learnt
         assert said['name'] == known.name == 'lump' and said['points'] == 18
@@ -230,8 +228,6 @@ def subject(begun):
 
 @pytest.mark.long
 class TestFollowing:
-    """The field model of every frame."""
-
     def test_without_metal_the_calibrated_model_stays_in_force(self, known):
         made = world.session(world.APPROACH, None, 12, 5)
         subject = follower_of(known, made)
@@ -326,8 +322,6 @@ def body_errors(evaluation):
 
 @pytest.mark.long
 class TestTracking:
-    """Poses of the tool, by the field that it has itself found the metal with."""
-
     def test_its_poses_are_as_good_as_without_metal_and_honest(self, known):
         session, model = world.session(world.APPROACH, world.lump(), 50, 3), certain_model()
         tracked = track_session(session, model, models=partial(KnownMetalModels, known=known))
@@ -379,8 +373,6 @@ def refused(arguments, words, capsys):
 
 @pytest.mark.long
 class TestCommands:
-    """What the two commands say and write."""
-
     def test_evaluate_says_in_how_many_frames_it_was_followed(
         self, bags, known, capsys, monkeypatch
     ):

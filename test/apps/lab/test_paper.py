@@ -28,7 +28,7 @@ from anser_ros.apps.lab.experiments.study import (
 )
 from anser_ros.apps.lab.measured import anser_board
 from anser_ros.cli.main import main
-from anser_ros.errors import BagError, FitError
+from anser_ros.errors import BagError
 
 
 @pytest.fixture(scope='module')
@@ -49,14 +49,13 @@ def study(recordings, tmp_path_factory):
 
 
 def write_run(folder):
-    """A run over the board with bent positions, in a frame of its own; its lines."""
+    """A run over the board with bent positions, in a frame of its own."""
     places = anser_board.places()
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     tracked = 1e3 * (places + 0.02 * places * np.abs(places)[:, ::-1] / 0.06) @ turn.T + 150.0
     lines = [f'id{i},{x:.4f},{y:.4f},{z:.4f},0' for i, (x, y, z) in enumerate(tracked)]
     folder.mkdir(parents=True, exist_ok=True)
     (folder / 'run.fcsv').write_text('# markups\n' + '\n'.join(lines) + '\n')
-    return lines
 
 
 def test_every_recording_is_made_and_named(recordings):
@@ -165,18 +164,12 @@ def test_corrected_errors_keep_what_was_not_tracked(recordings):
 
 
 def test_fiducials_are_read_aligned_and_mapped(tmp_path):
-    lines = write_run(tmp_path)
+    write_run(tmp_path)
     (run,) = board_runs(tmp_path)
     assert run['points'] == 41
     assert run['after_m'] < 0.8 * run['before_m'] and run['confirmed']
     assert run['across_m'] < 1e-5
     assert board_runs(tmp_path / 'nowhere') == []
-    (tmp_path / 'run.fcsv').write_text('a,b,c,d\n')
-    with pytest.raises(BagError, match='no table of fiducials'):
-        board_runs(tmp_path)
-    (tmp_path / 'run.fcsv').write_text(lines[0] + '\n')
-    with pytest.raises(FitError, match='41 fiducials expected, got 1'):
-        board_runs(tmp_path)
 
 
 def test_error_map_command(tmp_path, capsys):
