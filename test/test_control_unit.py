@@ -190,6 +190,11 @@ class TestEffects:
         assert np.abs(loose[:400, 20]).max() == 0
         assert np.array_equal(loose[400:800], clean[400:800])
 
+    def test_tilted_sensor_is_tilted_in_the_world_only(self):
+        real = effects.TiltedSensor(2, (0.0, 0.6, 0.8)).setup(SETUP)
+        assert real.sensors[2].axis == (0.0, 0.6, 0.8)
+        assert real.sensors[3:] == SETUP.sensors[3:]
+
     def test_gain_ripple_and_wrong_gain(self):
         clean = self.codes()
         swung = self.codes(effects.GainRipple(0.1, 0.4))

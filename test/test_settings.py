@@ -198,6 +198,22 @@ class TestEffect:
         less = VALUES['error_modes'].default - OTHER['error_modes']
         assert len(one.modes) - len(other.update(1, channels, flux).model.modes) == less
 
+    def test_the_refit_counts_references_and_frames(self, world, usual):
+        channels, flux = world.references.channel, world.baseline
+        few = self.with_settings(usual, min_references=len(world.references) + 1)
+        assert few.update(1, channels, flux).state == 'few_references'
+        brief = self.with_settings(usual, average_frames=1, hold_frames=3, persistence=0.5)
+        assert brief._average.longest == 1
+        brief._watch.exclude(0)
+        for _ in range(3):
+            assert brief._watch.excluded[0]
+            brief._watch.agreed(0, True)
+            brief._watch.readmit()
+        assert not brief._watch.excluded[0]
+        usual.reset()
+        odds = [refit.update(1, channels, flux).log_odds for refit in (usual, brief)]
+        assert odds[0] != odds[1]
+
     def test_the_diagnosis(self):
         session = load_session(BAGS / 'moving.mcap')
         model = model_for('nominal', session)

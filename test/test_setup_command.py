@@ -25,6 +25,7 @@ def options(folder):
     return ['setup', '--board', 'circular_loop', *geometry, *coils, *sensors, '--out', str(folder)]
 
 
+@pytest.mark.long
 def test_options_make_a_document_and_a_picture(tmp_path, capsys):
     assert main([*options(tmp_path), '--volume=-100,-100,50,100,100,250', '--json']) == 0
     out, said = capsys.readouterr()
