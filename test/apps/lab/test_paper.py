@@ -22,7 +22,6 @@ from anser_ros.apps.lab.experiments.study import (
     centres_extension,
     drawn_model,
     field_errors,
-    outer_planes,
     position_bound,
     track,
 )
@@ -79,11 +78,6 @@ def test_the_checkerboard_halves_the_points(recordings):
     assert abs(counts[0] - counts[1]) <= 1
     between = training.tools[0].position[:, None, :2] - test.tools[0].position[None, :, :2]
     assert np.linalg.norm(between, axis=2).min() > 0.01
-
-
-def test_outer_planes_leave_the_middle_out(recordings):
-    names = outer_planes(recordings.load('collimator_tool_a')).tools[0].sensors.name
-    assert {name.split('/')[1] for name in names} == {'0', '2'}
 
 
 def test_the_articles_own_method_is_real_least_squares(recordings):
