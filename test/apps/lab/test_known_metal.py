@@ -228,16 +228,6 @@ def subject(begun):
 
 @pytest.mark.long
 class TestFollowing:
-    def test_without_metal_the_calibrated_model_stays_in_force(self, known):
-        made = world.session(world.APPROACH, None, 12, 5)
-        subject = follower_of(known, made)
-        for row in range(12):
-            model, withheld = subject.at(stamp(made, row))
-            assert model is subject.model and withheld is None
-            subject.take(stamp(made, row), world.readings(made, row))
-            assert not subject.is_followed and subject.place is None
-            assert not subject._tracks, 'not even a trial'
-
     def test_metal_is_followed_until_it_is_driven_too_strongly(self, begun, subject, dive):
         run = begun[1] + followed(subject, dive, range(9, 25))
         assert [is_followed for is_followed, *_ in run] == [False] * 7 + [True] * 18
