@@ -48,7 +48,7 @@ CHAINS = ('recording', 'unit')
 PLAYED = ('test_replay', 'test_main_job', 'test_refit_live', 'test_watcher')
 """Files of chains of nodes that a recording feeds, about half the time of all chains; the first
 one's tests are short."""
-READS_SOURCES = ('test_decisions', 'test_docstrings', 'test_effect_names', 'test_layers')
+READS_SOURCES = ('test_decisions', 'test_effect_names', 'test_layers')
 """Files that walk the syntax trees of all sources; parsed once, they walk them in a third of the
 time."""
 

@@ -1,10 +1,10 @@
 """A model whose references fell silent: less certain while it ages, then given up."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 from tracking_world import certain_model
 
 from anser_ros.integrity.model_age import ModelAge
@@ -14,7 +14,6 @@ from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.sessions.tracked_session import track_session
 
-ROOT = Path(__file__).resolve().parents[1]
 STEP_NS = 20_000_000
 LONGEST_S = 0.5
 
@@ -83,8 +82,8 @@ def test_the_same_answer_again_replaces_the_first():
 @pytest.mark.long
 @pytest.mark.usefixtures('shared_tables')
 def test_a_session_whose_references_stop_near_metal_has_no_wrong_pose():
-    session = load_session(ROOT / 'bags/metal.mcap')
-    model, clean = load_model(ROOT / 'config/demo_model.yaml'), ROOT / 'bags/factory.mcap'
+    session = load_session(REPO / 'bags/metal.mcap')
+    model, clean = load_model(REPO / 'config/demo_model.yaml'), REPO / 'bags/factory.mcap'
     reference = session.reference
     stop_s = 4.0
     kept = reference.time < stop_s

@@ -101,8 +101,6 @@ def poses(count, turn=(0.0, 0.0, 0.0, 1.0)):
 
 
 class TestWriteSession:
-    """Arrays come back from the bag as they went in, to single precision."""
-
     def test_round_trip(self, tmp_path):
         rng = np.random.default_rng(1)
         times = 5.0 + np.arange(4) / 50.0

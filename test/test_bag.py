@@ -4,7 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 
+from anser_ros.cli.main import main
 from anser_ros.errors import BagError
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
@@ -201,3 +203,28 @@ def test_rounded_ones_are_brought_to_unit_length():
 def test_other_numbers_are_none():
     given = [[0.0, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0], [10.0, 20.0, 30.0, 0.0]]
     assert np.isnan(unit_quaternions(given)).all()
+
+
+NAMES = ('factory', 'moving', 'metal', 'scan')
+
+
+@pytest.fixture(scope='module')
+def remade(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp('bags')
+    setup = REPO / 'config' / 'demo_setup.yaml'
+    assert main(['bags', '--setup', str(setup), '--out', str(folder)]) == 0
+    return folder
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('name', NAMES)
+def test_bag_is_small_and_is_what_the_command_makes(remade, name):
+    committed = REPO / 'bags' / f'{name}.mcap'
+    assert committed.stat().st_size < 2_000_000
+    old, new = load_session(committed), load_session(remade / f'{name}.mcap')
+    assert old.setup == new.setup
+    for a, b in zip([*old.tools, old.reference], [*new.tools, new.reference], strict=True):
+        # Another BLAS sums in another order; float32 rounds what is left.
+        np.testing.assert_allclose(a.flux, b.flux, rtol=1e-6, atol=1e-15)
+        np.testing.assert_allclose(a.position, b.position, atol=1e-12)
+        assert a.usable.all()

@@ -1,10 +1,10 @@
 """A model that lies beside its board: found by the references, and not mistaken for metal."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 
 from anser_ros.errors import BagError, FitError, ModelFileError
 from anser_ros.nodes import field_model_io
@@ -14,14 +14,12 @@ from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model, model_for
 from anser_ros.sessions.tracked_session import track_session
 
-ROOT = Path(__file__).resolve().parents[1]
-
 
 @pytest.fixture(scope='module')
 def recorded():
     """A simulated recording of a board with manufacturing errors, and a calibrated model of it."""
-    session = load_session(ROOT / 'bags' / 'factory.mcap')
-    return session, load_model(ROOT / 'config/demo_model.yaml')
+    session = load_session(REPO / 'bags' / 'factory.mcap')
+    return session, load_model(REPO / 'config/demo_model.yaml')
 
 
 def found(session, model, flux):
@@ -54,7 +52,7 @@ def test_a_model_that_lies_aside_is_refused_and_its_shift_is_told(recorded, shif
 
 def test_a_session_is_not_tracked_with_a_model_that_its_references_contradict(recorded):
     _, model = recorded
-    near_metal = load_session(ROOT / 'bags' / 'metal.mcap')
+    near_metal = load_session(REPO / 'bags' / 'metal.mcap')
     check_place(model, near_metal)
     aside = replace(model, positions=model.positions + np.array([2e-3, 0.0, 0.0]))
     with pytest.raises(ModelFileError, match=r'2\.\d mm .* from where the references locate'):
@@ -64,7 +62,7 @@ def test_a_session_is_not_tracked_with_a_model_that_its_references_contradict(re
 
 def test_metal_is_no_board_that_lies_elsewhere(recorded):
     session, model = recorded
-    recording = load_session(ROOT / 'bags' / 'metal.mcap').reference
+    recording = load_session(REPO / 'bags' / 'metal.mcap').reference
     size = np.linalg.norm(recording.flux - recording.flux[0], axis=(1, 2))
     near = recording.flux[np.argmax(size)]
     placed = found(session, model, near)

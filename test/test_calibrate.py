@@ -2,11 +2,11 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from conftest import REPO
 
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.layouts import Layout
@@ -23,7 +23,7 @@ from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.setup import dump_setup
 
-BAGS = Path(__file__).resolve().parents[1] / 'bags'
+BAGS = REPO / 'bags'
 FACTORY = BAGS / 'factory.mcap'
 START = 1_700_000_000_000_000_000
 

@@ -1,13 +1,15 @@
 """Reference readings that are no baseline: metal at rest or moving is seen, the rest not."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 from refit_world import anser_world, metal_block, three_coil_world
 from tracking_world import triaxial_tool
 
+from anser_ros.calibration.disturbances import at_strength, emitter_strength
+from anser_ros.calibration.result import drift_records
 from anser_ros.errors import BagError, FitError
 from anser_ros.field.model import ReferenceReadings
 from anser_ros.frames.intake import Intake
@@ -24,7 +26,6 @@ from anser_ros.sessions.starting_model import load_model
 from anser_ros.settings import Accuracy
 
 SEED = 7
-ROOT = Path(__file__).resolve().parents[1]
 ACCURACY = Accuracy()
 SIGMA_T = 2e-12
 
@@ -95,8 +96,8 @@ def test_the_drawing_knows_the_survey_and_the_tolerances_but_no_plate(world, rng
 
 
 def test_a_recording_with_metal_is_no_baseline():
-    clean, metal = (load_session(ROOT / 'bags' / f'{n}.mcap') for n in ('factory', 'metal'))
-    model, sensors = load_model(ROOT / 'config/demo_model.yaml'), clean.reference.sensors
+    clean, metal = (load_session(REPO / 'bags' / f'{n}.mcap') for n in ('factory', 'metal'))
+    model, sensors = load_model(REPO / 'config/demo_model.yaml'), clean.reference.sensors
     assert np.isfinite(clean_flux(clean, sensors, model)).all()
     with pytest.raises(BagError, match=r'metal.mcap is not usable as a baseline: reference'):
         clean_flux(metal, sensors, model)
@@ -144,3 +145,35 @@ def test_baseline_window():
         dead.add(intake.judge(i + 1, CHANNELS, np.full((9, 8), np.nan, complex), flags))
     with pytest.raises(FitError, match='no reference'):
         dead.mean()
+
+
+@pytest.fixture(scope='module')
+def references():
+    """References of simulated recordings: without metal, and with metal that comes near."""
+    return [load_session(REPO / 'bags' / f'{name}.mcap').reference for name in ('moving', 'metal')]
+
+
+def test_a_drift_is_found_and_taken_away(references):
+    steady, _ = references
+    time = steady.time - steady.time[0]
+    true = np.ones((time.size, steady.flux.shape[2]), dtype=complex)
+    true[:, 5] = 1.0 + (0.03 + 0.005j) * (1.0 - np.exp(-time / 6.0))
+    drifting = replace(steady, flux=steady.flux * true[:, None])
+    strength = emitter_strength(drifting)
+    assert (np.delete(strength, 5, axis=1) == 1.0).all()
+    ratio = strength[:, 5] / true[:, 5]
+    assert np.abs(ratio / ratio.mean() - 1.0).max() < 1e-3
+    constant = at_strength(drifting, drifting.time, strength)
+    assert (emitter_strength(constant) == 1.0).all()
+    (record,) = drift_records(strength)
+    assert record.parameters['coil'] == 5
+    way = np.ptp(np.abs(true[:, 5]))
+    assert record.parameters['amount'] == pytest.approx(way, rel=0.05)
+
+
+def test_steady_emitters_and_metal_are_no_drift(references):
+    for reference in references:
+        assert (emitter_strength(reference) == 1.0).all()
+    few = references[0].sensors_only(np.arange(3))
+    assert (emitter_strength(replace(few, flux=few.flux * 1.5)) == 1.0).all()
+    assert drift_records(emitter_strength(references[1])) == ()

@@ -14,7 +14,7 @@ from anser_ros.signals.window import TickCheck, WindowCutter
 from anser_ros.simulation import effects
 from anser_ros.simulation.control_unit import ControlUnit, FrontEnd
 from anser_ros.simulation.effects import CATALOGUE, draw
-from anser_ros.simulation.world import Approach, World, steel_disc
+from anser_ros.simulation.world import World, steel_disc
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.frames import (
     DeviceState,
@@ -190,6 +190,11 @@ class TestEffects:
         assert np.abs(loose[:400, 20]).max() == 0
         assert np.array_equal(loose[400:800], clean[400:800])
 
+    def test_tilted_sensor_is_tilted_in_the_world_only(self):
+        real = effects.TiltedSensor(2, (0.0, 0.6, 0.8)).setup(SETUP)
+        assert real.sensors[2].axis == (0.0, 0.6, 0.8)
+        assert real.sensors[3:] == SETUP.sensors[3:]
+
     def test_gain_ripple_and_wrong_gain(self):
         clean = self.codes()
         swung = self.codes(effects.GainRipple(0.1, 0.4))
@@ -263,11 +268,6 @@ class TestMetal:
         bare, with_metal = world(), world(metal=[steel_disc()])
         change = [np.abs(with_metal.flux(t) - bare.flux(t)).max() for t in (0.0, 14.0, 30.0)]
         assert change[1] > 5e-9 and change[1] > 50 * max(change[0], change[2])
-
-    def test_approach_repeats_when_it_has_a_period(self):
-        path = replace(Approach(), period_s=20.0)
-        assert path(34.0)[0] == pytest.approx(path(14.0)[0])
-        assert path(14.0)[0] == pytest.approx(path.near_m)
 
 
 @pytest.mark.parametrize('kept', ['tool_sensors', 'reference_sensors'])

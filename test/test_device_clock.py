@@ -221,7 +221,6 @@ class TestFaults:
 
     @pytest.mark.parametrize('seed', range(12))
     def test_no_course_of_faults_gives_a_wrong_stamp_that_is_called_good(self, seed):
-        """What is confirmed is right to 5 ms, whatever happened before and in what order."""
         rng = np.random.default_rng(seed)
         line = Line(seed=seed, ppm=rng.uniform(-80, 80)).run(0.5, answers_s=0.002)
         for kind in rng.choice(['late', 'stall', 'lose', 'load'], 4):

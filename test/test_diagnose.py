@@ -1,11 +1,13 @@
 """`anser diagnose` on simulated bags: a clean one passes, a wrong gain is named and mended."""
 
+import itertools
 import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 
 from anser_ros.cli.diagnosis_words import MOST_CHARACTERS, short_ones, value_text, verdict
 from anser_ros.cli.main import main
@@ -17,8 +19,7 @@ from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 
-ROOT = Path(__file__).resolve().parents[1]
-BAGS, MODEL = ROOT / 'bags', ROOT / 'config' / 'demo_model.yaml'
+BAGS, MODEL = REPO / 'bags', REPO / 'config' / 'demo_model.yaml'
 CHANNEL, GAIN = 4, 0.97
 HELD_OUT = {
     'flux_rms_before_t', 'flux_rms_after_t', 'flux_rms_floor_t', 'position_rmse_before_m',
@@ -26,13 +27,14 @@ HELD_OUT = {
 }  # fmt: skip
 
 
-def rewritten(name: str, path: Path, gain: float) -> Path:
-    """A shipped session with one channel's readings too small."""
+def rewritten(name: str, path: Path, gain: float = 1.0, step: int = 1) -> Path:
+    """A shipped session: every so many frames, and one channel's readings too small."""
     bag = read_bag(BAGS / f'{name}.mcap')
     with SessionWriter(path) as writer:
         writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
         gains = np.where(bag.tool.channel == CHANNEL, gain, 1.0)[:, None]
-        for stamp, flux in zip(bag.tool.stamp_ns.tolist(), bag.tool.flux, strict=True):
+        frames = zip(bag.tool.stamp_ns.tolist(), bag.tool.flux, strict=True)
+        for stamp, flux in itertools.islice(frames, 0, None, step):
             writer.write_readings(bag.setup.tool_sensors, stamp, flux * gains)
         for body, track in bag.optical.items():
             for stamp, position, quaternion in zip(
@@ -76,6 +78,15 @@ def test_a_wrong_gain_is_named_and_the_model_corrects_it(tmp_path):
     assert 'http' not in page.replace('http-equiv', '')
     again = run(bag, tmp_path / 'again', tmp_path / 'out' / 'model.yaml')
     assert again['effects'] == [], 'the corrected model leaves nothing to find'
+
+
+@pytest.mark.long
+def test_metal_that_moves_is_found_and_its_verdict_is_short(tmp_path, capsys):
+    document = run(rewritten('metal', tmp_path / 'thinned.mcap', step=5), tmp_path / 'out')
+    names = [effect['name'] for effect in document['effects']]
+    assert 'moving_metal' in names
+    said = [line for line in capsys.readouterr().out.split('\n') if 'residual on' in line]
+    assert len(said) == 1 and 100 < len(said[0]) < MOST_CHARACTERS
 
 
 def test_the_session_needs_poses(tmp_path, capsys):

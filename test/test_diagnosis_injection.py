@@ -14,8 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
 from anser_ros.diagnosis.screening import clean_start, outlying_share
-from anser_ros.effects.effect import all_effects
-from anser_ros.effects.moving_metal import StraightPath
 from anser_ros.physics.pose_track import PoseTrack
 
 
@@ -62,15 +60,6 @@ def test_what_nothing_describes_stays_unexplained(name):
     assert not {f.record.name for f in result.findings} & set(CATALOGUE)
     assert result.unexplained > 0.9
     assert result.depends_on
-
-
-def test_metal_that_moves_is_the_last_resort():
-    """Its shape costs more than what one coil does from frame to frame, whatever it starts as."""
-    effects, problem = all_effects(), world(0, frames=30).problem()
-    course = np.array([0.0, 0.0, -0.1, 0.05, 0.0, -0.1, 0.2, 0.8, 0.5])
-    metal = effects['moving_metal'].starting(StraightPath(), course, 1.2, np.array([-1.0, 0.0]))
-    for name in ('coil_fluctuation', 'sensor_gain_drift', 'static_metal', 'coil_drift', 'pickup'):
-        assert effects[name].candidates(problem.apparatus)[0].complexity < metal.complexity
 
 
 CHANNEL, HIT = 2, np.arange(20, 500, 40)

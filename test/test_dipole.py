@@ -78,7 +78,6 @@ def test_gradient_is_that_of_the_field_symmetric_and_traceless(world, rng):
 
 
 def test_reciprocity(rng):
-    """The flux that dipole b links from a is what a links from b."""
     first, second = rng.normal(size=(2, 1, 3))
     u, v = rng.normal(size=(2, 1, 3))
     there = flux_basis(second, v, None, first, u)

@@ -59,8 +59,6 @@ def test_python_on_the_pages_runs(name, tmp_path, monkeypatch):
 
 
 class TestSetupPage:
-    """Every kind of emitter has an example that draws; every key that the code reads is told."""
-
     SENSOR = """
 sensors:
 - {channel: 0, name: pen/tip, body: pen, position_m: [0, 0, 0], axis: [0, 0, 1]}
@@ -96,8 +94,6 @@ sensors:
 
 
 class TestInterfacesPage:
-    """What the code promises is on the page, and what the page lists exists."""
-
     def test_every_schema_has_a_row(self):
         schema = re.compile(r'anser_[a-z_]+/\d+')
         files = (REPO / 'anser_ros').rglob('*.py')

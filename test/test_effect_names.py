@@ -8,8 +8,8 @@ import ast
 import importlib
 import inspect
 import pkgutil
-from pathlib import Path
 
+from conftest import REPO
 from source_trees import nodes_of
 
 import anser_ros.apps.poses.effects as pose_package
@@ -18,7 +18,7 @@ from anser_ros.apps.poses.effect import pose_effects
 from anser_ros.effects.base import BaseEffect, BaseTerm
 from anser_ros.effects.effect import all_effects
 
-PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
+PACKAGE = REPO / 'anser_ros'
 ALLOWED = {
     'effects/': 'their own room',
     'simulation/': 'faults of a simulated nature, labelled with what a diagnosis should call them',

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import REPO
 
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
@@ -24,7 +25,7 @@ from anser_ros.tracking.estimate import TrackerSettings
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 
-BAGS = Path(__file__).resolve().parents[1] / 'bags'
+BAGS = REPO / 'bags'
 OPTICAL_JITTER_M = 0.12e-3
 FIGURES = {
     f'{what}_{statistic}_{unit}'
@@ -121,7 +122,6 @@ def test_one_phase_suffices_without_metal_and_a_drawing_does_not(
     ],
 )  # fmt: skip
 def test_the_truth_is_what_the_model_s_effects_make_of_it(model, moving, record, moved_m):
-    """A wrong frame or clock of the optical poses that the model states is taken into account."""
     wrong = dataclasses.replace(load_model(model), effects=(record,))
     session = load_session(BAGS / 'moving.mcap')
     body = track_session(session, wrong).bodies['tool_a']
@@ -152,7 +152,6 @@ def test_a_refit_says_in_how_many_frames_it_did_what():
     assert 'refit' not in to_document(Evaluation({}, {}, 0.0))
 
 
-REPO = Path(__file__).resolve().parents[1]
 MODEL = REPO / 'config' / 'demo_model.yaml'
 METAL = REPO / 'bags' / 'metal.mcap'
 

@@ -98,15 +98,6 @@ def test_many_values_of_a_channel_are_summed_up():
     assert rows[0][1].startswith('2.5000 ±')
 
 
-def test_the_picture_has_a_panel_for_each_population():
-    figure = population_figure([GAINS, SINGLE, PLACES])
-    try:
-        titles = [panel.get_title() for panel in figure.axes]
-        assert titles == ['sensor_gain_spread: 0.2 %', 'sensor_place_spread: 2 mm']
-    finally:
-        plt.close(figure)
-
-
 def test_without_a_population_there_is_nothing_to_show():
     assert populations([SINGLE]) == []
     assert population_table([SINGLE])[1] == []

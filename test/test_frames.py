@@ -4,10 +4,10 @@ import re
 import struct
 import zlib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,7 +31,7 @@ from anser_ros.wire.frames import (
 )
 from anser_ros.wire.protocols import FrameReader
 
-DOCS = Path(__file__).resolve().parents[1] / 'docs'
+DOCS = REPO / 'docs'
 TONES = tuple(6000.0 + 170 * k for k in range(8))
 
 

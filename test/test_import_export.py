@@ -3,13 +3,13 @@
 import io
 import json
 import sqlite3
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import yaml
 import zstandard
+from conftest import REPO
 from scipy.io import loadmat, savemat
 
 from anser_ros.apps.poses.importing import read_pose_session
@@ -17,8 +17,7 @@ from anser_ros.cli.main import main
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
 
-ROOT = Path(__file__).resolve().parents[1]
-MOVING = ROOT / 'bags' / 'moving.mcap'
+MOVING = REPO / 'bags' / 'moving.mcap'
 FRAMES = 12
 
 

@@ -142,7 +142,6 @@ def test_the_place_of_metal_is_no_surer_than_its_shape(found):
 
 @pytest.mark.parametrize('metal', ['static_metal', 'conductive_plate', 'moving_metal'])
 def test_a_coil_that_moved_lights_metal_from_where_it_is(problem, found, metal):
-    """The same as metal in a world that has the coil there from the start."""
     tool, fields = problem.tools[0], problem.fields
     body = found[metal]
     coil = found['coil_moved'].with_theta(np.array([0.004, -0.003, 0.002]))

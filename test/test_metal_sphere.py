@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from metal_world import dipole_field, dipole_tensor, induced_moments
+from metal_world import induced_moments
 
 from anser_ros.metal.body import SMALL, sphere_polarisability
 from anser_ros.physics.constants import MU_0
@@ -64,18 +64,6 @@ def test_the_series_and_the_closed_form_meet():
 def test_impossible_spheres_are_refused(arguments):
     with pytest.raises(ValueError, match='must'):
         polarisability(*arguments)
-
-
-def test_tensor_is_the_dipole_field_and_reciprocal():
-    rng = np.random.default_rng(4)
-    points, sources = rng.normal(size=(2, 3, 3))
-    moment = rng.normal(size=3)
-    tensor = dipole_tensor(points, sources)
-    for s in range(3):
-        field = dipole_field(points, sources[s : s + 1], moment[None])
-        np.testing.assert_allclose(tensor[:, s] @ moment, field, rtol=1e-10)
-    np.testing.assert_allclose(tensor, dipole_tensor(sources, points).swapaxes(0, 1))
-    assert (dipole_tensor(points, points)[[0, 1, 2], [0, 1, 2]] == 0).all()
 
 
 def test_coupled_pair_along_the_line_that_joins_them():

@@ -1,17 +1,4 @@
-"""Moments at poses that jitter.
-
-| what                                   | must agree with                                  |
-|----------------------------------------|--------------------------------------------------|
-| triangular factor, Gram factor         | numpy's least squares; whatever the blocks       |
-| damping, prior                         | least squares with explicit further rows         |
-| slopes of the flux by a pose           | central differences                              |
-| most probable step                     | the jitter that was put in, to its posterior     |
-| fit at corrected poses                 | the true field, closer than plain least squares  |
-| estimated noise                        | the noise put in                                 |
-| predictive chi-square                  | one, at the true field                           |
-| start at another fit's poses           | that fit's moments, at once, and leaves it alone |
-| gross outliers                         | the fit without them                             |
-"""
+"""Moments at poses that jitter."""
 
 from dataclasses import replace
 
@@ -30,7 +17,7 @@ from anser_ros.calibration.moments import (
     pose_precision,
     pose_terms,
 )
-from anser_ros.calibration.readings import usable_weights, with_pose
+from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.errors import FitError
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.settings import Accuracy
@@ -81,6 +68,13 @@ def test_a_column_of_zeros_is_left_out(rows):
     spectrum = factor.spectrum()
     assert spectrum.rank == 7
     assert np.all(spectrum.solve(0.0)[7] == 0)
+
+
+def test_blocks_are_whole_frames_and_cover_all():
+    for count, sensors, most in ((10, 3, 7), (1, 900, 10), (0, 3, 7), (100, 2, 1000)):
+        slices = frame_blocks(count, sensors, most)
+        covered = [i for s in slices for i in range(s.start, s.stop)]
+        assert covered == list(range(count))
 
 
 def test_pose_slopes_are_differences(rng):

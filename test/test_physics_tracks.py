@@ -178,7 +178,6 @@ def test_other_refusals():
 
 
 def test_every_kind_has_a_nominal_model():
-    """Boards are data: other kinds, other numbers of emitters."""
     geometry = {'side_m': 0.098, 'side_x_m': 0.12, 'side_y_m': 0.06, 'radius_m': 0.05,
                 'turns': 40, 'pitch_m': 0.0004, 'layers': 2, 'thickness_m': 0.0016,
                 'current_a': 0.5}  # fmt: skip

@@ -9,7 +9,7 @@ from refit_world import anser_world
 
 from anser_ros.cli.main import main
 from anser_ros.refit.clouds import Excitation, Region, region_of
-from anser_ros.refit.design import StatedMetal, choose, expected_errors, family, random_designs
+from anser_ros.refit.design import choose, expected_errors, family, random_designs
 from anser_ros.settings import RefitSettings
 
 UNCORRECTED_M = 5e-3
@@ -51,16 +51,6 @@ def test_the_choice_is_about_the_best_of_all(metals):
     assert chosen.error_m <= min(every) * 1.05
     drawn = random_designs(metals, 3, K, 20, np.random.default_rng(1))
     assert chosen.error_m < np.mean([design.error_m for design in drawn])
-
-
-def test_coils_without_common_noise_are_chosen_by_what_each_tells():
-    """Nothing at all is left of a chosen one then."""
-    rng = np.random.default_rng(4)
-    cross = rng.normal(size=(3, 4 * K))
-    metal = StatedMetal('a', cross, np.eye(4 * K), 1.0 + float(np.linalg.norm(cross)))
-    told = np.sum(cross.reshape(3, 4, K) ** 2, axis=(0, 2))
-    designs = choose([metal], 4, K)
-    assert [list(design.coils) for design in designs][2] == np.argsort(-told)[:3].tolist()
 
 
 @pytest.mark.long

@@ -4,10 +4,10 @@ The recordings are those of bags/, written down wrongly in ways that people do.
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 from scipy.spatial.transform import Rotation
 
 from anser_ros.cli.main import main
@@ -26,13 +26,12 @@ from anser_ros.sessions.starting_model import load_model
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 
-ROOT = Path(__file__).resolve().parents[1]
-MODEL = ROOT / 'config' / 'demo_model.yaml'
+MODEL = REPO / 'config' / 'demo_model.yaml'
 
 
 @pytest.fixture(scope='module')
 def moving():
-    return load_session(ROOT / 'bags' / 'moving.mcap')
+    return load_session(REPO / 'bags' / 'moving.mcap')
 
 
 @pytest.fixture(scope='module')
@@ -176,7 +175,7 @@ def test_a_diagnosis_of_one_pose_ends_at_once(moving, tool):
 
 
 def test_commands_say_it_in_one_line(tmp_path, capsys):
-    bag = read_bag(ROOT / 'bags' / 'moving.mcap')
+    bag = read_bag(REPO / 'bags' / 'moving.mcap')
     path = tmp_path / 'millimetres.mcap'
     with SessionWriter(path) as writer:
         writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
@@ -191,7 +190,7 @@ def test_commands_say_it_in_one_line(tmp_path, capsys):
         ['calibrate', str(path), *out],
         ['evaluate', str(path), '--model', str(MODEL), *out],
         ['diagnose', str(path), '--model', str(MODEL), *out],
-        ['evaluate', str(ROOT / 'bags' / 'moving.mcap'), '--model', str(MODEL), *out,
+        ['evaluate', str(REPO / 'bags' / 'moving.mcap'), '--model', str(MODEL), *out,
          '--baseline', str(path)],
     ):  # fmt: skip
         assert main(command) == 2

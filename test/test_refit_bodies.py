@@ -6,7 +6,7 @@ from refit_world import anser_world, metal_block, metal_flux, volume_points
 from scipy.stats import multivariate_normal
 
 from anser_ros.physics.dipole import flux_basis
-from anser_ros.refit.clouds import BODY_RADIUS, Region, bodies
+from anser_ros.refit.clouds import Region, bodies
 from anser_ros.refit.tables import REMAINDER, BodySearch, body_factor
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
@@ -30,20 +30,6 @@ def follow(refit, points, frames=6, seed=1):
         flux = world.baseline + change + world.noise(rng)
         result = refit.update(10**9 + frame * 40_000_000, world.references.channel, flux)
     return result
-
-
-def test_bodies_are_around_the_volume_and_reach_each_other():
-    region = Region(np.array([0.01, -0.02]), 0.13)
-    found = bodies(region)
-    centres = np.array([body.positions[0] for body in found])
-    inner = np.abs(centres[:, :2] - region.centre).max(axis=1) < 0.7 * region.half
-    assert not (inner & (centres[:, 2] < 1.2 * region.half)).any()
-    gap = np.linalg.norm(centres[:, None] - centres, axis=2)
-    np.fill_diagonal(gap, np.inf)
-    assert gap.min(axis=1).max() < 2.0 * BODY_RADIUS * region.half
-    for body in found[:5]:
-        np.testing.assert_allclose(body.positions.mean(axis=0), body.positions[0], atol=1e-12)
-        assert np.isclose(body.volumes.sum(), 4.0 / 3.0 * np.pi * (BODY_RADIUS * 0.13) ** 3)
 
 
 def test_approximate_evidence_is_that_of_its_own_normal_distribution():

@@ -5,6 +5,7 @@ import pytest
 from tracking_world import NOISE_T, certain_model, fluxes, random_pose, triaxial_tool
 
 from anser_ros.errors import TrackingError
+from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.rigid import (
@@ -14,6 +15,7 @@ from anser_ros.tracking.rigid import (
     start_from_coils,
 )
 from anser_ros.tracking.solve import RealField, bounded_inverse
+from anser_ros.tracking.solve_context import error_whitening, source_spacing
 
 SEED = 41
 MODEL = certain_model()
@@ -115,15 +117,64 @@ def test_start_from_the_coils_own_poses(rng):
     assert start_from_coils(COILS.subset([]), points[:0], axes[:0], np.ones(0)) is None
 
 
-def test_what_is_observable():
-    assert COILS.observable
-    assert not COILS.subset([0]).observable
-    assert not COILS.subset([2, 5, 8]).observable, 'all along z'
-    assert COILS.subset([2, 3]).observable
-
-
 def test_refusals():
     with pytest.raises(TrackingError, match='9 coils'):
         solve(np.zeros((8, 8), complex), np.zeros(3), np.eye(3))
     with pytest.raises(TrackingError, match='must be finite'):
         common_factor(np.full((9, 1, WIDTH), np.nan), WEIGHTS)
+
+
+POINT, AXIS = np.array([0.02, -0.05, 0.13]), np.array([0.6, 0.0, 0.8])
+
+
+def columns_of(model):
+    return RealField.of(model.positions, model.directions, model.moments).columns
+
+
+def both(modes, sigma, length):
+    model = certain_model()
+    span = np.array([length])
+    basis = flux_basis(POINT[None], AXIS[None], span, model.positions, model.directions)
+    flux = np.ascontiguousarray(np.einsum('sn,rnk->rsk', basis, modes)).view(float)
+    laid_out = np.ascontiguousarray(
+        np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(len(model.positions), -1)
+    )
+    # Another coil beside it, so that the two are not mixed up.
+    errors, weights, away, among = error_whitening(
+        np.stack([POINT + 0.01, POINT]), np.stack([AXIS[::-1], AXIS]), np.array([0.0, length]),
+        columns_of(model), np.full(len(model.positions), 0.03), laid_out, sigma,
+    )  # fmt: skip
+    distance = np.linalg.norm(model.positions - POINT, axis=1).min()
+    assert away[1] == pytest.approx(distance)
+    assert among[1] == pytest.approx(0.03 / distance)
+    np.testing.assert_allclose(errors[1], flux[:, 0], rtol=1e-9, atol=1e-20)
+    covariance = np.diag(sigma**2) + flux[:, 0].T @ flux[:, 0]
+    return np.linalg.inv(np.linalg.cholesky(covariance)), weights[1]
+
+
+def test_it_is_the_inverse_factor_of_the_covariance():
+    rng = np.random.default_rng(1)
+    count = len(certain_model().positions)
+    modes = 1e-5 * (rng.normal(size=(5, count, 8)) + 1j * rng.normal(size=(5, count, 8)))
+    sigma = rng.uniform(50e-12, 90e-12, 16)
+    for length in (0.0, 0.008):
+        plain, kernel = both(modes, sigma, length)
+        np.testing.assert_allclose(kernel, plain, rtol=1e-8, atol=1e-9 * np.abs(plain).max())
+
+
+def test_what_is_not_finite_is_refused():
+    count = len(certain_model().positions)
+    modes = np.full((1, count, 8), np.inf + 0j)
+    model = certain_model()
+    laid_out = np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(count, -1)
+    with np.errstate(all='ignore'), pytest.raises(TrackingError, match='finite'):
+        error_whitening(
+            POINT[None], AXIS[None], np.zeros(1), columns_of(model), np.zeros(count),
+            np.ascontiguousarray(laid_out), np.full(16, 60e-12),
+        )  # fmt: skip
+
+
+def test_dipoles_are_as_far_apart_as_their_nearest_neighbours_elsewhere():
+    places = np.array([[0, 0, 0.1], [0, 0, 0.1], [0.03, 0, 0.1], [0.03, 0.05, 0.1], [0.03, 0, 0]])
+    np.testing.assert_allclose(source_spacing(places, 0.02), [0.03, 0.03, 0.03, 0.05, 0.0])
+    np.testing.assert_allclose(source_spacing(places[:2], 0.02), 0.0)

@@ -1,16 +1,23 @@
 """What a scan cannot tell: it is said, a model is made all the same, and poses own up to it."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from calibration_world import Errors, moved_scan, scene, tool_of
+from calibration_world import NOISE_T, Errors, moved_scan, scene, tool_of
 
+from anser_ros.calibration.calibrate import Options, _better, correct_scan, fit_scan
+from anser_ros.calibration.held_out import factor_of
+from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.population import Likelihood, Population
 from anser_ros.calibration.result import undetermined_words
 from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import KINDS, SURVEYED_M
+from anser_ros.diagnosis.problem import Spread, build_problem, evaluate, expected_rms, rms
+from anser_ros.errors import ModelFileError
+from anser_ros.field.model import from_document, parse_gaps, to_document
 from anser_ros.settings import Accuracy
-
-pytestmark = pytest.mark.long
 
 
 def surveyed(seed, coils, seconds, turn_rad, errors, flat=False):
@@ -21,6 +28,7 @@ def surveyed(seed, coils, seconds, turn_rad, errors, flat=False):
     return SensorFitter([told], KINDS, world.generator, Accuracy()).fit(), truth
 
 
+@pytest.mark.long
 def test_a_camera_that_jitters_shifts_neither_field_nor_tool_and_its_limits_are_known():
     found, truth = surveyed(307, 3, 20.0, 0.6, Errors(jitter=4.3))
     assert np.abs(found.errors_of('tool').lever_arm - truth.lever).max() < 1e-4
@@ -34,6 +42,7 @@ def test_a_camera_that_jitters_shifts_neither_field_nor_tool_and_its_limits_are_
     assert (np.abs(found.errors_of('tool').lever_arm - truth.lever) < 3.0 * lever).all()
 
 
+@pytest.mark.long
 def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
     found, _ = surveyed(22, 3, 6.0, 0.01, Errors())
     assert 'lever_arm' in found.undetermined
@@ -47,6 +56,7 @@ def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
     assert population.shift_sigma_m(much, population.fit(much)) < 1e-5, 'its setup knew the coils'
 
 
+@pytest.mark.long
 def test_a_scan_of_seconds_tells_nothing_of_the_sensors_and_takes_the_setup():
     found, _ = surveyed(23, 9, 2.0, 0.6, Errors())
     assert set(found.undetermined) == set(KINDS) and not found.evidence
@@ -56,6 +66,7 @@ def test_a_scan_of_seconds_tells_nothing_of_the_sensors_and_takes_the_setup():
     assert found.kept[0].sum() >= 45
 
 
+@pytest.mark.long
 def test_of_one_coil_in_seconds_what_is_not_told_stays_at_the_setups():
     found, _ = surveyed(31, 1, 8.0, 0.6, Errors())
     assert {'axes', 'lever_arm'} <= set(found.undetermined)
@@ -63,7 +74,82 @@ def test_of_one_coil_in_seconds_what_is_not_told_stays_at_the_setups():
     assert np.abs(found.errors_of('tool').lever_arm).max() < 1e-9
 
 
+@pytest.mark.long
 def test_a_flat_scan_says_what_it_cannot_give():
     found, _ = surveyed(24, 3, 6.0, 0.6, Errors(), flat=True)
     assert 'lever_arm' in found.undetermined and 'lever_arm' not in found.evidence
     assert 0.2e-3 < found.shift_sigma_m <= 1.01 * SURVEYED_M
+
+
+LAYER = Layout('layer', 10, 1.5, 0.0)
+
+
+@pytest.fixture(scope='module')
+def scanned():
+    """A scan that left out one side of its volume, and the model of it."""
+    world = scene(np.random.default_rng(7), side=17)
+    side = world.measurements.position[:, 0] > 0.04
+    part = world.measurements.frames(np.flatnonzero(~side))
+    options = Options(layout=LAYER)
+    tones = (1000.0, 1100.0, 1200.0)
+    generator = replace(world.generator, emitters=('a', 'b', 'c'), frequencies_hz=tones)
+    found = fit_scan(correct_scan([part], generator, options), ['scan'], generator, options)
+    return world, side, found.model
+
+
+def test_a_model_says_where_its_scan_has_a_gap(scanned):
+    world, side, model = scanned
+    table = world.measurements.sensors
+    points, axes = table.placed(world.position, world.rotation)
+    true = world.flux(points.reshape(-1, 3), axes.reshape(-1, 3)).reshape(*points.shape[:2], -1)
+    error = np.abs(model.flux(points, axes) - true) / np.sqrt(2.0)
+    told = model.gaps.sigma_t(points, axes, table.length)
+    far = world.position[:, 0] > 0.07
+    assert told[far].mean() > 5.0 * told[~side].mean()
+    ratio = np.sqrt(np.mean(error[far] ** 2) / np.mean(told[far] ** 2))
+    assert 0.3 < ratio < 3.0
+
+
+def test_a_reading_in_a_gap_counts_for_less(scanned):
+    world, side, model = scanned
+    spread = Spread(NOISE_T)
+    sure, unsure = (
+        evaluate(build_problem([world.measurements], None, None, one, None, spread), ())
+        for one in (replace(model, gaps=None), model)
+    )
+    before, after = sure.parts[0].whitener.weight, unsure.parts[0].whitener.weight
+    inner = np.abs(world.position - [-0.03, 0.0, 0.14]).max(axis=1) < 0.05
+    assert after[inner].mean() > 0.9 * before[inner].mean()
+    assert after[side].mean() < 0.7 * before[side].mean()
+    assert expected_rms(sure) == pytest.approx(NOISE_T)
+    assert expected_rms(unsure) > 1.2 * NOISE_T
+    assert rms(unsure) == pytest.approx(rms(sure)), 'told in T, whatever the weights are'
+    assert np.mean(unsure.parts[0].white ** 2) < 0.6 * np.mean(sure.parts[0].white ** 2)
+
+
+def test_gaps_survive_the_models_file_and_broken_ones_are_refused(scanned):
+    _, _, model = scanned
+    again = from_document(to_document(model)).gaps
+    assert np.array_equal(again.moments, model.gaps.moments)
+    assert np.array_equal(again.positions, model.gaps.positions)
+    with pytest.raises(ModelFileError, match='rows of at least 7 finite numbers'):
+        parse_gaps([[0.0] * 6])
+    with pytest.raises(ModelFileError, match='no table'):
+        parse_gaps([[0.0] * 7, ['x']])
+
+
+def test_blocks_that_were_held_out_say_how_much_too_small_a_covariance_is():
+    expected = np.geomspace(1e-24, 1e-20, 40)
+    assert factor_of(expected, 9.0 * expected) == pytest.approx(3.0)
+    assert factor_of(expected, 0.1 * expected) == 1.0
+    assert factor_of(expected[:5], 9.0 * expected[:5]) == 1.0
+
+
+def test_a_third_of_the_dipoles_may_leave_a_seventh_more():
+    def pair(score, dipoles):
+        return None, SimpleNamespace(score_t=score, n_dipoles=dipoles)
+
+    few, many = pair(1.1, 50), pair(1.0, 150)
+    assert _better([few, many]) is few
+    nearly_as_many = pair(1.1, 140)
+    assert _better([nearly_as_many, many]) is many

@@ -3,10 +3,10 @@
 import json
 import pickle
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 
 from anser_ros.diagnosis.diagnose import conclude, confirm, screen, search_screened
 from anser_ros.diagnosis.problem import test_blocks as held_out_blocks
@@ -30,29 +30,28 @@ from anser_ros.sessions.tracked_session import metrics, pose_series, track
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 
-ROOT = Path(__file__).resolve().parents[1]
 CHANNEL, GAIN = 4, 0.97
 LIGHT = SearchSettings(most_effects=1, finalists=2, iterations=4)
 
 
 @pytest.fixture(scope='module')
 def model():
-    return load_model(ROOT / 'config' / 'demo_model.yaml')
+    return load_model(REPO / 'config' / 'demo_model.yaml')
 
 
 @pytest.fixture(scope='module')
 def moving():
-    return load_session(ROOT / 'bags' / 'moving.mcap')
+    return load_session(REPO / 'bags' / 'moving.mcap')
 
 
 @pytest.fixture(scope='module')
 def factory():
-    return load_session(ROOT / 'bags' / 'factory.mcap')
+    return load_session(REPO / 'bags' / 'factory.mcap')
 
 
 @pytest.fixture(scope='module')
 def metal():
-    return load_session(ROOT / 'bags' / 'metal.mcap')
+    return load_session(REPO / 'bags' / 'metal.mcap')
 
 
 def with_gain(session):

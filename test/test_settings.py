@@ -3,11 +3,11 @@
 import argparse
 from copy import copy
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from conftest import REPO
 from refit_world import anser_world
 from test_setup import document
 
@@ -40,7 +40,7 @@ from anser_ros.wire.setup import dump_setup, parse_setup
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 
-BAGS = Path(__file__).resolve().parents[1] / 'bags'
+BAGS = REPO / 'bags'
 OTHER = {
     'flux_noise_t': 1.5e-10, 'optical_position_m': 0.3e-3, 'optical_rotation_rad': 2e-3,
     'reference_position_m': 1e-3, 'reference_axis_rad': 0.02, 'reference_gain': 0.02,
@@ -155,8 +155,6 @@ class TestStating:
 
 @pytest.mark.long
 class TestEffect:
-    """Each value, set to another, changes what it should."""
-
     def with_settings(self, usual, **values):
         """The refit with other settings that its tables do not depend on."""
         other = copy(usual)
@@ -199,6 +197,22 @@ class TestEffect:
         less = VALUES['error_modes'].default - OTHER['error_modes']
         assert len(one.modes) - len(other.update(1, channels, flux).model.modes) == less
 
+    def test_the_refit_counts_references_and_frames(self, world, usual):
+        channels, flux = world.references.channel, world.baseline
+        few = self.with_settings(usual, min_references=len(world.references) + 1)
+        assert few.update(1, channels, flux).state == 'few_references'
+        brief = self.with_settings(usual, average_frames=1, hold_frames=3, persistence=0.5)
+        assert brief._average.longest == 1
+        brief._watch.exclude(0)
+        for _ in range(3):
+            assert brief._watch.excluded[0]
+            brief._watch.agreed(0, True)
+            brief._watch.readmit()
+        assert not brief._watch.excluded[0]
+        usual.reset()
+        odds = [refit.update(1, channels, flux).log_odds for refit in (usual, brief)]
+        assert odds[0] != odds[1]
+
     def test_the_diagnosis(self):
         session = load_session(BAGS / 'moving.mcap')
         model = model_for('nominal', session)
@@ -221,7 +235,6 @@ class TestCommands:
         [('evaluate', VALUES), ('diagnose', VALUES), ('calibrate', SECTIONS['accuracy'])],
     )
     def test_the_session_has_what_is_stated(self, name, used, monkeypatch, tmp_path):
-        """From the command line to the session that all stages work on."""
         module = {'evaluate': evaluate, 'diagnose': diagnose, 'calibrate': calibrate}[name]
         target = {'evaluate': 'track_session', 'calibrate': 'calibrate_sessions'}
         seen = []

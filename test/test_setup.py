@@ -1,11 +1,11 @@
 """The setup document: what is read, and what is refused with the rule named."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from conftest import REPO
 
 from anser_ros.errors import SetupError
 from anser_ros.physics.volume import TrackedVolume
@@ -13,7 +13,7 @@ from anser_ros.refit.clouds import default_clouds, region_of
 from anser_ros.sessions.nominal_board import NominalBoard, stated_volume, tracked_volume
 from anser_ros.wire.setup import dump_setup, parse_setup, topic_of
 
-DEMO = Path(__file__).resolve().parents[1] / 'config' / 'demo_setup.yaml'
+DEMO = REPO / 'config' / 'demo_setup.yaml'
 
 
 def document() -> dict:
@@ -147,7 +147,6 @@ def test_a_stated_volume_is_read_and_written():
 
 
 def test_without_a_stated_volume_it_follows_from_the_board():
-    """Tracker, refit and views have the same box, to the digit."""
     setup = parse_setup(DEMO.read_text())
     region = region_of(NominalBoard.of(setup).field)
     assert tracked_volume(setup) == TrackedVolume() == region.volume

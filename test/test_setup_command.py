@@ -3,7 +3,6 @@
 import io
 import json
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
@@ -26,6 +25,7 @@ def options(folder):
     return ['setup', '--board', 'circular_loop', *geometry, *coils, *sensors, '--out', str(folder)]
 
 
+@pytest.mark.long
 def test_options_make_a_document_and_a_picture(tmp_path, capsys):
     assert main([*options(tmp_path), '--volume=-100,-100,50,100,100,250', '--json']) == 0
     out, said = capsys.readouterr()
@@ -128,7 +128,7 @@ def test_a_folder_that_takes_no_file_is_found_before_the_work(capsys):
         assert 'nothing can be written into /proc' in capsys.readouterr().err
 
 
-CONFIG = Path(__file__).resolve().parents[1] / 'config'
+CONFIG = REPO / 'config'
 FILES = ('anser.rviz', 'foxglove_layout.json')
 TWO_TOOLS = """
 schema: anser_setup/1

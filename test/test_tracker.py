@@ -209,7 +209,6 @@ def three_coil_model():
 
 
 def test_three_emitters_single_coils_are_ambiguous_and_the_tool_is_tracked(rng):
-    """Other systems have three emitters: a lone coil can't be told, nine on a tool can."""
     model = three_coil_model()
     tracker = Tracker(model, TOOL)
     position, rotation = random_pose(rng, 0.12, 0.18)
@@ -233,7 +232,6 @@ def metal_near(model, position):
 
 
 def test_metal_is_noticed_and_its_model_is_believed(rng):
-    """A ball of copper: refused with the clean model, tracked with the one that has the ball."""
     bent = metal_near(MODEL, (0.05, 0.0, 0.05))
     position, rotation = np.array([0.02, 0.02, 0.14]), np.eye(3)
     clean = Tracker(MODEL, TOOL)

@@ -96,7 +96,6 @@ def test_settings_may_change_on_the_way(rng):
 
 
 def test_effects_of_the_model_are_undone(rng):
-    """A sensor's gain that the model knows about does not move its pose."""
     record = EffectRecord('sensor_gain', {'channel': 3, 'gain': 0.97, 'phase_deg': 1.0})
     informed = replace(MODEL, effects=(record,))
     position, rotation = random_pose(rng)
@@ -206,7 +205,6 @@ def test_no_gate_is_the_same_however_it_is_said(gate):
 
 
 def test_three_sigma_hold_where_no_gate_refuses_a_wrong_gain(rng):
-    """The gain is wrong in what one coil reads of one emitter, or of all."""
     tracker, wrong = Tracker(MODEL, TOOL, TrackerSettings(gate=NO_GATE)), 0
     for frame in range(60):
         position, rotation = random_pose(rng)
@@ -222,7 +220,6 @@ def test_three_sigma_hold_where_no_gate_refuses_a_wrong_gain(rng):
 
 
 def test_hostile_fluxes_never_make_a_pose(rng):
-    """Random garbage of all sizes: refused, and no exception."""
     tracker = Tracker(MODEL, TOOL)
     for i in range(60):
         size = 10.0 ** rng.uniform(-13, 300 if i % 3 == 0 else 0)

@@ -1,10 +1,10 @@
 """Tools as witnesses of metal: what a rigid tool's coils contradict helps few references."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 from refit_world import NOISE_T, anser_world, metal_block, metal_flux
 from tracking_world import triaxial_tool
 
@@ -26,7 +26,6 @@ from anser_ros.sessions.starting_model import load_model
 from anser_ros.sessions.tracked_session import track_session
 from anser_ros.settings import RefitSettings, ToolSettings
 
-REPO = Path(__file__).resolve().parents[1]
 STEP_NS = 40_000_000
 FRAMES = 25
 METAL = metal_block([0.03, -0.02, -0.09], [0.1, 0.12, 0.06])

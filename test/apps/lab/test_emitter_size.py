@@ -1,11 +1,4 @@
-"""The size of an emitter without a drawing: magnets as magpylib's closed form has them.
-
-| what                             | compared with                                       |
-|----------------------------------|-----------------------------------------------------|
-| the field of a second moment     | a uniformly magnetised cylinder, long and flat      |
-| what `diagnose` finds            | L^2 / 12 - a^2 / 4; nothing of a magnet of no size  |
-| what `calibrate` finds           | the same                                            |
-"""
+"""The size of an emitter without a drawing: magnets as magpylib's closed form has them."""
 
 from dataclasses import dataclass, replace
 
@@ -14,6 +7,7 @@ import numpy as np
 import pytest
 from diagnosis_world import world as board_world
 from scipy.spatial.transform import Rotation
+from test_sources import AXIS, CENTRE, array_of_sensors
 
 from anser_ros.apps.lab.calibration_engines import with_source_sizes
 from anser_ros.calibration.calibrate import Options, fit_scan
@@ -25,12 +19,9 @@ from anser_ros.effects.effect import effect_named
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel, symmetry_axis
 from anser_ros.physics.rotations import tangents
-from anser_ros.physics.sensor import SensorTable
 from anser_ros.settings import Accuracy
 
 EFFECT = effect_named('emitter_size')
-CENTRE = np.array([0.004, -0.003, 0.002])
-AXIS = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
 MOMENT_AM2, NOISE_T = 0.5, 2e-8
 ACCURACY = Accuracy(NOISE_T, 1e-4, 5e-4)
 
@@ -70,18 +61,7 @@ def dipoles_of(model):
     return model.dipoles
 
 
-def array_of_sensors(rng):
-    """Seven three-axis sensors, some centimetres from each other, each turned at random."""
-    places = 0.03 * rng.uniform(-1.0, 1.0, size=(7, 3))
-    turns = Rotation.random(7, random_state=1).as_matrix()
-    names = tuple(f'array/{k}/{a}' for k in range(7) for a in 'xyz')
-    return SensorTable(
-        np.arange(21), names, ('array',) * 21, np.repeat(places, 3, axis=0),
-        turns.transpose(0, 2, 1).reshape(-1, 3), np.zeros(21),
-    )  # fmt: skip
-
-
-def recorded(world, rng, frames=300):
+def recorded(world, rng, frames=200):
     """Readings of an array that moves about a magnet, 80 to 160 mm away, and its optical poses."""
     table, time = array_of_sensors(rng), np.arange(frames) / 25.0
     place = np.stack(
@@ -136,7 +116,7 @@ def test_a_second_moment_is_what_a_cylinder_has_beyond_its_dipole(world, apparat
 @pytest.mark.long
 @pytest.mark.parametrize(('world', 'key'), [(LONG, 'length_m'), (FLAT, 'diameter_m')])
 def test_the_size_of_a_magnet_is_named_and_nothing_else(world, key):
-    tool = recorded(world, np.random.default_rng(3))
+    tool = recorded(world, np.random.default_rng(3), 300)
     result = diagnosed(tool)
     (finding,) = result.findings
     record = finding.record
@@ -153,7 +133,7 @@ def test_the_size_of_a_magnet_is_named_and_nothing_else(world, key):
     np.testing.assert_allclose(
         axis.second_moment_m2, record.parameters['second_moment_m2'], rtol=1e-6
     )
-    assert not diagnosed(recorded(world, np.random.default_rng(4)), result.model).findings
+    assert not diagnosed(recorded(world, np.random.default_rng(4), 300), result.model).findings
 
 
 @pytest.mark.long
@@ -181,7 +161,7 @@ def test_an_emitter_that_is_drawn_is_no_candidate():
 @pytest.mark.long
 @pytest.mark.parametrize('world', [LONG, FLAT, POINT])
 def test_calibrate_tells_the_size_from_blocks_left_out(world):
-    tool = recorded(world, np.random.default_rng(7), 150)
+    tool = recorded(world, np.random.default_rng(7), 100)
     generator = Generator(np.zeros((1, 3)), np.zeros(1), 0.1, ('magnet',), (1.0,))
     scan = Scan((tool,), ACCURACY)
     calibration = with_source_sizes(

@@ -15,6 +15,7 @@ from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 pytestmark = pytest.mark.long
+AT_REST = {'flux_noise_t': 1e-14, 'optical_position_m': 1e-6, 'optical_rotation_rad': 1e-6}
 VOLUME = ((-0.3, -0.3, 0.05), (0.3, 0.3, 0.5))
 
 
@@ -81,10 +82,11 @@ def test_a_plate_at_four_heights_has_its_errors_named(tmp_path):
 def test_a_helmet_at_rest_has_its_inverted_channels_named(tmp_path):
     turned, noisy = [3, 17, 40], [25]
     measured = resting(np.random.default_rng(5), inverted=turned, noisy=noisy)
-    stated = {'flux_noise_t': 1e-14, 'optical_position_m': 1e-6, 'optical_rotation_rad': 1e-6}
     places = np.tile([0.0, 0.0, 0.14], (len(NAMES), 1))
     bag = written(tmp_path / 'helmet.mcap', measured, NAMES, TONES, places, stated)
     assert few_poses.accepts(load_session(bag))
+    bag = written(tmp_path / 'helmet.mcap', measured, NAMES, TONES, places, AT_REST)
+    assert is_estimated_jointly(load_session(bag))
     document, _ = diagnosed(bag, tmp_path)
     found = {effect['name']: effect['parameters'] for effect in document['effects']}
     assert found['sensor_polarity']['channels'] == turned
@@ -92,3 +94,17 @@ def test_a_helmet_at_rest_has_its_inverted_channels_named(tmp_path):
     assert (
         document['held_out']['flux_rms_after_t'] < 0.5 * document['held_out']['flux_rms_before_t']
     )
+
+
+def test_calibrate_writes_places_and_what_is_inverted(tmp_path, capsys):
+    measured = resting(np.random.default_rng(8), inverted=(2, 21), count=40)
+    places = np.tile([0.0, 0.0, 0.1], (len(NAMES), 1))
+    bag = written(tmp_path / 'rest.mcap', measured, NAMES, TONES, places, AT_REST)
+    assert not load_session(bag).tools[0].sensors.is_single.any()
+    out = ['--out', str(tmp_path / 'model.yaml'), '--report', str(tmp_path / 'report')]
+    assert main(['calibrate', str(bag), *out]) == 0
+    assert 'sensor_polarity' in capsys.readouterr().out
+    document = json.loads((tmp_path / 'report' / 'calibration.json').read_text())
+    assert [one['name'] for one in document['sources']] == list(NAMES)
+    (polarity,) = document['effects']
+    assert set(polarity['parameters']['channels']) <= {2, 21}

@@ -95,8 +95,6 @@ def known(learnt) -> KnownMetal:
 
 @pytest.mark.long
 class TestLearning:
-    """What is learnt of the lump, and of what nothing is."""
-
     def test_it_tells_where_the_lump_was_and_what_drove_it(self, learnt):
         said, known = learnt
         assert said['name'] == known.name == 'lump' and said['points'] == 18
@@ -230,18 +228,6 @@ def subject(begun):
 
 @pytest.mark.long
 class TestFollowing:
-    """The field model of every frame."""
-
-    def test_without_metal_the_calibrated_model_stays_in_force(self, known):
-        made = world.session(world.APPROACH, None, 12, 5)
-        subject = follower_of(known, made)
-        for row in range(12):
-            model, withheld = subject.at(stamp(made, row))
-            assert model is subject.model and withheld is None
-            subject.take(stamp(made, row), world.readings(made, row))
-            assert not subject.is_followed and subject.place is None
-            assert not subject._tracks, 'not even a trial'
-
     def test_metal_is_followed_until_it_is_driven_too_strongly(self, begun, subject, dive):
         run = begun[1] + followed(subject, dive, range(9, 25))
         assert [is_followed for is_followed, *_ in run] == [False] * 7 + [True] * 18
@@ -326,8 +312,6 @@ def body_errors(evaluation):
 
 @pytest.mark.long
 class TestTracking:
-    """Poses of the tool, by the field that it has itself found the metal with."""
-
     def test_its_poses_are_as_good_as_without_metal_and_honest(self, known):
         session, model = world.session(world.APPROACH, world.lump(), 50, 3), certain_model()
         tracked = track_session(session, model, models=partial(KnownMetalModels, known=known))
@@ -379,8 +363,6 @@ def refused(arguments, words, capsys):
 
 @pytest.mark.long
 class TestCommands:
-    """What the two commands say and write."""
-
     def test_evaluate_says_in_how_many_frames_it_was_followed(
         self, bags, known, capsys, monkeypatch
     ):

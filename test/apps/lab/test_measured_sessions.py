@@ -11,39 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.lab.cli import measured
 from anser_ros.apps.lab.measured import hpi_coils, navion, transformer
-from anser_ros.apps.lab.measured.recipe import write_frames
 from anser_ros.cli.main import main
-from anser_ros.errors import BagError, FitError
+from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import save_model
-from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 SEED = 7
 NAVION = SHARED / 'measured' / 'navion'
 PLACES = np.array([[0.06, 0.02, 0.01], [-0.05, 0.04, 0.0], [-0.04, -0.05, 0.03], [0.0, 0.0, 0.09]])
-COILS = tuple(Coil(f'c{k}', (0.1 * k, 0.0, 0.0), 0.0, 1.0 + k) for k in range(3))
-
-
-class TestFrames:
-    def test_tools_move_and_references_stand_where_they_are(self, tmp_path, rng):
-        sensors = (
-            SensorSpec(4, 'fixed/0', 'fg', (0.1, 0.2, 0.3), (0.0, 0.6, 0.8), 0.0),
-            SensorSpec(2, 'tool/0', 'tool', (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.0),
-        )
-        setup = Setup('fg', 1.0, Emitter('somebody', {}, COILS), sensors)
-        flux = 1e-6 * (rng.normal(size=(2, 2, 3)) + 1j * rng.normal(size=(2, 2, 3)))
-        place, turn = np.array([[0, 0, 0.1], [0, 0, 0.2]]), np.tile([0, 0, 0, 1.0], (2, 1))
-        path = tmp_path / 'frames.mcap'
-        write_frames(path, setup, flux, {'tool': (place, turn)}, [10, 20])
-        session = load_session(path)
-        (tool,) = session.tools
-        np.testing.assert_allclose(tool.flux[:, 0], flux[:, 1], rtol=1e-6)
-        np.testing.assert_allclose(session.reference.flux[:, 0], flux[:, 0], rtol=1e-6)
-        np.testing.assert_allclose(tool.position, place)
-        assert session.setup.sensors[0] == sensors[0]
-        with pytest.raises(BagError, match='already exists'):
-            write_frames(path, setup, flux)
 
 
 def write_plate(folder, rng, signs):

@@ -62,8 +62,6 @@ def by_hand(moment, away):
 
 
 class TestLattice:
-    """What a lattice makes of a field."""
-
     def test_one_point_is_a_dipole_of_its_answer_times_the_field(self, setting):
         one = Lattice(np.zeros((1, 3)), 20.0, np.array([-0.7 + 0.2j]), np.array([0.3j]), 6500.0)
         at, axis = np.array([[0.05, -0.08, 0.15]]), np.array([[0.6, 0.0, 0.8]])
@@ -182,8 +180,6 @@ def known_of(lattice, directions=3) -> KnownMetal:
 
 
 class TestFile:
-    """The document of known metal."""
-
     def test_it_comes_back_bit_by_bit(self, lattice, tmp_path):
         known = known_of(lattice)
         save_known_metal(tmp_path / 'new' / 'a.yaml', known)

@@ -8,18 +8,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.lab.calibration_engines import is_at_one_place
-from anser_ros.apps.lab.measured.recipe import vector, write_frames
 from anser_ros.apps.lab.one_place import calibrate_at_one_place
 from anser_ros.apps.lab.source_calibration import KINDS
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.readings import check_single_coils
-from anser_ros.cli.main import main
 from anser_ros.diagnosis.problem import Spread, build_problem
 from anser_ros.errors import DiagnosisError, FitError, SetupError, TrackingError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import PlacedPoints, SensorTable, Windings
-from anser_ros.sessions.session import load_session
 from anser_ros.settings import Accuracy
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup, parse_setup
@@ -230,35 +227,6 @@ class TestOnePlace:
             check_single_coils([measured])
         with pytest.raises(TrackingError, match='single coil'):
             Tracker(None, measured.sensors)
-
-    def test_the_command_writes_places_and_what_is_inverted(self, tmp_path, capsys):
-        measured = resting(np.random.default_rng(8), inverted=(2, 21), count=40)
-        table = measured.sensors
-        specs = tuple(
-            SensorSpec(
-                k, table.name[k], 'h', vector(table.position[k]), vector(table.axis[k]), 0.0,
-                tuple((*vector(o), float(w)) for o, w in zip(
-                    table.windings.offset[k], table.windings.weight[k], strict=True)),
-            )
-            for k in range(len(table))
-        )  # fmt: skip
-        middle = tuple(Coil(n, (0, 0, 0.1), 0.0, t) for n, t in zip(NAMES, TONES, strict=True))
-        stated = {
-            'flux_noise_t': 1e-14, 'optical_position_m': 1e-6, 'optical_rotation_rad': 1e-6
-        }  # fmt: skip
-        setup = Setup('fg', 1.0, Emitter('coil', {}, middle), specs, None, stated)
-        pose = {'h': (np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))}
-        path = tmp_path / 'rest.mcap'
-        write_frames(path, setup, measured.flux, pose)
-        (tool,) = load_session(path).tools
-        assert not tool.sensors.is_single.any()
-        out = ['--out', str(tmp_path / 'model.yaml'), '--report', str(tmp_path / 'report')]
-        assert main(['calibrate', str(path), *out]) == 0
-        assert 'sensor_polarity' in capsys.readouterr().out
-        document = json.loads((tmp_path / 'report' / 'calibration.json').read_text())
-        assert [one['name'] for one in document['sources']] == list(NAMES)
-        (polarity,) = document['effects']
-        assert set(polarity['parameters']['channels']) <= {2, 21}
 
 
 @pytest.fixture

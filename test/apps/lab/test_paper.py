@@ -22,13 +22,12 @@ from anser_ros.apps.lab.experiments.study import (
     centres_extension,
     drawn_model,
     field_errors,
-    outer_planes,
     position_bound,
     track,
 )
 from anser_ros.apps.lab.measured import anser_board
 from anser_ros.cli.main import main
-from anser_ros.errors import BagError, FitError
+from anser_ros.errors import BagError
 
 
 @pytest.fixture(scope='module')
@@ -49,14 +48,13 @@ def study(recordings, tmp_path_factory):
 
 
 def write_run(folder):
-    """A run over the board with bent positions, in a frame of its own; its lines."""
+    """A run over the board with bent positions, in a frame of its own."""
     places = anser_board.places()
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     tracked = 1e3 * (places + 0.02 * places * np.abs(places)[:, ::-1] / 0.06) @ turn.T + 150.0
     lines = [f'id{i},{x:.4f},{y:.4f},{z:.4f},0' for i, (x, y, z) in enumerate(tracked)]
     folder.mkdir(parents=True, exist_ok=True)
     (folder / 'run.fcsv').write_text('# markups\n' + '\n'.join(lines) + '\n')
-    return lines
 
 
 def test_every_recording_is_made_and_named(recordings):
@@ -80,11 +78,6 @@ def test_the_checkerboard_halves_the_points(recordings):
     assert abs(counts[0] - counts[1]) <= 1
     between = training.tools[0].position[:, None, :2] - test.tools[0].position[None, :, :2]
     assert np.linalg.norm(between, axis=2).min() > 0.01
-
-
-def test_outer_planes_leave_the_middle_out(recordings):
-    names = outer_planes(recordings.load('collimator_tool_a')).tools[0].sensors.name
-    assert {name.split('/')[1] for name in names} == {'0', '2'}
 
 
 def test_the_articles_own_method_is_real_least_squares(recordings):
@@ -165,18 +158,12 @@ def test_corrected_errors_keep_what_was_not_tracked(recordings):
 
 
 def test_fiducials_are_read_aligned_and_mapped(tmp_path):
-    lines = write_run(tmp_path)
+    write_run(tmp_path)
     (run,) = board_runs(tmp_path)
     assert run['points'] == 41
     assert run['after_m'] < 0.8 * run['before_m'] and run['confirmed']
     assert run['across_m'] < 1e-5
     assert board_runs(tmp_path / 'nowhere') == []
-    (tmp_path / 'run.fcsv').write_text('a,b,c,d\n')
-    with pytest.raises(BagError, match='no table of fiducials'):
-        board_runs(tmp_path)
-    (tmp_path / 'run.fcsv').write_text(lines[0] + '\n')
-    with pytest.raises(FitError, match='41 fiducials expected, got 1'):
-        board_runs(tmp_path)
 
 
 def test_error_map_command(tmp_path, capsys):

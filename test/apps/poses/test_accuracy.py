@@ -377,7 +377,6 @@ class TestCommand:
         assert words in last and last.startswith('anser accuracy: ')
 
     def test_points_against_the_optical_reference(self, tmp_path, capsys):
-        """A bag with a body that rests now and then, seen by both trackers."""
         rng = rng_of(21)
         true = rng.uniform(-0.1, 0.1, (8, 3)) + [0, 0, 0.3]
         turns = list(Rotation.from_rotvec(rng.normal(0, 0.4, (8, 3))))

@@ -193,7 +193,6 @@ def test_the_node_corrects_what_comes_and_tells_what_does_not(ros, bent, tmp_pat
 
 
 def test_a_map_of_points_is_applied_where_it_is_confirmed(tmp_path, capsys):
-    """`error_map` writes what the corrector takes; mere noise is not corrected."""
     rng = np.random.default_rng(5)
     true = np.stack(np.meshgrid(*2 * [np.linspace(-0.1, 0.1, 8)], [0.0]), -1).reshape(-1, 3)
     turn, shift = Rotation.from_rotvec([0.3, 1.0, -0.4]), np.array([0.4, 0.1, -0.2])

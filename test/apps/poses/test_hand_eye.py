@@ -81,7 +81,6 @@ def test_frames_and_clocks_are_found_and_their_sigmas_are_honest():
 
 @pytest.mark.long
 def test_static_pairs_agree_with_a_closed_form():
-    """Both see the same data, and are as near to the truth."""
     ours, theirs = [], []
     for seed in SEEDS:
         session, lever, mount = static_pairs(seed)

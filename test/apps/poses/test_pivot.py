@@ -117,7 +117,6 @@ def test_what_is_no_pivot_is_refused():
 
 
 def test_a_tip_moves_as_its_body_does():
-    """Mean and covariance of the tip against draws from the body's own."""
     rng = np.random.default_rng(5)
     factor = rng.normal(0, 1, (6, 6)) * np.repeat([3e-4, 4e-3], 3)[:, None]
     turn = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()

@@ -330,34 +330,6 @@ def test_a_slow_filter_whose_error_hides_the_lever_arm_is_found():
     assert set(named(diagnose_poses(world.session()))) == {'tracker_lag'}
 
 
-class _MeanOfMatrices(World):
-    """A tracker whose low pass takes means of matrices, and not of rotation vectors."""
-
-    def body(self, time):
-        place, turn = super().body(time)
-        if self.tau == 0.0:
-            return place, turn
-        ages = 0.01 * (np.arange(1600) + 0.5)
-        weight = np.exp(-ages) / np.exp(-ages).sum()
-        every = (
-            share * Rotation.from_rotvec(self._turn(time - self.tau * age)).as_matrix()
-            for age, share in zip(ages, weight, strict=True)
-        )
-        return place, Rotation.from_matrix(sum(every))
-
-
-def test_a_time_constant_does_not_depend_on_how_orientations_are_averaged():
-    found = []
-    for kind in (World, _MeanOfMatrices):
-        world = kind(5, duration=30.0, sensors=1, rate=12.0, optical_rate=40.0)
-        world.tau = 0.16
-        record = named(diagnose_poses(world.session()))['tracker_lag']
-        found.append((record.parameters['tau_s'], record.uncertainty['tau_s']))
-    (vectors, sigma), (matrices, _) = found
-    assert abs(vectors - matrices) < sigma
-    assert abs(vectors - 0.16) < 3 * sigma
-
-
 @pytest.mark.parametrize('motion', ['in circles', 'far and near', 'about a tip', 'carried'])
 def test_nothing_is_named_on_a_clean_session(motion):
     stream = STREAMS[list(MOTIONS).index(motion) % len(STREAMS)]
