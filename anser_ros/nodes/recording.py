@@ -100,6 +100,8 @@ REPLY_TIMEOUT_S = 2.0
 """Time, s, that a listener has for an answer before it is asked again."""
 # A listener may be compiling its kernels.
 ATTEMPTS = 30
+# Fewest for one that has not answered yet: answers can miss a client that is new to the server.
+FIRST_ATTEMPTS = 5
 POLL_S = 0.1
 """How often a wait looks whether it was given up, s: a Ctrl-C takes so long."""
 # How often the graph is asked for new listeners, in messages.
@@ -116,12 +118,14 @@ class Consumers:
         self._clients: dict[str, Any] = {}
         self._listeners: dict[tuple[str, ...], set[str]] = {}
         self._silent: set[str] = set()
+        self._answered: set[str] = set()
         self._calls = 0
         self._given_up = threading.Event()
 
     def wait(self, *topics: str, attempts: int = ATTEMPTS) -> None:
         """Wait until all listeners of the topics, by their full names, have handled what was
-        published; after so many ``attempts`` to ask one it is gone on without it.
+        published; after so many ``attempts`` to ask one it is gone on without it, after
+        `FIRST_ATTEMPTS` at least where it has never answered.
         """
         if self._calls % REFRESH_EVERY == 0:
             self._listeners.clear()
@@ -130,8 +134,10 @@ class Consumers:
             self._listeners[topics] = set().union(*map(self._find, topics))
         waiting = {name: self._ask(name) for name in self._listeners[topics]}
         for name, answered in waiting.items():
-            if not self._answers(name, answered, attempts):
-                self._silent.add(name)
+            patience = attempts if name in self._answered else max(attempts, FIRST_ATTEMPTS)
+            if self._answers(name, answered, patience):
+                self._answered.add(name)
+            else:
                 self._listeners[topics].discard(name)
 
     def give_up(self) -> None:
@@ -168,9 +174,11 @@ class Consumers:
             while time.monotonic() < end_s:
                 if answered.wait(POLL_S):
                     return True
+                # One that the graph does not know now is looked for again with the others.
                 if self._given_up.is_set() or not self._clients[name].service_is_ready():
                     return False
             answered = self._ask(name)
+        self._silent.add(name)
         self._node.get_logger().warning(f'{name} does not answer; going on without it')
         return False
 

@@ -42,8 +42,8 @@ POLL_S = 0.05
 REPORT_AFTER_S = 3.0
 # Time of the recording between two messages on /clock, ns: half a window at 50 Hz.
 CLOCK_PERIOD_NS = 10_000_000
-# How long the end waits for listeners to acknowledge the last messages, s.
-LAST_ACK_S = 5.0
+# How long listeners have to acknowledge the first and the last messages, s.
+LONGEST_ACK_S = 5.0
 # How often a silent listener of poses is asked again: fewer times than one of fluxes, for it is
 # asked after every frame.
 ATTEMPTS_OF_LISTENERS = 2
@@ -129,7 +129,7 @@ class Replay(AnserNode):
         """Stop the thread that plays."""
         self._ending.set()
         self._consumers.give_up()
-        self._thread.join(LAST_ACK_S)
+        self._thread.join(LONGEST_ACK_S)
 
     # Before playing -----------------------------------------------------------------------
 
@@ -225,6 +225,7 @@ class Replay(AnserNode):
         """Play the bag from its begin; return whether it came to its end."""
         first_ns, began_s, clock_ns = None, time.monotonic(), 0
         given = dict(self._latched) if self._passes == 0 else {}
+        begun: set[str] = set()
         for message in self._messages():
             if given.pop(message.topic, None) is not None:
                 continue  # the first of a latched topic is out already
@@ -242,6 +243,11 @@ class Replay(AnserNode):
             self._outlets[message.topic].publish(message.data)
             self._done += 1
             if self._rate == 0.0 and message.topic.endswith(FLUX_ENDINGS):
+                if message.topic not in begun:
+                    # A listener that is known here may not know of this publisher yet: it would
+                    # answer, and get what it missed after more than its queue holds.
+                    begun.add(message.topic)
+                    self._acknowledged(message.topic)
                 # Those who take fluxes, and those who take poses made of them, catch up. After
                 # every frame: of several messages that wait an executor may have worked off one
                 # when it answers.
@@ -249,6 +255,10 @@ class Replay(AnserNode):
                 if self._poses:
                     self._consumers.wait(*self._poses, attempts=ATTEMPTS_OF_LISTENERS)
         return not self._ending.is_set()
+
+    def _acknowledged(self, topic: str) -> None:
+        """Wait until all who listen have received what was published."""
+        self._outlets[topic].wait_for_all_acked(Duration(seconds=LONGEST_ACK_S))
 
     def _messages(self) -> Iterator[RawMessage]:
         """Yield what can be published; bytes that are no message of their type are left out."""
@@ -265,9 +275,9 @@ class Replay(AnserNode):
 
     def _finish(self) -> None:
         """Wait until all is received, and end the process."""
-        for outlet in self._outlets.values():
+        for topic in self._outlets:
             if not self._ending.is_set():
-                outlet.wait_for_all_acked(Duration(seconds=LAST_ACK_S))
+                self._acknowledged(topic)
         left_out = self.counters['messages_left_out']
         played = f'{self._done} of {self._total} messages'
         if self._loop:  # in which every pass counts again
