@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Process, spin_until, wait
+from conftest import Process, wait
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -21,6 +21,7 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError
 from anser_ros.nodes import replay
 from anser_ros.nodes.replay import name_played
+from anser_ros.nodes.streams import readiness
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_writer import BagWriter, SessionWriter
@@ -76,11 +77,39 @@ def listener(ros, request):
     executor = SingleThreadedExecutor()
     executor.add_node(node)
 
-    node.run = lambda condition: wait(condition, lambda: executor.spin_once(timeout_sec=0.05))
+    node.spin = lambda: executor.spin_once(timeout_sec=0.05)
+    node.run = lambda condition: wait(condition, node.spin)
     node.count = lambda name: sum(topic == name for topic, _ in node.got)
     yield node
     executor.shutdown()
     node.destroy_node()
+
+
+@pytest.fixture
+def play(ros, monkeypatch):
+    """Play a bag in this process to its end, ``meanwhile`` spinning whoever listens.
+
+    Whoever listens is there before; ``ending`` is the event by which the node is ended.
+    """
+    monkeypatch.setattr(readiness, 'LOOK_S', 0.0)
+    nodes, executor = [], SingleThreadedExecutor()
+
+    def run(bag, meanwhile=lambda: time.sleep(0.01), ending=None, **options):
+        nodes.append(node := replay.Replay(str(bag), **options))
+        node._ending = ending or node._ending
+        executor.add_node(node)
+        assert wait(lambda: node.exit_code is not None, meanwhile)
+        return node
+
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    yield run
+    for node in nodes:
+        node.close()
+    executor.shutdown()
+    thread.join()
+    for node in nodes:
+        node.destroy_node()
 
 
 @pytest.mark.parametrize('listener', [100], indirect=True)
@@ -99,17 +128,15 @@ def test_everything_arrives_with_its_stamps(start, listener, tmp_path):
     assert clocks[0] == START_NS and clocks == sorted(clocks) and len(clocks) == 100
 
 
-def test_as_fast_as_taken_loses_nothing(start, listener, tmp_path):
+def test_as_fast_as_taken_loses_nothing(play, listener, tmp_path):
     """The listener's queue holds five, and it needs longer than the bag's publisher."""
     listener.delay_s = 0.002
-    bag = make_session(tmp_path / 'a.mcap', 150)
-    process = start('replay', bag, '--rate', '0', '--all')
-    assert listener.run(lambda: process.popen.poll() is not None)
+    play(make_session(tmp_path / 'a.mcap', 150), listener.spin, rate=0.0, all_topics=True)
     assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(150)]
     assert listener.run(lambda: listener.count('pose') == 150)
 
 
-def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, start, tmp_path):
+def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, play, tmp_path):
     """A relay stands in for the tracker; the queue of who listens holds five."""
     bag, topic, count = tmp_path / 'a.mcap', 'tool_a_0/x/pose', 50
     with SessionWriter(bag) as session:
@@ -134,15 +161,14 @@ def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, start, tmp_pat
     thread = threading.Thread(target=executors[0].spin)
     thread.start()
     try:
-        process = start('replay', bag, '--rate', '0')
-        wait(lambda: len(got) >= count, lambda: executors[1].spin_once(timeout_sec=0.05))
+        play(bag, lambda: executors[1].spin_once(timeout_sec=0.05), rate=0.0)
     finally:
         executors[0].shutdown()
         thread.join()
         executors[1].shutdown()
         relay.destroy_node()
         slow.destroy_node()
-    assert got == [START_NS + n * PERIOD_NS for n in range(count)], process.output
+    assert got == [START_NS + n * PERIOD_NS for n in range(count)]
 
 
 def test_loop_in_another_namespace_ends_at_a_signal(start, listener, tmp_path):
@@ -172,19 +198,17 @@ def test_what_a_bag_holds_is_played_in_this_namespace(topic, home, name):
     assert name_played(topic, home, '/here/') == name
 
 
-def test_a_cut_bag_is_played_as_far_as_it_reads(start, listener, tmp_path):
+def test_a_cut_bag_is_played_as_far_as_it_reads(play, listener, tmp_path):
     whole = make_session(tmp_path / 'a.mcap', 800).read_bytes()
     bag = tmp_path / 'cut.mcap'
     bag.write_bytes(whole[: len(whole) // 2])
-    process = start('replay', bag, '--rate', '0')
-    assert listener.run(lambda: process.popen.poll() is not None)
-    assert process.popen.returncode == 0
-    assert 'the bag breaks off after' in process.output
+    node = play(bag, listener.spin, rate=0.0)
+    assert node.exit_code == 0 and 'the bag breaks off after' in node.status().message
     assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(len(listener.stamps))]
     assert 100 < len(listener.stamps) < 600
 
 
-def test_what_does_not_decode_is_left_out(start, listener, tmp_path):
+def test_what_does_not_decode_is_left_out(play, listener, tmp_path, capfd):
     bag = BagWriter(tmp_path / 'bad.mcap')
     cloud, text = 'sensor_msgs/msg/PointCloud2', cdr.DEFINITIONS['sensor_msgs/msg/PointCloud2']
     flux = bag.add_topic('/anser/tool/flux', cloud, text)
@@ -194,12 +218,12 @@ def test_what_does_not_decode_is_left_out(start, listener, tmp_path):
     for n, data in enumerate((good, good[:40], b'', b'\xff' * 60, good)):
         bag.write(flux, START_NS + n, data)
     bag.close()
-    process = start('replay', tmp_path / 'bad.mcap', '--rate', '0')
-    assert listener.run(lambda: process.popen.poll() is not None)
-    assert process.popen.returncode == 0
-    assert '/anser/strange: type no_msgs/msg/None is not installed' in process.output
-    assert '3 messages that do not decode left out' in process.output
-    assert listener.run(lambda: len(listener.stamps) == 2)
+    node = play(tmp_path / 'bad.mcap', listener.spin, rate=0.0)
+    assert node.exit_code == 0 and node.counters['messages_left_out'] == 3
+    said = ''.join(capfd.readouterr())
+    assert '/anser/strange: type no_msgs/msg/None is not installed' in said
+    assert '3 messages that do not decode left out' in said
+    assert len(listener.stamps) == 2
 
 
 @pytest.mark.parametrize(
@@ -231,23 +255,6 @@ def test_what_cannot_be_played_is_refused(ros, tmp_path):
             replay.Replay(str(name), **options)
 
 
-@pytest.fixture
-def play(ros):
-    """Play a bag in this process to its end; ``ending`` is the event by which it is ended."""
-    nodes = []
-
-    def run(bag, ending=None, **options):
-        nodes.append(node := replay.Replay(str(bag), **options))
-        node._ending = ending or node._ending
-        assert spin_until(node, lambda: node.exit_code is not None)
-        return node
-
-    yield run
-    for node in nodes:
-        node.close()
-        node.destroy_node()
-
-
 def test_nobody_listens(play, tmp_path, monkeypatch):
     """It waits for listeners, and plays for the record when none comes."""
     steps = []
@@ -274,7 +281,7 @@ class Dues(threading.Event):
 def test_messages_are_due_at_the_pace_of_the_rate(play, tmp_path):
     """Counted in moments that are waited for, so that no busy machine makes a difference."""
     began, dues = time.monotonic(), Dues()
-    play(make_session(tmp_path / 'a.mcap', 100), dues, rate=0.2, wait=0.2)
+    play(make_session(tmp_path / 'a.mcap', 100), ending=dues, rate=0.2, wait=0.2)
     assert dues.until[-1] - began > 99 * PERIOD_NS * 1e-9 / 0.2, 'no faster than its pace'
 
 
