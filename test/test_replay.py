@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Process, spin_until, wait
+from conftest import Process, wait
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -18,8 +18,10 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
+from anser_ros.errors import AnserError
 from anser_ros.nodes import replay
 from anser_ros.nodes.replay import name_played
+from anser_ros.nodes.streams import readiness
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_writer import BagWriter, SessionWriter
@@ -75,11 +77,39 @@ def listener(ros, request):
     executor = SingleThreadedExecutor()
     executor.add_node(node)
 
-    node.run = lambda condition: wait(condition, lambda: executor.spin_once(timeout_sec=0.05))
+    node.spin = lambda: executor.spin_once(timeout_sec=0.05)
+    node.run = lambda condition: wait(condition, node.spin)
     node.count = lambda name: sum(topic == name for topic, _ in node.got)
     yield node
     executor.shutdown()
     node.destroy_node()
+
+
+@pytest.fixture
+def play(ros, monkeypatch):
+    """Play a bag in this process to its end, ``meanwhile`` spinning whoever listens.
+
+    Whoever listens is there before; ``ending`` is the event by which the node is ended.
+    """
+    monkeypatch.setattr(readiness, 'LOOK_S', 0.0)
+    nodes, executor = [], SingleThreadedExecutor()
+
+    def run(bag, meanwhile=lambda: time.sleep(0.01), ending=None, **options):
+        nodes.append(node := replay.Replay(str(bag), **options))
+        node._ending = ending or node._ending
+        executor.add_node(node)
+        assert wait(lambda: node.exit_code is not None, meanwhile)
+        return node
+
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    yield run
+    for node in nodes:
+        node.close()
+    executor.shutdown()
+    thread.join()
+    for node in nodes:
+        node.destroy_node()
 
 
 @pytest.mark.parametrize('listener', [100], indirect=True)
@@ -98,17 +128,15 @@ def test_everything_arrives_with_its_stamps(start, listener, tmp_path):
     assert clocks[0] == START_NS and clocks == sorted(clocks) and len(clocks) == 100
 
 
-def test_as_fast_as_taken_loses_nothing(start, listener, tmp_path):
+def test_as_fast_as_taken_loses_nothing(play, listener, tmp_path):
     """The listener's queue holds five, and it needs longer than the bag's publisher."""
     listener.delay_s = 0.002
-    bag = make_session(tmp_path / 'a.mcap', 150)
-    process = start('replay', bag, '--rate', '0', '--all')
-    assert listener.run(lambda: process.popen.poll() is not None)
+    play(make_session(tmp_path / 'a.mcap', 150), listener.spin, rate=0.0, all_topics=True)
     assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(150)]
     assert listener.run(lambda: listener.count('pose') == 150)
 
 
-def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, start, tmp_path):
+def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, play, tmp_path):
     """A relay stands in for the tracker; the queue of who listens holds five."""
     bag, topic, count = tmp_path / 'a.mcap', 'tool_a_0/x/pose', 50
     with SessionWriter(bag) as session:
@@ -133,15 +161,14 @@ def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, start, tmp_pat
     thread = threading.Thread(target=executors[0].spin)
     thread.start()
     try:
-        process = start('replay', bag, '--rate', '0')
-        wait(lambda: len(got) >= count, lambda: executors[1].spin_once(timeout_sec=0.05))
+        play(bag, lambda: executors[1].spin_once(timeout_sec=0.05), rate=0.0)
     finally:
         executors[0].shutdown()
         thread.join()
         executors[1].shutdown()
         relay.destroy_node()
         slow.destroy_node()
-    assert got == [START_NS + n * PERIOD_NS for n in range(count)], process.output
+    assert got == [START_NS + n * PERIOD_NS for n in range(count)]
 
 
 def test_loop_in_another_namespace_ends_at_a_signal(start, listener, tmp_path):
@@ -171,19 +198,17 @@ def test_what_a_bag_holds_is_played_in_this_namespace(topic, home, name):
     assert name_played(topic, home, '/here/') == name
 
 
-def test_a_cut_bag_is_played_as_far_as_it_reads(start, listener, tmp_path):
+def test_a_cut_bag_is_played_as_far_as_it_reads(play, listener, tmp_path):
     whole = make_session(tmp_path / 'a.mcap', 800).read_bytes()
     bag = tmp_path / 'cut.mcap'
     bag.write_bytes(whole[: len(whole) // 2])
-    process = start('replay', bag, '--rate', '0')
-    assert listener.run(lambda: process.popen.poll() is not None)
-    assert process.popen.returncode == 0
-    assert 'the bag breaks off after' in process.output
+    node = play(bag, listener.spin, rate=0.0)
+    assert node.exit_code == 0 and 'the bag breaks off after' in node.status().message
     assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(len(listener.stamps))]
     assert 100 < len(listener.stamps) < 600
 
 
-def test_what_does_not_decode_is_left_out(start, listener, tmp_path):
+def test_what_does_not_decode_is_left_out(play, listener, tmp_path, capfd):
     bag = BagWriter(tmp_path / 'bad.mcap')
     cloud, text = 'sensor_msgs/msg/PointCloud2', cdr.DEFINITIONS['sensor_msgs/msg/PointCloud2']
     flux = bag.add_topic('/anser/tool/flux', cloud, text)
@@ -193,23 +218,19 @@ def test_what_does_not_decode_is_left_out(start, listener, tmp_path):
     for n, data in enumerate((good, good[:40], b'', b'\xff' * 60, good)):
         bag.write(flux, START_NS + n, data)
     bag.close()
-    process = start('replay', tmp_path / 'bad.mcap', '--rate', '0')
-    assert listener.run(lambda: process.popen.poll() is not None)
-    assert process.popen.returncode == 0
-    assert '/anser/strange: type no_msgs/msg/None is not installed' in process.output
-    assert '3 messages that do not decode left out' in process.output
-    assert listener.run(lambda: len(listener.stamps) == 2)
+    node = play(tmp_path / 'bad.mcap', listener.spin, rate=0.0)
+    assert node.exit_code == 0 and node.counters['messages_left_out'] == 3
+    said = ''.join(capfd.readouterr())
+    assert '/anser/strange: type no_msgs/msg/None is not installed' in said
+    assert '3 messages that do not decode left out' in said
+    assert len(listener.stamps) == 2
 
 
 @pytest.mark.parametrize(
     ('arguments', 'said'),
     [
-        (['nowhere.mcap'], 'no such bag'),
         (['pyproject.toml'], 'not an MCAP file'),
-        (['nowhere.mcap', '--rate', '-1'], 'rate -1.0 is neither 0 nor a positive number'),
-        (['nowhere.mcap', '--wait', '-1'], 'wait -1.0 is negative'),
         (['nowhere.mcap', '--rate', 'fast'], "invalid float value: 'fast'"),
-        ([], 'arguments are required: bag'),
     ],
 )
 def test_bad_usage_is_one_clear_line(start, arguments, said):
@@ -218,23 +239,31 @@ def test_bad_usage_is_one_clear_line(start, arguments, said):
     assert said in process.output and 'Traceback' not in process.output
 
 
-def test_a_bag_of_other_topics_is_refused(start, tmp_path):
-    bag = BagWriter(tmp_path / 'other.mcap')
+def test_what_cannot_be_played_is_refused(ros, tmp_path):
+    other = tmp_path / 'other.mcap'
+    bag = BagWriter(other)
     chat = bag.add_topic('/chat', 'std_msgs/msg/String', 'string data\n')
     bag.write(chat, START_NS, b'\0\1\0\0\3\0\0\0hi\0')
     bag.close()
-    process = start('replay', tmp_path / 'other.mcap')
-    assert process.wait() == 2
-    assert 'neither a setup nor fluxes that could be replayed' in process.output
+    for name, options, said in (
+        ('nowhere.mcap', {}, 'no such bag'),
+        ('nowhere.mcap', {'rate': -1.0}, 'rate -1.0 is neither 0 nor a positive number'),
+        ('nowhere.mcap', {'wait': -1.0}, 'wait -1.0 is negative'),
+        (other, {}, 'neither a setup nor fluxes that could be replayed'),
+    ):
+        with pytest.raises(AnserError, match=said):
+            replay.Replay(str(name), **options)
 
 
-def test_nobody_listens(ros, tmp_path):
+def test_nobody_listens(play, tmp_path, monkeypatch):
     """It waits for listeners, and plays for the record when none comes."""
-    node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 3)), rate=100.0, wait=0.2)
-    assert spin_until(node, lambda: node.exit_code is not None)
+    steps = []
+    monkeypatch.setattr(replay.Replay, '_acknowledged', lambda _, topic: steps.append('received'))
+    monkeypatch.setattr(replay.Consumers, 'wait', lambda *_, **__: steps.append('handled'))
+    node = play(make_session(tmp_path / 'a.mcap', 3), rate=0.0, wait=0.2)
     assert node.exit_code == 0 and node.counters['no_listeners'] == 1
-    node.close()
-    node.destroy_node()
+    first = ['received', *3 * ['handled']]
+    assert steps[:4] == first, 'nobody who has not received the first is asked'
 
 
 class Dues(threading.Event):
@@ -249,28 +278,21 @@ class Dues(threading.Event):
         return super().wait(min(timeout, 1e-3))
 
 
-def test_messages_are_due_at_the_pace_of_the_rate(ros, tmp_path):
+def test_messages_are_due_at_the_pace_of_the_rate(play, tmp_path):
     """Counted in moments that are waited for, so that no busy machine makes a difference."""
-    began = time.monotonic()
-    node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 100)), rate=0.2, wait=0.2)
-    node._ending = dues = Dues()
-    assert spin_until(node, lambda: node.exit_code is not None)
+    began, dues = time.monotonic(), Dues()
+    play(make_session(tmp_path / 'a.mcap', 100), ending=dues, rate=0.2, wait=0.2)
     assert dues.until[-1] - began > 99 * PERIOD_NS * 1e-9 / 0.2, 'no faster than its pace'
-    node.close()
-    node.destroy_node()
 
 
-def test_a_node_that_is_still_starting_is_waited_for_longer(ros, tmp_path):
+def test_a_node_that_is_still_starting_is_waited_for_longer(ros, play, tmp_path):
     """A tracker that compiles its kernels is in the graph, and has not said a word yet."""
     starting = ros.create_node('tracker', namespace='anser')
     starting.create_subscription(PointCloud2, 'tool/flux', lambda _: None, 10)
     began = time.monotonic()
-    node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 3)), rate=100.0, wait=0.5)
-    assert spin_until(node, lambda: node.exit_code is not None)
+    node = play(make_session(tmp_path / 'a.mcap', 3), rate=100.0, wait=0.5)
     assert time.monotonic() - began >= replay.STARTING_FACTOR * 0.5
     assert node.exit_code == 0 and node.counters['no_listeners'] == 1
-    node.close()
-    node.destroy_node()
     starting.destroy_node()
 
 
@@ -284,17 +306,19 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-ending, stamps = [], {topic: set() for topic in sys.argv[1:]}
+ending, missing = [], {topic: set(range(200)) for topic in sys.argv[1:]}
 signal.signal(signal.SIGINT, lambda *_: ending.append(1))
 node = rclpy.create_node('outsider')
-for topic, got in stamps.items():
-    take = lambda m, got=got: got.add((m.header.stamp.sec, m.header.stamp.nanosec))
+for topic, left in missing.items():
+    take = lambda m, left=left: left.discard(
+        (m.header.stamp.sec - 1700000000) * 25 + m.header.stamp.nanosec // 40_000_000
+    )
     node.create_subscription(PoseStamped, f'/anser/{topic}/pose', take, 10)
 executor = SingleThreadedExecutor()
 executor.add_node(node)
-while not ending and min(map(len, stamps.values())) < 200:
+while not ending and any(missing.values()):
     executor.spin_once(timeout_sec=0.05)
-print(*map(len, stamps.values()))
+print('missing frames', *map(sorted, missing.values()))
 """
 
 
@@ -319,7 +343,7 @@ def test_all_started_in_the_same_moment_lose_no_frame(start, domain, tmp_path, f
         assert play.wait() == 0, play.output
         wait(lambda: outsider.popen.poll() is not None)
         assert outsider.interrupt() == 0
-        assert outsider.output.split() == ['200'] * 3, play.output
+        assert outsider.output == 'missing frames [] [] []\n', play.output
     finally:
         outsider.kill_group()
     assert recorder.interrupt() == 0

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -95,7 +96,7 @@ class Supervisor:
             process = subprocess.Popen(
                 list(command), stdin=subprocess.DEVNULL, stdout=stream,
                 stderr=None if stream is None else subprocess.STDOUT, start_new_session=True,
-                preexec_fn=_prepare,
+                preexec_fn=partial(_prepare, os.getpid()),
             )  # fmt: skip
         self._children.append(Child(name, process, log))
         return self._children[-1]
@@ -134,7 +135,9 @@ def _signal_group(child: Child, number: int) -> None:
         os.killpg(child.process.pid, number)
 
 
-def _prepare() -> None:
-    """Let the system kill the new process when its parent ends (Linux)."""
+def _prepare(parent: int) -> None:
+    """Let the system kill the new process when its parent, by its number, ends (Linux)."""
     if sys.platform.startswith('linux'):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it has ended before that
+            os._exit(1)

@@ -33,6 +33,8 @@ REPLY_TIMEOUT_S = 2.0
 """Time, s, that a listener has for an answer before it is asked again."""
 # A listener may be compiling its kernels.
 ATTEMPTS = 30
+# Fewest for one that has not answered yet: answers can miss a client that is new to the server.
+FIRST_ATTEMPTS = 5
 ANSWER_POLL_S = 0.1
 """How often a wait looks whether it was given up, s: a Ctrl-C takes so long."""
 # How often the graph is asked for new listeners, in messages.
@@ -49,12 +51,14 @@ class Consumers:
         self._clients: dict[str, Any] = {}
         self._listeners: dict[tuple[str, ...], set[str]] = {}
         self._silent: set[str] = set()
+        self._answered: set[str] = set()
         self._calls = 0
         self._given_up = threading.Event()
 
     def wait(self, *topics: str, attempts: int = ATTEMPTS) -> None:
         """Wait until all listeners of the topics, by their full names, have handled what was
-        published; after so many ``attempts`` to ask one it is gone on without it.
+        published; after so many ``attempts`` to ask one it is gone on without it, after
+        `FIRST_ATTEMPTS` at least where it has never answered.
         """
         if self._calls % REFRESH_EVERY == 0:
             self._listeners.clear()
@@ -63,8 +67,10 @@ class Consumers:
             self._listeners[topics] = set().union(*map(self._find, topics))
         waiting = {name: self._ask(name) for name in self._listeners[topics]}
         for name, answered in waiting.items():
-            if not self._answers(name, answered, attempts):
-                self._silent.add(name)
+            patience = attempts if name in self._answered else max(attempts, FIRST_ATTEMPTS)
+            if self._answers(name, answered, patience):
+                self._answered.add(name)
+            else:
                 self._listeners[topics].discard(name)
 
     def give_up(self) -> None:
@@ -99,11 +105,13 @@ class Consumers:
         for _ in range(attempts):
             end_s = time.monotonic() + REPLY_TIMEOUT_S
             while time.monotonic() < end_s:
-                if answered.wait(ANSWER_POLL_S):
+                if answered.wait(POLL_S):
                     return True
+                # One that the graph does not know now is looked for again with the others.
                 if self._given_up.is_set() or not self._clients[name].service_is_ready():
                     return False
             answered = self._ask(name)
+        self._silent.add(name)
         self._node.get_logger().warning(f'{name} does not answer; going on without it')
         return False
 
@@ -123,8 +131,8 @@ POLL_S = 0.05
 REPORT_AFTER_S = 3.0
 # Time of the recording between two messages on /clock, ns: half a window at 50 Hz.
 CLOCK_PERIOD_NS = 10_000_000
-# How long the end waits for listeners to acknowledge the last messages, s.
-LAST_ACK_S = 5.0
+# How long listeners have to acknowledge the first and the last messages, s.
+LONGEST_ACK_S = 5.0
 # How often a silent listener of poses is asked again: fewer times than one of fluxes, for it is
 # asked after every frame.
 ATTEMPTS_OF_LISTENERS = 2
@@ -210,7 +218,7 @@ class Replay(AnserNode):
         """Stop the thread that plays."""
         self._ending.set()
         self._consumers.give_up()
-        self._thread.join(LAST_ACK_S)
+        self._thread.join(LONGEST_ACK_S)
 
     # Before playing -----------------------------------------------------------------------
 
@@ -306,6 +314,7 @@ class Replay(AnserNode):
         """Play the bag from its begin; return whether it came to its end."""
         first_ns, began_s, clock_ns = None, time.monotonic(), 0
         given = dict(self._latched) if self._passes == 0 else {}
+        begun: set[str] = set()
         for message in self._messages():
             if given.pop(message.topic, None) is not None:
                 continue  # the first of a latched topic is out already
@@ -323,6 +332,11 @@ class Replay(AnserNode):
             self._outlets[message.topic].publish(message.data)
             self._done += 1
             if self._rate == 0.0 and message.topic.endswith(FLUX_ENDINGS):
+                if message.topic not in begun:
+                    # A listener that is known here may not know of this publisher yet: it would
+                    # answer, and get what it missed after more than its queue holds.
+                    begun.add(message.topic)
+                    self._acknowledged(message.topic)
                 # Those who take fluxes, and those who take poses made of them, catch up. After
                 # every frame: of several messages that wait an executor may have worked off one
                 # when it answers.
@@ -330,6 +344,10 @@ class Replay(AnserNode):
                 if self._poses:
                     self._consumers.wait(*self._poses, attempts=ATTEMPTS_OF_LISTENERS)
         return not self._ending.is_set()
+
+    def _acknowledged(self, topic: str) -> None:
+        """Wait until all who listen have received what was published."""
+        self._outlets[topic].wait_for_all_acked(Duration(seconds=LONGEST_ACK_S))
 
     def _messages(self) -> Iterator[RawMessage]:
         """Yield what can be published; bytes that are no message of their type are left out."""
@@ -346,9 +364,9 @@ class Replay(AnserNode):
 
     def _finish(self) -> None:
         """Wait until all is received, and end the process."""
-        for outlet in self._outlets.values():
+        for topic in self._outlets:
             if not self._ending.is_set():
-                outlet.wait_for_all_acked(Duration(seconds=LAST_ACK_S))
+                self._acknowledged(topic)
         left_out = self.counters['messages_left_out']
         played = f'{self._done} of {self._total} messages'
         if self._loop:  # in which every pass counts again

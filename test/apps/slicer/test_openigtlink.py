@@ -53,8 +53,12 @@ sensors:
 """
 
 
-def answer(header):
-    return header.kind.encode()
+@pytest.fixture
+def server():
+    """A server that answers a request with its kind."""
+    made = IgtlServer('127.0.0.1', 0, lambda header: header.kind.encode())
+    yield made
+    made.close()
 
 
 @pytest.fixture
@@ -137,18 +141,6 @@ def test_poses_and_states_reach_clients(start, tracker, connect):
     assert process.interrupt() == 0
 
 
-def test_a_pose_that_is_none_is_refused(ros, tracker):
-    node = OpenIGTLink(parameter_overrides=[Parameter('port', value=0)])
-    try:
-        assert spin_until(node, lambda: tracker.listeners() == 1)
-        tracker.send(x=float('nan'))
-        assert spin_until(node, lambda: node.counters['poses_refused'] == 1)
-        assert node.counters['transforms'] == 0
-    finally:
-        node.close()
-        node.destroy_node()
-
-
 class TestServer:
     def test_a_taken_port_is_said_in_one_line(self, start):
         with socket.create_server(('127.0.0.1', 0)) as taken:
@@ -158,93 +150,75 @@ class TestServer:
             assert f'cannot listen on 127.0.0.1:{port}: Address already' in process.output
             assert 'Traceback' not in process.output
             with pytest.raises(PortError, match='Address already in use'):
-                IgtlServer('127.0.0.1', port, answer)
+                IgtlServer('127.0.0.1', port, lambda _: b'')
 
-    def test_what_a_client_asks_is_answered(self):
+    def test_what_a_client_asks_is_answered(self, server):
         """Requests may come in pieces, and between messages that are none of ours."""
         other = igtl.message('IMAGE', 'x', 1.0, bytes(5000))
         asked = [igtl.message(kind, '', 1.0, b'') for kind in ('GET_CAPABIL', 'STP_TDATA')]
         begin = igtl.message('STT_TDATA', '', 1.0, struct.pack('>i32s', 20, b''), {})
-        server = IgtlServer('127.0.0.1', 0, answer)
-        try:
-            with socket.create_connection(('127.0.0.1', server.port)) as client:
-                client.settimeout(60.0)
-                for byte in asked[0][:30], asked[0][30:] + other, begin:
-                    client.sendall(byte)
-                    time.sleep(0.02)
-                assert read(client, 20) == b'GET_CAPABILSTT_TDATA'
-                server.send(b'old', b'new')
-                assert read(client, 3) == b'new', 'it has asked in version 2'
-                for now_s in (10.0, 10.01, 10.021, 10.022):
-                    server.send_tracking(lambda: b'tracked', now_s)
-                assert read(client, 14) == 2 * b'tracked'
-                client.sendall(asked[1])
-                assert read(client, 9) == b'STP_TDATA'
-                server.send_tracking(lambda: pytest.fail('nobody wants it'), 20.0)
-        finally:
-            server.close()
+        with socket.create_connection(('127.0.0.1', server.port)) as client:
+            client.settimeout(60.0)
+            for byte in asked[0][:30], asked[0][30:] + other, begin:
+                client.sendall(byte)
+                time.sleep(0.02)
+            assert read(client, 20) == b'GET_CAPABILSTT_TDATA'
+            server.send(b'old', b'new')
+            assert read(client, 3) == b'new', 'it has asked in version 2'
+            for now_s in (10.0, 10.01, 10.021, 10.022):
+                server.send_tracking(lambda: b'tracked', now_s)
+            assert read(client, 14) == 2 * b'tracked'
+            client.sendall(asked[1])
+            assert read(client, 9) == b'STP_TDATA'
+            server.send_tracking(lambda: pytest.fail('nobody wants it'), 20.0)
 
-    def test_clients_come_and_go(self):
-        server = IgtlServer('127.0.0.1', 0, answer)
-        try:
-            client = socket.create_connection(('127.0.0.1', server.port))
-            assert wait(lambda: server.n_clients == 1)
-            client.sendall(b'whatever a client may say')
-            server.send(b'hello', b'newer')
-            assert client.recv(5) == b'hello'
-            client.close()
-            assert wait(lambda: server.n_clients == 0)
-            server.send(b'to nobody')
-        finally:
-            server.close()
+    def test_clients_come_and_go(self, server):
+        client = socket.create_connection(('127.0.0.1', server.port))
+        assert wait(lambda: server.n_clients == 1)
+        client.sendall(b'whatever a client may say')
+        server.send(b'hello', b'newer')
+        assert client.recv(5) == b'hello'
+        client.close()
+        assert wait(lambda: server.n_clients == 0)
+        server.send(b'to nobody')
 
     @pytest.mark.long
-    def test_a_client_that_reads_nothing_holds_nobody_up(self):
-        server = IgtlServer('127.0.0.1', 0, answer)
-        try:
-            with socket.create_connection(('127.0.0.1', server.port)):
-                assert wait(lambda: server.n_clients == 1)
-                for _ in range(2000):
-                    server.send(bytes(100_000))
-                assert server.dropped > 0
-                assert wait(lambda: server.n_clients == 0)
-        finally:
-            server.close()
+    def test_a_client_that_reads_nothing_holds_nobody_up(self, server):
+        with socket.create_connection(('127.0.0.1', server.port)):
+            assert wait(lambda: server.n_clients == 1)
+            for _ in range(2000):
+                server.send(bytes(100_000))
+            assert server.dropped > 0
+            assert wait(lambda: server.n_clients == 0)
 
-    def test_more_clients_than_there_may_be_are_refused(self):
-        server = IgtlServer('127.0.0.1', 0, answer)
-        clients = []
-        try:
-            for _ in range(MOST_CLIENTS + 3):
-                clients.append(socket.create_connection(('127.0.0.1', server.port)))
+    def test_more_clients_than_there_may_be_are_refused(self, server):
+        with contextlib.ExitStack() as stack:
+
+            def connect():
+                client = socket.create_connection(('127.0.0.1', server.port))
+                return stack.enter_context(client)
+
+            clients = [connect() for _ in range(MOST_CLIENTS + 3)]
             assert wait(lambda: server.refused == 3)
             assert server.n_clients == MOST_CLIENTS
             assert clients[-1].recv(1) == b'', 'a refused connection is closed'
             clients[0].close()
             assert wait(lambda: server.n_clients == MOST_CLIENTS - 1)
-            clients.append(socket.create_connection(('127.0.0.1', server.port)))
+            connect()
             assert wait(lambda: server.n_clients == MOST_CLIENTS)
-        finally:
-            for client in clients:
-                client.close()
-            server.close()
 
-    def test_a_client_that_never_stops_talking_still_gets_its_poses(self):
-        server = IgtlServer('127.0.0.1', 0, answer)
-        try:
-            with socket.create_connection(('127.0.0.1', server.port)) as client:
-                assert wait(lambda: server.n_clients == 1)
-                client.setblocking(False)
-                sent = 0
-                while sent <= 2_000_000:
-                    with contextlib.suppress(BlockingIOError):
-                        sent += client.send(bytes(65536))
-                    server.send(b'pose')
-                    time.sleep(0.001)
-                client.settimeout(60.0)
-                assert client.recv(4) == b'pose'
-        finally:
-            server.close()
+    def test_a_client_that_never_stops_talking_still_gets_its_poses(self, server):
+        with socket.create_connection(('127.0.0.1', server.port)) as client:
+            assert wait(lambda: server.n_clients == 1)
+            client.setblocking(False)
+            sent = 0
+            while sent <= 2_000_000:
+                with contextlib.suppress(BlockingIOError):
+                    sent += client.send(bytes(65536))
+                server.send(b'pose')
+                time.sleep(0.001)
+            client.settimeout(60.0)
+            assert client.recv(4) == b'pose'
 
 
 def read(client, count):
@@ -257,7 +231,7 @@ def read(client, count):
 
 
 def test_replies_of_the_node(ros, tracker):
-    """What it can, how it is, and the poses of all that are tracked."""
+    """What it can, how it is, and the poses of all that are tracked, but none that is no pose."""
     values = {'port': 0, 'coil_name': '{sensor}Of{body}'}
     node = OpenIGTLink(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()])
     try:
@@ -274,6 +248,9 @@ def test_replies_of_the_node(ros, tracker):
             assert found[1][2][30:] == b'no setup yet\0'
             assert spin_until(node, lambda: tracker.listeners() == 1)
             assert spin_until(node, lambda: node._n_clients == 1)
+            tracker.send(x=float('nan'))
+            assert spin_until(node, lambda: node.counters['poses_refused'] == 1)
+            assert node.counters['transforms'] == 0
             tracker.send()
             assert spin_until(node, lambda: node.counters['transforms'] == 1)
             kinds = {}
@@ -360,13 +337,9 @@ def heard(client, server):
     return b''
 
 
-def test_whatever_a_client_says():
-    server = IgtlServer('127.0.0.1', 0, answer)
-    try:
-        for path in sorted(Path(__file__).with_name('corpus').iterdir()):
-            with socket.create_connection(('127.0.0.1', server.port), timeout=60.0) as client:
-                client.sendall(path.read_bytes())
-                client.settimeout(0.05)
-                assert heard(client, server) == b'pose', path
-    finally:
-        server.close()
+def test_whatever_a_client_says(server):
+    for path in sorted((Path(__file__).parents[2] / 'corpus').iterdir()):
+        with socket.create_connection(('127.0.0.1', server.port), timeout=60.0) as client:
+            client.sendall(path.read_bytes())
+            client.settimeout(0.05)
+            assert heard(client, server) == b'pose', path
