@@ -1,4 +1,4 @@
-"""Makes a session of your own arrays, checked against the setup and written to an MCAP bag."""
+"""Writes your own arrays as a session, checked against the setup, to an MCAP bag."""
 
 import os
 import time as clock

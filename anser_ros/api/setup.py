@@ -1,4 +1,4 @@
-"""Makes setup documents from whatever a script has: plain data, YAML text or a file."""
+"""Makes setup documents from plain data, YAML text or a file."""
 
 import os
 from collections.abc import Mapping

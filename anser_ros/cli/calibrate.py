@@ -98,7 +98,7 @@ def _kinds(text: str) -> tuple[str, ...]:
 def work(args: argparse.Namespace, tell: Tell) -> Result:
     """Calibrate with the sessions of the arguments, into their files.
 
-    Raises `FitError` when the drawing of the board is the better model, and that is not forced.
+    Raises `FitError` when the nominal model is better, and that is not forced.
     """
     stated = stated_values(args)
     options = _options(args)

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Holds what speaks for an effect."""
+    """Holds the evidence for an effect."""
 
     power: float  # what it takes off the sum of squares
     variation: float  # share of that power that refits in parts of the data take off besides

@@ -1,7 +1,7 @@
 """Calibrates bodies of many sensors that hardly move, and magnets, beside the usual scans.
 
 `ENGINES` are registered before the core's own (`sessions/calibration.py`). A scan of emitters
-without a drawing also says how large they are: moments of several dipoles on an axis are fitted in
+of unknown geometry also gives their sizes: moments of several dipoles on an axis are fitted in
 turn with the poses, and a size is close to a shift of all poses, which would take very many turns.
 So place, axis, moment and size of each emitter are fitted by Gauss-Newton to fluxes of which the
 part that poses explain counts as little as the jitter is large (`with_source_sizes`).
@@ -91,7 +91,7 @@ class _SizedSources:
 
 
 def with_source_sizes(calibration: Calibration) -> Calibration:
-    """Return a calibration that reports the sizes of emitters without a drawing.
+    """Return a calibration that reports the sizes of emitters of unknown geometry.
 
     Only dipoles on an axis of each emitter have a size, and none is reported where emitters
     without one predict the scan as well.
@@ -234,4 +234,4 @@ ENGINES = (
     Engine(SCAN.accepts, lambda *scan: with_source_sizes(SCAN.fit(*scan))),
 )
 """In their order: a body of many sensors at one place, at a few poses, and any scan, with the
-sizes of emitters without a drawing."""
+sizes of emitters of unknown geometry."""

@@ -123,7 +123,7 @@ class PoseExcessNoise(PoseEffect):
         return [EffectRecord(self.name, {'factor': factor}, {'factor': 0.1 * factor})]
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
-        """Return each sensor that is noisier than the median of the others."""
+        """Return each sensor with more noise than the median of the others."""
         noise = {}
         law = RangeNoise().observed(residuals)
         exponent = float(law[0].parameters['exponent']) if law else 0.0
