@@ -22,9 +22,9 @@ class CalibrationResult:
     ----------
     model : Model
     heldout_flux_rmse_t : float
-        Error on readings that took no part in the fit, T; the optical jitter is in it.
+        Error on readings that took no part in the fit, T, optical jitter included.
     flux_error_t : float
-        The model's own error there, T a phasor component, noise and jitter taken off.
+        The model's own error there, T a phasor component, noise and jitter subtracted.
     figures : mapping
         Everything that ``calibration.json`` holds.
     """
@@ -54,13 +54,13 @@ def calibrate(
     sessions : Session or sequence of Session
         With tool fluxes and optical poses.
     dipoles : int, optional
-        A layer of so many by so many vertical dipoles on the board. When not given, the layout is
+        Use a layer of so many by so many vertical dipoles on the board. By default the layout is
         chosen by its error on held-out blocks of space, which takes longer.
     estimate : sequence of str
-        What is found of sensors and clock together with the field, where the scan speaks for it;
-        all of `KINDS` by default, and nothing when it is empty.
+        Errors of sensors and clock to estimate together with the field, where the scan supports
+        them; all of `KINDS` by default, none when it is empty.
     force : bool
-        Whether a model is returned that is worse on held-out readings than the drawn board.
+        Whether to return a model that is worse on held-out readings than the nominal one.
     progress : callable, optional
         Called with the stage in words, and the finished share from 0 to 1.
 
@@ -68,8 +68,8 @@ def calibrate(
     ------
     FitError
         When the data cannot determine a model, with the number needed and the number found; when
-        the sessions are of different boards; or when the drawing is better and ``force`` is not
-        set.
+        the sessions are of different boards; or when the nominal model is better and ``force`` is
+        not set.
 
     Examples
     --------

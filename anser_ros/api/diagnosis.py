@@ -16,7 +16,7 @@ class DiagnosisResult:
     Attributes
     ----------
     model : Model
-        The model with the effects found, which `track` and every command and node use like any.
+        The model with the effects found, which `track` and all commands and nodes accept.
     effects : tuple of str
         Names of the effects found; empty for a session that the model explains.
     figures : mapping
@@ -49,13 +49,13 @@ def diagnose(
     baseline : Session, optional
         Distortion-free recording of the same board; with it the reference sensors are used.
     progress : callable, optional
-        Called with words on what goes on.
+        Called with the stage in words.
 
     Raises
     ------
     DiagnosisError
-        When fewer than 30 frames have fluxes and a pose; few poses of a body of many sensors are
-        enough where the emitters have no drawing.
+        When fewer than 30 frames have fluxes and a pose; fewer poses of a body of many sensors
+        are enough where the emitters are of unknown geometry.
     ModelFileError
         When the model's emitters are not the session's.
     BagError

@@ -1,4 +1,4 @@
-"""Offers the field model as a script sees it: load, save, predict."""
+"""Offers the field model to scripts: load, save, predict."""
 
 import os
 from dataclasses import dataclass
@@ -44,12 +44,12 @@ class Model:
 
     @classmethod
     def nominal(cls, setup: SetupSource) -> Self:
-        """Make the model of a board exactly as its setup document draws it (Biot-Savart).
+        """Make the nominal model of a board: the Biot-Savart field of its stated geometry.
 
         Raises
         ------
         SetupError
-            When the setup breaks a rule, or its emitter kind is not one that can be drawn.
+            When the setup breaks a rule, or its emitter kind is not one of known geometry.
 
         Examples
         --------
@@ -76,7 +76,7 @@ class Model:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Return the names of the effects that the model corrects, as a diagnosis found them."""
+        """Return the names of the effects that the model corrects."""
         return tuple(effect.name for effect in self.field.effects)
 
     def flux(self, position: ArrayLike, axis: ArrayLike) -> NDArray[np.complex128]:

@@ -1,8 +1,8 @@
 """Moves dipoles to where the readings put them: drawn coils as a whole, or each dipole by itself.
 
-A board's coils are etched, glued and soldered a fraction of a millimetre beside their drawing, and
-near them that is most of what a drawing misses. Far fewer readings determine six coordinates and a
-complex gain per coil (`CoilPlacer`) than free moments. Single dipoles are moved with their moments
+A board's coils are etched, glued and soldered a fraction of a millimetre off, and near them that
+is most of what a nominal model misses. Far fewer readings determine six coordinates and a complex
+gain per coil (`CoilPlacer`) than free moments. Single dipoles are moved with their moments
 eliminated at every step (Golub and Pereyra, Inverse Problems 19, 2003; `PositionFitter`). With
 Kaufman's derivative the normal matrix is a product, entry by entry, of two small matrices: the
 Gram matrix of the slopes of the basis outside the span of the basis, and that of the moments. Its

@@ -216,7 +216,7 @@ MOVING = (
 )
 """Layouts from which dipoles are moved; one does the work of several fixed ones."""
 COAXIAL = tuple(Layout('coaxial', n, 1.0, 0.0, moved=True) for n in (1, 3, 5))
-"""Layouts for emitters without a drawing: see `coaxial`."""
+"""Layouts for emitters of unknown geometry: see `coaxial`."""
 LOCAL_COUNT = 10
 """Dipoles along a side of the layer that every region of a local model has."""
 LOCAL_READINGS = 24

@@ -145,7 +145,7 @@ class SensorFit:
 
     parameters: SensorParameters  # what was asked for
     posterior: Posterior  # values, prior widths and covariance of all parameters
-    left_out: tuple[str, ...]  # kinds that the data do not speak for
+    left_out: tuple[str, ...]  # kinds that the data do not support
     evidence: dict[str, float]  # gain of the log probability by each other kind
     noise_t: float  # noise of a phasor component, with what the field's model misses, T
     optical: OpticalNoise  # jitter of the optical poses
@@ -282,7 +282,7 @@ class SensorFitter:
             self.values = np.zeros(0)
 
     def _result(self, tools: Sequence[_Tool]) -> SensorFit:
-        """Choose the kinds of errors that the readings speak for, and judge all frames."""
+        """Choose the kinds of errors that the readings support, and judge all frames."""
         whole = self.posterior
         posterior, left_out, evidence = self.population.chosen(self.likelihood)
         if 'gains' in evidence:

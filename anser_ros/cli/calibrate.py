@@ -86,7 +86,7 @@ def _kinds(text: str) -> tuple[str, ...]:
 def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Calibrate with the sessions of the arguments, into their files.
 
-    Raises `FitError` when the drawing of the board is the better model, and that is not forced.
+    Raises `FitError` when the nominal model is better, and that is not forced.
     """
     stated = output.stated_values(args)
     if not 0.0 <= (args.damping or 0.0) < math.inf:

@@ -182,7 +182,7 @@ SEARCH_FRAMES, FINAL_FRAMES, WIRING_FRAMES = 270, 400, 150
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Holds what was found, and what speaks for it."""
+    """Holds what was found, with its evidence."""
 
     findings: tuple[Finding, ...]
     # Held-out residuals with the pose jitter taken out, T a phasor component.

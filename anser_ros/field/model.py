@@ -283,7 +283,7 @@ class EffectRecord:
     parameters: Mapping[str, Any]
     # standard deviations of the parameters, under the same keys
     uncertainty: Mapping[str, Any] = field(default_factory=dict)
-    evidence: Mapping[str, Any] = field(default_factory=dict)  # figures that speak for the effect
+    evidence: Mapping[str, Any] = field(default_factory=dict)  # figures that support the effect
 
 
 @dataclass(frozen=True)

@@ -34,15 +34,15 @@ NODE_SPREADS = np.arange(0.6, 0.96, 0.02)
 inside the coil, as the outer nodes of a quadrature are, hence nothing up to 1."""
 GOOD_MISFIT = 1.5e-4
 """Relative misfit (rms of the field vector's error over the field) at which no more dipoles are
-tried. It is far below the 2 % by which a coil's moment differs from its drawing (`Tolerances`)."""
+tried. It is far below the 2 % by which a coil's moment is off (`Tolerances`)."""
 LARGEST_MISFIT = 1e-2
 """Relative misfit beyond which the nominal model is refused: half of the tolerance of the gain,
-so that what a model misses is never larger than what the drawing does."""
+so that what a model misses is never larger than what the geometry does."""
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Holds standard deviations of the differences between a manufactured board and its drawing.
+    """Holds standard deviations of the differences between a manufactured and the nominal board.
 
     The defaults are assumptions, not measurements. Larger ones make reported uncertainties larger
     and let references change the model more.

@@ -80,7 +80,7 @@ class Misplacement:
 
 
 class BoardPlace:
-    """Compares where a calibrated model and the references have the drawn board.
+    """Compares where a calibrated model and the references have the nominal board.
 
     ``field`` is the drawn field of the K coils at ``centres`` (K, 3), m; ``volume`` is where the
     model is good; ``sensors`` are the references at their stated places.

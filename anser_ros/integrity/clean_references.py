@@ -3,7 +3,7 @@
 A baseline is what all later readings are compared with: metal that was present when it was taken
 becomes part of the field for good, and no refit detects it. So a baseline has to agree with
 independent knowledge of the references: their readings when the model was calibrated, or else what
-the drawing of the board predicts (`DrawnReadings`). The strength of an emitter may have changed,
+the nominal board predicts (`DrawnReadings`). The strength of an emitter may have changed,
 and single sensors may be bad.
 """
 
@@ -31,7 +31,7 @@ FieldAt = Callable[[Array], Array]
 STEP_M = 1e-5
 """Step (m) of the differences by which the field changes with place."""
 FREE_GAIN = 0.1
-"""Deviation of an emitter's strength from its drawing, which is not judged here: a meter of the
+"""Deviation of an emitter from its nominal strength, which is not judged here: a meter of the
 current that is 10 % off is another fault."""
 
 
@@ -75,7 +75,7 @@ class DrawnReadings:
         )
 
     def by_manufacture(self, centres: Array) -> Array:
-        """Return what each coil's deviation from its drawing does, (6 K, S, K), T a standard
+        """Return what each coil's deviation from its nominal place does, (6 K, S, K), T a standard
         deviation.
 
         Six a coil: its strength, its place along x, y and z, its tilt about x and y.
@@ -115,7 +115,7 @@ STRENGTH_STEPS = 25
 """Steps in which sensors that changed most lose their say in the emitters' strengths: beside 8 of
 32 that changed by 20 % the others seem to change by 2e-5, and by 5e-3 after 10 steps."""
 DRAWN_GATE = 3.0
-"""Root mean square of all readings' differences from the drawn board, in units of what survey and
+"""Root mean square of all readings' differences from the nominal, in units of what survey and
 manufacture allow (then it is 1), from which on there is metal."""
 DRAWING_ERROR = 1e-4
 """Error of a drawn field relative to itself: turns and leads are not drawn to less."""
@@ -242,7 +242,7 @@ def _change(
 def check_as_drawn(
     field: FieldAt, centres: Array, sensors: SensorTable, flux: ComplexArray, accuracy: Accuracy
 ) -> None:
-    """Refuse readings that the drawn board, its tolerances and the survey do not explain.
+    """Refuse readings that the nominal board, its tolerances and the survey do not explain.
 
     It detects only large amounts of metal: a plate near the board, but not a piece of a hand's
     breadth at the side. ``centres`` (K, 3), m, are those of the coils; ``flux`` (R, K), T, may

@@ -96,7 +96,7 @@ class AcquisitionParameters:
         live=True,
     )
     set_frequencies: bool = parameter(
-        True, 'whether the control unit is told to drive the tones of the setup document'
+        True, 'whether the tones of the setup document are set on the control unit'
     )
     silence_s: float = parameter(
         SILENCE_S,

@@ -48,7 +48,7 @@ class CuSimulatorParameters:
     )
     board_seed: int = parameter(
         0,
-        'of the board: 0 for one as drawn, which the nominal model fits; 1 for that of '
+        'of the board: 0 for the nominal one, which the nominal model fits; 1 for that of '
         'demo_model.yaml and bags/; any other number for one with random manufacturing '
         'tolerances',
         minimum=0,

@@ -73,7 +73,7 @@ def check_clean(
 
 
 def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> BoardPlace | None:
-    """Return what compares the board's places by model and references, None without a drawing."""
+    """Return what compares the board's places by model and references, or None."""
     board = NominalBoard.of(setup).board
     if board is None or is_nominal(model) or not len(sensors) or not _is_without_metal(model):
         return None

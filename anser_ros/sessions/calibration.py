@@ -293,7 +293,7 @@ def _steady(session: Session, tool: Measurements) -> NDArray[np.bool_]:
 
 
 SCAN = Engine(lambda sessions, options: True, _fit_as_scan)
-"""Calibrates any sessions: a scan of the volume, with or without a drawing of the emitters."""
+"""Calibrates any sessions: a scan of the volume, with or without a nominal model."""
 
 
 @functools.cache

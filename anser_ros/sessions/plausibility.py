@@ -53,13 +53,13 @@ MOST_FRAMES = 40
 FEWEST_READINGS = 12
 """Readings (a coil in a frame) without which nothing is decided: fewer fit by chance."""
 MISFIT = 0.3
-"""Relative misfit of a reading up to which it fits. A board as drawn predicts to a few hundredths;
+"""Relative misfit of a reading up to which it fits. A nominal board predicts to a few hundredths;
 a wrong axis misses by one and more."""
 POOR, GOOD = 0.6, 0.8
 """Shares of readings that fit: below the first the poses are in doubt, above the second another
 reading is right. Half a turn about an axis leaves a third of a triaxial coil's readings right."""
 TOO_LARGE = 100.0
-"""Factor over the drawn board's fluxes from which on a unit is in doubt; gains stay far below."""
+"""Factor over the nominal board's fluxes from which a unit is in doubt; gains stay far below."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def _fit(
 
 
 def _check_flux(path: str, tool: Measurements, median: float, gain: float, where: str) -> None:
-    """Raise where fluxes are larger than the drawn board's by the factor of a unit."""
+    """Raise where fluxes are larger than the nominal board's by the factor of a unit."""
     if gain > TOO_LARGE:
         unit = unit_words(gain, FLUX_UNITS) or 'another unit than T'
         raise PlausibilityError(
@@ -200,7 +200,7 @@ def _check_flux(path: str, tool: Measurements, median: float, gain: float, where
 
 
 def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurements) -> None:
-    """Raise where fluxes are larger than the drawn board makes anywhere in the tracked volume."""
+    """Raise where fluxes are larger than the nominal board's in the tracked volume."""
     whole = np.isfinite(tool.flux).all(axis=2) & (tool.flags == 0)
     if not whole.any():
         return

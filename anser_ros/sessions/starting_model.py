@@ -108,7 +108,7 @@ def model_for(
 
 
 def is_nominal(model: FieldModel) -> bool:
-    """Return whether a model is a board's drawing, or was made from it without a calibration."""
+    """Return whether a model is a nominal one, or was made from it without a calibration."""
     return model.provenance.get('source') == NOMINAL
 
 

@@ -111,7 +111,7 @@ class FluxConverter:
 
 REACH_S = 0.03
 """Time over which the straight line is fitted, s. A tool's velocity hardly changes meanwhile; a
-shorter time makes the slopes noisier, a longer one makes them late."""
+shorter time adds noise to the slopes, a longer one makes them late."""
 LONGEST_WINDOW_GAP_S = 0.05
 """Longest time from one window to the next, s; after a longer gap the windows before it say
 nothing about the present motion."""

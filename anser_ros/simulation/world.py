@@ -2,7 +2,7 @@
 
 It gives the true flux of every sensor at any time. Bodies move on paths; metal is a rigid cloud of
 conducting and permeable spheres; the board's field is that of all tracks of its coils, which may
-differ from the drawing as manufactured boards do. Samples, noise and bytes are added elsewhere.
+differ from the nominal board as manufactured boards do. Samples, noise and bytes come later.
 """
 
 from __future__ import annotations
@@ -264,7 +264,7 @@ CURRENT_SHARE = 0.01
 def manufactured(setup: Setup, rng: np.random.Generator) -> Setup:
     """Return a setup with random errors of its coils' places and a slightly too large current.
 
-    The setup document keeps the drawing, so that the nominal model is wrong for such a board.
+    The setup document keeps the nominal geometry, so the nominal model is wrong for it.
     """
     coils = tuple(
         replace(

@@ -113,7 +113,7 @@ class RigidBody:
 
 
 class Judgement:
-    """Holds what the judges remember of a tracker's sensors and bodies."""
+    """Holds what the checks remember of a tracker's sensors and bodies."""
 
     def __init__(self) -> None:
         self._continuity: dict[str, Continuity] = {}
@@ -133,7 +133,7 @@ class Judgement:
         bodies: Sequence[RigidBody],
         settings: TrackerSettings,
     ) -> Estimates:
-        """Return the estimates of a frame, sensors first, with what the judges say of them."""
+        """Return the estimates of a frame, sensors first, with what the checks say of them."""
         found = [result.estimate for result in coils]
         if settings.has_gate:
             for body in bodies:

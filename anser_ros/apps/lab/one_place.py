@@ -213,7 +213,7 @@ def _reversed(
 
 
 def _noisy(channels: NDArray[np.int64], ratio: Array) -> tuple[EffectRecord, ...]:
-    """A record of each channel that is noisier than the median one."""
+    """A record of each channel with more noise than the median one."""
     return tuple(
         EffectRecord('excess_noise', {'factor': float(ratio[k]), 'channels': [int(channels[k])]})
         for k in np.flatnonzero(ratio > NOISY)

@@ -1,4 +1,4 @@
-"""Calibrates emitters without a drawing with few poses of a body of many sensors.
+"""Calibrates emitters of unknown geometry with few poses of a body of many sensors.
 
 A plate of a hundred three-axis sensors laid at four heights has more readings than many a scan,
 but nothing that a scan has: no poses to average over, and each sensor saw as many places as there

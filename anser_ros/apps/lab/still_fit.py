@@ -1,4 +1,4 @@
-"""Fits emitters without a drawing and all errors of a body that rests at few poses, jointly.
+"""Fits emitters of unknown geometry and all errors of a body that rests at few poses, jointly.
 
 A channel's own gain and tilt touch only its own readings, so they are marginalised there: they
 widen the covariance of those readings, and what is left is one generalised least-squares problem

@@ -1,4 +1,4 @@
-"""Fits frames and active effects with the noise of the rest, and judges what the motion tells.
+"""Fits frames and active effects with the noise of the rest, and what the motion shows.
 
 Which components of a lever arm the motion determines, and whether all sensors see one scale.
 """

@@ -223,7 +223,7 @@ gains as much where there is nothing else."""
 
 
 class PoseEvidence(NamedTuple):
-    """States what speaks for an active term, of the poses that were fitted."""
+    """States the evidence for an active term, of the poses that were fitted."""
 
     held_out_gain: float  # what it takes off the cross-validated squares, in units of the misfit
     held_out_share: float  # the same over the sum of squares without it

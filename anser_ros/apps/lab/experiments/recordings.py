@@ -1,5 +1,5 @@
 """Finds or simulates the recordings of the article's experiments, and holds what it reports. In
-simulated ones the board differs slightly from its drawing. Plates and the X-ray head are
+simulated ones the board differs slightly from the nominal one. Plates and the X-ray head are
 lattices of metal balls that the board magnetises and that do not magnetise each other: rougher
 than real ones, which distort the field by about as much.
 """
