@@ -180,11 +180,11 @@ def _starts_are_marked(request: pytest.FixtureRequest) -> Iterator[None]:
 
 def by_room(files: Iterable[Path]) -> Any:
     """Give a test the files of one folder of the package after the other; a test each is dear."""
-    rooms: dict[str, list[Path]] = {}
+    packages: dict[str, list[Path]] = {}
     for path in files:
         folder = path.parent.relative_to(REPO).as_posix()
-        rooms.setdefault(folder, []).append(path)
-    return pytest.mark.parametrize('paths', rooms.values(), ids=rooms)
+        packages.setdefault(folder, []).append(path)
+    return pytest.mark.parametrize('paths', packages.values(), ids=packages)
 
 
 @pytest.fixture

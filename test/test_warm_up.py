@@ -14,8 +14,8 @@ from numba.core.dispatcher import Dispatcher
 from anser_ros.tracking.tracker import warm_up
 
 def compiled():
-    rooms = [m for name, m in sys.modules.items() if name.startswith('anser_ros.tracking.')]
-    found = [value for room in rooms for value in vars(room).values()]
+    packages = [m for name, m in sys.modules.items() if name.startswith('anser_ros.tracking.')]
+    found = [value for package in packages for value in vars(package).values()]
     kernels = {id(value): value for value in found if isinstance(value, Dispatcher)}
     return {kernel.py_func.__qualname__: len(kernel.signatures) for kernel in kernels.values()}
 
