@@ -266,9 +266,8 @@ def fill_distances(  # type: ignore[no-untyped-def]
             for j in range(5):
                 total[i, j] = 0.0
             total[i, i] = survey[0] ** 2 + radial**2 if i < 3 else survey[1] ** 2
-        _add_product(slopes[0], covariances[s], total)
-        if not took_part[s]:
-            _add_product(slopes[1], covariance, total)
+        for way in range(1 if took_part[s] else 2):
+            _add_product(slopes[way], covariances[s] if way == 0 else covariance, total)
         found[1, s] = math.sqrt(apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2)
         found[0, s], found[2, s] = _squared_distance(total, apart), angle
 

@@ -66,7 +66,8 @@ def evidence_without(
     gain, strength = np.zeros(shape), np.zeros((*shape, 2), dtype=np.int64)
     fill_without(
         bank.bases, coils, bank.width, seen.projected, precision, seen.curve, seen.log_evidence,
-        (RISE, REACH), gain, strength,
+        (RISE, REACH), np.full(len(coils), -math.inf), np.zeros(seen.curve.shape[::2], np.bool_),
+        gain, strength,
     )  # fmt: skip
     evidence, residuals = (seen.log_evidence[:, None] + gain).T, []
     rows = (coils[:, None] * bank.width + np.arange(bank.width)).ravel()

@@ -77,8 +77,9 @@ def fill_scores(directions, white, inside, rest, log_det, scores):  # type: igno
     """
     bodies, strengths, count = inside.shape
     power, curve = np.empty((count, 2), np.float32), np.empty((2, strengths))
-    probability, total = np.empty(strengths), np.zeros(2)
+    probability, total = np.empty(strengths), np.empty(2)
     for part in range(2):
+        total[part] = 0.0
         for i in range(white.shape[1]):
             total[part] += white[part, i] * white[part, i]
     for body in range(bodies):
@@ -164,22 +165,23 @@ def _fill_gains(rows, width, projected, precision, weighted, block, columns, gai
 
 @kernel(fastmath=FAST)
 def fill_without(  # type: ignore[no-untyped-def]
-    bases, coils, width, projected, precision, curve, log_evidence, bounds, gain, strength
+    bases, coils, width, projected, precision, curve, log_evidence, bounds, best, done,
+    gain, strength,
 ):  # fmt: skip
     """Write what all hypotheses say without the first coil, the first two, and so on.
 
     ``bases`` (H, n, n), ``coils`` (Q,); ``curve`` (H, 2, A) and ``log_evidence`` (H,) are those of
-    all coils. ``gain`` (H, Q), zero on entry, is by how much the log likelihood at its top is
-    larger without them, ``strength`` (H, Q, 2) where that top is. It has one top, so only
-    strengths between the top with all coils and that without them are worked out: as far as it
-    rises by more than ``bounds[0]``, and where a hypothesis is within ``bounds[1]`` of the best.
+    all coils. On entry ``best`` (Q,) is -inf, ``done`` (H, A) False. ``gain`` (H, Q), then zero,
+    is by how much the log likelihood at its top is larger without them, ``strength`` (H, Q, 2)
+    where that top is. It has one top, so only strengths between the top with all coils and that
+    without them are worked out: as far as it rises by more than ``bounds[0]``, and where a
+    hypothesis is within ``bounds[1]`` of the best.
     """
     count, grid, n = precision.shape
     size, sets = len(coils) * width, len(coils)
     rows, block = np.empty((size, n)), np.empty((size, size))
     columns, weighted = np.empty((size, 2)), np.empty((2, n))
-    gains, done = np.empty((count, grid, sets, 2)), np.zeros((count, grid), np.bool_)
-    best = np.full(sets, -math.inf)
+    gains = np.empty((count, grid, sets, 2))
     for is_walk in (False, True):
         for h in range(count):
             if log_evidence[h] == -math.inf:
