@@ -44,6 +44,10 @@ def section(name):
     return '\n'.join(lines)
 
 
+def text():
+    return '\n'.join([HEAD, '\n\n'.join(map(section, NODES)), ''])
+
+
 if __name__ == '__main__':
-    TARGET.write_text('\n'.join([HEAD, '\n\n'.join(map(section, NODES)), '']))
+    TARGET.write_text(text())
     print(TARGET)

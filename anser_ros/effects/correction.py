@@ -266,7 +266,7 @@ class Correction:
         session, so that the course of a drift holds. Otherwise a drift is left as it is: live, the
         refit follows the strengths of the emitters with the references.
         """
-        terms = self._with(Remedy.FLUX)
+        terms = [t for t in self._with(Remedy.FLUX) if recorded or not t.effect.drifts]
         if not terms:
             return flux
         out = np.array(flux, dtype=complex)
@@ -283,8 +283,6 @@ class Correction:
             if mixing is not None:
                 values = np.asarray(np.linalg.solve(mixing, values), dtype=complex)
         for term in reversed(terms):
-            if term.effect.drifts and not recorded:
-                continue
             matrix = term.effect.emitter_matrix(term, np.array([time]), self.omega)
             if matrix is not None:
                 values = np.asarray(np.linalg.solve(matrix[0], values.T).T, dtype=complex)

@@ -154,7 +154,7 @@ class SerialProtocol:
     """Describes how a kind of control unit speaks."""
 
     make_reader: Callable[[], RecordReader]  # returns a new `RecordReader`
-    # bytes of a command (`records.Identify`, `SetFrequencies`, `Start`, `Stop`) with a tag that
+    # bytes of a command (`frames.Identify`, `SetFrequencies`, `Start`, `Stop`) with a tag that
     # its reply repeats. A command that the unit does not have is no bytes
     encode: Callable[[frames.Payload, int], bytes]
 

@@ -154,7 +154,7 @@ def _differs(power: NDArray[np.float64], axis: int) -> bool:
 
 
 def to_document(result: FewPosesDiagnosis) -> dict[str, Any]:
-    """Return what was found as plain data, as `diagnosis_document.to_document` does.
+    """Return what was found as plain data, as `sessions.diagnosis.to_document` does.
 
     Poses are not compared: there are too few of them.
     """
