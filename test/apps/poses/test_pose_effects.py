@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pose_world import FRAME, SHIFT, World
+from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.cli.pose_session import sizes
 from anser_ros.apps.poses.effect import PoseSetting
@@ -16,9 +17,10 @@ from anser_ros.apps.poses.effects.stream import ReceiptJitter, stamp_step
 from anser_ros.apps.poses.hand_eye import one_clock
 from anser_ros.apps.poses.problem import PoseNoise
 from anser_ros.apps.poses.search import with_noise
-from anser_ros.apps.poses.sequence import PoseSession, sequence_of
+from anser_ros.apps.poses.sequence import OpticalPath, PoseSession, sequence_of
 from anser_ros.apps.poses.start import first_fit, pose_problem
 from anser_ros.field.model import EffectRecord
+from anser_ros.physics.pose_track import PoseTrack
 
 SETTING = PoseSetting(('sensor_0', 'sensor_1'), 0.0, 40.0, np.zeros(3), 0.06)
 
@@ -88,6 +90,19 @@ def test_jitter_of_stamps_is_known_as_well_as_that_of_so_many_poses_can_be(share
     # A standard deviation of n values is known to its 1 / sqrt(2 n).
     known = 0.01 / np.sqrt(2 * (300 if shared else 600))
     assert record.uncertainty['rms_s'] == pytest.approx(known, rel=1e-3)
+
+
+def test_a_path_knows_the_noise_of_its_poses_at_a_point_of_the_body():
+    rng, time = np.random.default_rng(4), np.cumsum(np.full(2000, 0.03))
+    place, turn = World(5, duration=time[-1]).body(time)
+    place = place + 2e-4 * rng.normal(size=place.shape)
+    turn = Rotation.from_rotvec(2e-3 * rng.normal(size=place.shape)) * turn
+    path = OpticalPath.through(PoseTrack(time, place, turn.as_quat()))
+    lever = np.array([0.0, 0.1, 0.0])
+    # A turn about two of three axes moves the point.
+    expected = np.sqrt(2e-4**2 + (2e-3 * 0.1) ** 2 * 2 / 3)
+    assert path.jitter(np.zeros(3)) == pytest.approx(2e-4, rel=0.05)
+    assert path.jitter(lever) == pytest.approx(expected, rel=0.05)
 
 
 def test_a_map_of_one_sensor_may_shift_it_and_one_of_all_may_not():
