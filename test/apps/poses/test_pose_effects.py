@@ -8,7 +8,7 @@ from pose_world import FRAME, SHIFT, World
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.cli.pose_session import sizes
-from anser_ros.apps.poses.effect import PoseSetting
+from anser_ros.apps.poses.effect import PoseSetting, Role
 from anser_ros.apps.poses.effects.episodes import PoseMovingMetal
 from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
 from anser_ros.apps.poses.effects.noise import power_law
@@ -16,9 +16,9 @@ from anser_ros.apps.poses.effects.numbers import PoseClockRate
 from anser_ros.apps.poses.effects.stream import ReceiptJitter, stamp_step
 from anser_ros.apps.poses.hand_eye import one_clock
 from anser_ros.apps.poses.problem import PoseNoise
-from anser_ros.apps.poses.search import with_noise
+from anser_ros.apps.poses.search import doubt, with_noise
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSession, sequence_of
-from anser_ros.apps.poses.start import first_fit, pose_problem
+from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -197,6 +197,16 @@ def test_a_map_is_as_large_as_it_moves_the_poses_beside_a_rigid_motion():
     expected = 2e-3 * np.std(place[:, 0]) / SETTING.size
     assert record.parameters['rms_m'] == pytest.approx(expected, rel=0.02)
     assert 0 < record.uncertainty['rms_m'] < 2e-4
+
+
+def test_an_offset_of_all_sensors_that_is_less_than_known_is_doubted():
+    for offset, is_doubted in ((0.0, True), (0.03, False)):
+        world = World(4, duration=15.0, sensors=1)
+        world.offset = offset
+        problem = pose_problem(world.session())
+        fit = with_noise(first_fit(problem, coarse_offset(problem), False))
+        index = next(i for i, t in enumerate(fit.terms) if t.role is Role.OFFSET)
+        assert bool(doubt(fit, index)) == is_doubted
 
 
 def test_recordings_at_rest_one_after_the_other_are_compared_whole():
