@@ -1,5 +1,6 @@
 """Single parts of the diagnosis of poses, each against what it has to be by definition."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,17 +9,19 @@ from pose_world import FRAME, SHIFT, World
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.cli.pose_session import sizes
+from anser_ros.apps.poses.diagnosis import depends_on
 from anser_ros.apps.poses.effect import PoseSetting, Role
 from anser_ros.apps.poses.effects.episodes import PoseMovingMetal
 from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
 from anser_ros.apps.poses.effects.noise import power_law
 from anser_ros.apps.poses.effects.numbers import PoseClockRate
 from anser_ros.apps.poses.effects.stream import ReceiptJitter, stamp_step
+from anser_ros.apps.poses.fit import is_lever_determined
 from anser_ros.apps.poses.hand_eye import one_clock
 from anser_ros.apps.poses.problem import PoseNoise
 from anser_ros.apps.poses.search import doubt, with_noise
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSession, sequence_of
-from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem
+from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, started
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -71,6 +74,22 @@ def test_poses_are_thinned_out_of_step_with_a_poll(poses_a_step):
     late = stamp - taken
     assert 500 < kept.size <= 900
     assert late[kept].mean() == pytest.approx(late.mean(), abs=0.03 * step)
+
+
+def test_at_rest_nothing_depends_on_speed():
+    session = World(7, sensors=1).session()
+    problem = pose_problem(session)
+    still = replace(problem, path=replace(problem.path, is_at_rest=True))
+    assert 'speed' not in depends_on(still.state(started(still, 0.0)))
+
+
+def test_a_short_motion_with_little_error_gives_no_lever_arm():
+    world = World(6, duration=12.0, sensors=1)
+    world.noise_m, slow = 5e-5, world._turn
+    world._turn = lambda time: 0.06 * slow(time)
+    problem = pose_problem(world.session())
+    fit = with_noise(first_fit(problem, coarse_offset(problem), False))
+    assert not is_lever_determined(fit.state.parts[0], 0.0).any()
 
 
 @pytest.mark.parametrize('shared', [True, False])
