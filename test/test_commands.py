@@ -115,6 +115,7 @@ def test_help_has_examples_that_hold_and_a_document_for_programs(name, capsys):
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1800)
 def test_the_first_example_runs_as_it_is_written(tmp_path, monkeypatch, capsys):
     for folder in ('bags', 'config', 'examples'):
         (tmp_path / folder).symlink_to(REPO / folder)

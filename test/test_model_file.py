@@ -41,6 +41,18 @@ def test_a_model_survives_its_file(tmp_path):
     assert after.provenance == before.provenance
 
 
+def test_added_dipoles_add_their_field():
+    a, point, axis = model(), np.array([[0.3, 0.2, 5.0]]), np.array([[0.0, 0.6, 0.8]])
+    both = a.with_dipoles(a.positions + 1.0, a.directions, 2 * a.moments)
+    moved = FieldModel(
+        a.positions + 1.0, a.directions, 2 * a.moments, a.emitters, a.frequencies_hz
+    )
+    np.testing.assert_allclose(
+        both.flux(point, axis), a.flux(point, axis) + moved.flux(point, axis)
+    )
+    assert both.modes.shape == (3, 12, 2)
+
+
 @pytest.mark.parametrize(
     ('change', 'message'),
     [

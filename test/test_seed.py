@@ -5,6 +5,8 @@ import pytest
 from tracking_world import NOISE_T, certain_model
 
 from anser_ros.errors import TrackingError
+from anser_ros.field.nominal import nominal_model
+from anser_ros.physics.board import build_board
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.seed import build_grid, grid_points, solve_cold
 from anser_ros.tracking.solve import RealField, chi2_limit, whitening_of
@@ -52,6 +54,24 @@ def test_the_length_of_the_axis_tells_places_apart(rng):
     best = solve_cold(FIELD, GRID, 0.5 * flux, WHITENING, LOW, HIGH, 0.0, GATE)[0]
     assert np.linalg.norm(best.position - points[0]) > 5e-3
     assert best.chi2 > GATE
+
+
+def test_three_emitters_leave_one_coil_ambiguous(rng):
+    """Three fluxes can't tell five unknowns: several distinct poses explain them."""
+    board = build_board(
+        'circular_loop', {'radius_m': 0.05, 'turns': 50}, ['a', 'b', 'c'],
+        np.array([[-0.1, 0, 0], [0.1, 0, 0], [0, 0.12, 0]]), np.zeros(3), [1e3, 2e3, 3e3],
+    )  # fmt: skip
+    model = nominal_model(board)
+    field = RealField.of(model.positions, model.directions, model.moments)
+    grid = build_grid(field, np.full(6, NOISE_T), VOLUME, 0.035)
+    points, axes = poses(rng, 1)
+    flux = fluxes(points, axes, model=model)[0]
+    found = solve_cold(
+        field, grid, flux, whitening_of(np.full(6, NOISE_T)), LOW, HIGH, 0.0, chi2_limit(1, 1e-9)
+    )
+    good = [solution for solution in found if solution.chi2 < 50.0]
+    assert len(good) > 1
 
 
 def test_grid_covers_the_volume_and_widens_with_height():

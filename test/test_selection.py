@@ -75,6 +75,15 @@ def test_a_fold_holds_whole_cells_and_every_frame(rng):
         assert len(set(both[key == value])) == 1
 
 
+def test_neighbouring_cells_are_of_other_folds():
+    line = np.linspace(0, 1, 25)
+    x, y = np.meshgrid(line, line)
+    fold = fold_of_frames([np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)])[0]
+    lattice = fold.reshape(25, 25)[2::5, 2::5]
+    assert (lattice[1:] != lattice[:-1]).all()
+    assert (lattice[:, 1:] != lattice[:, :-1]).all()
+
+
 def test_frames_at_one_place_can_not_be_held_out():
     with pytest.raises(FitError, match='got 1: all frames are at one place'):
         fold_of_frames([np.zeros((30, 3))])
@@ -133,6 +142,13 @@ def test_selection_finds_a_prior_and_is_deterministic(world, monkeypatch):
     assert runs[0].finalists[0].layout == runs[1].finalists[0].layout
     assert runs[0].finalists[0].layout.prior == 'nominal'
     assert len(runs[0].candidates) > 10
+
+
+def test_thinning_is_even_and_bounded(world, monkeypatch):
+    monkeypatch.setattr(selection, 'MOST_ROWS', 200)
+    thin = thin_frames([world.measurements, world.measurements])
+    assert sum(m.flux.shape[0] * m.flux.shape[1] for m in thin) <= 212
+    assert (np.diff(thin[0].time) == thin[0].time[1]).all()
 
 
 @pytest.fixture(scope='module')

@@ -14,7 +14,7 @@ from anser_ros.cli.main import main
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.timeout(1800)]  # a minute of a quiet machine
 AT_REST = {'flux_noise_t': 1e-14, 'optical_position_m': 1e-6, 'optical_rotation_rad': 1e-6}
 VOLUME = ((-0.3, -0.3, 0.05), (0.3, 0.3, 0.5))
 

@@ -79,6 +79,7 @@ class TestSession:
 class TestKept:
     @needs_data
     @pytest.mark.long
+    @pytest.mark.timeout(1800)
     def test_a_pair_of_files_gives_the_kept_figures(self, tmp_path):
         _, tracked, learnt = magnet_patch.write_sessions(FOLDER, tmp_path / 'bags')
         model = str(tmp_path / f'{learnt.stem}_full.yaml')

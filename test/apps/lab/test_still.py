@@ -26,6 +26,8 @@ from anser_ros.physics.rotations import tilted
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.settings import Accuracy
 
+pytestmark = pytest.mark.timeout(1800)  # half a minute of a quiet machine
+
 CENTRES = np.array([[-0.08, 0.02, 0.0], [0.09, -0.01, 0.0], [0.0, 0.1, 0.0]])
 DIRECTIONS = np.array([[0.0, 0.2, 0.98], [0.6, 0.0, 0.8], [0.0, -0.6, 0.8]])
 IRON_AM2 = np.array([[0.3, 0.1, 0.2], [-0.1, 0.3, 0.1], [0.2, 0.2, -0.2]])

@@ -1,6 +1,7 @@
 """Sessions of poses with one thing wrong: it is named, with its size, and nothing else is."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from pose_world import FRAME, SHIFT, World
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.poses import search
 from anser_ros.apps.poses.cli.pose_session import pose_verdict
 from anser_ros.apps.poses.corrector import to_document
 from anser_ros.apps.poses.diagnosis import diagnose_poses, unconfirmed
+from anser_ros.apps.poses.effect import PoseSetting, Role, effect_with
 from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
 from anser_ros.apps.poses.fit import fit_poses
 from anser_ros.apps.poses.importing import write_pose_session
@@ -295,6 +298,21 @@ def test_a_body_that_is_only_carried_tells_the_clock_where_that_leaves_nothing(s
     found = diagnose_poses(world.session())
     assert set(named(found)) == expected
     assert (found.unexplained > 0.5) == (not expected)
+
+
+@pytest.mark.parametrize(('sensors', 'expected'), [(1, 'field_distortion'), (2, 'optical_scale')])
+def test_a_scale_that_gains_much_less_than_a_bend_is_part_of_it_unless_sensors_agree(
+    sensors, expected
+):
+    setting = PoseSetting(('a',), 0.0, 1.0, np.zeros(3), 0.1)
+    (scale,) = effect_with(Role.SCALE).sites(setting)
+    bend = effect_with(Role.MAP).at(setting, 2, None)
+    state = SimpleNamespace(parts=[None] * sensors)
+    accepted = [
+        (gain, SimpleNamespace(terms=[term], state=state))
+        for gain, term in ((150.0, scale), (1000.0, bend))
+    ]
+    assert search._simplest(accepted).terms[-1].effect.name == expected
 
 
 def test_the_slow_beat_of_a_poll_is_no_rate_of_the_clock():

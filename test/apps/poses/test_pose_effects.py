@@ -1,23 +1,28 @@
 """Single parts of the diagnosis of poses, each against what it has to be by definition."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from pose_world import FRAME, SHIFT, World
+from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.cli.pose_session import sizes
-from anser_ros.apps.poses.effect import PoseSetting
+from anser_ros.apps.poses.diagnosis import depends_on
+from anser_ros.apps.poses.effect import PoseSetting, Role
 from anser_ros.apps.poses.effects.episodes import PoseMovingMetal
 from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
 from anser_ros.apps.poses.effects.frames import PoseClockRate
 from anser_ros.apps.poses.effects.stream import ReceiptJitter, power_law, stamp_step
+from anser_ros.apps.poses.fit import is_lever_determined
 from anser_ros.apps.poses.hand_eye import one_clock
 from anser_ros.apps.poses.problem import PoseNoise
-from anser_ros.apps.poses.search import with_noise
-from anser_ros.apps.poses.sequence import PoseSession, sequence_of
-from anser_ros.apps.poses.start import first_fit, pose_problem
+from anser_ros.apps.poses.search import doubt, with_noise
+from anser_ros.apps.poses.sequence import OpticalPath, PoseSession, sequence_of
+from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, started
 from anser_ros.field.model import EffectRecord
+from anser_ros.physics.pose_track import PoseTrack
 
 SETTING = PoseSetting(('sensor_0', 'sensor_1'), 0.0, 40.0, np.zeros(3), 0.06)
 
@@ -70,6 +75,22 @@ def test_poses_are_thinned_out_of_step_with_a_poll(poses_a_step):
     assert late[kept].mean() == pytest.approx(late.mean(), abs=0.03 * step)
 
 
+def test_at_rest_nothing_depends_on_speed():
+    session = World(7, sensors=1).session()
+    problem = pose_problem(session)
+    still = replace(problem, path=replace(problem.path, is_at_rest=True))
+    assert 'speed' not in depends_on(still.state(started(still, 0.0)))
+
+
+def test_a_short_motion_with_little_error_gives_no_lever_arm():
+    world = World(6, duration=12.0, sensors=1)
+    world.noise_m, slow = 5e-5, world._turn
+    world._turn = lambda time: 0.06 * slow(time)
+    problem = pose_problem(world.session())
+    fit = with_noise(first_fit(problem, coarse_offset(problem), False))
+    assert not is_lever_determined(fit.state.parts[0], 0.0).any()
+
+
 @pytest.mark.parametrize('shared', [True, False])
 def test_jitter_of_stamps_is_known_as_well_as_that_of_so_many_poses_can_be(shared):
     rng = np.random.default_rng(8)
@@ -87,6 +108,19 @@ def test_jitter_of_stamps_is_known_as_well_as_that_of_so_many_poses_can_be(share
     # A standard deviation of n values is known to its 1 / sqrt(2 n).
     known = 0.01 / np.sqrt(2 * (300 if shared else 600))
     assert record.uncertainty['rms_s'] == pytest.approx(known, rel=1e-3)
+
+
+def test_a_path_knows_the_noise_of_its_poses_at_a_point_of_the_body():
+    rng, time = np.random.default_rng(4), np.cumsum(np.full(2000, 0.03))
+    place, turn = World(5, duration=time[-1]).body(time)
+    place = place + 2e-4 * rng.normal(size=place.shape)
+    turn = Rotation.from_rotvec(2e-3 * rng.normal(size=place.shape)) * turn
+    path = OpticalPath.through(PoseTrack(time, place, turn.as_quat()))
+    lever = np.array([0.0, 0.1, 0.0])
+    # A turn about two of three axes moves the point.
+    expected = np.sqrt(2e-4**2 + (2e-3 * 0.1) ** 2 * 2 / 3)
+    assert path.jitter(np.zeros(3)) == pytest.approx(2e-4, rel=0.05)
+    assert path.jitter(lever) == pytest.approx(expected, rel=0.05)
 
 
 def test_a_map_of_one_sensor_may_shift_it_and_one_of_all_may_not():
@@ -181,6 +215,16 @@ def test_a_map_is_as_large_as_it_moves_the_poses_beside_a_rigid_motion():
     expected = 2e-3 * np.std(place[:, 0]) / SETTING.size
     assert record.parameters['rms_m'] == pytest.approx(expected, rel=0.02)
     assert 0 < record.uncertainty['rms_m'] < 2e-4
+
+
+def test_an_offset_of_all_sensors_that_is_less_than_known_is_doubted():
+    for offset, is_doubted in ((0.0, True), (0.03, False)):
+        world = World(4, duration=15.0, sensors=1)
+        world.offset = offset
+        problem = pose_problem(world.session())
+        fit = with_noise(first_fit(problem, coarse_offset(problem), False))
+        index = next(i for i, t in enumerate(fit.terms) if t.role is Role.OFFSET)
+        assert bool(doubt(fit, index)) == is_doubted
 
 
 def test_recordings_at_rest_one_after_the_other_are_compared_whole():
