@@ -94,10 +94,12 @@ def chain(ros, start, tmp_path):
 
 
 def assert_on_grid(times, period_s):
-    """A busy machine may skip windows; those that it gives are a whole number of periods apart."""
+    """A busy machine may skip windows; those that it gives are a whole number of periods apart,
+    one after the other, but where the line of the clock began anew.
+    """
     steps = np.diff(times) / period_s
     off = np.abs(steps - np.round(steps))
-    assert (steps > 0).all() and np.median(off) < 0.02, 'but where a line began anew'
+    assert ((steps > 0) | (off > 0.02)).all() and np.median(off) < 0.02, steps[steps < 0.5]
 
 
 def _set(**parameters):

@@ -15,6 +15,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from anser_ros.errors import ParameterError
+from anser_ros.nodes.live import CHAIN
 from anser_ros.nodes.runtime import process, qos
 from anser_ros.nodes.runtime.handover import DirectSubscription, HandedFlux, Handover, NewestWorker
 from anser_ros.nodes.runtime.node import AnserNode
@@ -211,18 +212,13 @@ def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
     assert tracked, live.output
 
 
-@pytest.mark.processes
-@pytest.mark.parametrize(
-    ('words', 'said'),
-    [
-        (['-r', '__node:=other'], 'one node is renamed by -r tracker:__node:=NAME'),
-        (['-p', 'nobody:=1'], 'no parameter nobody'),
-    ],
-)
-def test_what_several_nodes_cannot_be_given_is_one_line(start, words, said):
-    process = start('live', '--ros-args', *words)
-    assert process.wait() == 2
-    assert said in process.output and 'Traceback' not in process.output
+def test_what_several_nodes_cannot_be_given_is_one_line(start, capsys):
+    assert process.main(CHAIN, ['live', '--ros-args', '-r', '__node:=other'], name='live') == 2
+    said = 'live: one node is renamed by -r tracker:__node:=NAME\n'
+    assert capsys.readouterr().err == said
+    live = start('live', '--ros-args', '-p', 'nobody:=1')
+    assert live.wait() == 2
+    assert 'no parameter nobody' in live.output and 'Traceback' not in live.output
 
 
 @pytest.mark.parametrize('is_noticed', [True, False])
