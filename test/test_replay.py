@@ -174,8 +174,8 @@ def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, play, tmp_path
 
 def test_loop_in_another_namespace_ends_at_a_signal(start, listener, tmp_path):
     bag = make_session(tmp_path / 'a.mcap', 10)
-    command = ('replay', bag, '--loop', '--rate', '5', '--ros-args', '-r', '__ns:=/other')
-    process = start(*command)
+    words = ['--loop', '--rate', '5', '--wait', '0.1', '--ros-args', '-r', '__ns:=/other']
+    process = start('replay', bag, *words)
     assert listener.run(lambda: len(listener.stamps) > 25), process.output
     assert process.interrupt(signal.SIGINT) == 0
     said = r'published the bag (\d+) times, and (\d+) of 21 messages once more'

@@ -250,7 +250,7 @@ def test_over_dds_on_a_session_that_this_package_did_not_make(ros, start, shared
         'watcher', '--ros-args', '-p', f'model_file:={effects_model}',
         '-p', f'baseline_file:={folder / "factory.mcap"}', '-p', 'cpu_share:=1.0',
     )  # fmt: skip
-    start('replay', folder / 's02.mcap', '--rate', '4', '--loop', '--wait', '4')
+    start('replay', folder / 's02.mcap', '--rate', '4', '--loop', '--wait', '0.2')
     title = 'anser/watcher: sensor_gain (channel 0)'
     raised = spin_until(node, lambda: lines.get(title, (0,))[0] == 1)
     assert raised, f'{lines}\n{watcher.output}'
