@@ -307,6 +307,38 @@ def spin_until(node: Any, condition: Callable[[], Any]) -> bool:
     return wait(condition, lambda: rclpy.spin_once(node, timeout_sec=0.05))
 
 
+def ask(node: Any, kind: Any, name: str, **values: Any) -> Any:
+    """Call a service of a type; return its reply."""
+    import rclpy
+
+    client = node.create_client(kind, name)
+    assert client.wait_for_service(PATIENCE_S)
+    for _ in range(3):  # a reply is lost while the server does not know of its reader yet
+        future = client.call_async(kind.Request(**values))
+        if wait(future.done, lambda: rclpy.spin_once(node, timeout_sec=0.05), 20.0):
+            break
+    assert future.done()
+    return future.result()
+
+
+def diagnostics(node: Any) -> dict[str, tuple[int, str, dict[str, str]]]:
+    """Return the last level, message and values that each name has in ``/diagnostics``.
+
+    The dictionary is filled while the node spins.
+    """
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    lines: dict[str, tuple[int, str, dict[str, str]]] = {}
+
+    def take(message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {item.key: item.value for item in status.values}
+            lines[status.name] = status.level[0], status.message, values
+
+    node.create_subscription(DiagnosticArray, '/diagnostics', take, 100)
+    return lines
+
+
 def needs(*parts: str) -> pytest.MarkDecorator:
     """Let a test be skipped where a folder of the shared data is not there."""
     folder = SHARED.joinpath(*parts)

@@ -6,8 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import spin_until, wait
-from diagnostic_msgs.msg import DiagnosticArray
+from conftest import ask, diagnostics, spin_until
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -33,10 +32,12 @@ LASTING_S = {'unplug': 2.0, 'wrong_baud': 5.0}
 """From these faults on the period is longer, s: they last for half of it at most."""
 
 
-def hello(numbers=NUMBERS, tones=SETUP.frequencies_hz):
+def new_stream(numbers=NUMBERS, tones=SETUP.frequencies_hz):
+    """Return the stream of a unit that says hello with these channels and tones."""
     channels = [Channel(n, ChannelKind.SENSE, 5.0) for n in numbers]
     current = Channel(99, ChannelKind.CURRENT, 2.5)
-    return Hello('t', 40e3, 1e6, 40, (*channels, current), tones, (0.25,) * len(tones))
+    hello = Hello('t', 40e3, 1e6, 40, (*channels, current), tones, (0.25,) * len(tones))
+    return FluxStream(hello, SETUP, CHANNELS, *OPTIONS)
 
 
 class Listener:
@@ -45,40 +46,25 @@ class Listener:
     def __init__(self, ros, namespace='/anser'):
         self.node = ros.create_node('listener')
         self.tool, self.reference, self.setups, self.optical = [], [], [], []
-        self.states, self.seen = {}, set()
+        self.states = diagnostics(self.node)
         subscribe = self.node.create_subscription
         subscribe(PointCloud2, f'{namespace}/tool/flux', self._on_tool, qos.STREAM)
         subscribe(PointCloud2, f'{namespace}/reference/flux', self.reference.append, qos.STREAM)
         subscribe(String, f'{namespace}/setup', self.setups.append, qos.LATCHED)
-        subscribe(DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.EVENTS)
         subscribe(PoseStamped, '/optical/tool_a/pose', self.optical.append, qos.STREAM)
 
     def _on_tool(self, message):
         self.tool.append((message, time.time()))
-
-    def _on_diagnostics(self, message):
-        for status in message.status:
-            values = {pair.key: pair.value for pair in status.values}
-            self.states[status.name] = (status.level, status.message, values)
-            self.seen.add(f'{status.name}: {status.message}')
 
     def until(self, condition):
         assert spin_until(self.node, condition), self.states.get('anser/acquisition')
 
     def set(self, name, parameter, value):
         """Change a live parameter of a node."""
-        import rclpy
-
-        client = self.node.create_client(SetParameters, f'/anser/{name}/set_parameters')
-        assert client.wait_for_service(10)
-        request = SetParameters.Request()
-        request.parameters = [Parameter(parameter, value=value).to_parameter_msg()]
-        for _ in range(3):  # a reply is lost while the server does not know of its reader yet
-            future = client.call_async(request)
-            if wait(future.done, lambda: rclpy.spin_once(self.node, timeout_sec=0.05), 20.0):
-                break
-        assert future.done()
-        assert future.result().results[0].successful, future.result().results[0].reason
+        changed = [Parameter(parameter, value=value).to_parameter_msg()]
+        service = f'/anser/{name}/set_parameters'
+        (result,) = ask(self.node, SetParameters, service, parameters=changed).results
+        assert result.successful, result.reason
 
     def value(self, key, node='anser/acquisition'):
         return float(self.states.get(node, (0, '', {}))[2].get(key, 'nan'))
@@ -108,10 +94,12 @@ def chain(ros, start, tmp_path):
 
 
 def assert_on_grid(times, period_s):
-    """A busy machine may skip windows; those that it gives are a whole number of periods apart."""
+    """A busy machine may skip windows; those that it gives are a whole number of periods apart,
+    one after the other, but where the line of the clock began anew.
+    """
     steps = np.diff(times) / period_s
     off = np.abs(steps - np.round(steps))
-    assert (steps > 0).all() and np.median(off) < 0.02, 'but where a line began anew'
+    assert ((steps > 0) | (off > 0.02)).all() and np.median(off) < 0.02, steps[steps < 0.5]
 
 
 def _set(**parameters):
@@ -147,7 +135,7 @@ def test_fluxes_arrive_with_layout_stamps_and_health(chain):
     assert 1e-11 < told.extra['flux_noise_t'] < 3e-10
     listener.until(lambda: 'anser/acquisition: emitter coil7' in listener.states)
     level, message, values = listener.states['anser/acquisition: emitter coil3']
-    assert (level, message) == (b'\x00', 'driven')
+    assert (level, message) == (0, 'driven')
     assert float(values['current_a']) == pytest.approx(0.25, rel=0.03)
     assert 1e-11 < float(values['flux_noise_t']) < 3e-10
     assert 'anser/acquisition: ref/15/1' in listener.states
@@ -174,14 +162,14 @@ def test_every_fault_is_survived_counted_and_named(chain):
         return said is not None and re.search(words, said[1]) and said[0] >= level
 
     for fault, words, level, counter in (
-        ('bad_crc', r'\d \(records with a wrong CRC\)', b'\x01', 'bad_crc'),
-        ('gap', r'\d \(blocks missing in the stream\)', b'\x01', 'gap_blocks'),
-        ('garbage', r'\d \(bytes of garbage\)', b'\x01', 'skipped_bytes'),
-        ('saturation', 'saturated: tool_a/0/x', b'\x01', None),
-        ('overrun', 'control unit: overrun, ', b'\x01', 'device_dropped_blocks'),
-        ('unplug', r'unplug \d+ \(cable pulled out\)', b'\x02', 'unplug'),
-        ('wrong_baud', r'wrong baud rate\?', b'\x02', 'wrong_baud'),
-        ('silence', r'silence \d+ \(nothing arrived\)', b'\x02', 'silence'),
+        ('bad_crc', r'\d \(records with a wrong CRC\)', 1, 'bad_crc'),
+        ('gap', r'\d \(blocks missing in the stream\)', 1, 'gap_blocks'),
+        ('garbage', r'\d \(bytes of garbage\)', 1, 'skipped_bytes'),
+        ('saturation', 'saturated: tool_a/0/x', 1, None),
+        ('overrun', 'control unit: overrun, ', 1, 'device_dropped_blocks'),
+        ('unplug', r'unplug \d+ \(cable pulled out\)', 2, 'unplug'),
+        ('wrong_baud', r'wrong baud rate\?', 2, 'wrong_baud'),
+        ('silence', r'silence \d+ \(nothing arrived\)', 2, 'silence'),
     ):
         if fault in LASTING_S:
             listener.set('cu_simulator', 'fault_period_s', LASTING_S[fault])
@@ -202,7 +190,7 @@ def test_a_port_that_is_not_there_and_a_setup_that_is_none(start, tmp_path, ros)
     start('acquisition', '--ros-args', *_set(device=tmp_path / 'absent'))
     listener.until(lambda: listener.value('open_failures') >= 2)
     level, words, _ = listener.states['anser/acquisition']
-    assert level == b'\x02'
+    assert level == 2
     absent = tmp_path / 'absent'
     assert words == f'no port: cannot open {absent}: No such file or directory'
     broken = tmp_path / 'broken.yaml'
@@ -218,6 +206,11 @@ class TestStream:
     def codes(self, seed=0, samples=40, columns=42):
         rng = np.random.default_rng(seed)
         return rng.integers(-500, 500, (samples, columns)).astype(np.int16)
+
+    def push(self, stream, k, late_ms=0.0, **options):
+        """Push the block that began after k ms; it comes at its end, or later."""
+        block = SampleBlock(k, 1000 * k, self.codes(k))
+        return stream.push(block, 10**12 + round(10**6 * (k + 1 + late_ms)), **options)
 
     def frames(self, stream, blocks, edit=lambda codes: None, skip=(), ticks=lambda k: 1000 * k):
         """Frames of blocks of 1 ms, after a start that was answered at once."""
@@ -235,7 +228,7 @@ class TestStream:
             codes[5, 2] = 32767
             codes[:, 4] = 17
 
-        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
+        stream = new_stream()
         first, second = self.frames(stream, 40, edit, skip={25})
         assert first.tool.flags.tolist() == [0, 0, SATURATED, 0, STALE, 0, 0, 0, 0]
         assert (second.flags & DROPPED).all()
@@ -251,7 +244,7 @@ class TestStream:
             k = next(blocks)
             codes[:, column] = self.codes(k if k < 40 else 10 + (k - 40) % 30)[:, column]
 
-        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
+        stream = new_stream()
         frames = self.frames(stream, 100, edit)
         stale = np.array([frame.flags & STALE > 0 for frame in frames])
         rows = slice(None) if column == 41 else [column]
@@ -261,7 +254,7 @@ class TestStream:
         assert not frames[-1].repeats
 
     def test_a_unit_that_repeats_itself_moves_no_clock(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
+        stream = new_stream()
         stream.restart(10**12)
         frames = []
         for k in range(400):
@@ -286,7 +279,7 @@ class TestStream:
         ],
     )
     def test_ticks_move_no_stamps(self, ticks, words):
-        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
+        stream = new_stream()
         frames = self.frames(stream, 200, ticks=ticks)
         assert len(frames) == 10
         times = np.array([frame.host_ns for frame in frames]) - 10**12
@@ -295,42 +288,31 @@ class TestStream:
         assert stream.ticks.disagreements == bool(words)
 
     def test_a_late_window_waits_and_is_withheld(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
+        """While one waits it is looked after with every block."""
+        stream = new_stream()
         assert len(self.frames(stream, 100)) == 5
-
-        def push(k, late_ms):
-            block = SampleBlock(k, 1000 * k, self.codes(k))
-            return stream.push(block, 10**12 + 10**6 * (k + 1 + late_ms))
-
-        assert not any(push(k, 50) for k in range(100, 120))
-        (frame,) = push(120, 0)
+        assert stream.blocks_wanted == 20
+        assert not any(self.push(stream, k, 50) for k in range(100, 120))
+        assert stream.waiting and stream.blocks_wanted == 1
+        (frame,) = self.push(stream, 120)
         assert frame.host_ns == pytest.approx(10**12 + 110 * 10**6, abs=10**5)
-        assert not any(push(k, 900) for k in range(121, 1000))
+        assert not any(self.push(stream, k, 900) for k in range(121, 1000))
         assert stream.waiting.withheld > 20 and stream.clock.wants_answer
 
     def test_windows_that_are_skipped_are_counted_and_cost_no_later_one(self):
         """A too slow computer takes the newest; what it passes over is not demodulated."""
-        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
+        stream = new_stream()
         stream.restart(10**12)
         frames = []
         for k in range(100):
-            block = SampleBlock(k, 1000 * k, self.codes(k))
-            frames += stream.push(block, 10**12 + 10**6 * (k + 1), skips=20 <= k < 80)
+            frames += self.push(stream, k, skips=20 <= k < 80)
         assert [frame.host_ns for frame in frames] == pytest.approx(
             [10**12 + 10 * 10**6, 10**12 + 90 * 10**6], abs=10**5
         )
         assert (stream.counters.windows, stream.counters.windows_skipped) == (2, 3)
 
-    def test_a_frame_that_waits_is_looked_after_with_every_block(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
-        self.frames(stream, 100)
-        assert stream.blocks_wanted == 20
-        for k in range(100, 120):
-            stream.push(SampleBlock(k, 1000 * k, self.codes(k)), 10**12 + 10**6 * (k + 51))
-        assert stream.waiting and stream.blocks_wanted == 1
-
     def test_a_restarted_stream_has_new_stamps(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
+        stream = new_stream()
         assert len(self.frames(stream, 110)) == 5
         frames = []
         for k in range(40):
@@ -341,30 +323,32 @@ class TestStream:
         (frame, _) = stream.push(SampleBlock(40, 47_000, self.codes(540)), 2 * 10**12 + 41 * 10**6)
         assert frame.host_ns == pytest.approx(2 * 10**12 + 10**7, abs=10**5)
 
-    def test_missing_channels_are_named(self):
-        stream = FluxStream(hello(NUMBERS[:-3]), SETUP, CHANNELS, *OPTIONS)
+    def test_what_does_not_fit_the_setup_is_named_left_alone_or_refused(self):
+        stream = new_stream(NUMBERS[:-3])
         assert [s.name for s in stream.missing] == ['ref/14/1', 'ref/15/0', 'ref/15/1']
         assert len(stream.sensors) == 38
-
-    def test_blocks_of_another_width_are_left_alone(self):
-        stream = FluxStream(hello(), SETUP, CHANNELS, *OPTIONS)
         assert stream.push(SampleBlock(0, 0, self.codes(columns=5)), 1) == []
-
-    def test_refusals(self):
         with pytest.raises(SetupError, match='none of the channels'):
-            FluxStream(hello([500]), SETUP, CHANNELS, *OPTIONS)
+            new_stream([500])
         with pytest.raises(SetupError, match='drives 2 coils'):
-            FluxStream(hello(tones=(6000.0, 7000.0)), SETUP, CHANNELS, *OPTIONS)
+            new_stream(tones=(6000.0, 7000.0))
 
 
-def test_pseudo_port_leaves_foreign_files_alone(tmp_path):
-    taken = tmp_path / 'file'
+def test_pseudo_port_leaves_what_is_not_its_own_alone(tmp_path):
+    taken, link = tmp_path / 'file', tmp_path / 'cu'
     taken.write_text('mine')
-    with pytest.raises(PortError, match='is not a link'):
-        PseudoPort(taken)
-    with pytest.raises(PortError, match='cannot make the link'):
-        PseudoPort(tmp_path / 'no' / 'folder')
-    assert taken.read_text() == 'mine'
+    port = PseudoPort(link)
+    terminal = os.readlink(link)
+    for path, said in (
+        (taken, 'is not a link'),
+        (tmp_path / 'no' / 'folder', 'cannot make the link'),
+        (link, 'another simulated control unit'),
+    ):
+        with pytest.raises(PortError, match=said):
+            PseudoPort(path)
+    assert taken.read_text() == 'mine' and os.readlink(link) == terminal
+    port.close()
+    PseudoPort(link).close()
 
 
 def test_pseudo_port_drops_what_nobody_reads_and_removes_only_its_own_link(tmp_path):
@@ -381,17 +365,6 @@ def test_pseudo_port_drops_what_nobody_reads_and_removes_only_its_own_link(tmp_p
     assert os.readlink(link) != '/dev/null'
     port.close()
     assert not link.is_symlink()
-
-
-def test_pseudo_port_is_not_taken_from_another_one_that_runs(tmp_path):
-    link = tmp_path / 'cu'
-    port = PseudoPort(link)
-    terminal = os.readlink(link)
-    with pytest.raises(PortError, match='another simulated control unit'):
-        PseudoPort(link)
-    assert os.readlink(link) == terminal
-    port.close()
-    PseudoPort(link).close()
 
 
 def test_faults_damage_what_they_say():

@@ -54,6 +54,18 @@ def decode(pieces):
     return [record.payload for record in FrameReader().feed(b''.join(p.data for p in pieces))]
 
 
+def streamed(unit, samples):
+    """Start a unit; return its bytes over so many samples."""
+    unit.receive(encode(Start()))
+    return b''.join(piece.data for piece in unit.advance(samples))
+
+
+def codes_of(unit, samples):
+    """Start a unit; return the codes of so many samples, shape (samples, columns)."""
+    payloads = [record.payload for record in FrameReader().feed(streamed(unit, samples))]
+    return np.concatenate([p.codes for p in payloads if isinstance(p, SampleBlock)])
+
+
 def fluxes(unit, seconds=0.1, window=800):
     """Fluxes (windows, S, K), their sigmas and the mid times, as acquisition makes them."""
     unit.receive(encode(Start()))
@@ -139,37 +151,35 @@ class TestProtocol:
 
 
 class TestSignals:
+    def errors(self, *front_end):
+        """Fluxes less the true ones in units of their sigma, and the sigmas."""
+        got, sigma, times = fluxes(ControlUnit(world(), CHANNELS, *front_end), 0.2)
+        return np.abs(got - [world().flux(t) for t in times]) / sigma, sigma
+
     def test_flux_comes_back_as_it_went_in(self):
-        truth = world()
-        got, sigma, times = fluxes(ControlUnit(truth, CHANNELS), 0.2)
-        expected = np.array([truth.flux(t) for t in times])
-        ratio = np.abs(got - expected) / sigma
-        assert len(got) == 10
+        ratio, sigma = self.errors()
+        assert len(ratio) == 10
         assert np.sqrt((ratio**2).mean() / 2) == pytest.approx(1.0, abs=0.1)
         assert 20e-12 < np.median(sigma) < 200e-12
 
+    def test_drifting_currents_move_no_flux(self):
+        ratio, _ = self.errors(FrontEnd(current_drift=0.3, warm_up_s=0.5))
+        assert ratio.max() < 7
+
     def test_converter_clips(self):
-        unit = ControlUnit(world(), CHANNELS, FrontEnd(full_scale_v=0.02))
-        unit.receive(encode(Start()))
-        blocks = [p for p in decode(unit.advance(400)) if isinstance(p, SampleBlock)]
-        codes = np.concatenate([b.codes for b in blocks])
+        codes = codes_of(ControlUnit(world(), CHANNELS, FrontEnd(full_scale_v=0.02)), 400)
         assert codes.min() == -32768 and codes.max() == 32767
 
     def test_same_seed_same_bytes(self):
-        streams = []
-        for _ in range(2):
-            unit = ControlUnit(world(metal=[steel_disc()]), CHANNELS, seed=3)
-            unit.receive(encode(Start()))
-            streams.append(b''.join(p.data for p in unit.advance(200)))
-        assert streams[0] == streams[1]
+        units = [ControlUnit(world(metal=[steel_disc()]), CHANNELS, seed=3) for _ in range(2)]
+        first, second = (streamed(unit, 200) for unit in units)
+        assert first == second
 
 
 class TestEffects:
     def codes(self, *effects):
         unit = ControlUnit(world(), CHANNELS, FrontEnd(noise_codes=0.0), effects=effects)
-        unit.receive(encode(Start()))
-        blocks = [p for p in decode(unit.advance(4000)) if isinstance(p, SampleBlock)]
-        return np.concatenate([b.codes for b in blocks]).astype(float)
+        return codes_of(unit, 4000).astype(float)
 
     def test_crosstalk(self):
         clean = self.codes()
@@ -248,8 +258,7 @@ class TestDraw:
             ControlUnit(world(), CHANNELS, quiet),
         ):
             unit.advance(40_000)
-            unit.receive(encode(Start()))
-            streams.append(b''.join(piece.data for piece in unit.advance(4000)))
+            streams.append(streamed(unit, 4000))
         optical = [effect.optical_time(10.0) for effect in drawn.effects]
         assert (streams[0] != streams[1]) or optical != [10.0] * len(optical)
 

@@ -7,8 +7,7 @@ from dataclasses import make_dataclass
 
 import numpy as np
 import pytest
-from conftest import PATIENCE_S, skip_if_too_slow, spin_until
-from diagnostic_msgs.msg import DiagnosticArray
+from conftest import PATIENCE_S, ask, diagnostics, skip_if_too_slow, spin_until
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import PointCloud2
@@ -16,6 +15,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from anser_ros.errors import ParameterError
+from anser_ros.nodes.live import CHAIN
 from anser_ros.nodes.runtime import process, qos
 from anser_ros.nodes.runtime.handover import DirectSubscription, HandedFlux, Handover, NewestWorker
 from anser_ros.nodes.runtime.node import AnserNode
@@ -187,13 +187,9 @@ def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros)
 
 
 def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
-    link, node, poses, levels = tmp_path / 'cu', ros.create_node('peer'), [], {}
-
-    def note(message):
-        levels.update({status.name: status.message for status in message.status})
-
+    link, node, poses = tmp_path / 'cu', ros.create_node('peer'), []
+    lines = diagnostics(node)
     node.create_subscription(PoseStamped, '/x/tool_a/pose', poses.append, 50)
-    node.create_subscription(DiagnosticArray, '/diagnostics', note, 50)
     start('cu_simulator', '--ros-args', '-p', f'link:={link}', '-p', 'sample_rate_hz:=20e3')
     words = ['-r', '__ns:=/x', '-r', 'tracker:__node:=guide', '-p', f'device:={link}']
     words += ['-p', 'tracker:gate:=4.0', '-p', 'allow_uncalibrated:=true']
@@ -205,15 +201,10 @@ def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
 
     assert spin_until(node, lambda: wanted <= names()), live.output
     # Each speaks once a second, and in a pause between two frames.
-    assert spin_until(node, lambda: {'x/acquisition', 'x/field_model', 'x/guide'} <= set(levels))
-    client = node.create_client(GetParameters, '/x/guide/get_parameters')
-    assert client.wait_for_service(10)
-    future = client.call_async(GetParameters.Request(names=['gate']))
-    assert spin_until(node, future.done) and future.result().values[0].double_value == 4.0
-    freeze = node.create_client(SetBool, '/x/field_model/freeze')
-    assert freeze.wait_for_service(10)
-    future = freeze.call_async(SetBool.Request(data=True))
-    assert spin_until(node, future.done) and future.result().success
+    assert spin_until(node, lambda: {'x/acquisition', 'x/field_model', 'x/guide'} <= set(lines))
+    reply = ask(node, GetParameters, '/x/guide/get_parameters', names=['gate'])
+    assert reply.values[0].double_value == 4.0
+    assert ask(node, SetBool, '/x/field_model/freeze', data=True).success
     tracked = spin_until(node, lambda: len(poses) > 50)
     assert live.interrupt() == 0, live.output
     if not tracked:
@@ -221,18 +212,13 @@ def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
     assert tracked, live.output
 
 
-@pytest.mark.processes
-@pytest.mark.parametrize(
-    ('words', 'said'),
-    [
-        (['-r', '__node:=other'], 'one node is renamed by -r tracker:__node:=NAME'),
-        (['-p', 'nobody:=1'], 'no parameter nobody'),
-    ],
-)
-def test_what_several_nodes_cannot_be_given_is_one_line(start, words, said):
-    process = start('live', '--ros-args', *words)
-    assert process.wait() == 2
-    assert said in process.output and 'Traceback' not in process.output
+def test_what_several_nodes_cannot_be_given_is_one_line(start, capsys):
+    assert process.main(CHAIN, ['live', '--ros-args', '-r', '__node:=other'], name='live') == 2
+    said = 'live: one node is renamed by -r tracker:__node:=NAME\n'
+    assert capsys.readouterr().err == said
+    live = start('live', '--ros-args', '-p', 'nobody:=1')
+    assert live.wait() == 2
+    assert 'no parameter nobody' in live.output and 'Traceback' not in live.output
 
 
 @pytest.mark.parametrize('is_noticed', [True, False])

@@ -171,8 +171,10 @@ def test_why_a_port_does_not_open_is_one_short_line(device, why):
         assert port.reason == f'cannot open {device}: {why}'
 
 
-def test_a_port_in_use_says_so(wire, port):
+def test_a_port_is_opened_and_started_once(wire, port):
     assert wait(lambda: port.counters.opens == 1)
+    with pytest.raises(PortError, match='started before'):
+        port.start()
     with started(port.device) as other:
         assert wait(lambda: other.counters.open_failures > 0)
         assert other.reason == f'cannot open {port.device}: another program uses it'
@@ -182,6 +184,9 @@ def test_unplugged_cable_is_counted_and_the_port_comes_back(wire, port):
     wire.write(encode(HELLO))
     assert receive(port, 1) == [HELLO]
     wire.unplug()
+    ended = []
+    wait(lambda: ended.append(port.get(0.1)) or (ended[-1] and not ended[-1].connected))
+    assert not ended[-1].connected, 'who receives hears of it'
     assert wait(lambda: port.state is PortState.ABSENT)
     assert port.counters.unplug == 1
     assert wait(lambda: port.counters.open_failures > 1)
@@ -242,11 +247,6 @@ def test_receiver_is_woken_for_as_many_blocks_as_it_wants(wire, port):
     assert len(receive(port, 2)) == 2, 'a hello waits for nothing'
 
 
-def test_port_can_be_started_once(port):
-    with pytest.raises(PortError, match='started before'):
-        port.start()
-
-
 def test_the_right_port_is_found_by_listening_only(wire, tmp_path):
     other = Wire(tmp_path / 'gps')
     try:
@@ -300,20 +300,18 @@ def test_control_asks_for_hello_then_tones_then_samples():
     assert control.due(now + 3 * SECOND) == Identify()
 
 
-def test_control_keeps_a_refusal_and_does_not_insist():
-    control = StreamControl((6000.0,))
-    control.take(Record(HELLO), 0)
-    assert control.due(SECOND) == SetFrequencies((6000.0,))
-    control.take(Record(Reply(0x84, ReplyCode.BAD_ARGUMENT, 'two coils')), SECOND)
-    assert 'two coils' in control.refusal
-    assert control.due(3 * SECOND) is None
-
-
-def test_control_that_may_not_set_tones_says_what_differs():
-    control = StreamControl((6000.0, 7000.0), set_frequencies=False)
-    control.take(Record(HELLO), 0)
-    assert control.due(SECOND) is None
-    assert '6170' in control.refusal and '7000' in control.refusal
+def test_control_keeps_a_refusal_and_says_what_differs():
+    for may_set, asked, words in (
+        (True, SetFrequencies((6000.0,)), ['two coils']),
+        (False, None, ['6170', '6000']),
+    ):
+        control = StreamControl((6000.0,), set_frequencies=may_set)
+        control.take(Record(HELLO), 0)
+        assert control.due(SECOND) == asked
+        if may_set:
+            control.take(Record(Reply(0x84, ReplyCode.BAD_ARGUMENT, 'two coils')), SECOND)
+        assert all(word in control.refusal for word in words)
+        assert control.due(3 * SECOND) is None, 'it does not insist'
 
 
 def test_control_asks_again_after_a_hello_that_contradicts_a_good_one():

@@ -8,8 +8,7 @@ import time
 
 import pytest
 import yaml
-from conftest import spin_until, wait
-from diagnostic_msgs.msg import DiagnosticArray
+from conftest import ask, diagnostics, spin_until, wait
 from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -57,27 +56,16 @@ def begin(start, source, tmp_path, *options):
     return process
 
 
-def values_of(message):
-    return {pair.key: pair.value for status in message.status for pair in status.values}
-
-
 def call(node, name):
-    client = node.create_client(Trigger, name)
-    assert client.wait_for_service(10)
-    future = client.call_async(Trigger.Request())
-    assert spin_until(node, future.done)
-    return future.result()
+    return ask(node, Trigger, name)
 
 
 def test_a_bag_is_complete_and_described(start, source, tmp_path):
     """With the poses of another tracker in it, and without the error of a model."""
-    told = {}
+    lines = diagnostics(source)
     for topic in ('field_model', 'field_model_error'):
         source.create_publisher(String, f'/anser/{topic}', 10)
     source.create_publisher(PoseStamped, '/tracked/tip/pose', 10)
-    source.create_subscription(
-        DiagnosticArray, '/diagnostics', lambda m: told.update(values_of(m)), qos_profile=10
-    )
     process = begin(start, source, tmp_path)
     for topic in ('/tracked/tip/pose', '/anser/field_model'):
         assert spin_until(source, lambda topic=topic: source.count_subscribers(topic) == 1)
@@ -88,7 +76,8 @@ def test_a_bag_is_complete_and_described(start, source, tmp_path):
     source.sent += 30
     source.send()
     # The poses, the latched setup and a diagnostic message.
-    assert spin_until(source, lambda: int(told.get('messages', 0)) > 52)
+    name, nothing = 'anser/recorder', (0, '', {})
+    assert spin_until(source, lambda: int(lines.get(name, nothing)[2].get('messages', 0)) > 52)
     assert process.interrupt(signal.SIGTERM) == 0
     assert '/optical/tool_a/pose 1 gaps up to 0.31 s' in process.output
     bag = tmp_path / 'bag' / 'bag_0.mcap'
@@ -170,20 +159,15 @@ def test_services_start_and_stop_and_no_bag_is_written_over(start, source, tmp_p
 def test_a_full_disk_ends_only_the_recording(start, source, small_disk):
     import rclpy
 
-    errors = []
-
-    def listen(message):
-        errors.extend(s.message for s in message.status if s.level == b'\x02')
-
-    source.create_subscription(DiagnosticArray, '/diagnostics', listen, 10)
+    lines = diagnostics(source)
     process = begin(start, source, small_disk)
 
     def fill():
         source.send(os.urandom(40_000).hex())  # that much noise can't be compressed away
         rclpy.spin_once(source, timeout_sec=0.01)
 
-    wait(lambda: errors, fill)
-    assert errors[0] == 'recording stopped: No space left on device'
+    stopped = 'recording stopped: No space left on device'
+    assert wait(lambda: (2, stopped) in [line[:2] for line in lines.values()], fill), lines
     assert process.popen.poll() is None
     answer = call(source, '/anser/recorder/stop')
     assert not answer.success

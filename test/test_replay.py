@@ -21,6 +21,7 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError
 from anser_ros.nodes import replay
 from anser_ros.nodes.replay import name_played
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams import readiness
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage, iter_messages
@@ -173,8 +174,8 @@ def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, play, tmp_path
 
 def test_loop_in_another_namespace_ends_at_a_signal(start, listener, tmp_path):
     bag = make_session(tmp_path / 'a.mcap', 10)
-    command = ('replay', bag, '--loop', '--rate', '5', '--ros-args', '-r', '__ns:=/other')
-    process = start(*command)
+    words = ['--loop', '--rate', '5', '--wait', '0.1', '--ros-args', '-r', '__ns:=/other']
+    process = start('replay', bag, *words)
     assert listener.run(lambda: len(listener.stamps) > 25), process.output
     assert process.interrupt(signal.SIGINT) == 0
     said = r'published the bag (\d+) times, and (\d+) of 21 messages once more'
@@ -226,17 +227,18 @@ def test_what_does_not_decode_is_left_out(play, listener, tmp_path, capfd):
     assert len(listener.stamps) == 2
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'said'),
-    [
-        (['pyproject.toml'], 'not an MCAP file'),
+def test_bad_usage_is_one_clear_line(start, capsys):
+    for words, said in (
         (['nowhere.mcap', '--rate', 'fast'], "invalid float value: 'fast'"),
-    ],
-)
-def test_bad_usage_is_one_clear_line(start, arguments, said):
-    process = start('replay', *arguments)
+        ([], 'arguments are required: bag'),
+    ):
+        with pytest.raises(SystemExit, match='2'):
+            main(replay.Replay, ['replay', *words])
+        found = capsys.readouterr().err
+        assert said in found and found.count('\n') == 1
+    process = start('replay', 'pyproject.toml')
     assert process.wait() == 2
-    assert said in process.output and 'Traceback' not in process.output
+    assert 'not an MCAP file' in process.output and 'Traceback' not in process.output
 
 
 def test_what_cannot_be_played_is_refused(ros, tmp_path):

@@ -153,12 +153,10 @@ class Sampler:
 
     def current(self, time_s: float) -> ComplexArray:
         """Return the true complex currents of the coils at a time, shape (K,), A."""
-        driven_s = time_s - self._start_s
-        warm = 1 - np.exp(-driven_s / self._front_end.warm_up_s)
-        current = self._nominal_a * (1 - self._front_end.current_drift * warm) * self._start
-        for effect in self._effects:
-            current = effect.current(driven_s, current)
-        return np.asarray(current)
+        warm = 1 - np.exp((self._start_s - time_s) / self._front_end.warm_up_s)
+        return np.asarray(
+            self._nominal_a * (1 - self._front_end.current_drift * warm) * self._start
+        )
 
     def _convert(self, volts: Array, current: Array) -> NDArray[np.int16]:
         front = self._front_end

@@ -37,10 +37,6 @@ class RawEffect:
         """Return the fluxes (S, K), T at nominal current, in the order of the setup's sensors."""
         return flux
 
-    def current(self, time_s: float, current: ComplexArray) -> ComplexArray:
-        """Return the coil currents (K,), A, for the field and for the current channel alike."""
-        return current
-
     def volts(self, time_s: Array, volts: Array) -> Array:
         """Return the voltages (n, S), V, at n sampling instants before noise and converter."""
         return volts

@@ -4,8 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from conftest import REPO, spin_until
-from diagnostic_msgs.msg import DiagnosticArray
+from conftest import REPO, diagnostics, spin_until
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 
@@ -14,7 +13,6 @@ from anser_ros.apps.dashboard.nodes.watcher import Watcher, WatcherParameters
 from anser_ros.apps.dashboard.watch import LIVE, OPTICAL, RIGID, SlidingWindow, Watch
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
-from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.parameters import stated_by
 from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.sessions.prepared import prepare
@@ -188,27 +186,10 @@ def write_changing(path, bag, rounds):
     return path
 
 
-class Heard:
-    """What the watcher says in /diagnostics: level, message and values of each of its lines."""
-
-    def __init__(self, ros):
-        self.node = ros.create_node('listener')
-        self.lines = {}
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._take, qos.EVENTS)
-
-    def _take(self, message):
-        for status in message.status:
-            if status.name.startswith('anser/watcher'):
-                values = {item.key: item.value for item in status.values}
-                self.lines[status.name] = (status.level[0], status.message, values)
-
-    def until(self, condition):
-        return spin_until(self.node, lambda: condition(self.lines))
-
-
 def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
     bag = write_changing(tmp_path / 'changing.mcap', moving, rounds=4)
-    heard = Heard(ros)
+    node = ros.create_node('listener')
+    lines = diagnostics(node)
     watcher = start(
         'watcher', '--ros-args', '-p', f'model_file:={MODEL}', '-p', 'window_s:=5.0',
         '-p', 'period_s:=0.5', '-p', 'cpu_share:=1.0',
@@ -216,24 +197,24 @@ def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
     start('replay', bag, '--rate', '2', '--loop', '--wait', '4')
     title = f'anser/watcher: sensor_gain (channel {CHANNEL})'
 
-    def is_raised(lines):
+    def is_raised():
         return lines.get(title, (0,))[0] == 1
 
-    assert heard.until(is_raised), f'{heard.lines}\n{watcher.output}'
-    _, message, values = heard.lines[title]
+    assert spin_until(node, is_raised), f'{lines}\n{watcher.output}'
+    _, message, values = lines[title]
     assert abs(float(values['gain']) - GAIN) < 2e-3 and 'gain' in message
     assert float(values['gain_sigma']) < 1e-3 and 'summary' in values
-    own = heard.lines['anser/watcher']
+    own = lines['anser/watcher']
     assert own[0] == 1 and own[1].startswith('sensor_gain (channel 4)')
     assert own[2]['compared_with'] == OPTICAL
 
-    def is_cleared(lines):
+    def is_cleared():
         return lines[title][:2] == (0, 'gone') and lines['anser/watcher'][0] == 0
 
-    assert heard.until(is_cleared), f'{heard.lines}\n{watcher.output}'
-    assert 'nothing found' in heard.lines['anser/watcher'][1]
+    assert spin_until(node, is_cleared), f'{lines}\n{watcher.output}'
+    assert 'nothing found' in lines['anser/watcher'][1]
     published = {
-        name for name, _ in heard.node.get_publisher_names_and_types_by_node('watcher', '/anser')
+        name for name, _ in node.get_publisher_names_and_types_by_node('watcher', '/anser')
     }
     assert '/diagnostics' in published
     assert published <= {'/diagnostics', '/rosout', '/parameter_events'}, 'it only speaks there'
@@ -265,17 +246,17 @@ def test_fluxes_of_another_frame_are_counted_and_not_looked_at(ros, moving):
 
 def test_over_dds_on_a_session_that_this_package_did_not_make(ros, start, shared, effects_model):
     folder = shared / 'sessions' / 'effects'
-    heard = Heard(ros)
+    node = ros.create_node('listener')
+    lines = diagnostics(node)
     watcher = start(
         'watcher', '--ros-args', '-p', f'model_file:={effects_model}',
         '-p', f'baseline_file:={folder / "factory.mcap"}', '-p', 'cpu_share:=1.0',
     )  # fmt: skip
-    start('replay', folder / 's02.mcap', '--rate', '4', '--loop', '--wait', '4')
+    start('replay', folder / 's02.mcap', '--rate', '4', '--loop', '--wait', '0.2')
     title = 'anser/watcher: sensor_gain (channel 0)'
-    assert heard.until(lambda lines: lines.get(title, (0,))[0] == 1), (
-        f'{heard.lines}\n{watcher.output}'
-    )
-    assert float(heard.lines[title][2]['gain']) == pytest.approx(0.98242, abs=1e-3)
+    raised = spin_until(node, lambda: lines.get(title, (0,))[0] == 1)
+    assert raised, f'{lines}\n{watcher.output}'
+    assert float(lines[title][2]['gain']) == pytest.approx(0.98242, abs=1e-3)
 
 
 def test_a_baseline_that_is_none_is_refused(start):

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import spin_until
-from diagnostic_msgs.msg import DiagnosticArray
+from conftest import diagnostics, spin_until
 from geometry_msgs.msg import PoseStamped
 from pose_world import World
 from rclpy.parameter import Parameter
@@ -118,14 +117,7 @@ def test_over_dds_a_late_tracker_is_named_with_no_field_model(ros):
     }  # fmt: skip
     node = Watcher(parameter_overrides=[Parameter(k, value=v) for k, v in given.items()])
     other = ros.create_node('trackers')
-    lines = {}
-
-    def heard(message):
-        for status in message.status:
-            values = {item.key: item.value for item in status.values}
-            lines[status.name] = (status.level[0], status.message, values)
-
-    other.create_subscription(DiagnosticArray, '/diagnostics', heard, qos.EVENTS)
+    lines = diagnostics(other)
     senders = {
         name: other.create_publisher(PoseStamped, topic, qos.STREAM)
         for name, topic in topics.items()
