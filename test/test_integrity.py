@@ -9,9 +9,8 @@ from tracking_world import NOISE_T, fluxes
 
 from anser_ros import pose_states as states
 from anser_ros.errors import TrackingError
-from anser_ros.frames.intake import Intake
+from anser_ros.frames.intake import Freshness, Intake
 from anser_ros.integrity.pose_checks import Continuity, MotionBounds, Place
-from anser_ros.integrity.streams import Freshness
 from anser_ros.physics.rotations import rotation_of_vector
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker

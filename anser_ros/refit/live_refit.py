@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
-from anser_ros.frames.intake import Frame, Intake
-from anser_ros.integrity.streams import Freshness
+from anser_ros.frames.intake import Frame, Freshness, Intake
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import REFERENCES_DOUBTFUL

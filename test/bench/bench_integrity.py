@@ -11,8 +11,7 @@ from unittest import mock
 import harness
 import numpy as np
 
-from anser_ros.frames.intake import Intake
-from anser_ros.integrity.streams import Freshness
+from anser_ros.frames.intake import Freshness, Intake
 from anser_ros.sessions.session import load_session
 from anser_ros.tracking import judgement
 from anser_ros.tracking.tracker import Tracker
