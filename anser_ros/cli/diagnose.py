@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from anser_ros.cli import output
+from anser_ros.cli import page as html
 from anser_ros.cli.calibrate import population_figure, population_table
 from anser_ros.cli.diagnosis_words import (
     flux_unit,
@@ -23,21 +24,6 @@ from anser_ros.cli.diagnosis_words import (
     short_ones,
     value_text,
     verdict,
-)
-from anser_ros.cli.page import (
-    AFTER,
-    BEFORE,
-    WIDE,
-    details,
-    heading,
-    legend_beside,
-    legend_under,
-    page,
-    paragraph,
-    picture,
-    spell_out,
-    table,
-    top,
 )
 from anser_ros.cli.sessions import add_session_kinds, named_kind, need_model, snapshot_notes
 from anser_ros.diagnosis.problem import Part, State, tool_parts
@@ -143,17 +129,17 @@ def time_line(before: State, after: State) -> Figure:
     figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
     # Larger below: where nothing is corrected, both lie on each other.
     for state, colour, label, size in (
-        (before, BEFORE, 'before', 6), (after, AFTER, 'after', 3),
+        (before, html.BEFORE, 'before', 6), (after, html.AFTER, 'after', 3),
     ):  # fmt: skip
         for part in tool_parts(state):
             axes.plot(part.view.time, _rms(part, 1), '.', ms=size, color=colour, label=label)
     axes.axhline(1.0, color='0.6', lw=0.8)
     axes.set(xlabel='time, s', ylabel='residual / expected')
     sizes = np.concatenate([_rms(part, 1) for one in (before, after) for part in tool_parts(one)])
-    if sizes.max() > WIDE * sizes.min():
+    if sizes.max() > html.WIDE * sizes.min():
         axes.set(yscale='log')
-        spell_out(axes.yaxis)
-    legend_beside(figure)
+        html.spell_out(axes.yaxis)
+    html.legend_beside(figure)
     return figure
 
 
@@ -183,19 +169,19 @@ def course(path: dict[str, Any], sigma: Any, state: State) -> Figure:
     time, place = np.asarray(path['time_s']), 1e3 * np.asarray(path['position_m'])
     tool = 1e3 * np.concatenate([part.view.position for part in tool_parts(state)])
     above.plot(tool[:, 0], tool[:, 1], '.', ms=3, color='0.8', label='tool')
-    above.plot(place[:, 0], place[:, 1], '.-', color=BEFORE, label='path')
-    above.plot(*place[0, :2], 'o', ms=9, mfc='none', color=BEFORE, label='start')
+    above.plot(place[:, 0], place[:, 1], '.-', color=html.BEFORE, label='path')
+    above.plot(*place[0, :2], 'o', ms=9, mfc='none', color=html.BEFORE, label='start')
     above.set(xlabel='x, mm', ylabel='y, mm', aspect='equal')
     spread = None if sigma is None else 1e3 * np.asarray(sigma).reshape(len(time), -1)
     for axis, (name, mark) in enumerate((('x', ':'), ('y', '--'), ('z', '-'))):
-        over.plot(time, place[:, axis], mark, color=BEFORE, label=name)
+        over.plot(time, place[:, axis], mark, color=html.BEFORE, label=name)
         if spread is not None:
             wide = spread[:, min(axis, spread.shape[1] - 1)]
             low, high = place[:, axis] - wide, place[:, axis] + wide
-            over.fill_between(time, low, high, color=BEFORE, alpha=0.12, lw=0)
+            over.fill_between(time, low, high, color=html.BEFORE, alpha=0.12, lw=0)
     over.set(xlabel='time, s', ylabel='position, mm')
     for panel in (above, over):
-        legend_under(panel)
+        html.legend_under(panel)
         panel.grid(alpha=0.3)
     return figure
 
@@ -204,7 +190,7 @@ def bars(before: State, after: State) -> Figure:
     """Draw the residual of every channel and of every emitter."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 3), layout='constrained')
     for offset, state, colour, label in (
-        (-0.2, before, BEFORE, 'before'), (0.2, after, AFTER, 'after'),
+        (-0.2, before, html.BEFORE, 'before'), (0.2, after, html.AFTER, 'after'),
     ):  # fmt: skip
         for panel, axis in zip(panels, ('channel', 'emitter'), strict=True):
             names, sizes = _by(state, axis)
@@ -212,7 +198,7 @@ def bars(before: State, after: State) -> Figure:
             panel.set_xticks(np.arange(len(names)), names)
             panel.set_xlabel(axis)
     panels[0].set_ylabel('residual / expected')
-    legend_beside(figure)
+    html.legend_beside(figure)
     return figure
 
 
@@ -233,25 +219,25 @@ MOST_CANDIDATES = 40
 def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, model: str) -> str:
     """Return the page of a diagnosis, and of the document that describes it, as HTML."""
     found = result.diagnosis
-    return page(
+    return html.page(
         'Diagnosis',
-        top('Diagnosis', verdict(document), session=session, model=model),
-        heading(
+        html.top('Diagnosis', verdict(document), session=session, model=model),
+        html.heading(
             'Before and after',
             'Measured on every fifth stretch of time, which was used neither to choose nor to '
             "fit. Each frame's optical jitter, which moves all channels together, is taken out "
             'of the flux residual.',
         ),
-        table(['', 'before', 'after'], held_out_rows(document)),
+        html.table(['', 'before', 'after'], held_out_rows(document)),
         effects_section(document),
         _paths(document, result),
         population_sections(found.model.effects),
-        heading('Residuals over time', 'In the pictures 1 is what noise alone would give.'),
-        picture(time_line(found.before, found.after)),
-        heading('Residuals over the volume'),
-        picture(maps(found.before, found.after)),
-        heading('Residuals by channel and emitter'),
-        picture(bars(found.before, found.after)),
+        html.heading('Residuals over time', 'In the pictures 1 is what noise alone would give.'),
+        html.picture(time_line(found.before, found.after)),
+        html.heading('Residuals over the volume'),
+        html.picture(maps(found.before, found.after)),
+        html.heading('Residuals by channel and emitter'),
+        html.picture(bars(found.before, found.after)),
         _structure(result),
         _candidates(found.search.rounds),
         _left_out(result),
@@ -261,9 +247,9 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
 def effects_section(document: dict[str, Any]) -> Iterator[str]:
     """Show the effects as a table, or a paragraph where there are none."""
     factor, unit = flux_unit(document['held_out']['flux_rms_before_t'])
-    yield heading('Effects')
+    yield html.heading('Effects')
     if not document['effects']:
-        yield paragraph(
+        yield html.paragraph(
             'No effect is named: those that explained something differed from one part of the '
             'data to the next, or left too much where they act (see Refused, below). Nothing is '
             'corrected; a wrong correction would be worse than none.'
@@ -271,7 +257,7 @@ def effects_section(document: dict[str, Any]) -> Iterator[str]:
             else 'None: the session passes every test, and nothing is corrected.'
         )
         return
-    yield table(
+    yield html.table(
         ['effect', 'what it is', 'parameters', '1 sigma', f'residual without it, {unit}',
          'explains nearly as much', 'online'],
         [
@@ -294,36 +280,36 @@ def _paths(document: dict[str, Any], result: SessionDiagnosis) -> Iterator[str]:
     for effect in document['effects']:
         for key, path in paths(effect['parameters']):
             sigma = effect['uncertainty'].get(key)
-            yield heading(f'{effect["name"]}: {key}', level=3)
+            yield html.heading(f'{effect["name"]}: {key}', level=3)
             if 'position_m' in path:
-                yield picture(course(path, sigma, result.diagnosis.after))
+                yield html.picture(course(path, sigma, result.diagnosis.after))
             columns = {**path, **({'1 sigma': sigma} if sigma is not None else {})}
             rows = [[value_text(v) for v in row] for row in zip(*columns.values(), strict=True)]
-            yield details(f'{len(rows)} points', table(list(columns), rows))
+            yield html.details(f'{len(rows)} points', html.table(list(columns), rows))
 
 
 def population_sections(records: Sequence[EffectRecord]) -> Iterator[str]:
     """Show how the sensors differ, as the model corrects it: what it had and what was found."""
     figure = population_figure(records)
     if figure is not None:
-        yield heading(
+        yield html.heading(
             'Errors of all sensors',
             'The error of each sensor with one standard deviation, as the corrected model removes '
             'it; the grey band is the spread of all sensors.',
         )
-        yield picture(figure)
-        yield details('all sensors', table(*population_table(records)))
+        yield html.picture(figure)
+        yield html.details('all sensors', html.table(*population_table(records)))
 
 
 def _structure(result: SessionDiagnosis) -> Iterator[str]:
     found = result.diagnosis
-    yield heading(
+    yield html.heading(
         'What stays unexplained',
         'Share of the residual power that follows each variable beyond chance. A trace is '
         'significant, but too small to matter.',
     )
     if found.unexplained > 0:
-        yield paragraph(strongest(found.after))
+        yield html.paragraph(strongest(found.after))
     before = {test.variable: test.share for test in found.tests_before}
     rows = []
     for test in (test for test in found.tests_after if test.variable in before):
@@ -331,14 +317,14 @@ def _structure(result: SessionDiagnosis) -> Iterator[str]:
         left = 'yes' if test.variable in found.depends_on else left
         shares = f'{before[test.variable]:.2%}', f'{test.share:.2%}'
         rows.append([test.variable, *shares, f'{test.probability:.2g}', left])
-    yield table(
+    yield html.table(
         ['residual against', 'share before', 'share after', 'probability in noise alone', 'left?'],
         rows,
     )
 
 
 def _candidates(rounds: Sequence[Sequence[Candidate]]) -> Iterator[str]:
-    yield heading(
+    yield html.heading(
         'Every candidate',
         'How much each lowers the squared residual of blocks that its fit did not use, in units '
         'of the misfit.',
@@ -356,14 +342,16 @@ def _candidates(rounds: Sequence[Sequence[Candidate]]) -> Iterator[str]:
             for one in ordered
         ]
         words = f'Round {count}: {len(candidates)} candidates, the best {len(ordered)}'
-        yield details(words, table(head, rows), is_open=count == 1)
+        yield html.details(words, html.table(head, rows), is_open=count == 1)
 
 
 def _left_out(result: SessionDiagnosis) -> Iterator[str]:
     found = result.diagnosis
     if found.refused:
-        yield heading('Refused', 'These explained something, but not reliably enough to be named.')
-        yield table(
+        yield html.heading(
+            'Refused', 'These explained something, but not reliably enough to be named.'
+        )
+        yield html.table(
             ['candidate', 'why', 'varies by', 'residual where it acts'],
             [
                 [term.label, check.reason, f'{check.variation:.0%}', f'{check.remainder:.1%}']
@@ -372,4 +360,4 @@ def _left_out(result: SessionDiagnosis) -> Iterator[str]:
         )
     if found.search.removed:
         names = ', '.join(term.label for term in found.search.removed)
-        yield paragraph(f'Explained away by others: {names}.')
+        yield html.paragraph(f'Explained away by others: {names}.')

@@ -13,19 +13,8 @@ from numpy.typing import NDArray
 
 from anser_ros import extensions
 from anser_ros.cli import output, sessions
+from anser_ros.cli import page as html
 from anser_ros.cli.commands import SESSION_KINDS
-from anser_ros.cli.page import (
-    WIDE,
-    Html,
-    heading,
-    legend_below,
-    page,
-    picture,
-    save,
-    spell_out,
-    table,
-    top,
-)
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.evaluation_files import recording_of, to_document, write_tables
@@ -69,13 +58,13 @@ def over_time(evaluation: Evaluation) -> Figure:
         lost = time[~series.ok]
         lower.plot(lost, np.full(lost.size, rank), '|', color=colour)
     upper.set(ylabel='position error, mm', yscale='log')
-    spell_out(upper.yaxis)
+    html.spell_out(upper.yaxis)
     lower.set(xlabel='time, s', ylabel='no pose', ylim=(-0.8, len(found) - 0.2))
     lower.set_yticks([])
     if all(series.ok.all() for series in found.values()):
         lower.text(0.5, 0.5, 'every frame has a pose', transform=lower.transAxes, ha='center')
     upper.grid(alpha=0.3)
-    legend_below(figure, upper)
+    html.legend_below(figure, upper)
     return figure
 
 
@@ -151,17 +140,17 @@ def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
         left.plot(line, line, '-', color='0.3', label='error = sigma')
         left.plot(line, 3 * line, '--', color='0.3', label='error = 3 sigma')
         left.set(yscale='log')
-        spell_out(left.yaxis)
-        if high > WIDE * low:
+        html.spell_out(left.yaxis)
+        if high > html.WIDE * low:
             left.set(xscale='log')
-            spell_out(left.xaxis)
+            html.spell_out(left.xaxis)
         else:
             left.locator_params(axis='x', nbins=5)
     left.set(xlabel='sigma, with the optical jitter, mm', ylabel='position error, mm')
     right.set(xlabel='multiple of sigma', ylabel='share of the errors within', ylim=(0, 1.02))
     for panel in (left, right):
         panel.grid(alpha=0.3)
-    legend_below(figure, left)
+    html.legend_below(figure, left)
     return figure
 
 
@@ -185,7 +174,7 @@ def write_figures(
     found = _series(evaluation)
     if not any(np.isfinite(series.position_error).any() for series in found.values()):
         return []
-    parts: list[Html] = []
+    parts: list[html.Html] = []
     files = []
     drawn = (
         over_time(evaluation), over_space(evaluation), by_coil(evaluation),
@@ -193,10 +182,10 @@ def write_figures(
     )  # fmt: skip
     for (name, title), figure in zip(FIGURES.items(), drawn, strict=True):
         files.append(folder / f'{name}.png')
-        save(figure, files[-1])
-        parts += [heading(title), picture(files[-1])]
-    head = top('Evaluation', session=session, model=model)
-    text = page('Evaluation', head, table(ERRORS_HEAD, error_rows(document)), parts)
+        html.save(figure, files[-1])
+        parts += [html.heading(title), html.picture(files[-1])]
+    head = html.top('Evaluation', session=session, model=model)
+    text = html.page('Evaluation', head, html.table(ERRORS_HEAD, error_rows(document)), parts)
     files.append(folder / 'evaluation.html')
     files[-1].write_text(text, encoding='utf-8')
     return files
