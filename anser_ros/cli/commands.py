@@ -35,9 +35,7 @@ _COMPOSED = {
 }
 _CORE = {
     'bags': 'record the small simulated sessions of the folder bags/',
-    'batch': 'calibrate, evaluate or diagnose many sessions with Dask, with a summary',
     'calibrate': 'fit a field model to recorded sessions',
-    'compare': 'compare two evaluations of a session, paired, with bootstrap intervals',
     'demo': 'watch a simulated tool being tracked: a live table, a bag, a picture',
     'diagnose': 'find what a model leaves unexplained on a session, name the effect, correct it',
     'doctor': 'check the installation, ports, clock and graph, with a remedy for each problem',

@@ -1,37 +1,17 @@
-"""Reads what nodes published during a recording: poses, and their reports in ``/diagnostics``.
-
-The poses of live trackers are compared with the optical ones.
-"""
+"""Reads the poses that nodes published during a recording."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from anser_ros.errors import BagError
-from anser_ros.field.measurements import Measurements
-from anser_ros.physics.rotations import axis_angles, rotation_angles
-from anser_ros.pose_states import FRAMES_IN, OK
-from anser_ros.sessions.prepared import PreparedSession, with_truth
-from anser_ros.sessions.session import Session
-from anser_ros.stamps import NANO, stamp_of
+from anser_ros.stamps import stamp_of
 from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
 from anser_ros.wire.recorded import PoseStream, pose_numbers
-from anser_ros.wire.setup import topic_of
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class LiveErrors:
-    """Holds errors (n,), m and rad, of a coil's place and axis, or of a body's place and turn."""
-
-    position: Array
-    orientation: Array
 
 
 def published_poses(
@@ -42,7 +22,7 @@ def published_poses(
     ``salvage``: a `wire.bag.Salvage`, which takes what could not be read.
     """
     # Nodes that read no bag run where the packages that read bags are not installed.
-    from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
+    from anser_ros.wire.bag import POSE_TYPE
 
     rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics or ()}
     stamps: dict[str, list[int]] = {topic: [] for topic in topics or ()}
@@ -58,141 +38,3 @@ def published_poses(
         stamp = np.array(stamps[topic], dtype=np.int64)
         found[topic] = PoseStream(stamp, table[:, :3], table[:, 3:])
     return found
-
-
-def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErrors]:
-    """Return errors of all that the tracker of a namespace published, by sensor and body.
-
-    The recording has optical poses, and is prepared with the tracker's model, whose corrections of
-    the clock, the optical frame and the sensors are made. Raises `BagError` when the recording has
-    no optical poses.
-    """
-    session = prepared.session
-    names = [name for tool in session.tools for name in (*tool.sensors.name, tool.body)]
-    topics = {name: f'{namespace}/{topic_of(name)}/pose' for name in names}
-    received = published_poses(session.path, list(topics.values()))
-    errors = {}
-    for tool in session.tools:
-        true = with_truth(tool, prepared.correction)
-        for column, name in enumerate(tool.sensors.name):
-            errors[name] = _compared(session, true, received[topics[name]], column)
-        errors[tool.body] = _compared(session, true, received[topics[tool.body]], None)
-    return errors
-
-
-def _compared(
-    session: Session,
-    tool: Measurements,
-    poses: PoseStream,
-    column: int | None,
-) -> LiveErrors:
-    """Errors of one sensor (by its column), or of the body."""
-    if tool.track is None:
-        raise BagError(f'{session.path}: no optical poses of {tool.body}')
-    time = np.asarray((poses.stamp_ns - session.start_ns) * NANO, dtype=np.float64)
-    position, rotation, valid = tool.track.at(time)
-    turned = Rotation.from_quat(poses.quaternion[valid]).as_matrix() if valid.any() else None
-    if turned is None:
-        return LiveErrors(np.zeros(0), np.zeros(0))
-    if column is None:
-        truth = position[valid]
-        turn = rotation_angles(rotation[valid].transpose(0, 2, 1) @ turned)
-    else:
-        centres, axes = tool.sensors.placed(position[valid], rotation[valid])
-        truth = centres[:, column]
-        turn = axis_angles(turned[:, :, 2], axes[:, column])
-    distance = np.linalg.norm(poses.position[valid] - truth, axis=1)
-    return LiveErrors(distance, turn)
-
-
-TOPIC = '/diagnostics'
-WARN = 1
-"""Level of a warning in diagnostic_msgs/DiagnosticStatus."""
-BUSY = {
-    'lags': 'stretches of samples that the simulated unit could not make in time',
-    'dropped_blocks': 'blocks that the simulated unit could not send',
-    'overrun_blocks': 'blocks that the host was too slow to take',
-    'gap_blocks': 'blocks missing in the stream',
-    'windows_skipped': 'windows that the host was too slow for',
-    'windows_lost': 'windows without enough samples',
-    'windows_dropped_samples': 'windows with holes',
-    'frames_skipped': 'frames that the tracker was too slow for',
-    'lost_messages': 'messages that the recorder lost',
-}
-"""Counters that rise when a machine cannot keep up, and what they count."""
-
-
-def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
-    """Return the last values of every status by its name.
-
-    A bag without diagnostics, or one that cannot be read yet, gives an empty mapping.
-    """
-    try:
-        return {
-            status.name: {item.key: item.value for item in status.values}
-            for _, status in _statuses(path)
-        }
-    except BagError:
-        return {}
-
-
-def _statuses(path: str | os.PathLike[str]) -> Iterator[tuple[int, Any]]:
-    """Every status of a recording with its log time, ns."""
-    decoder = MessageDecoder()
-    for raw in iter_messages(path, Salvage()):
-        if raw.topic == TOPIC:
-            for status in decoder.decode(raw).status:
-                yield raw.log_time_ns, status
-
-
-def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
-    """Return the share of poses in state ok among all that a tracker judged; 0 if it judged none.
-
-    Frames that it never saw, because the machine was too slow for them, do not count. The statuses
-    of its sensors and bodies, of `last_words`, are named ``NODE: SENSOR``.
-    """
-    ok = judged = 0
-    for name, values in words.items():
-        if name.startswith(f'{tracker}: '):
-            counts = {key: int(n) for key, n in values.items() if key.startswith(FRAMES_IN)}
-            ok += counts.get(f'{FRAMES_IN}{OK}', 0)
-            judged += sum(counts.values())
-    return ok / judged if judged else 0.0
-
-
-def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
-    """Return when each part of a node first warned: log time, ns, by the part's name.
-
-    The statuses of a node's parts are named ``NODE: PART``. Raises `BagError` when the recording
-    cannot be read.
-    """
-    found: dict[str, int] = {}
-    for log_time_ns, status in _statuses(path):
-        node, _, name = status.name.partition(': ')
-        level = status.level  # a ``byte``, which some decoders give as bytes
-        level = level[0] if isinstance(level, bytes) else int(level)
-        if node == part_of and name and level == WARN:
-            found.setdefault(name, log_time_ns)
-    return found
-
-
-def overload(path: str | os.PathLike[str]) -> list[str]:
-    """Return signs, in words, that the machine was too busy for a recording; empty if complete."""
-    signs = []
-    for name, values in last_words(path).items():
-        for key, meaning in BUSY.items():
-            count = int(float(values.get(key) or 0))
-            if count:
-                signs.append(f'{name}: {count} {meaning}')
-    return signs
-
-
-def kept_share(session: Session) -> float:
-    """Return the share of frames with tool readings, of those that their period lets expect."""
-    shares = [0.0]
-    for tool in session.tools:
-        if tool.time.size > 1:
-            period = float(np.median(np.diff(tool.time)))
-            expected = 1 + round(float(tool.time[-1] - tool.time[0]) / period)
-            shares.append(float(np.any(tool.valid, axis=1).sum()) / expected)
-    return min(1.0, max(shares))

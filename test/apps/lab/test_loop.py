@@ -19,12 +19,12 @@ from anser_ros.apps.lab.cli.loop import (
     table,
     verdict,
 )
+from anser_ros.apps.lab.recorded_health import ok_share
 from anser_ros.cli.demo import SAMPLE_RATE_HZ
 from anser_ros.cli.main import main
 from anser_ros.effects.channels import FLUX, VOLTAGE
 from anser_ros.effects.effect import all_effects, effect_named
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.recorded_poses import ok_share
 from anser_ros.simulation.effects import CATALOGUE, compressing, draw
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.setup import parse_setup

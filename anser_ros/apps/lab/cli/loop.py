@@ -20,6 +20,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from anser_ros.apps.lab.recorded_health import (
+    LiveErrors,
+    first_warnings,
+    kept_share,
+    last_words,
+    live_errors,
+    ok_share,
+    overload,
+)
 from anser_ros.cli.demo import FROZEN_TRACKER, PATIENCE_S, in_namespace, simulated_unit
 from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.main import check_packages
@@ -31,15 +40,6 @@ from anser_ros.errors import AnserError, DiagnosisError, ParameterError, SetupEr
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.recorded_poses import (
-    LiveErrors,
-    first_warnings,
-    kept_share,
-    last_words,
-    live_errors,
-    ok_share,
-    overload,
-)
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.sessions.tracked_session import error_statistics

@@ -14,8 +14,8 @@ import pytest
 from conftest import wait
 from pose_world import World
 
+from anser_ros.apps.lab.cli import batch
 from anser_ros.apps.poses.importing import write_pose_session
-from anser_ros.cli import batch
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, main
 from anser_ros.cli.sessions import Outcome, names_of, perform, row_of, runs_of, write_summary
 from anser_ros.errors import BagError, ParameterError
