@@ -17,11 +17,7 @@ import pytest
 from metal_world import dipole_field, dipole_gradient
 
 from anser_ros.physics.constants import DIPOLE_CONSTANT
-from anser_ros.physics.dipole import (
-    field_basis,
-    flux_basis,
-    flux_jacobian,
-)
+from anser_ros.physics.dipole import field_basis, flux_basis, flux_jacobian
 
 SEED = 11
 

@@ -12,14 +12,7 @@ from anser_ros.effects.correction import tool_view
 from anser_ros.effects.metal_at_rest import REMAINDER, UP_M, Couplings, IlluminationChange
 from anser_ros.effects.moving_metal import FreePath, StraightPath, moving_times
 from anser_ros.field.model import Dipoles
-from anser_ros.metal.body import (
-    BODIES,
-    ODD,
-    body_spread,
-    centre_sigma,
-    multipoles,
-    sheet_sources,
-)
+from anser_ros.metal.body import BODIES, ODD, body_spread, centre_sigma, multipoles, sheet_sources
 from anser_ros.physics.constants import MU_0
 
 

@@ -15,12 +15,7 @@ from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.nominal_board import NominalBoard
-from anser_ros.sessions.plausibility import (
-    FLUX_UNITS,
-    LENGTH_UNITS,
-    check_points,
-    plausible_tools,
-)
+from anser_ros.sessions.plausibility import FLUX_UNITS, LENGTH_UNITS, check_points, plausible_tools
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.wire.bag import read_bag

@@ -8,12 +8,7 @@ from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.tracking.rigid import (
-    BodyCoils,
-    common_factor,
-    solve_body,
-    start_from_coils,
-)
+from anser_ros.tracking.rigid import BodyCoils, common_factor, solve_body, start_from_coils
 from anser_ros.tracking.solve import RealField, bounded_inverse
 from anser_ros.tracking.solve_context import error_whitening, source_spacing
 

@@ -11,11 +11,7 @@ from anser_ros.calibration import selection
 from anser_ros.calibration.calibrate import Options, best_damped, correct_scan, fit_scan
 from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
 from anser_ros.calibration.held_out import rms
-from anser_ros.calibration.layout_fit import (
-    LayoutFitter,
-    LayoutPlacer,
-    ScaledNominal,
-)
+from anser_ros.calibration.layout_fit import LayoutFitter, LayoutPlacer, ScaledNominal
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.readings import FOLDS, fold_of_frames
 from anser_ros.calibration.selection import (

@@ -19,12 +19,7 @@ from anser_ros.nodes.tracker import TrackerParameters
 from anser_ros.refit.prior import UPRIGHT, build_prior
 from anser_ros.sessions.diagnosis import spread_of
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.session import (
-    load_session,
-    measured_noise,
-    stamp_sigma,
-    tracking_noise,
-)
+from anser_ros.sessions.session import load_session, measured_noise, stamp_sigma, tracking_noise
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.sessions.tracked_session import track_session
 from anser_ros.settings import (
@@ -273,10 +268,7 @@ class TestNodes:
     @pytest.mark.parametrize(
         ('table', 'names'),
         [
-            (
-                FieldModelParameters,
-                {*VALUES} - {*SECTIONS['tools'], *OPTICAL, 'stamp_sigma_s'},
-            ),
+            (FieldModelParameters, {*VALUES} - {*SECTIONS['tools'], *OPTICAL, 'stamp_sigma_s'}),
             (
                 TrackerParameters,
                 {'flux_noise_t', 'stamp_sigma_s', 'references_age_s', *SECTIONS['tools']},

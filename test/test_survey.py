@@ -8,11 +8,7 @@ from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, Errors, moved_scan,
 
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
 from anser_ros.calibration.population import Likelihood, Population, solve
-from anser_ros.calibration.result import (
-    contradiction_words,
-    corrections,
-    reported_effects,
-)
+from anser_ros.calibration.result import contradiction_words, corrections, reported_effects
 from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters
 from anser_ros.effects.correction import Correction

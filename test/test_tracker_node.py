@@ -5,15 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from graph_bench import (
-    BODY,
-    SENSORS,
-    Bench,
-    ready,
-    reference_specs,
-    tracker_bench,
-    wait_frame,
-)
+from graph_bench import BODY, SENSORS, Bench, ready, reference_specs, tracker_bench, wait_frame
 from rclpy.parameter import Parameter
 from tracking_world import certain_model, fluxes, random_pose, setup_of
 

@@ -180,9 +180,7 @@ def populations(records: Sequence[EffectRecord]) -> list[EffectRecord]:
     return [r for r in records if {'channels', 'values', 'uncertainty'} <= r.parameters.keys()]
 
 
-def population_table(
-    records: Sequence[EffectRecord],
-) -> tuple[list[str], list[list[str]]]:
+def population_table(records: Sequence[EffectRecord]) -> tuple[list[str], list[list[str]]]:
     """Return the head and the rows, one per channel, of the table of all populations.
 
     Of gains, the difference from one is shown.

@@ -30,9 +30,7 @@ _NODES = {
     'cu_simulator': 'a control unit behind a pseudo-terminal',
     'monitor': 'a live table of sensors, rates and latencies',
 }
-_COMPOSED = {
-    'live': 'acquisition, field_model and tracker in one process, for the least latency',
-}
+_COMPOSED = {'live': 'acquisition, field_model and tracker in one process, for the least latency'}
 _CORE = {
     'bags': 'record the small simulated sessions of the folder bags/',
     'calibrate': 'fit a field model to recorded sessions',

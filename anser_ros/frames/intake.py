@@ -105,12 +105,9 @@ class Intake:
         """Judge a frame as the next one of a stream; None for one that was already seen.
 
         As `judge`, but ``emitters`` are the names of those that there ought to be, None while no
-        model is known; ``jump_s`` is how far ahead of the last one a stamp may be, s.
-
-        Raises
-        ------
-        LayoutError, or the intake's own error
-            As `judge`, and when the emitters are not as many as there ought to be.
+        model is known; ``jump_s`` is how far ahead of the last one a stamp may be, s. Raises
+        `LayoutError`, or the intake's own error, as `judge`, and when the emitters are not as many
+        as there ought to be.
         """
         frame = self.judge(stamp_ns, channels, flux, flags, None if emitters is None else
                            len(emitters))  # fmt: skip
@@ -150,13 +147,9 @@ class Intake:
         """Judge a frame by itself; nothing is counted.
 
         ``channels`` (N,) are those of the rows of ``flux`` (N, K), T, in any order; ``flags`` (N,)
-        are bits of `wire.points`; ``emitters`` says how many there ought to be.
-
-        Raises
-        ------
-        LayoutError, or the intake's own error
-            When the stamp is not positive, shapes don't fit, a channel appears twice, or the
-            emitters are not as many as there ought to be.
+        are bits of `wire.points`; ``emitters`` says how many there ought to be. Raises
+        `LayoutError`, or the intake's own error, when the stamp is not positive, shapes don't fit,
+        a channel appears twice, or the emitters are not as many as there ought to be.
         """
         if stamp_ns <= 0:
             raise self._error(f'a flux frame needs a positive stamp, got {stamp_ns} ns')

@@ -118,10 +118,7 @@ class BoardPlace:
     def check(self, flux: ComplexArray) -> bool:
         """Refuse a model that lies beside the board; return whether the readings determine it.
 
-        Raises
-        ------
-        FitError
-            With how far.
+        Raises `FitError` with how far.
         """
         found = self.misplacement(flux)
         if found is not None and found.is_certain:

@@ -150,13 +150,9 @@ def check_steady(flux: ComplexArray) -> float | None:
     strength of an emitter may drift while there is no metal, and a refit follows it.
 
     ``flux`` (F, R, K) are frames of readings, T, in the order of time; NaN where one is bad.
-    Returns the noise of a component of the mean reading, T, by the frames' scatter; None for
-    fewer than `FEWEST_FRAMES_OF_CHANGE`, which are not judged.
-
-    Raises
-    ------
-    FitError
-        With how much a tenth of the sensors change at least.
+    Returns the noise of a component of the mean reading, T, by the frames' scatter; None for fewer
+    than `FEWEST_FRAMES_OF_CHANGE`, which are not judged. Raises `FitError` with how much a tenth
+    of the sensors change at least.
     """
     if len(flux) < FEWEST_FRAMES_OF_CHANGE:
         return None
@@ -192,11 +188,8 @@ def check_as_calibrated(
     """Refuse readings that are not those of the calibration; return whether they were compared.
 
     ``flux`` (R, K), T, are readings of the sensors now, with the noise ``sigma_t`` of a component.
-
-    Raises
-    ------
-    FitError
-        When most sensors read something else, which is metal at rest, or another board.
+    Raises `FitError` when most sensors read something else, which is metal at rest, or another
+    board.
     """
     before = np.full(flux.shape, np.nan, dtype=np.complex128)
     rows = {name: i for i, name in enumerate(known.name)}
@@ -246,12 +239,8 @@ def check_as_drawn(
 
     It detects only large amounts of metal: a plate near the board, but not a piece of a hand's
     breadth at the side. ``centres`` (K, 3), m, are those of the coils; ``flux`` (R, K), T, may
-    have NaN rows, which are passed over.
-
-    Raises
-    ------
-    FitError
-        When all readings together differ by more than `DRAWN_GATE` of what is allowed.
+    have NaN rows, which are passed over. Raises `FitError` when all readings together differ by
+    more than `DRAWN_GATE` of what is allowed.
     """
     good = np.isfinite(flux).all(axis=1)
     if good.sum() < FEWEST_SENSORS:

@@ -47,11 +47,8 @@ def sphere_polarisability(
     (J. R. Wait, Geophysics 16, 1951, p. 666). The limits are -2 pi a^3 / mu_0 for a perfect
     conductor and ``4 pi a^3 / mu_0 (mu_r - 1) / (mu_r + 2)`` for a permeable insulator, whose
     conductivity is 0. ``omega`` (K,) is in rad/s, the moments (K,) per flux density in A m^2 / T.
-
-    Raises
-    ------
-    ValueError
-        When the radius or permeability is not positive, or another value is negative.
+    Raises `ValueError` when the radius or permeability is not positive, or another value is
+    negative.
     """
     if not (radius_m > 0 and relative_permeability > 0):
         raise ValueError('radius and relative permeability must be positive')

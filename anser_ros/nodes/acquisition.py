@@ -24,12 +24,7 @@ from anser_ros.nodes.acquisition_status import (
     sensor_statuses,
     signal_troubles,
 )
-from anser_ros.nodes.acquisition_stream import (
-    FluxFrame,
-    FluxStream,
-    MeasuredAccuracy,
-    WallClock,
-)
+from anser_ros.nodes.acquisition_stream import FluxFrame, FluxStream, MeasuredAccuracy, WallClock
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status

@@ -105,19 +105,14 @@ class WaitingFrames:
 
 
 class FluxStream:
-    """Turns samples into fluxes; it is made again for every hello that differs from the one
-    before.
+    """Turns samples into fluxes, for one hello of the control unit.
 
-    Raises `SetupError` when the control unit has none of the channels, or other emitters than the
-    setup, and `ParameterError` when the window cannot be demodulated.
-
-    Attributes
-    ----------
-    sensors : those of the setup that the control unit has a channel for, tools first
-    missing : those that it has none for
-    rate_hz : windows a second, a whole number of samples apart
-    clock, ticks : host time of the samples, and what the device's own clock says beside them
-    waiting : frames whose stamps are not confirmed yet
+    ``sensors`` are those of the setup that the unit has a channel for, tools first, ``missing``
+    the others; ``rate_hz`` is windows a second, a whole number of samples apart; ``clock`` and
+    ``ticks`` are host time of the samples, and what the device's own clock says beside them;
+    ``waiting`` are frames whose stamps are not confirmed yet. Raises `SetupError` when the unit
+    has none of the channels, or other emitters than the setup, and `ParameterError` when the
+    window cannot be demodulated.
     """
 
     def __init__(

@@ -28,7 +28,6 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.frames.intake import Frame
 from anser_ros.integrity.board_place import BoardPlace
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.incoming import pose_numbers
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.streams.clouds import ModelWriter, read_frame
 from anser_ros.nodes.streams.one_source import OneSource
@@ -44,7 +43,7 @@ from anser_ros.sessions.kept_tables import DAMAGED, read_arrays, used_s, write_a
 from anser_ros.sessions.session import sensor_table, tracking_noise
 from anser_ros.stamps import set_stamp, stamp_of
 from anser_ros.wire.points import FluxPoints
-from anser_ros.wire.recorded import unit_quaternions
+from anser_ros.wire.recorded import pose_numbers, unit_quaternions
 from anser_ros.wire.setup import Setup, topic_of
 
 Array = NDArray[np.float64]
@@ -268,11 +267,7 @@ class PlaceWatch:
 
     @classmethod
     def of(
-        cls,
-        base: FieldModel,
-        references: SensorTable,
-        setup: Setup,
-        announced: Callable[[], int],
+        cls, base: FieldModel, references: SensorTable, setup: Setup, announced: Callable[[], int]
     ) -> 'PlaceWatch':
         """Return what watches a model."""
         return cls(board_place_of(base, references, setup), announced)

@@ -20,7 +20,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
-from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
+from anser_ros.nodes.runtime.incoming import seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
@@ -33,7 +33,7 @@ from anser_ros.nodes.traces import (
     middle,
     targets_of,
 )
-from anser_ros.wire.recorded import optical_topic
+from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 LINE_PERIOD_S = 1.0

@@ -202,10 +202,7 @@ def model_field(model: FieldModel, points: Array) -> ComplexArray:
 def region_of(field: Callable[[Array], NDArray[np.generic]]) -> Region:
     """Return the board's extent: the square with 98 % of its field's power over the surface.
 
-    Raises
-    ------
-    FitError
-        When the field is zero or not finite.
+    Raises `FitError` when the field is zero or not finite.
     """
     side = np.linspace(-SEARCH_M, SEARCH_M, SEARCH_POINTS)
     x, y = np.meshgrid(side, side, indexing='ij')
@@ -229,12 +226,8 @@ def excitation_for(
 ) -> tuple[Excitation, Region]:
     """Return the drawing's field scaled to the model, or the model's if the drawing is another's.
 
-    ``volume`` is the tracked volume as stated; None for the default over the board.
-
-    Raises
-    ------
-    FitError
-        When the drawing has another number of emitters than the model.
+    ``volume`` is the tracked volume as stated; None for the default over the board. Raises
+    `FitError` when the drawing has another number of emitters than the model.
     """
 
     def own(points: Array) -> ComplexArray:

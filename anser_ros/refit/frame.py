@@ -32,12 +32,8 @@ MOST_FRAMES = 2000
 class ReadingWindow:
     """Holds the most recent readings of a set of sensors.
 
-    ``span_s``: how far back readings are kept, s of their stamps.
-
-    Raises
-    ------
-    FitError
-        When the span is not positive.
+    ``span_s``: how far back readings are kept, s of their stamps. Raises `FitError` when the span
+    is not positive.
     """
 
     def __init__(self, sensors: SensorTable, emitters: int, span_s: float) -> None:
@@ -64,10 +60,7 @@ class ReadingWindow:
     def add(self, frame: Frame) -> None:
         """Take in a judged frame of the sensors; a jump back in time restarts it.
 
-        Raises
-        ------
-        FitError
-            When the number of emitters is another one.
+        Raises `FitError` when the number of emitters is another one.
         """
         if frame.flux.shape != self._shape:
             raise FitError(
@@ -88,10 +81,7 @@ class ReadingWindow:
     def mean(self) -> ComplexArray:
         """Return the mean reading (S, K), T, with NaN for sensors that are bad in half the frames.
 
-        Raises
-        ------
-        FitError
-            When there are too few frames, or no sensor has good readings.
+        Raises `FitError` when there are too few frames, or no sensor has good readings.
         """
         if len(self._frames) < FEWEST_BASELINE_FRAMES:
             raise FitError(
@@ -113,10 +103,7 @@ class ReadingWindow:
 def check_enough(baseline: ComplexArray, needed: int) -> int:
     """Return the number of sensors that have a value in a baseline of shape (S, K).
 
-    Raises
-    ------
-    FitError
-        When there are fewer than are needed.
+    Raises `FitError` when there are fewer than are needed.
     """
     count = int(np.isfinite(baseline).all(axis=1).sum())
     if count < needed:
@@ -131,10 +118,8 @@ def checked_baseline(
 ) -> ComplexArray:
     """Return a refit's baseline as an array, shape (S, K), T.
 
-    Raises
-    ------
-    FitError
-        When there are no references, their channels are not unique, or the shape is another.
+    Raises `FitError` when there are no references, their channels are not unique, or the shape is
+    another.
     """
     given = np.asarray(baseline, dtype=np.complex128)
     if len(references) == 0:

@@ -53,13 +53,9 @@ def evidence_without(
 
     By the rules of the conditional normal distribution no matrix is decomposed again. The change
     of the evidence is taken from the likelihood of the most likely strengths. ``coils`` (Q,) are
-    numbers among the coils in use.
-
-    Returns
-    -------
-    log_evidence : ndarray, shape (Q, H)
-    residuals : list of Q ndarrays, of shapes (1 K, 2) to (Q K, 2)
-        Measured minus predicted under the most likely hypothesis, in noise units.
+    numbers among the coils in use. The results are logarithms (Q, H) of the evidence, and Q
+    residuals, (1 K, 2) to (Q K, 2): measured minus predicted under the most likely hypothesis, in
+    noise units.
     """
     precision, _ = bank.precision(seen.noise)
     shape = len(bank.bases), len(coils)

@@ -72,12 +72,8 @@ class LiveRefit:
     readings without it, NaN for a coil that has none. ``drawing`` is the field of the board as
     drawn (`physics.board.Board.field`); without it the model's own dipoles drive the metal, which
     is much less accurate. In the ``volume`` the field must be right. ``tables`` are those of all
-    these but the baseline, where they are there already.
-
-    Raises
-    ------
-    FitError
-        When shapes don't fit, a channel appears twice, or there are no references.
+    these but the baseline, where they are there already. Raises `FitError` when shapes don't fit,
+    a channel appears twice, or there are no references.
     """
 
     def __init__(
@@ -159,12 +155,8 @@ class LiveRefit:
         """Take in one frame of reference fluxes and return the result of the refit.
 
         ``channels`` (S,) may come in any order, and unknown ones are passed over; ``flux`` (S, K)
-        is in T; a reading with ``flags`` (S,) is not used.
-
-        Raises
-        ------
-        FitError
-            When shapes don't fit or a channel appears twice.
+        is in T; a reading with ``flags`` (S,) is not used. Raises `FitError` when shapes don't fit
+        or a channel appears twice.
         """
         width = len(self.model.emitters)
         return self.follow(self._intake.judge(stamp_ns, channels, flux, flags, width))

@@ -268,12 +268,7 @@ def tables_of(
 ) -> RefitTables:
     """Return the tables whose arrays these are; the other arguments are those of `build_tables`.
 
-    Raises
-    ------
-    KeyError
-        When an array is missing.
-    FitError
-        As `excitation_for`.
+    Raises `KeyError` when an array is missing; `FitError` as `excitation_for`.
     """
     excitation, region = excitation_for(model, drawing, volume)
     bottom, box = (Layer(**_given(f'layer{i}', Layer, arrays)) for i in range(2))

@@ -12,10 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import BagError, ParameterError
-from anser_ros.sessions.recorded_poses import published_poses
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire import cdr
-from anser_ros.wire.bag import POSE_TYPE, Salvage, iter_messages, read_fluxes, read_foreign
+from anser_ros.wire.bag import (
+    POSE_TYPE,
+    Salvage,
+    iter_messages,
+    published_poses,
+    read_fluxes,
+    read_foreign,
+)
 from anser_ros.wire.bag_writer import SETUP_TYPE, SessionWriter
 from anser_ros.wire.recorded import PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup

@@ -164,10 +164,7 @@ def _smallest_spacing(tones: NDArray[np.float64]) -> float:
 
 
 def _kept_harmonics(
-    mains_hz: float | None,
-    tones: NDArray[np.float64],
-    sample_rate_hz: float,
-    length_s: float,
+    mains_hz: float | None, tones: NDArray[np.float64], sample_rate_hz: float, length_s: float
 ) -> NDArray[np.float64]:
     if mains_hz is None:
         return np.empty(0)

@@ -273,12 +273,7 @@ def common_factor(modes: Array, inverse_sigma: Array) -> Array:
     """Return E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
 
     ``modes`` (S, R, 2K) are flux errors of one standard deviation each that several coils share,
-    T; ``inverse_sigma`` (S, 2K) is in 1/T.
-
-    Raises
-    ------
-    TrackingError
-        When the modes are not finite.
+    T; ``inverse_sigma`` (S, 2K) is in 1/T. Raises `TrackingError` when the modes are not finite.
     """
     count = modes.shape[1]
     whitened = (modes * inverse_sigma[:, None]).swapaxes(0, 1).reshape(count, inverse_sigma.size)
@@ -306,12 +301,8 @@ def solve_body(
 
     ``flux`` (S, 2K) in T has real and imaginary part by turns, ``inverse_sigma`` (S, 2K) is in
     1/T; ``common`` is from `common_factor`, without a row for a model without uncertainty. The
-    body's origin does not leave the box from ``low`` to ``high``, m.
-
-    Raises
-    ------
-    TrackingError
-        When shapes don't fit.
+    body's origin does not leave the box from ``low`` to ``high``, m. Raises `TrackingError` when
+    shapes don't fit.
     """
     count, width = len(coils.offsets), field.moments.shape[1]
     if flux.shape != (count, width) or inverse_sigma.shape != flux.shape:

@@ -264,12 +264,8 @@ def grid_points(volume: TrackedVolume, spacing_m: float) -> Array:
     """Return points of a grid that covers a volume, shape (G, 3), m.
 
     The field changes over a length that grows with the height, so does the spacing: ``spacing_m``
-    holds at 0.1 m height and grows in proportion above it.
-
-    Raises
-    ------
-    TrackingError
-        When the spacing is not positive, or the grid would have more than 100,000 points.
+    holds at 0.1 m height and grows in proportion above it. Raises `TrackingError` when the spacing
+    is not positive, or the grid would have more than 100,000 points.
     """
     if not (math.isfinite(spacing_m) and spacing_m > 0):
         raise TrackingError(f'grid spacing must be positive, got {spacing_m}')
@@ -296,10 +292,7 @@ def build_grid(
 ) -> SeedGrid:
     """Precompute the scan of a volume; ``sigma`` (2K,) is each flux component's, T.
 
-    Raises
-    ------
-    TrackingError
-        When the spacing doesn't suit the volume, see `grid_points`.
+    Raises `TrackingError` when the spacing doesn't suit the volume, see `grid_points`.
     """
     points = grid_points(volume, spacing_m)
     moments = field.moments.view(np.complex128)

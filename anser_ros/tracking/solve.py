@@ -52,10 +52,7 @@ class RealField:
     ) -> 'RealField':
         """Lay out dipoles with complex magnitudes, shape (N, K).
 
-        Raises
-        ------
-        TrackingError
-            When the shapes don't fit or a value is not finite.
+        Raises `TrackingError` when the shapes don't fit or a value is not finite.
         """
         r = np.ascontiguousarray(positions, dtype=np.float64)
         u = np.ascontiguousarray(directions, dtype=np.float64)
@@ -99,12 +96,7 @@ def whitening_of(sigma: Array) -> Array:
     """Return the matrix, 1/T, that turns a flux residual into one of unit covariance.
 
     It is the diagonal alone, shape (1, 2K), from the standard deviation ``sigma`` (2K,) of each
-    flux component, T.
-
-    Raises
-    ------
-    TrackingError
-        When a sigma is not positive and finite.
+    flux component, T. Raises `TrackingError` when a sigma is not positive and finite.
     """
     deviations = np.asarray(sigma, dtype=np.float64)
     if not (np.isfinite(deviations).all() and (deviations > 0).all()):
@@ -127,12 +119,7 @@ def solve_coil(
     ``flux`` (2K,) in T has real and imaginary part by turns; ``whitening`` is from `whitening_of`,
     or a whole matrix (2K, 2K), 1/T. The start is a ``position`` (m, frame fg) and a unit ``axis``;
     the position does not leave the box from ``low`` to ``high``, m. A ``length_m`` of 0 is a point
-    sensor.
-
-    Raises
-    ------
-    TrackingError
-        When ``flux`` doesn't have two values for every emitter.
+    sensor. Raises `TrackingError` when ``flux`` doesn't have two values for every emitter.
     """
     width = field.moments.shape[1]
     if flux.shape != (width,) or whitening.shape[1:] != (width,):

@@ -100,22 +100,11 @@ def error_whitening(
     errors of one standard deviation each, A m^2, ``spacing`` is `source_spacing`, m. ``sigma``
     (2K,) is each flux component's standard deviation, T.
 
-    Returns
-    -------
-    errors : ndarray, shape (S, R, 2K)
-        Flux errors of one standard deviation each, T.
-    whitening : ndarray, shape (S, 2K, 2K)
-        1/T, lower triangular.
-    away : ndarray, shape (S,)
-        Distance from the nearest of the dipoles, m.
-    among : ndarray, shape (S,)
-        Spacing over distance, of the dipole for which that is largest: above 1 a coil is where
-        the dipoles are no description of the field.
-
-    Raises
-    ------
-    TrackingError
-        Where the covariance is not finite.
+    The results are flux errors (S, R, 2K) of one standard deviation each, T; the whitening
+    (S, 2K, 2K), 1/T, lower triangular; the distance (S,) from the nearest of the dipoles, m; and
+    spacing over distance (S,) of the dipole for which that is largest: above 1 a coil is where the
+    dipoles are no description of the field. Raises `TrackingError` where the covariance is not
+    finite.
     """
     count, width = len(points), len(sigma)
     basis, whitening = np.empty((count, len(modes))), np.empty((count, width, width))
@@ -137,16 +126,9 @@ GRID_TOLERANCE = 0.05
 
 
 class Starts:
-    """Makes the cold start's grid in a field when it is needed, or takes it over where it still
-    fits.
+    """Makes the cold start's grid in a field when it is needed.
 
-    Parameters
-    ----------
-    volume : TrackedVolume
-    spacing_m : float
-        Of the grid, m.
-    before : Starts, optional
-        Of the model before. Its grid serves on while the field is nearly the same.
+    That of the model ``before`` serves on while the field is nearly the same.
     """
 
     def __init__(
@@ -318,10 +300,7 @@ def build_context(
 ) -> SolveContext:
     """Make a model ready; what depends on things that have not changed is kept.
 
-    Raises
-    ------
-    TrackingError
-        When the model's arrays can't be used.
+    Raises `TrackingError` when the model's arrays can't be used.
     """
     field = RealField.of(model.positions, model.directions, model.moments)
     variance = settings.flux_noise_t**2 + float(model.flux_error_t) ** 2
@@ -359,9 +338,7 @@ class ReducedScene:
 
 
 def without_dead(
-    context: SolveContext,
-    living: NDArray[np.bool_],
-    previous: ReducedScene | None = None,
+    context: SolveContext, living: NDArray[np.bool_], previous: ReducedScene | None = None
 ) -> ReducedScene:
     """Return the context of the living emitters; what has not changed since ``previous`` is
     kept.

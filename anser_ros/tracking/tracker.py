@@ -133,36 +133,19 @@ class TrackedScene:
 class Tracker:
     """Tracks all tool sensors and rigid bodies of a setup.
 
-    Parameters
-    ----------
-    model : FieldModel or None
-        None until one is known; every state is then ``no_model``.
-    sensors : SensorTable
-        The tool sensors, positions and axes in their body's frame. Those that are sums of
-        windings are left out.
-    settings : TrackerSettings, optional
-    observers : sequence of Observer
-        What else is followed.
-    past : Past, optional
-        Of another tracker of these sensors, from which this one goes on.
-    scene : TrackedScene, optional
-        Made of the model, if that was done before.
+    Without a ``model`` every state is ``no_model``. Of the ``sensors``, positions and axes in
+    their body's frame, those that are sums of windings are left out; ``observers`` are what else
+    is followed. ``past`` is that of another tracker of these sensors, from which this one goes on,
+    and ``scene`` was made of the model before.
 
-    Attributes
-    ----------
-    counters : collections.Counter
-        ``frames``, ``cold_starts``, ``duplicates``; ``time_jumps`` back, ``time_jumps_forward``
-        beyond the age of a warm start; ``frames_empty``; ``frames_dead_emitter``; and sensors'
-        readings that were not used: ``readings_missing``, ``readings_saturated``,
-        ``readings_stale``, ``readings_dropped``, ``readings_not_finite``, ``readings_absurd``,
-        ``readings_stuck``.
+    The ``counters`` are ``frames``, ``cold_starts``, ``duplicates``; ``time_jumps`` back,
+    ``time_jumps_forward`` beyond the age of a warm start; ``frames_empty``,
+    ``frames_dead_emitter``; and sensors' readings that were not used: ``readings_missing``,
+    ``readings_saturated``, ``readings_stale``, ``readings_dropped``, ``readings_not_finite``,
+    ``readings_absurd``, ``readings_stuck``.
 
-    Raises
-    ------
-    TrackingError
-        When there is no sensor, a channel or name appears twice, or the model can't be used.
-    ModelFileError
-        When an effect of the model is not one that can be undone.
+    Raises `TrackingError` when there is no sensor, a channel or name appears twice, or the model
+    can't be used; `ModelFileError` when an effect of the model is not one that can be undone.
     """
 
     def __init__(
@@ -222,11 +205,7 @@ class Tracker:
         """Return the same tracker with another field model; warm starts and counters go on.
 
         What its first frame needs of the model is worked out here, in whatever thread that is.
-
-        Raises
-        ------
-        TrackingError
-            When the model can't be used; this tracker is as it was.
+        Raises `TrackingError` when the model can't be used; this tracker is as it was.
         """
         scene = self._scene.with_model(model, self.settings, model_id)
         assert scene.context is not None
@@ -266,26 +245,12 @@ class Tracker:
     ) -> list[PoseEstimate]:
         """Estimate the poses of one frame: one a sensor, then one a rigid body.
 
-        There are none for a frame that was already seen.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Middle of the demodulation window; must be positive.
-        channels : ndarray, shape (S,)
-            Channel of each row, in any order; unknown ones are passed over.
-        flux : ndarray, shape (S, K), complex
-            T.
-        flags : ndarray, shape (S,), optional
-            Flag bits of `wire.points`.
-        withheld : Withheld, optional
-            Why no pose may be given for this frame.
-
-        Raises
-        ------
-        TrackingError
-            When the stamp is not positive, shapes don't fit, a channel appears twice, or the
-            emitters are not as many as the model's.
+        ``stamp_ns`` is the middle of the demodulation window; ``channels`` (S,) are those of the
+        rows of ``flux`` (S, K), T, in any order, of which unknown ones are passed over; ``flags``
+        (S,) are bits of `wire.points`; ``withheld`` is why no pose may be given for this frame.
+        There are none for a frame that was already seen. Raises `TrackingError` when the stamp is
+        not positive, shapes don't fit, a channel appears twice, or the emitters are not as many as
+        the model's.
         """
         names = None if self.model is None else self.model.emitters
         frame = self._past.intake.admit(

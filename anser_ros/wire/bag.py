@@ -16,7 +16,7 @@ import sqlite3
 import struct
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -463,3 +463,28 @@ def _definitions(base: sqlite3.Connection) -> dict[str, str]:
         return {str(kind): str(text) for kind, text in rows}
     except sqlite3.Error:
         return {}
+
+
+def published_poses(
+    path: str | os.PathLike[str],
+    topics: Sequence[str] | None = None,
+    salvage: Salvage | None = None,
+) -> dict[str, recorded.PoseStream]:
+    """Return what each PoseStamped topic of a bag carries, of some topics or of all.
+
+    ``salvage`` takes what could not be read.
+    """
+    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics or ()}
+    stamps: dict[str, list[int]] = {topic: [] for topic in topics or ()}
+    decoder = MessageDecoder()
+    for raw in iter_messages(path, salvage or Salvage()):
+        if raw.type_name == POSE_TYPE and (topics is None or raw.topic in rows):
+            message = decoder.decode(raw)
+            stamps.setdefault(raw.topic, []).append(stamp_of(message))
+            rows.setdefault(raw.topic, []).append(recorded.pose_numbers(message.pose))
+    found = {}
+    for topic, values in rows.items():
+        table = np.array(values, dtype=np.float64).reshape(-1, 7)
+        stamp = np.array(stamps[topic], dtype=np.int64)
+        found[topic] = recorded.PoseStream(stamp, table[:, :3], table[:, 3:])
+    return found

@@ -43,10 +43,7 @@ from anser_ros.physics.rotations import tangents
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Excitation, excitation_for
 from anser_ros.refit.witness import FREE_M, FREE_RAD, ToolReading, linearised
-from anser_ros.sessions.nominal_board import (
-    NominalBoard,
-    stated_volume,
-)
+from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
 from anser_ros.sessions.session import Session, load_session
 
 PATHS = {

@@ -12,15 +12,7 @@ from collections.abc import Iterator
 
 import harness
 import numpy as np
-from live_chain import (
-    METAL_FROM_S,
-    SETTLE_S,
-    TOOL_SENSORS,
-    Layout,
-    Run,
-    made_bytes,
-    run_chain,
-)
+from live_chain import METAL_FROM_S, SETTLE_S, TOOL_SENSORS, Layout, Run, made_bytes, run_chain
 
 LONG_S, SHORT_S = 60.0, 15.0
 """Time that the case of interest is measured, s, and each of those beside it."""

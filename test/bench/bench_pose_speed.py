@@ -10,10 +10,7 @@ import numpy as np
 from pose_faults import KINDS
 from pose_world import World
 
-from anser_ros.apps.poses.corrector import (
-    PoseCorrector,
-    to_model,
-)
+from anser_ros.apps.poses.corrector import PoseCorrector, to_model
 from anser_ros.apps.poses.diagnosis import diagnose_poses
 
 

@@ -31,10 +31,7 @@ from laboratory import FLUX_NOISE_T, Laboratory, measured, read_fluxes
 from anser_ros.apps.lab.experiments.refit_ablation import spread_out
 from anser_ros.sessions.follower import with_references
 from anser_ros.sessions.session import Session, load_session
-from anser_ros.sessions.tracked_session import (
-    PoseSeries,
-    track_session,
-)
+from anser_ros.sessions.tracked_session import PoseSeries, track_session
 
 COUNTS = (0, 2, 4, 8, 16, 32)
 KINDS = ('approach', 'sweep', 'beside', 'over', 'two_metals')

@@ -16,15 +16,8 @@ import numpy as np
 from chain import replay_through_nodes
 
 from anser_ros.sessions.session import load_session
-from anser_ros.sessions.starting_model import (
-    load_model,
-    model_for,
-    save_model,
-)
-from anser_ros.sessions.tracked_session import (
-    metrics,
-    track_session,
-)
+from anser_ros.sessions.starting_model import load_model, model_for, save_model
+from anser_ros.sessions.tracked_session import metrics, track_session
 from anser_ros.wire.setup import topic_of
 
 

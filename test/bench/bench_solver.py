@@ -18,10 +18,7 @@ WARM_REPEATS = 5
 COLD_POSES = 10_000
 NEAR_M = 2e-3
 LOW, HIGH = np.array([-0.125, -0.125, 0.08]), np.array([0.125, 0.125, 0.25])
-BOUNDS = (
-    [-0.5, -0.5, 0.0, -np.pi, -3 * np.pi],
-    [0.5, 0.5, 0.5, np.pi, 3 * np.pi],
-)
+BOUNDS = ([-0.5, -0.5, 0.0, -np.pi, -3 * np.pi], [0.5, 0.5, 0.5, np.pi, 3 * np.pi])
 GATE_PROBABILITY = 1e-9
 RIVAL = 'scipy least_squares as python-anser'
 

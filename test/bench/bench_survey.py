@@ -19,15 +19,7 @@ from pathlib import Path
 
 import harness
 import numpy as np
-from calibration_world import (
-    JITTER_M,
-    NOISE_T,
-    Errors,
-    hand,
-    moved_scan,
-    scene,
-    tool_of,
-)
+from calibration_world import JITTER_M, NOISE_T, Errors, hand, moved_scan, scene, tool_of
 
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
 from anser_ros.calibration.layouts import Layout

@@ -158,10 +158,7 @@ def metal(world: World, size: float) -> Truth:
 
 def polled(world: World, size: float) -> Truth:
     step = 1e-3 * size
-    truth: Truth = {
-        'quantised_stamps': ('step_s', step),
-        'time_offset': ('offset_s', step / 2),
-    }
+    truth: Truth = {'quantised_stamps': ('step_s', step), 'time_offset': ('offset_s', step / 2)}
     delays: Stream = []
 
     def change(name: str, rows: Stream) -> None:

@@ -220,10 +220,7 @@ def main() -> int:
         open_ = {row.name for row in found.values() if not row.is_judged}
         trials = [faults for faults in trials if _name(faults) in open_]
         commands = []
-    with (
-        tempfile.TemporaryDirectory(prefix='anser_chaos_') as folder,
-        domain_pool() as domains,
-    ):
+    with tempfile.TemporaryDirectory(prefix='anser_chaos_') as folder, domain_pool() as domains:
         chain = Chain(Path(folder), domains.take())
         try:
             for command in commands:

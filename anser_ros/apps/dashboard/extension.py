@@ -12,5 +12,5 @@ DEMO = {
     'dashboard': (
         'serve the live view to a browser, too',
         f'live view: http://127.0.0.1:{LIVE_VIEW}/',
-    ),
+    )
 }

@@ -94,8 +94,7 @@ def calibrate_at_one_place(
         damping=0.0,
         n_measurements=int(posed.usable.sum()),
         residuals=Residuals(
-            np.sqrt((np.abs(left) ** 2).mean(axis=0)),
-            float(flux.real.max() - flux.real.min()),
+            np.sqrt((np.abs(left) ** 2).mean(axis=0)), float(flux.real.max() - flux.real.min())
         ),
         scan=Scan((right,), accuracy, effects, _noisy(posed.sensors.channel, noise_ratio)),
         undetermined=_unclear(posed, fit, readings.used & ~turned) if looked_for else (),

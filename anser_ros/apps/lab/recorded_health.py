@@ -14,10 +14,9 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.pose_states import FRAMES_IN, OK
 from anser_ros.sessions.prepared import PreparedSession, with_truth
-from anser_ros.sessions.recorded_poses import published_poses
 from anser_ros.sessions.session import Session
 from anser_ros.stamps import NANO
-from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
+from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages, published_poses
 from anser_ros.wire.recorded import PoseStream
 from anser_ros.wire.setup import topic_of
 
@@ -53,10 +52,7 @@ def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErro
 
 
 def _compared(
-    session: Session,
-    tool: Measurements,
-    poses: PoseStream,
-    column: int | None,
+    session: Session, tool: Measurements, poses: PoseStream, column: int | None
 ) -> LiveErrors:
     """Errors of one sensor (by its column), or of the body."""
     if tool.track is None:

@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.convention import read_rightly
-from anser_ros.apps.poses.effect import (
-    PoseTerm,
-    PoseView,
-    Role,
-    pose_effects,
-)
+from anser_ros.apps.poses.effect import PoseTerm, PoseView, Role, pose_effects
 from anser_ros.apps.poses.fit import (
     PoseFit,
     fit_poses,

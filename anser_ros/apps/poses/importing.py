@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.sessions.plausibility import LENGTH_M
-from anser_ros.sessions.recorded_poses import published_poses
 from anser_ros.stamps import NANO
-from anser_ros.wire.bag import Salvage
+from anser_ros.wire.bag import Salvage, published_poses
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import (
     BODY,
@@ -84,8 +83,7 @@ def read_form(path: Path) -> Found:
     if not lines:
         raise ParameterError(f'{path}: no rows')
     first, reader = next(
-        ((i, r) for i, line in enumerate(lines[:TITLE_LINES]) if (r := _reader(line))),
-        (0, _table),
+        ((i, r) for i, line in enumerate(lines[:TITLE_LINES]) if (r := _reader(line))), (0, _table)
     )
     rows, read = reader(lines[first:], path)
     if not any(one.rows for one in rows.values()):

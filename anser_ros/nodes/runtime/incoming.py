@@ -7,7 +7,6 @@ taken as bytes, and their number, and the sizes that they state, are looked at.
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Pose
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
@@ -44,12 +43,6 @@ def opened(data: bytes, message_type: type) -> Any:
                 f'the most is {MOST_POINTS} with {MOST_FIELDS}'
             )
     return deserialize_message(data, message_type)
-
-
-def pose_numbers(pose: Pose) -> tuple[float, float, float, float, float, float, float]:
-    """Return the position, m, and the quaternion x, y, z, w of a pose."""
-    p, q = pose.position, pose.orientation
-    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
 def seconds_of(message: Any) -> float:

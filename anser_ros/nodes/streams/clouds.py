@@ -47,10 +47,7 @@ class CloudMaker:
         self._fields: dict[tuple[PointFieldTuple, ...], list[PointField]] = {}
 
     def message(
-        self,
-        packed: tuple[Sequence[PointFieldTuple], int, bytes],
-        frame_id: str,
-        stamp_ns: int,
+        self, packed: tuple[Sequence[PointFieldTuple], int, bytes], frame_id: str, stamp_ns: int
     ) -> PointCloud2:
         """Return the message of packed points (fields, point_step, bytes)."""
         fields, step, data = packed

@@ -16,12 +16,7 @@ from tracking_world import NOISE_T, certain_model
 
 from anser_ros.apps.lab import metal_follower, metal_learning
 from anser_ros.apps.lab.metal_follower import KnownMetalFollower, KnownMetalModels
-from anser_ros.apps.lab.metal_lattice import (
-    Coils,
-    KnownMetal,
-    load_known_metal,
-    moved,
-)
+from anser_ros.apps.lab.metal_lattice import Coils, KnownMetal, load_known_metal, moved
 from anser_ros.apps.lab.metal_learning import learn_metal
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, FitError

@@ -17,13 +17,7 @@ from anser_ros.apps.poses.assessment.distances import (
     single_point,
     standing_alone,
 )
-from anser_ros.apps.poses.assessment.history import (
-    ALERT,
-    FAIL,
-    NOTE,
-    PASS,
-    judged,
-)
+from anser_ros.apps.poses.assessment.history import ALERT, FAIL, NOTE, PASS, judged
 from anser_ros.apps.poses.assessment.protocols import assess_motion
 from anser_ros.apps.poses.assessment.rest import StillPoint, metal_shifts, still_points
 from anser_ros.apps.poses.hand_eye import fit_hand_eye

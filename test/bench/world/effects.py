@@ -65,11 +65,7 @@ def sensor_axis(lab, rng):
     across *= np.radians(angle) / np.linalg.norm(across)
     axis[row] = Rotation.from_rotvec(across).apply(axis[row])
     lab.tool = replace(lab.tool, axis=axis)
-    return {
-        'channel': int(lab.tool.channel[row]),
-        'tilt_deg': angle,
-        'axis': axis[row].tolist(),
-    }
+    return {'channel': int(lab.tool.channel[row]), 'tilt_deg': angle, 'axis': axis[row].tolist()}
 
 
 def cluster_axis(lab, rng):

@@ -25,7 +25,6 @@ from anser_ros.nodes.operator_words import (
     titles_of,
 )
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.incoming import pose_numbers
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
@@ -36,7 +35,7 @@ from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import empty_session, load_session
 from anser_ros.sessions.starting_model import NOMINAL, load_model, model_for
 from anser_ros.stamps import stamp_of
-from anser_ros.wire.recorded import optical_topic
+from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import parse_setup
 
 POLL_S = 0.2

@@ -130,8 +130,7 @@ def _rows(
 
 
 def draw(
-    found: Mapping[str, Mapping[str, Compared]],
-    shares: Mapping[str, ComparedShares],
+    found: Mapping[str, Mapping[str, Compared]], shares: Mapping[str, ComparedShares]
 ) -> Figure:
     """Draw the differences of each name's errors and shares of poses with their intervals.
 

@@ -14,13 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.apps.lab.measured import (
-    anser_board,
-    hpi_coils,
-    magnet_patch,
-    navion,
-    transformer,
-)
+from anser_ros.apps.lab.measured import anser_board, hpi_coils, magnet_patch, navion, transformer
 from anser_ros.apps.lab.measured import recipe as shared_data
 from anser_ros.apps.lab.measured.recipe import SHARED, Recipe, ReportRow
 from anser_ros.cli import main

@@ -365,10 +365,7 @@ class Study:
         clean = self._bent(self.factory_calibration.model)
         self._compare('table_5 uncompensated', test, clean, drawing=self.drawing)
         compensated = self._compare('table_5 compensated', test, ours, article=article)
-        known = {
-            'article': track(bottom, article, in_phase=True),
-            'ours': track(bottom, ours),
-        }
+        known = {'article': track(bottom, article, in_phase=True), 'ours': track(bottom, ours)}
         self.results.tracking['table_5 compensated and corrected'] = {
             method: self._corrected(method, known[method], errors)
             for method, errors in compensated.items()

@@ -257,7 +257,4 @@ def _shifts(sensing: Sensing, residuals: PoseResiduals) -> tuple[float, float, f
     return share, place, turn
 
 
-EFFECTS = (
-    PoseMovingMetal(),
-    LooseMount(),
-)
+EFFECTS = (PoseMovingMetal(), LooseMount())

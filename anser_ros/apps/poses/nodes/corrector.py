@@ -13,11 +13,11 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from anser_ros.apps.poses.corrector import OK, OUTSIDE, PoseCorrector
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.incoming import pose_numbers
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter, tracked_parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.stamps import set_stamp, stamp_of
+from anser_ros.wire.recorded import pose_numbers
 from anser_ros.wire.setup import topic_of
 from anser_ros.wire.text_files import read_document
 

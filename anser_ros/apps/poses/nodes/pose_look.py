@@ -8,8 +8,8 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.qos import qos_profile_sensor_data
 
 from anser_ros.nodes.graph_look import looking
-from anser_ros.nodes.runtime.incoming import pose_numbers
 from anser_ros.stamps import stamp_of
+from anser_ros.wire.recorded import pose_numbers
 
 NAME = 'anser_pose_look'
 FIRST_S = 10.0

@@ -13,11 +13,10 @@ from anser_ros.apps.poses.sequence import REFERENCE, PoseWindow
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.operator_words import findings_words, titles_of
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.incoming import pose_numbers
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.streams.one_source import OneSource
 from anser_ros.stamps import stamp_of
-from anser_ros.wire.recorded import ENDING, TRACKED
+from anser_ros.wire.recorded import ENDING, TRACKED, pose_numbers
 
 QUIET_S = 2.0
 """Time without a pose on a topic, s, after which it counts as silent."""

@@ -25,11 +25,12 @@ from anser_ros.apps.slicer import igtl
 from anser_ros.apps.slicer.extension import OPENIGTLINK
 from anser_ros.errors import AnserError, ParameterError, PortError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.incoming import pose_numbers, seconds_of
+from anser_ros.nodes.runtime.incoming import seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import STALE_AFTER_S, parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.pose_states import OK, STALE
+from anser_ros.wire.recorded import pose_numbers
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 from anser_ros.wire.setup_values import tip_name
 
