@@ -90,7 +90,7 @@ class FieldModelParameters:
         MOST_RATE_HZ, 'most refits a second, by the stamps', minimum=2.0, maximum=1000.0, live=True
     )
     witnesses: bool = parameter(
-        False, 'whether contradictions among the coils of rigid tools tell of metal, too'
+        False, 'whether contradictions among the coils of rigid tools show metal, too'
     )
     save_file: str = parameter(
         'field_model.yaml', 'where the service save writes the model', live=True

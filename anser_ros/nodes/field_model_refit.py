@@ -304,10 +304,10 @@ class ActiveRefit:
 TROUBLED = tuple(WITHHELD)
 """States of the refit that an operator is warned of."""
 PREPARING = (
-    'a baseline is there, the refit is being prepared: until it is in force there are no poses '
+    'a baseline is there, the refit is being prepared: until it is active there are no poses '
     '(state references_lost), as metal may come meanwhile'
 )
-ACTIVE = 'the refit is in force: the model follows the references'
+ACTIVE = 'the refit is active: the model follows the references'
 
 
 def no_baseline(namespace: str) -> str:

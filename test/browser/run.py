@@ -173,7 +173,7 @@ class Trial:
         if args.calibrate:
             self._click('Set baseline')
             said = page.locator('.words').filter(
-                has_text=re.compile(r'\w'), has_not_text='in force'
+                has_text=re.compile(r'\w'), has_not_text='active: '
             )
             found['baseline'] = said.first.inner_text()
         self._click('Record')
@@ -189,13 +189,13 @@ class Trial:
         found['report'] = opened.value.locator('body').inner_text()[:60].replace('\n', ' ')
         opened.value.close()
         self._click('Load corrected model')
-        page.get_by_text('the new model is in force').wait_for()
+        page.get_by_text('the new model is active').wait_for()
         found['tracked_again_s'] = self._tracked_again_s()
         page.wait_for_timeout(1e3 * FIGURES_S)
         found['tables'] = self._tables()
         self._picture('')
         self._click('Undo')
-        page.get_by_text('the previous model is in force again').wait_for()
+        page.get_by_text('the previous model is active again').wait_for()
         found['tracked_again_after_undo_s'] = self._tracked_again_s()
         found['after_undo'] = page.locator('.bar .pill').inner_text()
         live = found['tables']['live, last 10 s']

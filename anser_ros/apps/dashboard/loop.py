@@ -322,7 +322,7 @@ class CorrectionLoop:
         await self._exchange(before, dict.fromkeys(before, str(self.found.model)))
         self._loaded = [*self._loaded[-MOST_UNDONE + 1 :], Loaded(before, figures, time.time())]
         self._live.mark('model loaded')
-        return 'the new model is in force'
+        return 'the new model is active'
 
     @_step
     async def undo(self) -> str:
@@ -332,7 +332,7 @@ class CorrectionLoop:
         await self._exchange(await self._chain.model_files(), self._loaded[-1].before)
         self._loaded.pop()
         self._live.mark('undone')
-        return 'the previous model is in force again'
+        return 'the previous model is active again'
 
     def refresh_names(self) -> None:
         """See which recordings there are."""

@@ -78,7 +78,7 @@ class Screen:
                 'Fit a field model to this recording, which has optical poses'
             )
             self._diagnose = _button('Diagnose', loop.diagnose, 'search').tooltip(
-                'Find what the model in force lacks on this recording'
+                'Find what the active model lacks on this recording'
             )
             self._cancel = _button('Cancel', self._end, 'close', flat=True)
         self._progress = ui.linear_progress(0.0, show_value=False).classes('progress')
@@ -203,7 +203,7 @@ class Screen:
         self._enable(self._report, found is not None)
         self._enable(self._load, loop.can_load)
         self._enable(self._undo, loop.can_undo)
-        self._text(self._model, f'in force: {loop.model_name}' if loop.model else '')
+        self._text(self._model, f'active: {loop.model_name}' if loop.model else '')
         self._html(self._live, _table('live, last 10 s', loop.comparison()))
 
     def _show_share(self, share: float) -> None:
