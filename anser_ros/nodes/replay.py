@@ -105,7 +105,7 @@ class Consumers:
         for _ in range(attempts):
             end_s = time.monotonic() + REPLY_TIMEOUT_S
             while time.monotonic() < end_s:
-                if answered.wait(POLL_S):
+                if answered.wait(ANSWER_POLL_S):
                     return True
                 # One that the graph does not know now is looked for again with the others.
                 if self._given_up.is_set() or not self._clients[name].service_is_ready():
