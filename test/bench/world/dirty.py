@@ -7,26 +7,22 @@ arm, and a camera that stamps off. One scan by hand is calibrated; sessions with
 gain, metal at rest, a drift and another registration are diagnosed. A line is printed for each.
 Errors of positions are exact, of every coil of the tool in the clean session.
 """
-# ruff: noqa: E402  (threads are set before numpy comes in)
 
 import argparse
 import json
-import os
 import sys
 from dataclasses import replace
 from pathlib import Path
 
-for variable in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'NUMBA_NUM_THREADS'):
-    os.environ.setdefault(variable, '1')
-sys.path.insert(1, str(Path(__file__).resolve().parents[3]))  # to run from a bare checkout
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
-import boards
-import effects
+import harness
 import numpy as np
 import recording
-import scenarios
-from judge import run
+from boards import build
+from effects import coil_drift, registration, sensor_gain
 from laboratory import Laboratory
+from scenarios import static_metal
 from scoring import true_errors
 
 ROWS = (
@@ -35,8 +31,8 @@ ROWS = (
 )  # fmt: skip
 """Board, most coils of the tool, spread of gains, and how late the camera's stamps are, s."""
 SESSIONS = {
-    'check': (), 'gain': (effects.sensor_gain,), 'metal': (scenarios.static_metal,),
-    'drift': (effects.coil_drift, effects.registration),
+    'check': (), 'gain': (sensor_gain,), 'metal': (static_metal,),
+    'drift': (coil_drift, registration),
 }  # fmt: skip
 
 
@@ -59,49 +55,45 @@ def wrong(board, gains, late_s, rng):
 
 
 def make(folder, row, seed):
-    """Record the scan and the sessions of a row that are not there yet; return what is in them."""
+    """Record the scan and the sessions of a row that are not there yet; return its board."""
     index, coils, gains, late_s = ROWS[row]
-    board = boards.build(index, np.random.default_rng([seed, row]))
+    board = build(index, np.random.default_rng([seed, row]))
     few = board.tool
     keep = {k: getattr(few, k)[:coils] for k in ('channel', 'name', 'place', 'axis', 'length')}
-    board, truth = replace(board, tool=replace(few, **keep)), {}
+    board = replace(board, tool=replace(few, **keep))
     folder.mkdir(parents=True, exist_ok=True)
     for number, (name, kinds) in enumerate({'scan': (), **SESSIONS}.items()):
         lab = wrong(board, gains, late_s, np.random.default_rng([seed, row, 1]))
         rng = np.random.default_rng([seed, row, 2, number])
-        truth[name] = {kind.__name__: kind(lab, rng) for kind in kinds}
+        for kind in kinds:
+            kind(lab, rng)
         if not (folder / f'{name}.npz').exists():
             path = recording.record_session(folder / f'{name}.mcap', lab, rng)
             np.savez_compressed(folder / f'{name}.npz', **path)
-    return board, truth
+    return board
 
 
 def lines(out, row, seed):
     """Run the commands on a row; yield its lines of the table."""
     folder = out / f'{seed}_{row}'
-    board, truth = make(folder, row, seed)
-    runs, model = folder / 'runs', str(folder / 'model.yaml')
-    scan, check = str(folder / 'scan.mcap'), str(folder / 'check.mcap')
-    made = run(runs / 'calibrate', ['calibrate', scan, '--out', model], False)
-    if made['failed']:
-        raise SystemExit(f'{folder.name}: calibrate: {made["failed"]}')
-    tracked = runs / 'evaluate'
-    run(tracked, ['evaluate', check, '--model', model, '--out', str(tracked)], False)
+    board = make(folder, row, seed)
+    runs, model = folder / 'runs', folder / 'model.yaml'
+    made = harness.anser('calibrate', folder / 'scan.mcap', '--out', model, '--force')
+    tracked = '--model', model, '--out', runs / 'evaluate'
+    harness.anser('evaluate', folder / 'check.mcap', *tracked)
     _, _, gains, late_s = ROWS[row]
-    exact = true_errors(tracked / 'poses.csv', folder / 'check.npz')
+    rmse_m, over = true_errors(runs / 'evaluate' / 'poses.csv', folder / 'check.npz')
     yield (
         f'| {board.design.name} | {len(board.tool.channel)} | {100 * gains:g} | {1e3 * late_s:g} '
-        f'| {1e3 * exact["rmse_m"]:.3f} mm | {100 * exact["over_3_sigma"]:.2f} '
-        f'| {made["seconds"]:.0f} s |'
+        f'| {1e3 * rmse_m:.3f} mm | {100 * over:.2f} | {made.cpu_s:.0f} s |'
     )
-    for name in SESSIONS:
-        there = runs / name
-        arguments = ['diagnose', str(folder / f'{name}.mcap'), '--model', model]
-        run(there, [*arguments, '--out', str(there)], False)
-        found = json.loads((there / 'diagnosis.json').read_text())
+    for name, kinds in SESSIONS.items():
+        bag = folder / f'{name}.mcap'
+        harness.anser('diagnose', bag, '--model', model, '--out', runs / name)
+        found = json.loads((runs / name / 'diagnosis.json').read_text())
         after = 1e12 * found['held_out']['flux_rms_after_t']
         names = ', '.join(effect['name'] for effect in found['effects']) or 'nothing'
-        put = ', '.join(truth[name]) or 'nothing'
+        put = ', '.join(kind.__name__ for kind in kinds) or 'nothing'
         yield f'| {board.design.name} | {name}: {put} | {names} | {after:.1f} pT |'
 
 
@@ -113,14 +105,16 @@ def main():
     parser.add_argument('--seed', type=int, default=703)
     parser.add_argument('--json', type=Path, help='file that gets the lines')
     args = parser.parse_args()
-    kept = []
-    for row in args.rows:
-        for number, line in enumerate(lines(args.out, row, args.seed)):
-            print(line, flush=True)
-            name = ('scan', *SESSIONS)[number]
-            kept.append({'name': f'row {row}, seed {args.seed}: {name}', 'line': line})
-            if args.json:
-                args.json.write_text(json.dumps(kept, indent=1) + '\n')
+    harness.print_lines(
+        (
+            (f'row {row}, seed {args.seed}: {name}', line)
+            for row in args.rows
+            for name, line in zip(
+                ('scan', *SESSIONS), lines(args.out, row, args.seed), strict=True
+            )
+        ),
+        args.json,
+    )
 
 
 if __name__ == '__main__':

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from boards import Board, Sensors
 from filaments import along
-from sheets import edge_currents, flux_nodes, mesh, sheet_field
 from spheres import dipole_field, response
 
 FLUX_NOISE_T = 60e-12
@@ -34,7 +33,6 @@ class Laboratory:
     tool: Sensors  # as they really are
     paths: list  # the emitters' tracks
     metals: list = field(default_factory=list)  # of (Body, Travel)
-    sheets: list = field(default_factory=list)
     on_flux: list[Callable] = field(default_factory=list)
     on_optical: list[Callable] = field(default_factory=list)
     noise: dict = field(default_factory=dict)  # factor by channel; key -1 for all
@@ -54,40 +52,25 @@ class Scattered:
     """The answer of all metal at given times.
 
     ``place`` (T, N, 3) and ``moments`` (T, N, 3, K) are of the spheres of each body, T being 1
-    where nothing moves; ``currents`` (T, E, K) of the edges of each sheet's mesh.
+    where nothing moves.
     """
 
     def __init__(self, lab, time):
         self.lab, omega = lab, lab.board.omega
         self.still = not any(travel.moves for _, travel in lab.metals)
         time = np.asarray(time)[:1] if self.still else np.asarray(time)
-        self.count = time.size
         poses = [travel.at(time) for _, travel in lab.metals]
         self.place = [
             at[:, None] + np.einsum('tij,nj->tni', turn, body.place)
             for (body, _), (at, turn) in zip(lab.metals, poses, strict=True)
         ]
-        self.turns = [turn for _, turn in poses]
-        self.grids = [mesh(sheet) for sheet in lab.sheets]
         responses = [response(body, omega) for body, _ in lab.metals]
         drive = [np.moveaxis(lab.field(place), -2, -1) for place in self.place]
-        nodes = [flux_nodes(g, s) for g, s in zip(self.grids, lab.sheets, strict=True)]
-        normal = [lab.field(n) @ g.normal for n, g in zip(nodes, self.grids, strict=True)]
         self.moments = [np.zeros(d.shape, dtype=complex) for d in drive]
-        self.currents = [
-            np.zeros((self.count, len(g.start), omega.size), dtype=complex) for g in self.grids
-        ]
-        rounds = ROUNDS if len(drive) + len(normal) > 1 else 1
-        for _ in range(rounds):
+        for _ in range(ROUNDS if len(drive) > 1 else 1):
             for b, own in enumerate(drive):
-                here = own + np.moveaxis(self._others(self.place[b], body=b), -2, -1)
-                self.moments[b] = self._answer(responses[b], self.turns[b], here)
-            for s, own in enumerate(normal):
-                other = self._others(np.broadcast_to(nodes[s], (self.count, *nodes[s].shape)), s)
-                total = (own + other @ self.grids[s].normal).mean(axis=-2)
-                self.currents[s] = np.array(
-                    [edge_currents(self.grids[s], frame, omega) for frame in total]
-                )
+                here = own + np.moveaxis(self.field(self.place[b], without=b), -2, -1)
+                self.moments[b] = self._answer(responses[b], poses[b][1], here)
 
     @staticmethod
     def _answer(matrices, turn, drive):
@@ -98,28 +81,17 @@ class Scattered:
         moments = np.stack([flat[..., k] @ matrices[k].T for k in range(emitters)], axis=-1)
         return np.einsum('tij,tnjk->tnik', turn, moments.reshape(own.shape))
 
-    def _others(self, points, sheet=None, body=None):
-        """Field (T, ..., K, 3) of all metal but one piece at points (T, ..., 3)."""
+    def field(self, points, without=None):
+        """Field (T, ..., K, 3), T, of all metal but perhaps one body at points (T, ..., 3)."""
         out = np.zeros((*points.shape[:-1], self.lab.board.omega.size, 3), dtype=complex)
-        alone = len(self.place) + len(self.grids) == 1
-        if alone and (sheet is not None or body is not None):
-            return out
-        for t in range(len(points)):
-            flat = points[t].reshape(-1, 3)
-            now = 0 if self.still else t
-            total = np.zeros((len(flat), *out.shape[-2:]), dtype=complex)
+        for t, frame in enumerate(points):
+            flat = frame.reshape(-1, 3)
             for b, place in enumerate(self.place):
-                if b != body:
-                    total += dipole_field(flat, place[now], self.moments[b][now])
-            for s, grid in enumerate(self.grids):
-                if s != sheet:
-                    total += sheet_field(flat, grid, self.currents[s][now])
-            out[t] = total.reshape(out[t].shape)
+                if b != without:
+                    now = 0 if self.still else t
+                    total = dipole_field(flat, place[now], self.moments[b][now])
+                    out[t] += total.reshape(out[t].shape)
         return out
-
-    def field(self, points):
-        """Field (T, ..., K, 3), T, at points (T, ..., 3)."""
-        return self._others(points)
 
 
 def _flux_of(total, axes, weights):
@@ -142,7 +114,7 @@ def read_fluxes(lab, time, position, rotation):
     tool = _flux_of(lab.field(nodes), axes, weights).astype(complex)
     reference = _flux_of(lab.field(fixed), real.axis, fixed_weights).astype(complex)
     reference = np.tile(reference, (len(time), 1, 1))
-    if lab.metals or lab.sheets:
+    if lab.metals:
         scattered = Scattered(lab, time)
         tool += _flux_of(scattered.field(nodes), axes, weights)
         frames = (

@@ -3,8 +3,6 @@
 Of `anser_ros` only the writer of bags and the byte layout of the clouds are used.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import yaml
 from laboratory import (
@@ -104,16 +102,12 @@ def record_session(path, lab, rng):
     """Write a session of 40 s in which the tool moves; return its true path.
 
     That is ``stamp_ns``, ``position``, ``rotation`` of the tool's body in fg at every flux stamp,
-    ``sensor_position`` (F, S, 3), ``metal_m`` (B, F, 3), where each metal body's origin was, and
-    ``metal_flux_t``, the root mean square of a phasor component of what all metal adds to the
-    tool's fluxes.
+    and ``sensor_position`` (F, S, 3).
     """
     wander = wander_over(lab.board, rng)
     time = np.arange(0, LENGTH_S, 1 / FLUX_HZ)
     position, rotation = wander.at(time)
-    true = read_fluxes(lab, time, position, rotation)
-    fluxes = measured(lab, time, true, FLUX_NOISE_T, rng)
-    bare = read_fluxes(replace(lab, metals=[], sheets=[]), time, position, rotation)
+    fluxes = measured(lab, time, read_fluxes(lab, time, position, rotation), FLUX_NOISE_T, rng)
     optical, place, turn = _tracked(lab, wander, rng)
     stamps = _stamps(time)
     poses = _reported(place, turn, rng)
@@ -123,6 +117,4 @@ def record_session(path, lab, rng):
         'position': position,
         'rotation': rotation,
         'sensor_position': position[:, None] + np.einsum('fij,sj->fsi', rotation, lab.tool.place),
-        'metal_m': np.reshape([way.at(time)[0] for _, way in lab.metals], (-1, len(time), 3)),
-        'metal_flux_t': np.sqrt(0.5 * np.mean(np.abs(true[0] - bare[0]) ** 2)),
     }

@@ -6,15 +6,12 @@ import numpy as np
 from bodies import block, head, rail, retractor
 from laboratory import Scattered
 from motions import Travel, resting
-from sheets import Sheet
 
 ROOM_M = 0.012
 """Least distance between a sphere's surface and a reference coil or the tool's volume."""
 LUMP_T, HEAD_T, HINDRANCE_T = 0.5e-9, 2e-9, 0.3e-9
 """Least field that the kinds of metal make in the volume: what is weaker is no test."""
 MOST_DRAWN = 300
-SHEETS = {'aluminium': 3.6e-8, 'copper': 1.75e-8, 'stainless': 7.2e-7}
-"""Resistivity, ohm m."""
 
 
 def _clear(lab, body, travel):
@@ -43,7 +40,7 @@ def strength(lab, body, travel):
     low, high = lab.board.heights_m
     line = np.array([-0.1, 0.0, 0.1])
     points = np.array([(x, y, z) for x in line for y in line for z in (low, high)])
-    alone = replace(lab, metals=[(body, travel)], sheets=[])
+    alone = replace(lab, metals=[(body, travel)])
     times = np.linspace(travel.t_start, travel.t_end, 4) if travel.moves else np.zeros(1)
     field = Scattered(alone, times).field(np.tile(points, (len(times), 1, 1)))
     return np.sqrt(np.mean(np.abs(field) ** 2, axis=(1, 2, 3))).max()
@@ -86,7 +83,6 @@ def _placed(lab, draw, least_t):
     if best is None:
         raise RuntimeError('no clear place for the metal was found')
     lab.metals.append(best)
-    return best
 
 
 def static_metal(lab, rng, ferrous=None):
@@ -95,65 +91,13 @@ def static_metal(lab, rng, ferrous=None):
     names = ['steel', 'ferrite_steel'] if ferrous else ['aluminium', 'copper', 'brass']
     material, radius = str(rng.choice(names)), rng.uniform(0.035, 0.06)
     shape = block(rng, radius, material)
-    _, travel = _placed(lab, lambda: (shape, resting(_spot(lab, radius, rng), _turn(rng))), LUMP_T)
-    return {
-        'position_m': travel.start.tolist(),
-        'radius_m': radius,
-        'ferrous': ferrous,
-        'material': material,
-    }
+    _placed(lab, lambda: (shape, resting(_spot(lab, radius, rng), _turn(rng))), LUMP_T)
 
 
 def two_metals(lab, rng):
     """Two different lumps."""
-    return {'bodies': [static_metal(lab, rng, False), static_metal(lab, rng, True)]}
-
-
-def conductive_plate(lab, rng):
-    """A sheet below, parallel to the board."""
-    material = str(rng.choice(['aluminium', 'aluminium', 'copper', 'stainless']))
-    thickness, edge = rng.uniform(0.7e-3, 3e-3), rng.uniform(0.18, 0.35)
-    below = lab.board.reference.place[:, 2]
-    while True:
-        z = -rng.uniform(0.025, 0.11)
-        if np.abs(z - below).min() > ROOM_M:
-            break
-    centre = np.array([*rng.uniform(-0.025, 0.025, 2), z])
-    a = rng.uniform(0, np.pi / 2)
-    turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
-    ohm = SHEETS[material] / thickness
-    lab.sheets.append(Sheet(centre, turn, edge, ohm))
-    return {'z_m': z, 'edge_m': edge, 'centre_m': centre[:2].tolist(), 'sheet_ohm': ohm}
-
-
-def _truth(travel, **more):
-    return {
-        'start_m': travel.start.tolist(),
-        'end_m': travel.end.tolist(),
-        't_start_s': travel.t_start,
-        't_end_s': travel.t_end,
-        **more,
-    }
-
-
-def moving_metal(lab, rng):
-    """A lump that is carried from one place to another."""
-    ferrous = bool(rng.integers(2))
-    material = str(rng.choice(['steel', 'ferrite_steel'] if ferrous else ['aluminium', 'brass']))
-    radius = rng.uniform(0.035, 0.06)
-    shape = block(rng, radius, material)
-    t0 = rng.uniform(4, 12)
-    t1 = t0 + rng.uniform(12, 22)
-
-    def draw():
-        start, end = _spot(lab, radius, rng), _spot(lab, radius, rng)
-        while np.linalg.norm(end - start) < 0.1:
-            end = _spot(lab, radius, rng)
-        turn = _turn(rng)
-        return shape, Travel(start, end, t0, t1, turn, turn + _turn(rng, 0.5), np.zeros(3))
-
-    _, travel = _placed(lab, draw, LUMP_T)
-    return _truth(travel, radius_m=radius, ferrous=ferrous)
+    static_metal(lab, rng, ferrous=False)
+    static_metal(lab, rng, ferrous=True)
 
 
 def approach(lab, rng):
@@ -172,8 +116,7 @@ def approach(lab, rng):
         bow = np.array([*rng.uniform(-0.03, 0.03, 2), 0.0])
         return shape, Travel(start, end, t0, t1, lean, spin, bow)
 
-    _, travel = _placed(lab, draw, HEAD_T)
-    return _truth(travel, scenario='approach')
+    _placed(lab, draw, HEAD_T)
 
 
 def sweep(lab, rng):
@@ -192,8 +135,7 @@ def sweep(lab, rng):
         bow = np.array([0.0, 0.0, rng.uniform(-0.01, 0.0)])
         return shape, Travel(start, end, t0, t1, spin, spin + [0, 0, 0.5], bow)
 
-    _, travel = _placed(lab, draw, HEAD_T)
-    return _truth(travel, scenario='sweep')
+    _placed(lab, draw, HEAD_T)
 
 
 def beside(lab, rng):
@@ -211,8 +153,7 @@ def beside(lab, rng):
         spin = np.array([0, 0, a + np.pi / 2])
         return shape, Travel(start, end, t0, t1, spin, spin, 0.05 * side)
 
-    _, travel = _placed(lab, draw, HINDRANCE_T)
-    return _truth(travel, scenario='beside', shape='rail' if long else 'lump')
+    _placed(lab, draw, HINDRANCE_T)
 
 
 def over(lab, rng):
@@ -228,5 +169,4 @@ def over(lab, rng):
         turn = _turn(rng, 0.3) + [np.pi * large, 0.0, 0.0]
         return shape, Travel(start, end, t0, t1, turn, turn + _turn(rng, 0.4), np.zeros(3))
 
-    _, travel = _placed(lab, draw, HINDRANCE_T)
-    return _truth(travel, scenario='over', shape='head' if large else 'retractor')
+    _placed(lab, draw, HINDRANCE_T)
