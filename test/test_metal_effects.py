@@ -1,18 +1,32 @@
-"""Effects of metal: bodies, their ways, their places, and who lights them."""
+"""Metal: spheres, bodies, their ways and places, who lights them, and what has departed."""
 
+import cmath
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis_world import world
+from diagnosis_world import board, world
 from effects_scene import candidates, in_force, moving, visiting
 from metal_world import induced_moments
 
+from anser_ros.diagnosis import departure as departing
+from anser_ros.diagnosis.departure import departure
+from anser_ros.diagnosis.problem import evaluate, train_blocks
 from anser_ros.effects.correction import tool_view
 from anser_ros.effects.metal_at_rest import REMAINDER, UP_M, Couplings, IlluminationChange
-from anser_ros.effects.moving_metal import FreePath, StraightPath, moving_times
+from anser_ros.effects.moving_metal import DepartedMetal, FreePath, StraightPath, moving_times
 from anser_ros.field.model import Dipoles
-from anser_ros.metal.body import BODIES, ODD, body_spread, centre_sigma, multipoles, sheet_sources
+from anser_ros.metal.body import (
+    BODIES,
+    ODD,
+    SMALL,
+    body_spread,
+    centre_sigma,
+    multipoles,
+    sheet_sources,
+    sphere_polarisability,
+)
 from anser_ros.physics.constants import MU_0
 
 
@@ -187,3 +201,149 @@ def test_lighting_is_an_emitter_that_sits_higher(problem, found):
     wanted = view.along(there.flux(*view.flat) - here.flux(*view.flat))[..., 1]
     np.testing.assert_allclose(column[..., 1], wanted, atol=0.01 * np.abs(wanted).max())
     assert not np.any(column[..., [0, 2]])
+
+
+REST, NEAREST = np.array([0.12, -0.1, -0.16]), np.array([0.03, -0.02, -0.08])
+BALLS = np.array([[0.0, 0.0, 0.0], [0.04, 0.01, 0.0], [-0.01, 0.035, 0.01]])
+"""Places of the balls of a piece of metal, m."""
+
+
+def metal_at(centre, light, omega):
+    """Dipoles of three conducting balls that do not see each other."""
+    points = centre + BALLS
+    strength = sphere_polarisability(0.016, 3.5e7, 1.0, omega)
+    return Dipoles.vectors(points, light.field(points) * strength)
+
+
+@pytest.fixture(scope='module')
+def scanned():
+    """A problem whose model and baseline have the metal at rest, and the metal's field there."""
+    made = world(seed=3, frames=500)
+    light = made.field
+    omega = 2 * np.pi * np.asarray(made.model.frequencies_hz)
+    duration = float(made.tool.time[-1])
+
+    def place(time):
+        share = np.sin(np.pi * time / duration) ** 2
+        return REST + share * (NEAREST - REST)
+
+    position, rotation = made.true_pose()
+    centres, axes = made.tool.sensors.placed(position, rotation)
+    fixed = made.reference.sensors
+    flux, reference = made.tool.flux.copy(), made.reference.flux.copy()
+    for i, time in enumerate(made.tool.time.tolist()):
+        sources = metal_at(place(time), light, omega)
+        flux[i] += sources.flux(centres[i], axes[i], made.tool.sensors.length)
+        reference[i] += sources.flux(fixed.position, fixed.axis, fixed.length)
+    resting = metal_at(REST, light, omega)
+    learnt = light.joined(resting)
+    made.model = replace(made.model, **vars(learnt))
+    made.drawn = board()
+    made.baseline = made.baseline + resting.flux(fixed.position, fixed.axis, fixed.length)
+    made.flux(flux)
+    made.references(reference)
+    return made.problem(), resting
+
+
+def test_metal_at_rest_changes_nothing_and_its_derivatives_are_right(scanned):
+    problem, _ = scanned
+    rows = np.arange(0, 500, 125)
+    part = problem.in_blocks(train_blocks()).frames([rows[:3]], rows[:1])
+    view = evaluate(part, ()).parts[0].view
+    path = FreePath((0.0, 7.0, 14.0, 20.0))
+    course = np.array([REST, NEAREST, (REST + NEAREST) / 2, REST]).ravel()
+    effect = DepartedMetal(rest_s=7.0)
+    term = effect.starting(path, course, 20.0, np.array([-0.5, 0.1]))
+    assert not effect.moving_flux(term, term.resting(view)).any()
+    columns = effect.columns(term, view)
+    for index in (0, 4, 11, path.count, term.theta.size - 1):
+        step = 1e-5 * np.eye(term.theta.size)[index]
+        more, less = (
+            effect.moving_flux(term.with_theta(term.theta + s), view) for s in (step, -step)
+        )
+        slope = (more - less) / 2e-5
+        assert np.abs(columns[..., index] - slope).max() < 2e-2 * np.abs(slope).max() + 1e-16
+
+
+@pytest.mark.long
+def test_what_metal_does_at_rest_is_found_from_how_it_moves(scanned, monkeypatch):
+    problem, resting = scanned
+    monkeypatch.setattr(departing, '_ways', lambda: [np.array([0.1, -0.06, -0.06])])
+    monkeypatch.setattr(departing, 'MANY_FRAMES', 100)
+    monkeypatch.setattr(departing, 'SPACINGS', {})
+    found = departure(problem, 0.0)
+    assert found is not None and found.is_predictive and found.before > 5.0 * found.after
+    view = evaluate(problem.in_blocks(np.array([3, 12])), ()).parts[0].view
+    flux, sigma = found.rest_flux(view)
+    truth = view.along(resting.flux(*view.flat))
+    size = np.sqrt(np.mean(np.abs(truth) ** 2))
+    assert np.sqrt(np.mean(np.abs(flux - truth) ** 2)) < 0.2 * size
+    assert 0.0 < sigma.mean() < 0.3 * size
+    assert departure(replace(problem, references=None), 0.0) is None
+
+
+RADIUS = 0.02
+
+
+def polarisability(radius, conductivity, permeability, frequency):
+    """Return the sphere's polarisability at one frequency, m^3."""
+    omega = np.array([2 * math.pi * frequency])
+    return MU_0 * sphere_polarisability(radius, conductivity, permeability, omega)[0]
+
+
+def test_static_permeable_sphere():
+    """4 pi a^3 (mu_r - 1)/(mu_r + 2), Jackson section 5.11."""
+    for permeability in (1.0, 2.0, 1000.0):
+        alpha = polarisability(RADIUS, 0.0, permeability, 0.0)
+        expected = 4 * math.pi * RADIUS**3 * (permeability - 1) / (permeability + 2)
+        assert alpha == pytest.approx(expected, abs=1e-18)
+
+
+def test_perfect_conductor():
+    alpha = polarisability(RADIUS, 5.8e7, 1.0, 1e9)
+    assert alpha == pytest.approx(-2 * math.pi * RADIUS**3, rel=1e-3)
+
+
+def test_weak_conductor_is_the_first_order_of_its_eddy_currents():
+    """m = -j w mu0 sigma 2 pi a^5 B / (15 mu0): Landau and Lifshitz, section 59."""
+    conductivity, frequency = 1e3, 1e3
+    alpha = polarisability(RADIUS, conductivity, 1.0, frequency)
+    omega = 2 * math.pi * frequency
+    expected = -2j * math.pi * RADIUS**5 * omega * MU_0 * conductivity / 15
+    assert alpha == pytest.approx(expected, rel=1e-2)
+
+
+@pytest.mark.parametrize('frequency', [1.0, 1e2, 1e3, 1e4, 1e6])
+def test_conductor_against_the_bessel_series(frequency):
+    """alpha = -2 pi a^3 (1 + 3/x^2 - 3 coth(x)/x) for mu_r = 1 (Landau and Lifshitz, 59.4)."""
+    x = RADIUS * cmath.sqrt(2j * math.pi * frequency * MU_0 * 3.5e7)
+    coth = cmath.cosh(x) / cmath.sinh(x) if x.real < 300 else 1.0
+    expected = -2 * math.pi * RADIUS**3 * (1 + 3 / x**2 - 3 * coth / x)
+    alpha = polarisability(RADIUS, 3.5e7, 1.0, frequency)
+    assert alpha == pytest.approx(expected, rel=1e-6)
+    assert alpha.real < 0
+    assert alpha.imag < 0, 'an induced moment lags'
+
+
+def test_the_series_and_the_closed_form_meet():
+    edge = (SMALL / RADIUS) ** 2 / MU_0
+    below, above = sphere_polarisability(RADIUS, 1.0, 1.0, edge * np.array([0.99999, 1.00001]))
+    assert above == pytest.approx(below, rel=5e-5)
+
+
+@pytest.mark.parametrize('arguments', [(0.0, 1.0, 1.0, 1.0), (1.0, 1.0, 0.0, 1.0),
+                                       (1.0, -1.0, 1.0, 1.0), (1.0, 1.0, 1.0, -1.0)])  # fmt: skip
+def test_impossible_spheres_are_refused(arguments):
+    with pytest.raises(ValueError, match='must'):
+        polarisability(*arguments)
+
+
+def test_coupled_pair_along_the_line_that_joins_them():
+    """Two spheres in an axial field: alpha_eff = alpha / (1 - alpha / (2 pi d^3))."""
+    distance = 0.05
+    positions = np.array([[0, 0, 0], [0, 0, distance]])
+    alpha = 4 * math.pi * RADIUS**3
+    field = np.tile([0.0, 0.0, 1e-6], (2, 1, 1))
+    moments = induced_moments(positions, np.full(2, alpha / MU_0), field)
+    expected = alpha / (1 - alpha / (2 * math.pi * distance**3)) * 1e-6 / MU_0
+    np.testing.assert_allclose(moments[:, 0, 2], expected, rtol=1e-12)

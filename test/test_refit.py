@@ -4,8 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from refit_frames import HEAD, STEP_NS, errors, replace_geometry, rms, run, share_left
-from refit_world import NOISE_T, anser_world, metal_block, three_coil_world, volume_points
+from refit_world import (
+    HEAD,
+    NOISE_T,
+    STEP_NS,
+    anser_world,
+    errors,
+    metal_block,
+    replace_geometry,
+    rms,
+    run,
+    share_left,
+    three_coil_world,
+    volume_points,
+)
 
 from anser_ros.errors import FitError
 from anser_ros.frames.intake import Intake

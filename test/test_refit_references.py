@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from refit_frames import HEAD, STEP_NS, run, share_left
-from refit_world import anser_world
+from refit_world import HEAD, STEP_NS, anser_world, run, share_left
 
 from anser_ros.pose_states import REFERENCES_DOUBTFUL
 from anser_ros.refit.health import ReferenceWatch
