@@ -13,7 +13,6 @@ from typing import Any
 
 import harness
 import numpy as np
-from refit_world import anser_world, metal_block
 
 from anser_ros.apps.lab.experiments import refit_ablation as ablation
 from anser_ros.refit.live_refit import LiveRefit
@@ -121,25 +120,6 @@ def spend(
     return spent
 
 
-def detection() -> Iterator[harness.Row]:
-    """Frames until metal that moves 0.1 mm of the tool's place is seen, and false alarms."""
-    world = anser_world(32)
-    refit, rng = world.refit(), np.random.default_rng(1)
-    alarms = 0
-    for frame in range(500):
-        flux = world.baseline + world.noise(rng)
-        found = refit.update(1 + frame, world.references.channel, flux)
-        alarms += found.model is not refit.model
-    change = world.metal(metal_block([0.03, -0.02, -0.2], [0.1, 0.12, 0.06]))
-    delay, state = 0, 'frozen'
-    while state == 'frozen' and delay < 100:
-        delay += 1
-        flux = world.baseline + change + world.noise(rng)
-        state = refit.update(1000 + delay, world.references.channel, flux).state
-    yield harness.row('frames until metal 0.2 m below the board is seen', delay, '1', target=3)
-    yield harness.row('false alarms in 500 frames', alarms, '1', target=0)
-
-
 def against_references(
     sessions: dict[str, Any], model: Any, baseline: Any
 ) -> Iterator[harness.Row]:
@@ -167,5 +147,4 @@ def rows() -> Iterator[harness.Row]:
         yield from accuracy(name, session, model, baseline)
     moving = next(iter(sessions.values()))
     yield from costs(moving, model, baseline)
-    yield from detection()
     yield from against_references(sessions, model, baseline)

@@ -1,13 +1,10 @@
 """How well a scan tells its own errors: simulated scans by a hand, on seeds that chose nothing.
 
-Coils of seven random dipoles each, no drawing. Of three coils, what is found is compared with what
-was put in, relative to the rules for what no data determine. Of eight, the coils are tracked
-singly on a path that the scan did not take, and their exact error is compared with that of a scan
-by a perfect tool and a camera that only jitters; that table is in docs/calibration.md.
+Eight emitters of seven random dipoles each, no drawing. The tool's coils are tracked singly on a
+path that the scan did not take, and their exact error is compared with that of a scan by a perfect
+tool and a camera that only jitters; the table is in docs/calibration.md.
 
-    python test/bench/bench_survey.py              # parameters of all rows, one seed
-    python test/bench/bench_survey.py --tracked    # errors of tracked coils
-    python test/bench/bench_survey.py --rows 0 3 --seeds 701 702 --json lines.json
+    python test/bench/bench_survey.py [--rows 0 3] [--seeds 701 702] [--json lines.json]
 """
 
 from __future__ import annotations
@@ -23,9 +20,7 @@ from calibration_world import JITTER_M, NOISE_T, Errors, hand, moved_scan, scene
 
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
 from anser_ros.calibration.layouts import Layout
-from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.settings import Accuracy
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
@@ -45,11 +40,6 @@ ROWS = (
 )
 """Coils of the tool, length of the scan (s), turns (deg), and what is wrong with it."""
 HEAD = (
-    '| coils | scan, s | turns, deg | gains, % | offset, ms | jitter, mm | gain error, % '
-    '| axis, mrad | place, mm | lever arm, mm | offset error, ms | jitter found, mm '
-    '| reported as undetermined | CPU, s |'
-)
-TRACKED_HEAD = (
     '| coils | scan, s | turns, deg | gains, % | offset, ms | jitter, mm | ours, mm | worst, mm '
     "| over 3 sigma, % | a perfect tool's, mm | reported as undetermined | CPU, s |"
 )
@@ -61,7 +51,7 @@ UNSEEN_S = 700.0
 """The hand's path from this time on is another one than that of any scan."""
 
 
-def tracked_row(coils: int, seconds: float, turns_deg: float, errors: Errors, seed: int) -> str:
+def row_of(coils: int, seconds: float, turns_deg: float, errors: Errors, seed: int) -> str:
     """One scan's line of the table of tracked coils."""
     begin = time.process_time()
     ours = _tracked(coils, seconds, turns_deg, errors, seed, KINDS)
@@ -121,43 +111,17 @@ def _tracked(
     )
 
 
-def row_of(coils: int, seconds: float, turns_deg: float, errors: Errors, seed: int) -> str:
-    """One scan's line of the table."""
-    rng = np.random.default_rng(seed)
-    world, table = scene(rng, side=4), tool_of(coils)
-    told, truth = moved_scan(world, table, rng, seconds, errors, np.radians(turns_deg))
-    begin = time.process_time()
-    found = SensorFitter([told], KINDS, world.generator, Accuracy()).fit()
-    spent = time.process_time() - begin
-    own = found.errors_of('tool')
-    gain = 100.0 * np.sqrt(np.mean(np.abs(own.gain - truth.gain) ** 2))
-    axis = 1e3 * np.sqrt(np.mean(np.sum((own.axis - truth.axis) ** 2, axis=1)))
-    place = 1e3 * np.sqrt(np.mean(np.sum((own.place - truth.place) ** 2, axis=1)))
-    lever = 1e3 * np.linalg.norm(own.lever_arm - truth.lever)
-    offset = 1e3 * abs(own.offset_s - errors.offset_s)
-    undetermined = ', '.join(sorted(found.undetermined)) or 'nothing'
-    values = (
-        coils, f'{seconds:g}', f'{turns_deg:g}', f'{100 * errors.gain:g}',
-        f'{1e3 * errors.offset_s:g}', f'{1e3 * errors.jitter * JITTER_M:.3f}', f'{gain:.4f}',
-        f'{axis:.3f}', f'{place:.4f}', f'{lever:.3f}', f'{offset:.4f}',
-        f'{1e3 * found.optical.position_m:.3f}', undetermined, f'{spent:.0f}',
-    )  # fmt: skip
-    return f'| {" | ".join(map(str, values))} |'
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--rows', type=int, nargs='*', default=range(len(ROWS)))
     parser.add_argument('--seeds', type=int, nargs='*', default=SEEDS)
-    parser.add_argument('--tracked', action='store_true', help='exact errors of tracked coils')
     parser.add_argument('--json', type=Path, help='file that gets the lines')
     given = parser.parse_args()
-    head, row = (TRACKED_HEAD, tracked_row) if given.tracked else (HEAD, row_of)
-    print(head, '|---' * head.count(' | ') + '|---|', sep='\n', flush=True)
+    print(HEAD, '|---' * HEAD.count(' | ') + '|---|', sep='\n', flush=True)
     harness.print_lines(
         (
-            (f'row {index}, seed {seed}', row(*ROWS[index], seed))
+            (f'row {index}, seed {seed}', row_of(*ROWS[index], seed))
             for index in given.rows
             for seed in given.seeds
         ),
