@@ -17,7 +17,7 @@ from anser_ros.errors import PortError, SetupError
 from anser_ros.nodes.acquisition_stream import FluxStream
 from anser_ros.nodes.runtime import qos
 from anser_ros.simulation.control_unit import Piece
-from anser_ros.simulation.line import FaultInjector, PseudoPort
+from anser_ros.simulation.line import PseudoPort
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.frames import Channel, ChannelKind, Hello, SampleBlock
 from anser_ros.wire.points import DROPPED, SATURATED, STALE, decode_flux
@@ -365,13 +365,3 @@ def test_pseudo_port_drops_what_nobody_reads_and_removes_only_its_own_link(tmp_p
     assert os.readlink(link) != '/dev/null'
     port.close()
     assert not link.is_symlink()
-
-
-def test_faults_damage_what_they_say():
-    pieces = [Piece(bytes([k]) * 50, is_block=True) for k in range(4)]
-    for kind, count in (('none', 4), ('gap', 3), ('garbage', 5), ('bad_crc', 4), ('silence', 0)):
-        assert len(FaultInjector(kind, 5.0).apply(pieces, 0.1)) == count
-    assert FaultInjector('gap', 5.0).apply(pieces, 7.0) == pieces[1:]
-    garbled = FaultInjector('wrong_baud', 8.0).apply(pieces, 0.1)
-    assert all(a.data not in b.data for a, b in zip(garbled, pieces, strict=True))
-    assert FaultInjector('silence', 5.0).apply(pieces, 3.0) == pieces

@@ -5,7 +5,6 @@ import subprocess
 import sys
 
 import pytest
-import yaml
 from conftest import REPO
 
 from anser_ros.cli.commands import OFFLINE
@@ -72,15 +71,6 @@ def missing(text):
 
 def test_whatever_is_named_is_there():
     assert list(missing(TEXT)) == []
-
-
-def test_the_hooks_use_what_make_has_installed():
-    hooks = yaml.safe_load((REPO / '.pre-commit-config.yaml').read_text())['repos']
-    assert [repo['repo'] for repo in hooks] == ['local']
-    entries = {hook['id']: hook for hook in hooks[0]['hooks']}
-    assert set(entries) == {'ruff-lint', 'ruff-format', 'mypy', 'yaml'}
-    for hook in entries.values():
-        assert hook['language'] == 'system' and hook['entry'].startswith('.venv/bin/')
 
 
 @pytest.mark.processes

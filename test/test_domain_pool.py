@@ -22,13 +22,6 @@ def test_runs_at_the_same_time_never_share_a_domain(tmp_path):
     assert DomainPool(tmp_path, range(1, 41)).take() in ours
 
 
-def test_a_run_begins_anew_with_the_domains_that_it_had_longest_ago(tmp_path):
-    pool = DomainPool(tmp_path, range(1, 4))
-    first = [pool.take() for _ in range(3)]
-    assert sorted(first) == [1, 2, 3]
-    assert [pool.take() for _ in range(5)] == [*first, *first[:2]]
-
-
 @pytest.mark.processes
 def test_a_killed_run_gives_its_domains_back(tmp_path):
     script = (

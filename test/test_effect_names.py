@@ -128,21 +128,3 @@ def test_what_a_site_holds_is_known_to_the_effects_alone():
         nodes = nodes_of(path)
         lines = [n.lineno for n in nodes if isinstance(n, ast.Attribute) and n.attr == 'site']
         assert not lines, f'{path}: {lines}'
-
-
-def test_the_walk_sees_special_cases_and_nothing_else():
-    for text in (
-        "if term.effect.name == 'coil_moved': pass",
-        "METALS = ('static_metal', 'something else')",
-        'isinstance(term.effect, Fluctuation)',
-        'isinstance(term, (int, moving_metal.MovingTerm))',
-        'type(term.effect) is CoilGain',
-        'match term:\n    case MovingTerm(): pass',
-        "eyes = [r for r in records if r.name == 'hand_eye']",
-        'isinstance(term.effect, (Mount, OpticalFrame))',
-        'isinstance(term, FrameTerm)',
-        'type(effect) is PoseTimeOffset',
-    ):
-        assert list(special_cases(ast.walk(ast.parse(text)))), text
-    text = '"""An outliers\' pickup."""\nisinstance(x, Measurements)\ntype(x) is int\ny = "metal"'
-    assert not list(special_cases(ast.walk(ast.parse(text))))

@@ -200,11 +200,6 @@ def test_payload_too_long_for_a_record():
         encode(block(0, 1000, 40))
 
 
-def test_unknown_type_is_refused():
-    with pytest.raises(FrameError, match='unknown record type'):
-        frames.decode_payload(0x7F, memoryview(b''))
-
-
 def test_forged_length_holds_nothing_back_once_the_block_size_is_known():
     reader = FrameReader(max_payload=4096)
     forged = _forge(0x02, bytes(60000))[:2000]

@@ -146,14 +146,6 @@ def test_solution_and_diagonal_are_scipy_s(size):
     np.testing.assert_allclose(factor.inverse_diagonal(), np.diag(inverse), rtol=1e-6)
 
 
-@pytest.mark.parametrize('size', SIZES)
-def test_products_are_subtracted_from_the_upper_triangle(size):
-    rows = np.random.default_rng(size).standard_normal((50, size))
-    out = np.ones((size, size))
-    subtract_gram(out, rows)
-    np.testing.assert_allclose(np.triu(out), np.triu(1.0 - rows.T @ rows), atol=1e-12)
-
-
 def test_threads_change_no_bit():
     matrix, right = equations(SIZES[-1])
     found = []

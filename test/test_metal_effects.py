@@ -299,20 +299,6 @@ def test_static_permeable_sphere():
         assert alpha == pytest.approx(expected, abs=1e-18)
 
 
-def test_perfect_conductor():
-    alpha = polarisability(RADIUS, 5.8e7, 1.0, 1e9)
-    assert alpha == pytest.approx(-2 * math.pi * RADIUS**3, rel=1e-3)
-
-
-def test_weak_conductor_is_the_first_order_of_its_eddy_currents():
-    """m = -j w mu0 sigma 2 pi a^5 B / (15 mu0): Landau and Lifshitz, section 59."""
-    conductivity, frequency = 1e3, 1e3
-    alpha = polarisability(RADIUS, conductivity, 1.0, frequency)
-    omega = 2 * math.pi * frequency
-    expected = -2j * math.pi * RADIUS**5 * omega * MU_0 * conductivity / 15
-    assert alpha == pytest.approx(expected, rel=1e-2)
-
-
 @pytest.mark.parametrize('frequency', [1.0, 1e2, 1e3, 1e4, 1e6])
 def test_conductor_against_the_bessel_series(frequency):
     """alpha = -2 pi a^3 (1 + 3/x^2 - 3 coth(x)/x) for mu_r = 1 (Landau and Lifshitz, 59.4)."""

@@ -20,13 +20,7 @@ from anser_ros.calibration.moments import (
     pose_terms,
 )
 from anser_ros.calibration.placement import CoilPlacer, PositionFitter, position_slopes
-from anser_ros.calibration.readings import (
-    DipoleSites,
-    fold_of_frames,
-    frame_blocks,
-    usable_weights,
-    with_pose,
-)
+from anser_ros.calibration.readings import DipoleSites, fold_of_frames, usable_weights, with_pose
 from anser_ros.calibration.selection import LayoutScorer
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
@@ -79,13 +73,6 @@ def test_a_column_of_zeros_is_left_out(rows):
     spectrum = factor.spectrum()
     assert spectrum.rank == 7
     assert np.all(spectrum.solve(0.0)[7] == 0)
-
-
-def test_blocks_are_whole_frames_and_cover_all():
-    for count, sensors, most in ((10, 3, 7), (1, 900, 10), (0, 3, 7), (100, 2, 1000)):
-        slices = frame_blocks(count, sensors, most)
-        covered = [i for s in slices for i in range(s.start, s.stop)]
-        assert covered == list(range(count))
 
 
 def test_pose_slopes_are_differences(rng):

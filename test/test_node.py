@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.runtime import parameters
 from anser_ros.nodes.runtime import process as processes
-from anser_ros.nodes.runtime.diagnostics import Throttle, text_of
+from anser_ros.nodes.runtime.diagnostics import Throttle
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import complaints, parameter
 
@@ -108,22 +108,14 @@ class TestThrottle:
         assert throttle.admit('gap', 'gap of 6', 121.0) == 'gap of 6'
 
 
-def test_figures_are_short():
-    assert text_of(1.23456789e-7) == '1.23457e-07'
-    assert text_of(float('nan')) == 'nan'
-    assert text_of(3) == '3'
-
-
 NODE = '''
 """A node of the tests."""
 import ctypes
 import sys
 import time
 from dataclasses import dataclass
-from std_srvs.srv import Trigger
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.runtime.parameters import complaints
 from anser_ros.nodes.runtime.parameters import parameter
 
 @dataclass(frozen=True)
@@ -134,11 +126,7 @@ class Sample(AnserNode):
     NAME = 'sample'
     PARAMETERS = Table
 
-    @classmethod
-    def add_arguments(cls, parser):
-        parser.add_argument('--end', type=int)
-
-    def __init__(self, end=None, **options):
+    def __init__(self, **options):
         super().__init__(**options)
         print('rate', self.parameters.rate_hz, flush=True)
         if self.parameters.rate_hz == 99.0:
@@ -146,8 +134,6 @@ class Sample(AnserNode):
         if self.parameters.rate_hz == 98.0:  # a library that lets no Python handler run
             ctypes.CDLL(None).poll(None, 0, 600000)
             ctypes.CDLL(None).sleep(600)
-        if end is not None:
-            self.stop(end)
 
     def close(self):
         print('closed', flush=True)
@@ -195,9 +181,6 @@ class TestProcess:
         assert process.interrupt() == 0
         assert 'Traceback' not in process.output
 
-    def test_it_can_end_itself(self, run):
-        assert run('--end', '0').wait() == 0
-
     @pytest.mark.parametrize(
         ('arguments', 'said'),
         [
@@ -220,11 +203,6 @@ class TestProcess:
         process = run('--ros-args', '--params-file', str(file))
         process.wait_for("nothing for sample; is '/anser/smaple' meant?")
         process.wait_for('rate 25.0')
-
-    def test_help_prints_the_table(self, run):
-        process = run('--help')
-        assert process.wait() == 0
-        assert 'rate_hz = 25.0 [1 to inf]' in process.output
 
 
 class TestGraph:

@@ -32,12 +32,9 @@ def flux_points(sensors: int = 4, emitters: int = 8) -> FluxPoints:
     geometry = rng.normal(size=(sensors, 6)).astype(np.float32).astype(float)
     geometry[0] = np.nan
     return FluxPoints(
-        channel=np.arange(sensors) * 3,
-        flags=np.arange(sensors) % 8,
-        flux=flux[..., 0] + 1j * flux[..., 1],
-        position=geometry[:, :3],
-        axis=geometry[:, 3:],
-    )
+        channel=np.arange(sensors) * 3, flags=np.arange(sensors) % 8,
+        flux=flux[..., 0] + 1j * flux[..., 1], position=geometry[:, :3], axis=geometry[:, 3:],
+    )  # fmt: skip
 
 
 def assert_same(a: FluxPoints, b: FluxPoints) -> None:

@@ -185,12 +185,9 @@ def test_tables_are_read_as_they_were_written(tmp_path):
     kept = KeptTables(tmp_path, setup, world.model, world.references)
     assert kept.read() is None
     made = tables.build_tables(
-        world.model,
-        world.references,
-        setup.refit,
-        NominalBoard.of(setup).field,
+        world.model, world.references, setup.refit, NominalBoard.of(setup).field,
         stated_volume(setup),
-    )
+    )  # fmt: skip
     kept.write(made)
     read = KeptTables(tmp_path, setup, world.model, world.references).read()
     assert len(read.priors) == len(made.priors) and len(read.factors) == len(made.factors)

@@ -21,7 +21,6 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError
 from anser_ros.nodes import replay
 from anser_ros.nodes.replay import name_played
-from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams import readiness
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage, iter_messages
@@ -225,20 +224,6 @@ def test_what_does_not_decode_is_left_out(play, listener, tmp_path, capfd):
     assert '/anser/strange: type no_msgs/msg/None is not installed' in said
     assert '3 messages that do not decode left out' in said
     assert len(listener.stamps) == 2
-
-
-def test_bad_usage_is_one_clear_line(start, capsys):
-    for words, said in (
-        (['nowhere.mcap', '--rate', 'fast'], "invalid float value: 'fast'"),
-        ([], 'arguments are required: bag'),
-    ):
-        with pytest.raises(SystemExit, match='2'):
-            main(replay.Replay, ['replay', *words])
-        found = capsys.readouterr().err
-        assert said in found and found.count('\n') == 1
-    process = start('replay', 'pyproject.toml')
-    assert process.wait() == 2
-    assert 'not an MCAP file' in process.output and 'Traceback' not in process.output
 
 
 def test_what_cannot_be_played_is_refused(ros, tmp_path):

@@ -23,15 +23,10 @@ OPTIONAL = {'tf2_msgs', 'launch', 'launch_ros'}
 SETUPTOOLS = 'setuptools'
 """Is needed by colcon's build of a Python package, by no import."""
 ROSDEP = {
-    'numpy': 'python3-numpy',
-    'scipy': 'python3-scipy',
-    'pyyaml': 'python3-yaml',
-    'pyserial': 'python3-serial',
-    'matplotlib': 'python3-matplotlib',
-    'h5py': 'python3-h5py',
-    'numba': 'python3-numba',
-    'rich': 'python3-rich',
-}
+    'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'pyyaml': 'python3-yaml',
+    'pyserial': 'python3-serial', 'matplotlib': 'python3-matplotlib', 'h5py': 'python3-h5py',
+    'numba': 'python3-numba', 'rich': 'python3-rich',
+}  # fmt: skip
 """PyPI's name and rosdep's key, where rosdep has the package."""
 
 

@@ -184,12 +184,6 @@ def test_what_is_not_used_is_counted_by_its_kind(rng):
     assert tracker.counters['time_jumps'] == 0
 
 
-def test_no_model(rng):
-    found = one_frame(Tracker(None, TOOL), fluxes(MODEL, TOOL, *random_pose(rng)))
-    assert {e.state for e in found.values()} == {states.NO_MODEL}
-    assert 'tool_a' in found
-
-
 def test_outside_the_volume(rng):
     settings = TrackerSettings(volume=TrackedVolume((-0.1, -0.1, 0.08), (0.1, 0.1, 0.2)))
     flux = fluxes(MODEL, TOOL, np.array([0.0, 0.0, 0.255]), np.eye(3), rng)
@@ -258,24 +252,16 @@ def test_a_long_distortion_costs_few_scans_and_ends_in_less_than_a_second(rng):
     assert tracker.counters['cold_starts'] < 0.2 * 120 * 9
 
 
-def test_one_bad_coil_does_not_stop_the_tool(rng):
+def test_one_bad_coil_does_not_stop_the_tool_and_is_used_again_once_it_recovers(rng):
     tracker = Tracker(MODEL, TOOL)
-    for stamp, position, rotation in path(20):
+    for stamp, position, rotation in path(90):
         flux = fluxes(MODEL, TOOL, position, rotation, rng)
-        flux[4] *= -1.0
+        if is_bad := stamp <= 20 * STEP_NS:
+            flux[4] *= -1.0
         found = one_frame(tracker, flux, stamp)
         assert found['tool_a'].state == 'ok'
-        assert found['tool_a'].reason == '1 of 9 coils left out'
+        assert not is_bad or found['tool_a'].reason == '1 of 9 coils left out'
         assert np.linalg.norm(found['tool_a'].position - position) < 2e-4
-
-
-def test_a_coil_that_recovers_is_used_again(rng):
-    tracker = Tracker(MODEL, TOOL)
-    for stamp, position, rotation in path(80):
-        flux = fluxes(MODEL, TOOL, position, rotation, rng)
-        if stamp < 10 * STEP_NS:
-            flux[4] *= 0.8
-        found = one_frame(tracker, flux, stamp)
     assert found['tool_a'].reason == ''
 
 

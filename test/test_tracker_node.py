@@ -221,16 +221,6 @@ def test_what_acquisition_measures_meanwhile_changes_settings_only(tracker):
     tracker.spin_until(lambda: len(node._topics) < len(topics))
 
 
-def test_a_wrong_parameter_ends_the_node_with_one_line(start):
-    process = start('tracker', '--ros-args', '-p', 'volume_low_m:=[0.1]')
-    assert process.wait() == 2
-    assert 'volume_low_m: three numbers needed' in process.output
-    process = start('field_model', '--ros-args', '-p', 'model_file:=/dev/null')
-    assert process.wait() == 2
-    assert 'schema' in process.output
-    assert 'Traceback' not in process.output
-
-
 def test_the_nominal_model_is_no_file(ros):
     node = TrackerNode(parameter_overrides=[Parameter('model_file', value='nominal')])
     assert node.status().message == 'no setup yet'

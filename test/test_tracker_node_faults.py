@@ -127,20 +127,6 @@ def test_refusals_are_counted_with_their_reason_and_tracking_goes_on(tracker):
     assert node.counters['callback_faults'] == 0
 
 
-def test_a_jump_back_in_time_and_duplicates(tracker):
-    rng = np.random.default_rng(6)
-    ready(tracker)
-    flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
-    tracker.say_flux(flux)
-    tracker.say_flux(flux, stamp_ns=tracker.stamp_ns)
-    tracker.say_flux(flux, stamp_ns=FIRST_NS - 10**12)
-    wait_frame(tracker, 3)
-    counters = tracker.node._tracker.counters
-    assert counters['duplicates'] == 1
-    assert counters['time_jumps'] == 1
-    tracker.spin_until(lambda: len(tracker.poses.get(BODY, [])) == 2)
-
-
 def test_every_kind_of_bad_flux_has_its_counter(tracker):
     rng = np.random.default_rng(8)
     ready(tracker)

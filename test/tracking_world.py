@@ -12,13 +12,9 @@ from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 NOISE_T = 60e-12
 GEOMETRY = {
-    'turns': 25,
-    'side_m': 0.07,
-    'pitch_m': 0.00075,
-    'layers': 2,
-    'thickness_m': 0.0016,
+    'turns': 25, 'side_m': 0.07, 'pitch_m': 0.00075, 'layers': 2, 'thickness_m': 0.0016,
     'current_a': 0.25,
-}
+}  # fmt: skip
 CENTRES_MM = (
     (-93.543, 93.543), (0.0, 68.55), (93.543, 93.543), (-68.55, 0.0),
     (68.55, 0.0), (-93.543, -93.543), (0.0, -68.55), (93.543, -93.543),
@@ -44,12 +40,9 @@ def certain_model() -> FieldModel:
     model = nominal_model(anser_board())
     turn = np.exp(1j * np.linspace(-0.02, 0.02, 8))
     return FieldModel(
-        model.positions,
-        model.directions,
-        model.moments * turn,
-        model.emitters,
+        model.positions, model.directions, model.moments * turn, model.emitters,
         model.frequencies_hz,
-    )
+    )  # fmt: skip
 
 
 def triaxial_tool(body: str = 'tool_a', first: int = 0, length_m: float = 0.0) -> SensorTable:

@@ -104,11 +104,8 @@ def _tracked(
     )
     ok = np.isfinite(squares).sum()
     return (
-        float(np.sqrt(np.mean(rms**2))),
-        float(rms.max()),
-        100.0 * over / max(ok, 1),
-        undetermined,
-    )
+        float(np.sqrt(np.mean(rms**2))), float(rms.max()), 100.0 * over / max(ok, 1), undetermined,
+    )  # fmt: skip
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Runs every benchmark here, prints their table and writes bench.json.
+"""Runs every benchmark here, prints their rows and writes bench.json.
 
 A benchmark is a module ``bench_*.py`` with ``rows()``, which returns or yields dicts. A row has
 ``name``, ``value`` and ``unit``, and where there are such: ``rival``, ``rival_value``, ``ratio``
@@ -55,15 +55,6 @@ def line(row: dict[str, Any]) -> str:
     return '; '.join(parts)
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Return the rows as aligned text."""
-    cells = [list(KEYS), *([text(row[key]) for key in KEYS] for row in rows)]
-    widths = [max(len(line[i]) for line in cells) for i in range(len(KEYS))]
-    lines = ['  '.join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in cells]
-    lines.insert(1, '  '.join('-' * width for width in widths))
-    return '\n'.join(line.rstrip() for line in lines)
-
-
 def main() -> int:
     """Run the benchmarks; 1 when one of them broke, whatever the figures."""
     parser = argparse.ArgumentParser(description='benchmarks beside their rivals, on one thread')
@@ -89,7 +80,6 @@ def main() -> int:
     except KeyboardInterrupt:
         print(f'bench: interrupted; {len(rows)} rows are in {args.out}', file=sys.stderr)
         return 130
-    print('\n' + table(rows))
     if broken:
         print(f'bench: broken: {", ".join(broken)}', file=sys.stderr)
     return 1 if broken else 0

@@ -34,14 +34,9 @@ CONTROL = (
     Fault('nothing-metal', 'nothing, metal moves', lambda rig, rng: nothing, 9.0, 'metal'),
 )
 GROUPS: dict[str, tuple[Fault, ...]] = {
-    'control': CONTROL,
-    'serial': SERIAL,
-    'clock': CLOCK,
-    'references': REFERENCES,
-    'models': MODELS,
-    'graph': GRAPH,
-    'processes': PROCESSES,
-}
+    'control': CONTROL, 'serial': SERIAL, 'clock': CLOCK, 'references': REFERENCES,
+    'models': MODELS, 'graph': GRAPH, 'processes': PROCESSES,
+}  # fmt: skip
 RECOVERY_S = 12.0
 """Longest wait for poses after a fault has gone, s; then the chain is started anew."""
 AFTER_S = 1.0

@@ -174,16 +174,6 @@ class TestServer:
             assert read(client, 9) == b'STP_TDATA'
             server.send_tracking(lambda: pytest.fail('nobody wants it'), 20.0)
 
-    def test_clients_come_and_go(self, server):
-        client = socket.create_connection(('127.0.0.1', server.port))
-        assert wait(lambda: server.n_clients == 1)
-        client.sendall(b'whatever a client may say')
-        server.send(b'hello', b'newer')
-        assert client.recv(5) == b'hello'
-        client.close()
-        assert wait(lambda: server.n_clients == 0)
-        server.send(b'to nobody')
-
     @pytest.mark.long
     def test_a_client_that_reads_nothing_holds_nobody_up(self, server):
         with socket.create_connection(('127.0.0.1', server.port)):

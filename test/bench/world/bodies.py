@@ -4,13 +4,9 @@ import numpy as np
 from spheres import Body
 
 MATERIALS = {
-    'aluminium': (2.5e7, 1.0),
-    'brass': (1.5e7, 1.0),
-    'copper': (5.8e7, 1.0),
-    'stainless': (1.35e6, 1.02),
-    'steel': (5e6, 150.0),
-    'ferrite_steel': (2e6, 400.0),
-}
+    'aluminium': (2.5e7, 1.0), 'brass': (1.5e7, 1.0), 'copper': (5.8e7, 1.0),
+    'stainless': (1.35e6, 1.02), 'steel': (5e6, 150.0), 'ferrite_steel': (2e6, 400.0),
+}  # fmt: skip
 """Conductivity in S/m and relative permeability."""
 
 

@@ -67,12 +67,6 @@ def coil_field(points, coils):
     return _coils(points, start[keep], end[keep], owner[keep], len(coils))
 
 
-def weighted_field(points, start, end, currents):
-    """Field of separate pieces from start to end (E, 3) with currents (E, K): (P, K, 3), T."""
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    return _weighted(points, start, end, np.ascontiguousarray(currents, dtype=np.complex128))
-
-
 def along(points, axes, lengths):
     """Gauss points (..., Q, 3), m, along sensors, and their weights (Q,), which add up to one.
 

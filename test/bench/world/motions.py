@@ -26,13 +26,9 @@ class Wander:
         rates = rng.uniform(0.04, fastest_hz, (6, 3)) * 2 * np.pi
         weights = rng.uniform(0.5, 1.0, (6, 3))
         return cls(
-            np.asarray(low),
-            np.asarray(high),
-            rates,
-            rng.uniform(0, 2 * np.pi, (6, 3)),
-            weights / weights.sum(axis=1)[:, None],
-            tilt_rad,
-        )
+            np.asarray(low), np.asarray(high), rates, rng.uniform(0, 2 * np.pi, (6, 3)),
+            weights / weights.sum(axis=1)[:, None], tilt_rad,
+        )  # fmt: skip
 
     def at(self, time):
         """Position (F, 3) m and rotation (F, 3, 3)."""
