@@ -23,7 +23,6 @@ from injection_subject import (
     TABLE,
     TRACK,
     UNLISTED,
-    Injection,
     Subject,
     Truth,
     a_channel,
@@ -41,10 +40,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.effects.channels import compressed
 from anser_ros.physics.pose_track import PoseTrack
 
-__all__ = [
-    'CATALOGUE', 'EMITTER', 'LISTED', 'SIZES', 'TOLERANCE', 'TRACK', 'UNLISTED', 'Injection',
-    'Subject', 'Truth',
-]  # fmt: skip
+__all__ = ['CATALOGUE', 'LISTED', 'SIZES', 'TOLERANCE', 'UNLISTED']
 
 CATALOGUE = (
     'sensor_gain', 'sensor_axis', 'sensor_polarity', 'sensor_size', 'lever_arm', 'registration',

@@ -20,7 +20,6 @@ from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.sessions.tracked_session import track_session
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.setup import dump_setup
 
 BAGS = REPO / 'bags'
@@ -46,14 +45,7 @@ def write_bag(path, setup, tool, *, poses=True, fluxes=True, with_setup=True):
                     f'/optical/{tool.body}/pose', stamp, tool.position[frame], quaternion
                 )
             if fluxes:
-                nowhere = np.full((len(tool.sensors), 3), np.nan)
-                cloud = FluxPoints(
-                    tool.sensors.channel, np.zeros(len(tool.sensors), dtype=np.int64),
-                    tool.flux[frame], nowhere, nowhere,
-                )  # fmt: skip
-                fields, step, data = encode_flux(cloud)
-                count = len(tool.sensors)
-                writer.write_flux('/anser/tool/flux', stamp, fields, step, count, data)
+                writer.write_readings(setup.tool_sensors, stamp, tool.flux[frame])
     return path
 
 

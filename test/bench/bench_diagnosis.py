@@ -19,18 +19,8 @@ from functools import cache
 
 import harness
 import numpy as np
-from injection import (
-    CATALOGUE,
-    EMITTER,
-    LISTED,
-    SIZES,
-    TOLERANCE,
-    TRACK,
-    UNLISTED,
-    Injection,
-    Subject,
-    Truth,
-)
+from injection import CATALOGUE, LISTED, SIZES, TOLERANCE, UNLISTED
+from injection_subject import EMITTER, TRACK, Injection, Subject, Truth
 
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
 from anser_ros.field.model import Dipoles, FieldModel

@@ -40,29 +40,14 @@ def _each(world: World, change: Callable[[str, Stream], None], *, also: bool = F
     world.after = after
 
 
-def late(world: World, size: float) -> Truth:
-    world.offset = 1e-3 * size
-    return {'time_offset': ('offset_s', world.offset)}
+def stated(attribute: str, unit: float, effect: str, parameter: str) -> Callable[..., Truth]:
+    """What a world states in one number, and a diagnosis finds as a parameter of an effect."""
 
+    def change(world: World, size: float) -> Truth:
+        setattr(world, attribute, unit * size)
+        return {effect: (parameter, unit * size)}
 
-def fast(world: World, size: float) -> Truth:
-    world.rate_ppm = size
-    return {'clock_rate': ('rate_ppm', size)}
-
-
-def scaled(world: World, size: float) -> Truth:
-    world.scale = size
-    return {'optical_scale': ('scale', size)}
-
-
-def jittery(world: World, size: float) -> Truth:
-    world.jitter = 1e-3 * size
-    return {'stamp_jitter': ('rms_s', world.jitter)}
-
-
-def filtered(world: World, size: float) -> Truth:
-    world.tau = 1e-3 * size
-    return {'tracker_lag': ('tau_s', world.tau)}
+    return change
 
 
 def _bend(world: World, size: float, first: int) -> Truth:
@@ -202,11 +187,13 @@ def exchanged(world: World, size: float) -> Truth:
 
 
 KINDS = {
-    'late': Kind(late, (8, 30, 100), ('offset',)),
-    'fast': Kind(fast, (600, 1200, 2500), ('rate',)),
-    'scaled': Kind(scaled, (1.006, 0.987, 1.03), ('scale',)),
-    'jittery': Kind(jittery, (4, 8, 14), ('stamps',)),
-    'filtered': Kind(filtered, (40, 80, 160), ('offset', 'stamps')),
+    'late': Kind(stated('offset', 1e-3, 'time_offset', 'offset_s'), (8, 30, 100), ('offset',)),
+    'fast': Kind(stated('rate_ppm', 1, 'clock_rate', 'rate_ppm'), (600, 1200, 2500), ('rate',)),
+    'scaled': Kind(stated('scale', 1, 'optical_scale', 'scale'), (1.006, 0.987, 1.03), ('scale',)),
+    'jittery': Kind(stated('jitter', 1e-3, 'stamp_jitter', 'rms_s'), (4, 8, 14), ('stamps',)),
+    'filtered': Kind(
+        stated('tau', 1e-3, 'tracker_lag', 'tau_s'), (40, 80, 160), ('offset', 'stamps')
+    ),
     'bent': Kind(bent, (1, 2, 4), ('place', 'scale')),
     'bent_one': Kind(bent_one, (1, 2, 4), ('place', 'scale'), 2),
     'shrunk_one': Kind(shrunk_one, (0.01, 0.02, 0.04), ('place', 'scale'), 2),
