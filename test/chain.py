@@ -1,7 +1,5 @@
 """The real nodes as processes over DDS: a bag replayed through them, and what came out."""
 
-import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -10,12 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from conftest import wait
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
+from anser_ros.cli.processes import Supervisor
+from anser_ros.nodes.runtime import qos
+from anser_ros.stamps import stamp_of
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
 from anser_ros.wire.bag_writer import BagWriter
 
@@ -49,40 +51,12 @@ class ReceivedPoses:
     axis: np.ndarray
 
 
-def start(*arguments: str, domain: int, log: Path) -> subprocess.Popen:
-    """Start `anser ARGUMENTS` in a ROS domain of its own."""
-    environment = {
-        **os.environ,
-        'ROS_DOMAIN_ID': str(domain),
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        'ROS_LOG_DIR': str(log.parent),
-    }
-    with log.open('wb') as stream:
-        return subprocess.Popen(
-            [sys.executable, '-m', 'anser_ros.cli.main', *arguments],
-            stdout=stream, stderr=subprocess.STDOUT, env=environment, start_new_session=True,
-        )  # fmt: skip
-
-
-def stop(processes: list[subprocess.Popen]) -> None:
-    """End processes, and kill what does not end."""
-    for process in processes:
-        if process.poll() is None:
-            process.terminate()
-    for process in processes:
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait(10)
-
-
-def _axis(q: Any) -> tuple[float, float, float]:
-    return (
-        2 * (q.x * q.z + q.w * q.y),
-        2 * (q.y * q.z - q.w * q.x),
-        1 - 2 * (q.x * q.x + q.y * q.y),
-    )
+def _row(message: Any) -> tuple[float, ...]:
+    p, q = message.pose.position, message.pose.orientation
+    axis = (
+        2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y)
+    )  # fmt: skip
+    return p.x, p.y, p.z, *axis
 
 
 class Listener:
@@ -96,25 +70,13 @@ class Listener:
         self._node = rclpy.create_node('pose_listener', context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._setup = self._node.create_publisher(String, '/anser/setup', latched)
-        self._text = String
+        self._setup = self._node.create_publisher(String, '/anser/setup', qos.LATCHED)
         self._refit_starts = 0
-        self._node.create_subscription(
-            DiagnosticArray, '/diagnostics', self._on_diagnostics, QoSProfile(depth=10)
-        )
-        self.got: dict[str, list[tuple]] = {topic: [] for topic in topics}
-        for topic in topics:
-            self._node.create_subscription(
-                PoseStamped, topic, lambda m, rows=self.got[topic]: self._add(m, rows),
-                QoSProfile(depth=4000),
-            )  # fmt: skip
-
-    @staticmethod
-    def _add(message: Any, rows: list[tuple]) -> None:
-        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        p, q = message.pose.position, message.pose.orientation
-        rows.append((stamp, p.x, p.y, p.z, *_axis(q)))
+        self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+        self.got: dict[str, list[Any]] = {topic: [] for topic in topics}
+        for topic, messages in self.got.items():
+            depth = QoSProfile(depth=4000)
+            self._node.create_subscription(PoseStamped, topic, messages.append, depth)
 
     def _on_diagnostics(self, message: Any) -> None:
         for status in message.status:
@@ -123,29 +85,31 @@ class Listener:
 
     def await_refit(self) -> None:
         """Wait until the field model has made its refit: frames that come before may be lost."""
-        end = time.monotonic() + STARTUP_S
-        while not self._refit_starts:
-            assert time.monotonic() < end, 'the field model never made its refit'
-            self.spin(0.2)
+        assert wait(lambda: self._refit_starts, self.spin_once, STARTUP_S), 'no refit was made'
 
     def announce(self, setup: str) -> None:
         """Say the setup, and wait for a publisher of every topic: before, poses would be lost."""
-        self._setup.publish(self._text(data=setup))
-        end = time.monotonic() + STARTUP_S
-        while not all(self._node.count_publishers(topic) for topic in self.got):
-            assert time.monotonic() < end, 'the tracker never made its topics'
-            self.spin(0.2)
+        self._setup.publish(String(data=setup))
+
+        def is_there() -> bool:
+            return all(self._node.count_publishers(topic) for topic in self.got)
+
+        assert wait(is_there, self.spin_once, STARTUP_S), 'the tracker never made its topics'
         self.spin(SETTLE_S)
+
+    def spin_once(self) -> None:
+        """Receive what is there."""
+        self._executor.spin_once(timeout_sec=0.05)
 
     def spin(self, seconds: float) -> None:
         """Receive for a while."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.05)
+            self.spin_once()
 
     def total(self) -> int:
         """Number of poses so far."""
-        return sum(len(rows) for rows in self.got.values())
+        return sum(map(len, self.got.values()))
 
     def close(self) -> None:
         """Leave the graph."""
@@ -156,9 +120,9 @@ class Listener:
     def poses(self) -> dict[str, ReceivedPoses]:
         """What came, by topic."""
         series = {}
-        for topic, rows in self.got.items():
-            stamps = np.array([row[0] for row in rows], dtype=np.int64)
-            values = np.array([row[1:] for row in rows]).reshape(-1, 6)
+        for topic, messages in self.got.items():
+            stamps = np.array([stamp_of(message) for message in messages], dtype=np.int64)
+            values = np.array([_row(message) for message in messages]).reshape(-1, 6)
             series[topic] = ReceivedPoses(stamps, values[:, :3], values[:, 3:])
         return series
 
@@ -183,33 +147,27 @@ def replay_through_nodes(
     server : parameters of field_model beside its model file
     tracker : parameters of the tracker beside its model file
     """
-    with tempfile.TemporaryDirectory() as folder:
-        logs = Path(folder)
-        file = f'model_file:={model}'
-        listener = Listener(topics, domain)
-        processes = [
-            start('field_model', '--ros-args', '-p', file, *server, domain=domain,
-                  log=logs / 'field_model.log'),
-            start('tracker', '--ros-args', '-p', file, *tracker, domain=domain,
-                  log=logs / 'tracker.log'),
-        ]  # fmt: skip
+    listener, given = Listener(topics, domain), ('--ros-args', '-p', f'model_file:={model}')
+    with tempfile.TemporaryDirectory() as folder, Supervisor(Path(folder)) as supervisor:
+
+        def start(name: str, *arguments: str) -> Any:
+            command = [sys.executable, '-m', 'anser_ros.cli.main', name, *arguments]
+            return supervisor.start(name, command)
+
         try:
+            start('field_model', *given, *server)
+            start('tracker', *given, *tracker)
             listener.announce(read_bag(bag).setup_text)
             if any('baseline_file' in argument for argument in server):
                 listener.await_refit()
-            player = start(
-                'replay', str(bag), '--rate', str(rate), '--wait', str(STARTUP_S),
-                domain=domain, log=logs / 'replay.log',
-            )  # fmt: skip
-            processes.append(player)
-            while player.poll() is None:
+            player = start('replay', str(bag), '--rate', str(rate), '--wait', str(STARTUP_S))
+            while player.process.poll() is None:
                 listener.spin(0.2)
-            assert player.returncode == 0, (logs / 'replay.log').read_text()
+            assert player.process.returncode == 0, player.log.read_text()
             before = -1
             while listener.total() != before:  # what is on its way comes sooner than that
                 before = listener.total()
                 listener.spin(2.0)
             return listener.poses()
         finally:
-            stop(processes)
             listener.close()
