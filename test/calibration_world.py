@@ -151,15 +151,10 @@ def scene(rng, side=9, jitter=1.0, sensors=None, noise=NOISE_T, height=0.14, cen
     turn = Rotation.from_rotvec(jitter * JITTER_RAD * rng.normal(size=position.shape)).as_matrix()
     count = len(position)
     measurements = Measurements(
-        body='tool',
-        sensors=table,
-        time=np.arange(count, dtype=float),
-        flux=flux,
+        body='tool', sensors=table, time=np.arange(count, dtype=float), flux=flux,
         valid=np.ones((count, len(table)), dtype=bool),
-        flags=np.zeros((count, len(table)), dtype=np.int64),
-        position=seen,
-        rotation=turn @ rotation,
-        has_pose=np.ones(count, dtype=bool),
-    )
+        flags=np.zeros((count, len(table)), dtype=np.int64), position=seen,
+        rotation=turn @ rotation, has_pose=np.ones(count, dtype=bool),
+    )  # fmt: skip
     generator = Generator(centres, np.zeros(emitters), 0.07)
     return Scene(measurements, position, rotation, dipoles, moments, generator)

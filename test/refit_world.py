@@ -28,13 +28,10 @@ def reference_ring(count: int, half: float, seed: int = 3) -> SensorTable:
     position = np.stack([1.2 * half * np.cos(angle), 1.2 * half * np.sin(angle), height], axis=1)
     axis = rng.normal(size=(count, 3))
     return SensorTable(
-        channel=np.arange(100, 100 + count),
-        name=tuple(f'ref/{i}' for i in range(count)),
-        body=('fg',) * count,
-        position=position,
-        axis=axis / np.linalg.norm(axis, axis=1)[:, None],
+        channel=np.arange(100, 100 + count), name=tuple(f'ref/{i}' for i in range(count)),
+        body=('fg',) * count, position=position, axis=axis / np.linalg.norm(axis, axis=1)[:, None],
         length=np.full(count, 0.008),
-    )
+    )  # fmt: skip
 
 
 def metal_block(centre, size, count: int = 60, seed: int = 5):
@@ -110,13 +107,9 @@ def three_coil_world() -> World:
     """Three round coils, as other systems have."""
     centres = np.array([[-0.06, -0.04, 0.0], [0.06, -0.04, 0.0], [0.0, 0.07, 0.0]])
     board = build_board(
-        'circular_loop',
-        {'turns': 30, 'radius_m': 0.04, 'current_a': 0.5},
-        ['a', 'b', 'c'],
-        centres,
-        np.zeros(3),
-        [1000.0, 1300.0, 1700.0],
-    )
+        'circular_loop', {'turns': 30, 'radius_m': 0.04, 'current_a': 0.5}, ['a', 'b', 'c'],
+        centres, np.zeros(3), [1000.0, 1300.0, 1700.0],
+    )  # fmt: skip
     return world_of(board, 24)
 
 

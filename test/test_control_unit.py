@@ -76,16 +76,11 @@ def fluxes(unit, seconds=0.1, window=800):
     numbers = [c.number for c in hello.channels[:-1]]
     demodulator = Demodulator(hello.sample_rate_hz, np.array(hello.frequencies_hz), window)
     converter = FluxConverter(
-        np.array(hello.frequencies_hz),
-        np.arange(columns),
-        scales[:-1],
-        CHANNELS.areas_m2(numbers),
-        CHANNELS.delays_s(numbers),
-        current_column=columns,
-        amperes_per_code=scales[-1],
-        nominal_currents_a=np.array(hello.currents_a),
+        np.array(hello.frequencies_hz), np.arange(columns), scales[:-1],
+        CHANNELS.areas_m2(numbers), CHANNELS.delays_s(numbers), current_column=columns,
+        amperes_per_code=scales[-1], nominal_currents_a=np.array(hello.currents_a),
         current_delay_s=CHANNELS.current_delay_s,
-    )
+    )  # fmt: skip
     watch, ticks = RepetitionWatch(columns + 1, 40e3), TickCheck(40e3, 1e6)
     cutter = WindowCutter(window, window, watch, ticks)
     found = []

@@ -192,15 +192,9 @@ class TestFlux:
     def test_refusals(self):
         with pytest.raises(ParameterError, match='effective area'):
             FluxConverter(
-                TONES,
-                np.array([0]),
-                np.ones(1),
-                np.zeros(1),
-                np.zeros(1),
-                current_column=1,
-                amperes_per_code=1.0,
-                nominal_currents_a=self.NOMINAL,
-            )
+                TONES, np.array([0]), np.ones(1), np.zeros(1), np.zeros(1), current_column=1,
+                amperes_per_code=1.0, nominal_currents_a=self.NOMINAL,
+            )  # fmt: skip
         with pytest.raises(ParameterError, match='nominal current'):
             self.converter(nominal_currents_a=np.zeros(8))
 

@@ -49,13 +49,10 @@ def triaxial_tool(body: str = 'tool_a', first: int = 0, length_m: float = 0.0) -
     """Three clusters of three coils each, 30 mm apart."""
     names = [f'{body}/{i}/{axis}' for i in range(3) for axis in 'xyz']
     return SensorTable(
-        channel=np.arange(first, first + 9),
-        name=tuple(names),
-        body=(body,) * 9,
-        position=np.repeat(np.array(CLUSTER), 3, axis=0),
-        axis=np.tile(np.eye(3), (3, 1)),
+        channel=np.arange(first, first + 9), name=tuple(names), body=(body,) * 9,
+        position=np.repeat(np.array(CLUSTER), 3, axis=0), axis=np.tile(np.eye(3), (3, 1)),
         length=np.full(9, length_m),
-    )
+    )  # fmt: skip
 
 
 def random_pose(rng: np.random.Generator, low: float = 0.1, high: float = 0.22):

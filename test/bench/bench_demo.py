@@ -49,11 +49,9 @@ def rows() -> Iterator[harness.Row]:
     )
     for share, key in ((50, 'p50'), (99, 'p99'), (100, 'max')):
         yield harness.row(
-            f'{what}: {key}',
-            float(np.percentile(late, share, method='higher')),
-            'ms',
+            f'{what}: {key}', float(np.percentile(late, share, method='higher')), 'ms',
             target=40.0 if key == 'p99' else None,
-        )
+        )  # fmt: skip
     yield harness.row(f'{what}: lost, of {late.size}', float(np.isinf(late).sum()), target=0.0)
     yield harness.row(
         'demo: age of the model that poses used, of each second the largest, 99 %',

@@ -67,11 +67,9 @@ def scan_rows(folder: Path, truth: dict[str, Any]) -> Iterator[harness.Row]:
     found = parameters_of(calibration, 'moving_metal')
     wrong = [found[key] - metal[key] for key in ('t_start_s', 't_end_s')]
     yield harness.row(
-        'dirty/scan_metal: error of the times of the metal',
-        float(np.abs(wrong).max()),
-        's',
+        'dirty/scan_metal: error of the times of the metal', float(np.abs(wrong).max()), 's',
         target=1.5,
-    )
+    )  # fmt: skip
 
 
 def session_rows(folder: Path, truth: dict[str, Any], scan: str) -> Iterator[harness.Row]:
@@ -85,10 +83,8 @@ def session_rows(folder: Path, truth: dict[str, Any], scan: str) -> Iterator[har
         what = f'dirty/{name}, model of {scan}'
         yield harness.row(
             f'{what}: {", ".join(truth[name]) or "nothing"} and no other named',
-            float(names == sorted(truth[name])),
-            target=1.0,
-            target_is='least',
-        )
+            float(names == sorted(truth[name])), target=1.0, target_is='least',
+        )  # fmt: skip
         left = found['held_out']['flux_rms_after_t']
         clean = left if name == CLEAN else clean
         yield harness.row(f'{what}: flux left, over that of {CLEAN}', left / clean, target=1.15)

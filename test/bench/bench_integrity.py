@@ -70,9 +70,6 @@ def rows() -> Iterator[harness.Row]:
     yield harness.row('integrity: poses that are ok', tracked / total, '1')
     for check in CHECKS:
         yield harness.row(
-            f'integrity: {check}, 9 coils and a body, a frame, median',
-            clocks[check].median_ms(),
-            'ms',
-            target=TARGET_MS,
-            rival=(WHOLE, clocks[WHOLE].median_ms()),
-        )
+            f'integrity: {check}, 9 coils and a body, a frame, median', clocks[check].median_ms(),
+            'ms', target=TARGET_MS, rival=(WHOLE, clocks[WHOLE].median_ms()),
+        )  # fmt: skip

@@ -50,10 +50,8 @@ def rows() -> Iterator[harness.Row]:
         windows = np.rint(one.ages_s * Layout().rate_hz)
         yield harness.row(
             'age of the model that poses used, 99 % of 60 s, one process',
-            float(np.percentile(windows, 99)),
-            'windows',
-            target=1.0,
-        )
+            float(np.percentile(windows, 99)), 'windows', target=1.0,
+        )  # fmt: skip
         yield harness.row(
             'age of the model that poses used, the largest of 60 s, one process',
             1e3 * float(one.ages_s.max()),
@@ -66,19 +64,13 @@ def rows() -> Iterator[harness.Row]:
     for run, name in ((one, 'one process'), (apart, 'three processes')):
         parts = ', '.join(f'{who} {100 * share:.0f}' for who, share in sorted(run.load.items()))
         yield harness.row(
-            f'CPU at 50 Hz, metal moving, {name}',
-            100 * sum(run.load.values()),
-            f'% of a core ({parts})',
-            target=60.0,
-        )
+            f'CPU at 50 Hz, metal moving, {name}', 100 * sum(run.load.values()),
+            f'% of a core ({parts})', target=60.0,
+        )  # fmt: skip
     yield harness.row(
-        'rate without a lost window, no metal, one process',
-        _sustained_hz(clear),
-        'Hz',
-        rival=('usual rate', 50.0),
-        target=200.0,
-        target_is='least',
-    )
+        'rate without a lost window, no metal, one process', _sustained_hz(clear), 'Hz',
+        rival=('usual rate', 50.0), target=200.0, target_is='least',
+    )  # fmt: skip
 
 
 TARGETS = {'p50': (50.0, 2.5), 'p99': (99.0, 6.0), 'max': (100.0, None)}
@@ -91,11 +83,9 @@ def _latencies(what: str, run: Run, rival: Run, name: str) -> Iterator[harness.R
         ours, other = run.percentile(share), (name, rival.percentile(share))
         yield harness.row(f'{what}: {key}', ours, 'ms', other, target=target)
     yield harness.row(
-        f'{what}: windows of a sensor without a pose, of {run.latency_ms.size}',
-        float(run.lost),
-        rival=(name, float(rival.lost)),
-        target=0.0,
-    )
+        f'{what}: windows of a sensor without a pose, of {run.latency_ms.size}', float(run.lost),
+        rival=(name, float(rival.lost)), target=0.0,
+    )  # fmt: skip
 
 
 def _busy(run: Run) -> str:

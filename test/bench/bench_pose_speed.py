@@ -23,10 +23,8 @@ def rows() -> Iterator[harness.Row]:
         found = diagnose_poses(session)
         yield harness.row(
             f'poses: {name}, 60 s, four sensors of 100 Hz, processor time',
-            time.process_time() - start,
-            's',
-            target=20.0,
-        )
+            time.process_time() - start, 's', target=20.0,
+        )  # fmt: skip
         if name == 'filtered':
             continue
         corrector, poses = PoseCorrector(to_model(found)), session.sensors['sensor_0']

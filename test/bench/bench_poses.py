@@ -163,12 +163,10 @@ def summary(outcomes: Sequence[Judged]) -> Iterator[harness.Row]:
     for name in dict.fromkeys(kind for kind, _, _ in outcomes):
         own = [one for kind, _, one in outcomes if kind == name]
         yield harness.row(
-            f'poses: {name} named, nothing else',
-            sum(one.is_right for one in own),
-            f'of {len(own)}',
-            target=len(own) if name == CLEAN else math.ceil(TARGET * len(own)),
+            f'poses: {name} named, nothing else', sum(one.is_right for one in own),
+            f'of {len(own)}', target=len(own) if name == CLEAN else math.ceil(TARGET * len(own)),
             target_is='least',
-        )
+        )  # fmt: skip
     took = [one.took_s for _, _, one in outcomes]
     for name, value in (('median', np.median(took)), ('longest', max(took))):
         yield harness.row(f'poses: a session, wall time, {name}', float(value), 's')
@@ -183,20 +181,14 @@ def summary(outcomes: Sequence[Judged]) -> Iterator[harness.Row]:
             size = float(np.sqrt(np.mean(np.square(values))))
             if key in WIDE:
                 yield harness.row(
-                    f'poses: {key}, rms of error over sigma ({WIDE[key]})',
-                    size,
-                    f'of {len(values)}',
-                    target='at most 1.3',
-                    met=bool(size <= HONEST[1]),
-                )
+                    f'poses: {key}, rms of error over sigma ({WIDE[key]})', size,
+                    f'of {len(values)}', target='at most 1.3', met=bool(size <= HONEST[1]),
+                )  # fmt: skip
                 continue
             yield harness.row(
-                f'poses: {key}, rms of error over sigma',
-                size,
-                f'of {len(values)}',
-                target='0.8 to 1.3',
-                met=bool(HONEST[0] <= size <= HONEST[1]),
-            )
+                f'poses: {key}, rms of error over sigma', size, f'of {len(values)}',
+                target='0.8 to 1.3', met=bool(HONEST[0] <= size <= HONEST[1]),
+            )  # fmt: skip
 
 
 def rows() -> Iterator[harness.Row]:
@@ -233,10 +225,7 @@ def main() -> None:
             said = 'right' if one.is_right else f'WRONG: {", ".join(one.found) or "nothing"}'
             figures = ', '.join(f'{key} {value:+.1f} sigma' for key, value in one.errors.items())
             print(f'{name}, {what}: {said} {figures}', flush=True)
-    for row in summary(outcomes):
-        least = row.get('target')
-        met = row.get('met', not isinstance(least, int) or row['value'] >= least)
-        print(f'{row["name"]}: {row["value"]:.2f} {row["unit"]} {"" if met else "NOT met"}')
+    harness.print_rows(summary(outcomes))
 
 
 if __name__ == '__main__':

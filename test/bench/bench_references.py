@@ -95,17 +95,13 @@ def of_recordings(counts: Sequence[int], every: int, witnesses: bool) -> Iterato
                 figures = judged(list(series.values()), JITTER_M)
                 target = TARGETS.get((name.split('/')[1], what, count))
                 yield harness.row(
-                    f'{name}, {count} references, {what}: position RMSE',
-                    figures['rms'],
-                    'mm',
+                    f'{name}, {count} references, {what}: position RMSE', figures['rms'], 'mm',
                     target=target,
-                )
+                )  # fmt: skip
                 yield harness.row(
-                    f'{name}, {count} references, {what}: withheld',
-                    figures['withheld'],
-                    '1',
+                    f'{name}, {count} references, {what}: withheld', figures['withheld'], '1',
                     target=0.05 if count >= 4 else None,
-                )
+                )  # fmt: skip
 
 
 def scene(board: Any, kind: str, seed: Sequence[int], folder: Path) -> tuple[Session, Any, Any]:
@@ -175,10 +171,8 @@ def of_scenes(
         for key, text in (('over', 'over 3 sigma'), ('gross', 'over 3 sigma and 1 mm')):
             yield harness.row(
                 f'scenes of seed {seed}, {count} references, {what}: ok but {text}',
-                sum(row[key] for row in rows) / poses,
-                '1',
-                target=0.003,
-            )
+                sum(row[key] for row in rows) / poses, '1', target=0.003,
+            )  # fmt: skip
         yield harness.row(
             f'scenes of seed {seed}, {count} references, {what}: withheld',
             float(np.mean([row['withheld'] for row in rows])),

@@ -52,7 +52,5 @@ def rows() -> Iterator[harness.Row]:
         key = 'longest' if share == 100 else f'{share} %'
         yield harness.row(
             f'update on the clock, {shape}, metal moving for {SECONDS:g} s: {key}',
-            float(np.percentile(spent, share, method='higher')),
-            'ms',
-            target=target,
-        )
+            float(np.percentile(spent, share, method='higher')), 'ms', target=target,
+        )  # fmt: skip

@@ -123,5 +123,5 @@ def print_rows(rows: Iterator[Row]) -> None:
     """Print rows as they come, for a benchmark that is run by itself."""
     for one in rows:
         target = one.get('target')
-        words = '' if target is None else f'   (target {target:g})'
+        words = '' if target is None else f'   (target {target})'
         print(f'{one["name"]}: {one["value"]:.4g} {one["unit"]}{words}', flush=True)

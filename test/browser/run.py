@@ -2,8 +2,7 @@
 
 A control unit with one effect in its raw samples, the chain, a recorder and the live view run as
 processes; a headless Chromium opens the page, records, diagnoses, loads the corrected model and
-undoes it. With --calibrate it sets a baseline and fits a new model to the recording instead; with
---replay BAG the fluxes are those of a bag, which is less work than a simulated unit. What
+undoes it. With --calibrate it sets a baseline and fits a new model to the recording instead. What
 the page says before and after is printed beside what was put in, with the rate of the page's poses
 and the processor time of the live view's process.
 """
@@ -71,8 +70,6 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         '--calibrate', action='store_true', help='set a baseline, and calibrate, not diagnose'
     )
-    parser.add_argument('--replay', type=Path, metavar='BAG', help='in place of the unit')
-    parser.add_argument('--speed', type=float, default=4.0, help='of the replay (%(default)s)')
     parser.add_argument('--pictures', type=Path, metavar='DIR', help='folder for pictures')
     parser.add_argument(
         '--processor', type=float, default=0.0, metavar='S', help='measure its load for so long'
@@ -97,8 +94,6 @@ def _chain(folder: Path, args: argparse.Namespace) -> Iterator[dict[str, Child]]
         ),
         'dashboard': node_command('dashboard', directory=folder / 'bags', port=0),
     }  # fmt: skip
-    if args.replay:
-        commands = _replayed(commands, args, model)
     if args.watch:
         commands['watcher'] = node_command('watcher', model_file=model, window_s=10.0)
     with Supervisor(folder / 'logs') as supervisor:
@@ -109,20 +104,6 @@ def _chain(folder: Path, args: argparse.Namespace) -> Iterator[dict[str, Child]]
             for child in children.values():
                 print(f'{child.name}:\n{tail(child)}', file=sys.stderr)
             raise
-
-
-def _replayed(
-    commands: dict[str, list[str]], args: argparse.Namespace, model: Path
-) -> dict[str, list[str]]:
-    """Put a bag, which is gone through again and again, in the place of unit and acquisition."""
-    words = node_command('replay')
-    at = words.index('--ros-args')
-    words[at:at] = [str(args.replay), '--loop', '--rate', str(args.speed), '--wait', '5']
-    return {
-        'live': node_command('tracker', model_file=model),
-        'field_model': node_command('field_model', model_file=model),
-        'recorder': commands['recorder'], 'dashboard': commands['dashboard'], 'replay': words,
-    }  # fmt: skip
 
 
 def _address(dashboard: Child) -> str:
@@ -200,8 +181,6 @@ class Trial:
         found['after_undo'] = page.locator('.bar .pill').inner_text()
         live = found['tables']['live, last 10 s']
         found['closed'] = _fell(live['tracked frames, %'][::-1]) or _fell(live['error, mm rms'])
-        if args.replay:  # nothing is wrong there: it has to stay so
-            found['closed'] = float(live['tracked frames, %'][1]) > 0.0
         if args.calibrate:
             found['closed'] &= found['baseline'].startswith('baseline of')
         return found

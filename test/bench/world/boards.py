@@ -108,13 +108,10 @@ class Board:
     def document(self, rate_hz):
         """The setup document."""
         return {
-            'schema': 'anser_setup/1',
-            'frame_id': 'fg',
-            'flux_rate_hz': rate_hz,
-            'flux_unit': 'T',
+            'schema': 'anser_setup/1', 'frame_id': 'fg', 'flux_rate_hz': rate_hz, 'flux_unit': 'T',
             'emitter': self.design.emitter(self.frequencies),
             'sensors': self.tool.documents() + self.reference.documents(),
-        }
+        }  # fmt: skip
 
 
 def _ring8(rng):
@@ -252,14 +249,8 @@ def build(index, rng):
     if not tall:
         scan.update(count=31, heights_m=(0.15,))
     return Board(
-        design=design,
-        frequencies=_frequencies(count, rng),
-        paths=[path for path, _ in coils],
-        amperes=CURRENT_A * np.array([strength for _, strength in coils]),
-        tool=tool,
-        reference=reference,
-        reference_real=real,
-        reference_gain=gain,
-        scan=scan,
+        design=design, frequencies=_frequencies(count, rng), paths=[path for path, _ in coils],
+        amperes=CURRENT_A * np.array([strength for _, strength in coils]), tool=tool,
+        reference=reference, reference_real=real, reference_gain=gain, scan=scan,
         heights_m=(0.112, 0.208) if tall else (0.147, 0.183),
-    )
+    )  # fmt: skip

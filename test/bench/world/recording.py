@@ -39,12 +39,10 @@ def _stamps(time):
 def _cloud(sensors, moves, flux):
     blank = np.full_like(sensors.place, np.nan)
     points = FluxPoints(
-        channel=np.asarray(sensors.channel),
-        flags=np.zeros(len(sensors.channel), dtype=np.int64),
-        flux=flux,
-        position=blank if moves else sensors.place,
+        channel=np.asarray(sensors.channel), flags=np.zeros(len(sensors.channel), dtype=np.int64),
+        flux=flux, position=blank if moves else sensors.place,
         axis=blank if moves else sensors.axis,
-    )
+    )  # fmt: skip
     return encode_flux(points)
 
 
