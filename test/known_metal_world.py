@@ -22,7 +22,7 @@ from anser_ros.refit.clouds import Excitation, excitation_for
 from anser_ros.refit.witness import ToolReading
 from anser_ros.sessions.session import Session
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.setup import SensorSpec, Setup, dump_setup
+from anser_ros.wire.setup import Setup, dump_setup
 
 WORLD = Path(__file__).parent / 'bench' / 'world'
 RATE_HZ, START_NS = 12.5, 10**18
@@ -67,13 +67,7 @@ def references() -> SensorTable:
 @cache
 def world_setup() -> Setup:
     """The setup of board, tool and references."""
-    table = references()
-    rows = zip(table.channel, table.name, table.position, table.axis, strict=True)
-    specs = [
-        SensorSpec(int(channel), name, 'fg', tuple(map(float, at)), tuple(map(float, axis)), 0.0)
-        for channel, name, at, axis in rows
-    ]
-    return setup_of(TOOL, tuple(specs))
+    return setup_of(TOOL, setup_of(references()).sensors)
 
 
 def metal_flux(metal, place, turn, at, axes):

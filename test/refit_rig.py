@@ -8,7 +8,7 @@ from rclpy.parameter import Parameter
 from refit_world import anser_world, metal_block
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from tracking_world import CENTRES_MM, GEOMETRY, TURNED
+from tracking_world import setup_of
 from visualization_msgs.msg import MarkerArray
 
 from anser_ros.nodes.field_model import FieldModelNode
@@ -16,7 +16,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.points import FluxPoints
-from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
+from anser_ros.wire.setup import dump_setup
 
 HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
 FIRST_NS = 1_750_000_000_000_000_000
@@ -25,21 +25,7 @@ STEP_NS = 20_000_000
 
 def setup_text(world):
     """The test's world as a setup document."""
-    names, tones = world.board.names, world.board.frequencies_hz
-    coils = tuple(
-        Coil(name, (x * 1e-3, y * 1e-3, 0.0), turn, tone)
-        for name, (x, y), turn, tone in zip(names, CENTRES_MM, TURNED, tones, strict=True)
-    )
-    table = world.references
-    sensors = [
-        SensorSpec(int(c), n, 'fg', tuple(p), tuple(a), float(length))
-        for c, n, p, a, length in zip(
-            table.channel, table.name, table.position.tolist(), table.axis.tolist(),
-            table.length, strict=True,
-        )
-    ]  # fmt: skip
-    emitter = Emitter('square_spiral_pcb', GEOMETRY, coils)
-    return dump_setup(Setup('fg', 50.0, emitter, tuple(sensors)))
+    return dump_setup(setup_of(world.references))
 
 
 class Rig:

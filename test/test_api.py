@@ -143,17 +143,11 @@ class TestWriteSession:
         assert load_session(path).tools[0].time.size == 2
 
 
-def test_a_setup_from_a_file_that_is_not_there(tmp_path):
+def test_what_is_none_is_refused(tmp_path):
     with pytest.raises(SetupError, match=r'none\.yaml'):
         load_setup(tmp_path / 'none.yaml')
-
-
-def test_a_calibration_of_nothing():
     with pytest.raises(FitError, match='at least one session'):
         anser_ros.calibrate([])
-
-
-def test_flux_wants_a_position_for_every_axis():
     with pytest.raises(ParameterError, match='must both be'):
         Model.nominal(SETUP).flux([[0.0, 0.0, 0.1]], [0.0, 0.0, 1.0])
 

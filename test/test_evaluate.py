@@ -170,13 +170,9 @@ def metal():
 
 @pytest.mark.parametrize('text', ['', '1,1', '3,x', '3;4', 'None', '-1'])
 def test_a_list_that_is_none_is_refused(text):
+    assert parse_references('17, 20') == (17, 20) and parse_references('none') == ()
     with pytest.raises(ParameterError, match='references'):
         parse_references(text)
-
-
-def test_a_list_of_channels_is_read():
-    assert parse_references('17, 20') == (17, 20)
-    assert parse_references('none') == ()
 
 
 def test_the_chosen_references_are_all_that_a_session_has(metal):
@@ -285,22 +281,16 @@ PICKUP = record('sensor_pickup_spread', [[3e-9, 4e-9, 0.0, 0.0], [0.0] * 4, [1e-
 SINGLE = EffectRecord('sensor_gain', {'channel': 3, 'gain': 1.1})
 
 
-def test_every_channel_has_its_values_and_their_sigma():
+def test_every_channel_has_its_values_and_their_sigma_or_there_is_nothing_to_show():
     head, rows = population_table([GAINS, SINGLE, PLACES])
     assert head[1] == 'sensor_gain_spread in phase, %'
     assert head[-1] == 'sensor_place_spread z, mm'
     assert [row[0] for row in rows] == ['0', '1', '2', '4']
     assert rows[0][1:4] == ['0.2000 ± 0.0100', '0.1000 ± 0.0100', '']
     assert rows[1][3:] == ['0.1000 ± 0.1000', '0.0000 ± 0.1000', '-0.2000 ± 0.1000']
-
-
-def test_many_values_of_a_channel_are_summed_up():
     head, rows = population_table([PICKUP])
     assert head == ['channel', 'sensor_pickup_spread rms, nT']
     assert rows[0][1].startswith('2.5000 ±')
-
-
-def test_without_a_population_there_is_nothing_to_show():
     assert populations([SINGLE]) == []
     assert population_table([SINGLE])[1] == []
     assert population_figure([SINGLE]) is None

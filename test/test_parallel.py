@@ -23,11 +23,6 @@ def test_results_come_in_the_order_of_the_pieces_from_several_threads():
     assert len({name for _, name in found}) == 2
 
 
-def test_one_thread_is_the_caller_s_own():
-    names = in_order(lambda _: threading.current_thread().name, range(3))
-    assert set(names) == {threading.current_thread().name}
-
-
 def test_pieces_that_share_out_work_do_it_alone():
     with shared_among(2):
         found = in_order(lambda a: in_order(lambda b: a + b, range(3)), range(5))

@@ -127,7 +127,11 @@ def map_record(degree, kind, coefficients, **uncertainty):
     return {'name': 'field_distortion', 'parameters': parameters, 'uncertainty': uncertainty}
 
 
-def test_a_map_whose_coefficients_are_not_those_of_its_degree_is_refused(bent):
+def test_what_is_no_model_of_poses_or_no_map_of_its_degree_is_refused(bent):
+    with pytest.raises(ModelFileError, match='anser_pose_model/1'):
+        PoseCorrector({'schema': 'anser_model/1'})
+    with pytest.raises(ModelFileError, match='support'):
+        PoseCorrector({k: v for k, v in bent[1].items() if k != 'support'})
     record = map_record(2, 'quadratic', [0.1] * 27)
     with pytest.raises(ModelFileError, match='27 coefficients_mm, such a map has 30'):
         PoseCorrector({**bent[1], 'effects': [record]})
@@ -146,13 +150,6 @@ def test_a_shrunk_space_is_stretched_about_its_own_point_with_its_variance(bent)
     np.testing.assert_allclose(after.position - before.position, moved, atol=1e-12)
     variance = np.mean((0.3e-3 * away / 0.05) ** 2) + 1e-8
     assert after.covariance[0, 0] - before.covariance[0, 0] == pytest.approx(variance, rel=1e-9)
-
-
-def test_what_is_no_model_of_poses_is_refused(bent):
-    with pytest.raises(ModelFileError, match='anser_pose_model/1'):
-        PoseCorrector({'schema': 'anser_model/1'})
-    with pytest.raises(ModelFileError, match='support'):
-        PoseCorrector({k: v for k, v in bent[1].items() if k != 'support'})
 
 
 @pytest.mark.light
