@@ -192,15 +192,12 @@ def test_a_chunk_that_declares_too_much_is_never_unpacked(whole, tmp_path, monke
     assert salvage.lost
 
 
-def test_rounded_ones_are_brought_to_unit_length():
+def test_quaternions_are_brought_to_unit_length_or_are_none():
     true = np.random.default_rng(1).normal(size=(200, 4))
     true /= np.linalg.norm(true, axis=1, keepdims=True)
     mended = unit_quaternions(np.round(true, 2))
     np.testing.assert_allclose(np.linalg.norm(mended, axis=1), 1.0, rtol=1e-12)
     assert np.abs(mended - true).max() < 0.011
-
-
-def test_other_numbers_are_none():
     given = [[0.0, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0], [10.0, 20.0, 30.0, 0.0]]
     assert np.isnan(unit_quaternions(given)).all()
 

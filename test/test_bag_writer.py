@@ -87,12 +87,10 @@ class TestSession:
         assert references.flags.tolist() == [STALE]
         np.testing.assert_allclose(references.position[0], fixed.position_m, rtol=1e-6)
 
-    def test_refuses_to_write_over_a_bag(self, tmp_path):
+    def test_refuses_to_write_over_a_bag_and_into_a_folder_that_is_none(self, tmp_path):
         SessionWriter(tmp_path / 'a.mcap').close()
         with pytest.raises(BagError, match='already exists'):
             SessionWriter(tmp_path / 'a.mcap')
-
-    def test_refuses_a_folder_that_is_none(self, tmp_path):
         (tmp_path / 'file').write_text('')
         with pytest.raises(BagError, match='file'):
             SessionWriter(tmp_path / 'file' / 'a.mcap')

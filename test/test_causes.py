@@ -28,11 +28,8 @@ def told(**changes):
     return {**quiet, **{name.replace('__', '/'): value for name, value in changes.items()}}
 
 
-def test_nothing_is_said_of_what_is_well():
+def test_nothing_is_said_of_what_is_well_and_a_slow_computer_is():
     assert causes(told(), 'anser', 50.0) == []
-
-
-def test_a_computer_that_is_too_slow():
     words = 'overrun_blocks 120 (blocks lost: this computer is too slow)'
     slow = told(anser__acquisition=LastStatus(1, words, {'rate_hz': '30'}))
     assert causes(slow, 'anser', 50.0) == [f'acquisition: {words}; 40% of the frames are missing']
@@ -61,7 +58,7 @@ def test_a_flood_has_an_end():
     assert len(texts) == MOST_CAUSES and max(map(len, texts)) == MOST_TEXT
 
 
-def test_a_fault_is_told_with_its_count_and_forgotten_in_time():
+def test_a_fault_is_told_and_forgotten_in_time_and_what_stops_the_stream_comes_first():
     faults = RecentFaults()
     faults.note({'bad_crc': 7, 'gap_blocks': 0}, 0.0)
     assert faults.words == ''
@@ -70,9 +67,6 @@ def test_a_fault_is_told_with_its_count_and_forgotten_in_time():
     assert faults.level is Level.WARN
     faults.note({'bad_crc': 8, 'gap_blocks': 0}, 1.0 + MEMORY_S)
     assert faults.words == ''
-
-
-def test_what_stops_the_stream_is_an_error_and_comes_first():
     faults = RecentFaults()
     faults.note({'wrong_baud': 0, 'skipped_bytes': 0}, 0.0)
     faults.note({'wrong_baud': 1, 'skipped_bytes': 900}, 1.0)

@@ -84,7 +84,7 @@ def test_the_main_file_is_as_it_is_written():
     assert (CONFIG / 'anser.yaml').read_text() == writer['text']()
 
 
-def test_every_parameter_is_read():
+def test_every_parameter_is_read_and_every_node_has_the_name_of_its_module():
     """A parameter that nothing asks for would promise what is not done; the names of
     `anser_ros.settings` are read together, by `stated_by`.
     """
@@ -93,9 +93,6 @@ def test_every_parameter_is_read():
     tables = {name: set(node_class(name).PARAMETERS.__dataclass_fields__) for name in NODES}
     unread = {name: names - read - set(VALUES) for name, names in tables.items()}
     assert not {name: sorted(names) for name, names in unread.items() if names}
-
-
-def test_every_node_has_the_name_of_its_module():
     for name in NODES:
         assert name == node_class(name).NAME
 

@@ -123,11 +123,9 @@ class TestLine:
         line.run(0.3)
         assert line.good[-1] and abs(line.error_s()) < 5e-3
 
-    def test_an_answer_settles_a_new_line_at_once(self):
+    def test_an_answer_settles_a_new_line_and_tells_one_that_is_late_from_the_start(self):
         line = Line().run(0.002, answers_s=0.001)
         assert line.good[-1] and abs(line.error_s()) < 2e-3
-
-    def test_a_line_that_is_late_from_the_start_is_known_by_its_answers(self):
         line = Line().run(3.0, late_by(1.2), answers_s=1.3)
         assert not any(line.good[:-1250]), 'the last 1.2 s arrive together'
         line.run(0.1, answers_s=0.002)

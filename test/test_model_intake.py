@@ -57,13 +57,10 @@ def test_one_whose_model_was_lost_is_passed_over():
     assert intake.has_error
 
 
-def test_what_is_not_said_yet_is_unknown():
+def test_what_is_not_said_yet_is_unknown_but_a_shift_from_the_file():
     intake = ModelIntake()
     assert intake.take(messages([0])[1][0]).error is None
     assert not intake.has_error
-
-
-def test_a_shift_that_all_poses_share_is_known_from_the_file():
     given = ModelIntake().take(messages([0])[1][0])
     setup = setup_of(triaxial_tool())
     assert given.field_model(setup, None).shift_sigma_m == 0.0

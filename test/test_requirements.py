@@ -236,14 +236,11 @@ def test_the_image_has_the_packages_of_package_xml():
     assert 'noble' in text and 'jazzy' in text
 
 
-def test_the_container_of_editors_is_that_image():
+def test_container_and_citation_are_of_this_image_and_version():
     document = json.loads((REPO / '.devcontainer' / 'devcontainer.json').read_text())
     folder = REPO / '.devcontainer'
     assert (folder / document['build']['dockerfile']).resolve() == REPO / 'Dockerfile'
     assert (folder / document['build']['context']).resolve() == REPO
-
-
-def test_the_citation_has_version_and_licence():
     cited = yaml.safe_load((REPO / 'CITATION.cff').read_text())
     assert str(cited['version']) == PACKAGE.findtext('version')
     assert cited['license'] == PACKAGE.findtext('license')

@@ -71,16 +71,13 @@ def test_a_fold_holds_whole_cells_and_every_frame(rng):
         assert len(set(both[key == value])) == 1
 
 
-def test_neighbouring_cells_are_of_other_folds():
+def test_neighbouring_cells_are_of_other_folds_and_one_place_cannot_be_held_out():
     line = np.linspace(0, 1, 25)
     x, y = np.meshgrid(line, line)
     fold = fold_of_frames([np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)])[0]
     lattice = fold.reshape(25, 25)[2::5, 2::5]
     assert (lattice[1:] != lattice[:-1]).all()
     assert (lattice[:, 1:] != lattice[:, :-1]).all()
-
-
-def test_frames_at_one_place_can_not_be_held_out():
     with pytest.raises(FitError, match='got 1: all frames are at one place'):
         fold_of_frames([np.zeros((30, 3))])
 

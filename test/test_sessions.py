@@ -102,11 +102,9 @@ class TestTrack:
         assert np.array_equal(first.flux, metal.tools[0].flux[0])
         assert (first.in_phase().flux.imag == 0.0).all()
 
-    def test_nothing_to_compare_has_no_figures(self):
+    def test_nothing_to_compare_has_no_figures_and_no_tools_are_refused(self, moving, model):
         figures = metrics(pose_series('tool_a/0/x', (), np.empty((0, 3)), np.empty((0, 3))))
         assert figures['n'] == 0 and figures['position_rmse_m'] is None
-
-    def test_without_tools_is_refused(self, moving, model):
         with pytest.raises(BagError, match='no tool fluxes'):
             track(prepare(replace(moving, tools=()), model))
 

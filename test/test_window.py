@@ -150,11 +150,8 @@ def test_a_wrong_pace_is_said_within_a_tenth_of_a_second(rate):
     assert check.disagreements == 1
 
 
-def test_a_counter_that_stands_still():
+def test_a_counter_that_stands_still_is_said_and_a_jump_forgotten_after_a_while():
     assert run(lambda k: 5, 10).words == 'stand still'
-
-
-def test_a_jump_is_said_and_forgotten_after_a_while():
     check = run(lambda k: 1000 * k + 1_200_000 * (k >= 900))
     assert check.words == 'jumped by 1.2 s' and check.disagreements == 1
     for k in range(1000, 1300):

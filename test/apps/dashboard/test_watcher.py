@@ -93,7 +93,7 @@ class TestWindow:
         assert session.tools[0].time.size == size
         assert session.tools[0].track.time.size == moving.optical['tool_a'].stamp_ns.size
 
-    def test_other_channels_begin_anew(self, moving):
+    def test_other_channels_begin_anew_and_before_there_is_nothing(self, moving):
         window = filled(moving, optical=False)
         fewer = replace(
             points(moving.tool, 0), channel=moving.tool.channel[:4],
@@ -101,8 +101,6 @@ class TestWindow:
         )  # fmt: skip
         window.take_tool(int(moving.tool.stamp_ns[-1]) + SECOND_NS, fewer)
         assert window.session().tools[0].time.size == 1
-
-    def test_nothing_yet(self, moving):
         assert SlidingWindow(moving.setup, 5.0, 50).session() is None
 
 

@@ -46,13 +46,10 @@ def test_clocks_that_were_set_alike_have_no_offset_beside_their_rate(offset_s, i
     assert found[-1].parameters['offset_s'] == offset_s
 
 
-def test_a_poll_slower_than_its_tracker_is_told_by_poses_that_share_a_stamp():
+def test_a_poll_is_told_by_poses_that_share_a_stamp_or_by_its_beat():
     taken = np.arange(0, 20, 1 / 92)
     assert stamp_step(np.ceil(taken / 0.016) * 0.016) == pytest.approx(0.016)
     assert stamp_step(np.arange(0, 20, 0.016)) == 0.0  # the tracker's own rate
-
-
-def test_a_poll_hardly_slower_than_its_tracker_is_told_by_its_beat():
     taken = np.arange(0, 40, 1 / 32.5)
     assert stamp_step(np.ceil(taken / 0.03) * 0.03) == pytest.approx(0.03)
     own, rng = np.arange(1600), np.random.default_rng(1)

@@ -277,15 +277,13 @@ class TestNames:
     def named(self, text=SETUP, **values):
         return devices_of(parse_setup(text), OpenIGTLinkParameters(**values))
 
-    def test_templates(self):
+    def test_templates_name_coils_bodies_and_tips(self):
         assert self.named() == {'tool_a/0/x': 'tool_a/0/x', 'tool_a': 'tool_a'}
         assert self.named(body_name='{body}ToTracker', coils=False) == {
             'tool_a': 'tool_aToTracker'
         }
         with pytest.raises(ParameterError, match=r'body_name may have \{body\}'):
             check_templates(OpenIGTLinkParameters(body_name='{tool}'))
-
-    def test_the_tip_of_a_stylus_is_a_body(self):
         setup = parse_setup(SETUP).with_tips({'tool_a': TipSpec((0.01, -0.02, -0.15), (0.0,) * 6)})
         table = OpenIGTLinkParameters(coils=False)
         assert set(devices_of(setup, table)) == {'tool_a', 'tool_a/tip'}
