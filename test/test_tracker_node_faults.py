@@ -75,51 +75,44 @@ def test_two_publishers_give_no_poses_and_their_models_are_not_obeyed(tracker):
 
 
 def test_refusals_are_counted_with_their_reason_and_tracking_goes_on(tracker):
-    rng = np.random.default_rng(4)
     ready(tracker)
-    model = certain_model()
+    node, model, rng = tracker.node, certain_model(), np.random.default_rng(4)
     flux = fluxes(model, SENSORS, *random_pose(rng), rng)
-    node = tracker.node
 
     def refused(counter, count, word):
         tracker.spin_until(lambda: node.counters[counter] == count)
         node.publish_diagnostics()
         tracker.spin_until(lambda: word in tracker.value('anser/tracker', 'last_refusal'))
 
-    tracker.say_flux(flux, stamp_ns=0)
-    refused('fluxes_refused', 1, 'no stamp')
-    message = tracker.cloud.message(tracker.points(flux), 7)
-    message.data = message.data[:-8]
-    tracker.flux.publish(message)
-    refused('fluxes_refused', 2, 'bytes')
-    message = tracker.cloud.message(tracker.points(flux), 8)
-    message.fields = [f for f in message.fields if f.name != 'coil3_im']
-    tracker.flux.publish(message)
-    refused('fluxes_refused', 3, 'coil3_im')
-    message = tracker.cloud.message(tracker.points(flux[:, :5]), 9)
-    tracker.flux.publish(message)
-    refused('fluxes_refused', 4, '8 emitters')
-    message = tracker.cloud.message(
-        tracker.points(flux, channels=np.zeros(9, dtype=int)), FIRST_NS + 1
-    )
-    tracker.flux.publish(message)
-    refused('fluxes_refused', 5, 'twice')
-    tracker.say_model(model, stamp_ns=0)
-    refused('models_refused', 1, 'no stamp')
+    def frame(stamp_ns, flux=flux, **more):
+        return tracker.cloud.message(tracker.points(flux, **more), stamp_ns)
+
+    cut, lacking = frame(7), frame(8)
+    cut.data = cut.data[:-8]
+    lacking.fields = [f for f in lacking.fields if f.name != 'coil3_im']
+    twice = frame(FIRST_NS + 1, channels=np.zeros(9, dtype=int))
+    wrong = (
+        (frame(0), 'no stamp'), (cut, 'bytes'), (lacking, 'coil3_im'),
+        (frame(9, flux[:, :5]), '8 emitters'), (twice, 'twice'),
+    )  # fmt: skip
+    for count, (message, word) in enumerate(wrong, 1):
+        tracker.flux.publish(message)
+        refused('fluxes_refused', count, word)
     bad = model.positions.copy()
     bad[3, 1] = np.nan
-    tracker.say_model(type(model)(bad, model.directions, model.moments, model.emitters,
-                                  model.frequencies_hz), stamp_ns=8)  # fmt: skip
-    refused('models_refused', 2, 'not finite')
-    tracker.say_model(type(model)(model.positions, model.directions, model.moments[:, :3],
-                                  model.emitters[:3], model.frequencies_hz[:3]),
-                      stamp_ns=9)  # fmt: skip
-    refused('models_refused', 3, '3 emitters')
+    three = replace(
+        model, moments=model.moments[:, :3], emitters=model.emitters[:3],
+        frequencies_hz=model.frequencies_hz[:3],
+    )  # fmt: skip
+    broken = (model, 0, 'no stamp'), (replace(model, positions=bad), 8, 'not finite')
+    for count, (given, stamp_ns, word) in enumerate((*broken, (three, 9, '3 emitters')), 1):
+        tracker.say_model(given, stamp_ns=stamp_ns)
+        refused('models_refused', count, word)
     tracker.say_model(model, stamp_ns=10)
-    tracker.say_setup('schema: anser_setup/1\nsensors: 5\n')
-    refused('setups_refused', 1, 'sensors')
-    tracker.say_setup('schema: [')
-    refused('setups_refused', 2, 'YAML')
+    texts = ('schema: anser_setup/1\nsensors: 5\n', 'sensors'), ('schema: [', 'YAML')
+    for count, (text, word) in enumerate(texts, 1):
+        tracker.say_setup(text)
+        refused('setups_refused', count, word)
     before = node.counters['frames']
     tracker.say_flux(flux)
     wait_frame(tracker, before + 1)
@@ -127,35 +120,21 @@ def test_refusals_are_counted_with_their_reason_and_tracking_goes_on(tracker):
     assert node.counters['callback_faults'] == 0
 
 
-def test_every_kind_of_bad_flux_has_its_counter(tracker):
-    rng = np.random.default_rng(8)
+def test_bad_fluxes_have_their_counters_and_a_dead_emitter_is_named(tracker):
+    """What there are counters for, `test_intake` and the field model's node have whole."""
     ready(tracker)
+    node, rng = tracker.node, np.random.default_rng(8)
     flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
-    node = tracker.node
-
-    def send(values, **header):
-        tracker.stamp_ns += 20_000_000
-        message = tracker.cloud.message(tracker.points(values), tracker.stamp_ns)
-        for name, value in header.items():
-            setattr(message.header if name == 'frame_id' else message.header.stamp, name, value)
-        tracker.flux.publish(message)
-
-    bad = flux.copy()
+    bad, dead = flux.copy(), flux.copy()
     bad[0, 0], bad[1, 1] = np.inf, 1e20
-    dead = flux.copy()
     dead[:, 6] = np.nan
-    send(flux, frame_id='world')
-    send(flux, nanosec=1_000_000_000)
-    send(flux[:0])
-    tracker.spin_until(lambda: node.counters['frames'] == 1)
-    send(bad)
-    message = tracker.cloud.message(tracker.points(flux), tracker.stamp_ns + 1)
-    message.is_bigendian = True
-    tracker.flux.publish(message)
-    tracker.spin_until(lambda: node.counters['fluxes_big_endian'] == 1)
-    send(dead)
-    tracker.stamp_ns += 10**10
-    send(dead)
+    elsewhere = tracker.cloud.message(tracker.points(flux), FIRST_NS + 1)
+    elsewhere.header.frame_id = 'world'
+    tracker.flux.publish(elsewhere)
+    for values, later_ns in ((flux[:0], 0), (bad, 0), (dead, 0), (dead, 10**10)):
+        tracker.stamp_ns += later_ns
+        tracker.say_flux(values)
+        wait_frame(tracker, 1)
     tracker.spin_until(lambda: node._tracker.counters['time_jumps_forward'] == 1)
     node.publish_diagnostics()
     # The words about the first frame without the emitter may still be on their way; only those
@@ -164,14 +143,10 @@ def test_every_kind_of_bad_flux_has_its_counter(tracker):
     assert tracker.value('anser/tracker', 'dead_emitters') == 'coil6'
     assert tracker.state('anser/tracker') == 'no flux of coil6'
     for counter, count in (
-        ('fluxes_other_frame_id', 1), ('fluxes_without_stamp', 1), ('frames_empty', 1),
-        ('readings_not_finite', 1), ('frames_dead_emitter', 2), ('fluxes_refused', 2),
-        ('fluxes_big_endian', 1), ('time_jumps_forward', 1),
+        ('fluxes_other_frame_id', 1), ('frames_empty', 1), ('readings_not_finite', 1),
+        ('readings_absurd', 1), ('frames_dead_emitter', 2), ('fluxes_refused', 1),
     ):  # fmt: skip
         assert tracker.value('anser/tracker', counter) == str(count), counter
-    # The bytes that were called big endian make other channels.
-    assert int(tracker.value('anser/tracker', 'readings_missing')) > 9
-    assert int(tracker.value('anser/tracker', 'readings_absurd')) >= 1
     assert node.counters['callback_faults'] == 0
 
 
