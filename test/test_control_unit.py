@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 from anser_ros.errors import ParameterError, SetupError
+from anser_ros.nodes.acquisition_stream import FluxStream
 from anser_ros.physics.dipole import field_basis
-from anser_ros.signals.demodulation import Demodulator
-from anser_ros.signals.flux import FluxConverter
-from anser_ros.signals.repetition import RepetitionWatch
-from anser_ros.signals.window import TickCheck, WindowCutter
 from anser_ros.simulation import effects
 from anser_ros.simulation.control_unit import ControlUnit, FrontEnd
 from anser_ros.simulation.effects import CATALOGUE, draw
@@ -37,6 +34,7 @@ from anser_ros.wire.text_files import config_path, read_config
 SETUP = parse_setup(read_config('demo_setup.yaml'))
 CHANNELS = parse_channels(read_config('demo_channels.yaml'))
 TONES = np.array(SETUP.frequencies_hz)
+WINDOW_S = 0.02
 
 
 def dipoles(points):
@@ -66,31 +64,21 @@ def codes_of(unit, samples):
     return np.concatenate([p.codes for p in payloads if isinstance(p, SampleBlock)])
 
 
-def fluxes(unit, seconds=0.1, window=800):
+def fluxes(unit, seconds=0.1):
     """Fluxes (windows, S, K), their sigmas and the mid times, as acquisition makes them."""
     unit.receive(encode(Start()))
-    begin = unit.samples / unit.sample_rate_hz
+    begin, arrival_ns, found = unit.samples / unit.sample_rate_hz, 10**12, []
     (hello,) = [p for p in decode(unit.receive(encode(Identify()))) if isinstance(p, Hello)]
-    columns = len(hello.channels) - 1
-    scales = np.array([c.full_scale / 32768 for c in hello.channels])
-    numbers = [c.number for c in hello.channels[:-1]]
-    demodulator = Demodulator(hello.sample_rate_hz, np.array(hello.frequencies_hz), window)
-    converter = FluxConverter(
-        np.array(hello.frequencies_hz), np.arange(columns), scales[:-1],
-        CHANNELS.areas_m2(numbers), CHANNELS.delays_s(numbers), current_column=columns,
-        amperes_per_code=scales[-1], nominal_currents_a=np.array(hello.currents_a),
-        current_delay_s=CHANNELS.current_delay_s,
-    )  # fmt: skip
-    watch, ticks = RepetitionWatch(columns + 1, 40e3), TickCheck(40e3, 1e6)
-    cutter = WindowCutter(window, window, watch, ticks)
-    found = []
+    stream = FluxStream(hello, SETUP, CHANNELS, WINDOW_S, 1 / WINDOW_S)
+    stream.restart(arrival_ns)
     for _ in range(round(seconds / 0.005)):
         for block in decode(unit.advance(200)):
             if isinstance(block, SampleBlock):
-                found += cutter.push(block.sequence, block.timestamp_ticks, block.codes)
-    converted = [converter.convert(demodulator.demodulate(one.codes)) for one in found]
-    times = begin + (np.arange(len(found)) + 0.5) * window / hello.sample_rate_hz
-    return np.array([c.flux for c in converted]), np.array([c.sigma for c in converted]), times
+                arrival_ns += 10**6
+                found += stream.push(block, arrival_ns)
+    flux = [np.concatenate([frame.tool.flux, frame.reference.flux]) for frame in found]
+    times = begin + (np.arange(len(found)) + 0.5) * WINDOW_S
+    return np.array(flux), np.array([frame.window.sigma for frame in found]), times
 
 
 class TestProtocol:
