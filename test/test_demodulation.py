@@ -111,7 +111,7 @@ def test_lost_samples_are_left_out_of_the_fit():
     assert np.abs(fit.phasors - truth).max() < 1e-6
 
 
-def test_too_few_samples_left():
+def test_too_few_samples_and_tones_too_close_are_refused():
     present = np.zeros(800, bool)
     present[:30] = True
     with pytest.raises(FitError, match='unknowns need more than 30'):
@@ -119,17 +119,14 @@ def test_too_few_samples_left():
     present[:60] = True
     with pytest.raises(FitError, match='not separable'):
         Demodulator(RATE, TONES, 800).demodulate(np.zeros((800, 1)), present)
+    with pytest.raises(ParameterError, match='cannot separate'):
+        Demodulator(RATE, np.array([6000.0, 6010.0]), 200)
 
 
 @pytest.mark.parametrize('samples', [199, 2001])
 def test_window_length_is_5_to_50_ms(samples):
     with pytest.raises(ParameterError, match='5 to 50 ms'):
         Demodulator(RATE, TONES, samples)
-
-
-def test_tones_too_close_for_the_window():
-    with pytest.raises(ParameterError, match='cannot separate'):
-        Demodulator(RATE, np.array([6000.0, 6010.0]), 200)
 
 
 class TestFlux:

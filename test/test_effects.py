@@ -136,7 +136,7 @@ def test_a_correction_undoes_its_effects(problem):
         np.testing.assert_allclose(back, plain.flux[frame], rtol=1e-5, atol=1e-13)
 
 
-def test_a_correction_keeps_missing_readings_missing(problem):
+def test_a_correction_leaves_missing_readings_and_a_drift_without_a_course_alone(problem):
     record = EffectRecord('sensor_gain', {'channel': 0, 'gain': 2.0})
     correction = corrected(problem, record)
     flux = np.ones((2, 4), dtype=complex)
@@ -145,9 +145,6 @@ def test_a_correction_keeps_missing_readings_missing(problem):
     np.testing.assert_allclose(back[0], 0.5)
     assert np.isnan(back[1]).all()
     assert corrected(problem).flux(0.0, np.array([0, 1]), flux) is flux
-
-
-def test_a_drift_is_left_alone_where_nothing_tells_its_course(problem):
     record = EffectRecord('coil_drift', {'coil': 2, 'amount': 0.5, 'tau_s': 1.0})
     correction = corrected(problem, record)
     flux = np.ones((1, 4), dtype=complex)

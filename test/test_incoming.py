@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from conftest import wait
+from conftest import spin_until
 from geometry_msgs import msg
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
@@ -62,20 +61,15 @@ def test_a_node_counts_what_it_refuses_and_goes_on(ros):
     node, peer = Taker(), ros.create_node('peer', namespace='anser')
     text = peer.create_publisher(String, 'text', qos.STREAM)
     clouds = peer.create_publisher(PointCloud2, 'cloud', qos.STREAM)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    executor.add_node(peer)
-
-    def spin_until(condition):
-        assert wait(condition, lambda: executor.spin_once(timeout_sec=0.05)), node.counters
-
-    spin_until(lambda: text.get_subscription_count() and clouds.get_subscription_count())
+    both = text, clouds
+    assert spin_until(node, lambda: all(one.get_subscription_count() for one in both))
     clouds.publish(PointCloud2(height=1, width=10**6, point_step=1))
     text.publish(String(data='x' * 1_100_000))
     text.publish(String(data='good'))
-    spin_until(lambda: node.texts and node.counters['refused_LayoutError'] == 2)
+    assert spin_until(node, lambda: node.texts and node.counters['refused_LayoutError'] == 2)
     assert node.texts == [('good', True)] and not node.clouds
-    executor.shutdown()
+    node.destroy_node()
+    peer.destroy_node()
 
 
 @pytest.mark.parametrize('frame_id', ['', 'fg', 'left_fg', 'boards/left/fg'])

@@ -143,15 +143,12 @@ def judged(places, bounds=HANDS, step_s=0.02, sigma_m=1e-4):
     return found
 
 
-def test_what_slips_through_a_long_refusal_is_not_confirmed():
+def test_what_slips_through_a_long_refusal_waits_for_a_run():
     places = [0.0] * 10 + ([None] * 6 + [0.1]) * 30
     found = judged(places)
     assert all(found[:10])
     late = [good for x, good in zip(places[60:], found[60:], strict=True) if x is not None]
     assert not any(late)
-
-
-def test_a_track_begins_again_after_a_run():
     found = judged([0.0] * 10 + [None] * 100 + [0.1] * 40)
     assert not any(found[110:122]) and all(found[123:])
 

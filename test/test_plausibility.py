@@ -81,14 +81,11 @@ def test_positions_far_away_need_no_drawing(moving, tool):
     says(undrawn, far, 'span', 'millimetres?')
 
 
-def test_quaternions_in_another_order(moving, tool):
+def test_quaternions_in_another_order_and_axes_exchanged_or_reversed(moving, tool):
     first = with_track(tool, quaternion=tool.track.quaternion[:, [3, 0, 1, 2]])
     says(moving, first, 'quaternions with w first', '100 %')
     inverse = with_track(tool, quaternion=tool.track.quaternion * [-1, -1, -1, 1])
     says(moving, inverse, 'rotations from fg to the body')
-
-
-def test_axes_that_are_exchanged_or_reversed(moving, tool):
     place, turned = tool.track.position, Rotation.from_quat(tool.track.quaternion)
     says(moving, with_track(tool, position=place[:, [1, 0, 2]]), 'positions with the axes y, x, z')
     mirror = np.diag([1.0, 1.0, -1.0])

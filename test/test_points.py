@@ -46,7 +46,7 @@ def test_flag_bits_are_those_that_others_write_and_read():
     assert (SATURATED, STALE, DROPPED) == (1, 2, 4)
 
 
-def test_flux_layout_is_that_of_the_interfaces():
+def test_fluxes_have_the_layout_of_the_interfaces_and_are_read_in_any_other():
     points = flux_points()
     fields, step, data = encode_flux(points)
     assert step == 92
@@ -54,19 +54,9 @@ def test_flux_layout_is_that_of_the_interfaces():
     assert fields[8] == ('coil0_re', 28, 7, 1)
     assert fields[-1] == ('coil7_im', 88, 7, 1)
     assert_same(decode_flux(fields, step, 4, data), points)
-
-
-def test_fields_are_read_by_name_and_offset():
-    points = flux_points()
-    fields, step, data = encode_flux(points)
     padded = b''.join(b'\xff' * 6 + data[i * step : (i + 1) * step] for i in range(4))
     moved = [(n, o + 6, t, c) for n, o, t, c in reversed(fields)] + [('rgb', 0, 2, 1)]
     assert_same(decode_flux(moved, step + 6, 4, padded), points)
-
-
-def test_big_endian_clouds_are_read():
-    points = flux_points()
-    fields, step, data = encode_flux(points)
     kinds = {4: '<u2', 7: '<f4'}
     record = np.dtype({'names': [f[0] for f in fields], 'offsets': [f[1] for f in fields],
                        'formats': [kinds[f[2]] for f in fields], 'itemsize': step})  # fmt: skip

@@ -248,14 +248,11 @@ def turns():
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True) * ANGLES[:, None]
 
 
-def test_the_angle_of_a_rotation_is_that_which_made_it(turns):
+def test_angles_of_rotations_and_between_axes_are_those_which_made_them(turns):
     matrices = Rotation.from_rotvec(turns).as_matrix()
     np.testing.assert_allclose(rotation_angles(matrices), ANGLES, rtol=1e-9, atol=1e-15)
     assert rotation_angles(matrices[3]) == pytest.approx(0.3, rel=1e-12)
     assert np.isnan(rotation_angles(np.full((3, 3), np.nan)))
-
-
-def test_the_angle_between_axes_is_that_of_the_turn_across_them(turns):
     rng = np.random.default_rng(2)
     first = np.cross(np.where(ANGLES[:, None] > 0, turns, 1.0), rng.normal(size=turns.shape))
     second = 3.0 * Rotation.from_rotvec(turns).apply(first)
@@ -321,7 +318,7 @@ def test_three_emitters_leave_one_coil_ambiguous(rng):
     assert len(good) > 1
 
 
-def test_grid_covers_the_volume_and_widens_with_height():
+def test_grid_covers_the_volume_widens_with_height_and_stays_above_the_board():
     volume = TrackedVolume((-0.1, -0.1, 0.05), (0.1, 0.1, 0.3))
     points = grid_points(volume, 0.03)
     assert (points.min(axis=0) == volume.low).all()
@@ -333,9 +330,6 @@ def test_grid_covers_the_volume_and_widens_with_height():
     assert volume.contains(np.array([0.0, 0.0, 0.1]))
     assert not volume.contains(np.array([0.0, 0.0, 0.31]))
     assert not volume.contains(np.full(3, np.nan))
-
-
-def test_the_box_stays_above_the_boards_plane():
     low, high = TrackedVolume((-0.1, -0.1, 0.02), (0.1, 0.1, 0.3)).grown(0.05)
     assert low[2] == pytest.approx(0.01)
     np.testing.assert_allclose(high, [0.15, 0.15, 0.35])

@@ -1,7 +1,5 @@
 """What the best possible estimator could know of moving metal, by few references and a tool.
 
-    python test/bench/bench_bound.py [--counts 0,4] [--bodies 2] [--every 16]
-
 The Bayesian Cramer-Rao bound: the posterior covariance of all that is unknown (metal, path, errors
 of all coils, poses), linearised at simulated bodies that are drawn from a class, from every
 frame of a session up to the one in question. It assumes
@@ -25,7 +23,6 @@ measured ones contain, are not in them.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -251,17 +248,3 @@ def rows(
                 float(value),
                 'mm',
             )
-
-
-def main() -> None:
-    """Run the command."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
-    parser.add_argument('--counts', type=harness.integers, default=[0, 4])
-    parser.add_argument('--bodies', type=int, default=2)
-    parser.add_argument('--every', type=int, default=16, help='frames, each for so many')
-    args = parser.parse_args()
-    harness.print_rows(rows(args.counts, args.bodies, args.every))
-
-
-if __name__ == '__main__':
-    main()

@@ -100,16 +100,12 @@ def test_clocks_that_run_apart_are_corrected_where_their_rate_was_learnt():
     assert late(130) == round(0.06 * second)
 
 
-def test_outside_the_covariance_grows_and_the_state_says_so(bent):
+def test_outside_the_covariance_grows_and_what_is_no_pose_or_unknown_is_said(bent):
     corrector = PoseCorrector(bent[1])
     near = corrector.correct('sensor_0', 10**9, MIDDLE, PLAIN)
     far = corrector.correct('sensor_0', 10**9, np.array([0.6, 0.02, -0.3]), PLAIN)
     assert (near.state, far.state) == (OK, OUTSIDE)
     assert np.sqrt(far.covariance[0, 0]) > 0.02 > 10 * np.sqrt(near.covariance[0, 0])
-
-
-def test_no_pose_stays_none_and_an_unknown_sensor_is_said(bent):
-    corrector = PoseCorrector(bent[1])
     for place, turn in (
         (MIDDLE * np.nan, PLAIN),
         (np.full(3, -3.7e28), PLAIN),
