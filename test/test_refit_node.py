@@ -210,27 +210,25 @@ def test_metal_at_rest_is_in_no_baseline(make):
 
 def test_a_model_beside_its_board_gives_no_poses_until_the_references_agree(make):
     rig = make(baseline_at_start=True)
-    codes, write = [], rig.node._output.new_error
-    rig.node._output.new_error = lambda *given: codes.append(given[-1]) or write(*given)
     table = rig.world.references
     there = table.position - [0.002, 0.0, 0.0]
     aside = rig.world.model.flux(there, table.axis, table.length)
     here = rig.world.model.flux(table.position, table.axis, table.length)
     rig.node._on_setup(String(data=setup_text(rig.world)))
     assert rig.node.status().message == f'{REFERENCES_LOST}: no reference fluxes yet'
-    assert codes == [], 'the model was withheld from the beginning'
+    assert rig.codes == [], 'the model was withheld from the beginning'
     rig.say(aside - here)
     state = rig.node.status()
     assert state.level == Level.ERROR
     assert re.match(r'other_model: the model lies (1\.9|2\.0|2\.1) mm', state.message)
-    assert codes[-1] == code_of(OTHER_MODEL)
+    assert rig.codes[-1] == code_of(OTHER_MODEL)
     for _ in range(12):
         rig.say(aside - here)
-    assert codes[-1] == code_of(OTHER_MODEL) and not rig.node._refit.is_making
+    assert rig.codes[-1] == code_of(OTHER_MODEL) and not rig.node._refit.is_making
     for _ in range(24):
         rig.say(0.0)
     rig.until(lambda: rig.node._refit.current is not None)
-    assert codes[-1] == 0
+    assert rig.codes[-1] == 0
     assert rig.node.status().level == Level.OK
 
 

@@ -64,8 +64,6 @@ def held(monkeypatch):
 @pytest.fixture
 def rig(ros, tmp_path, held):
     rig = Rig(ros, tmp_path, refit_rate_hz=1000.0)
-    rig.codes, write = [], rig.node._output.new_error
-    rig.node._output.new_error = lambda *given: rig.codes.append(given[-1]) or write(*given)
     yield rig
     held.let.set()
     rig.close()
@@ -267,8 +265,6 @@ def started(ros, tmp_path, monkeypatch):
             rigs.pop().close()
         rigs.append(rig := Rig(ros, tmp_path, refit_rate_hz=1000.0, keep_state=True))
         rig.stamp_ns = time.time_ns()
-        rig.codes, write = [], rig.node._output.new_error
-        rig.node._output.new_error = lambda *given: rig.codes.append(given[-1]) or write(*given)
         rig.until(lambda: rig.node._refit._kept._sender() != '')
         return rig
 
@@ -279,8 +275,7 @@ def started(ros, tmp_path, monkeypatch):
 
 def test_a_node_that_is_started_near_metal_follows_the_references_again(started):
     rig = started()
-    rig.give_baseline()
-    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    rig.start()
     for _ in range(3):
         rig.say(0.0)
     rig.node._refit.confirm()
@@ -299,8 +294,7 @@ def test_a_node_that_is_started_near_metal_follows_the_references_again(started)
 
 def test_a_baseline_that_references_contradict_is_not_taken_up(started):
     rig = started()
-    rig.give_baseline()
-    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    rig.start()
     for _ in range(12):
         rig.say(0.0)
     rig.node._refit.confirm()

@@ -1,13 +1,12 @@
 """What a scan cannot tell: it is said, a model is made all the same, and poses own up to it."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from calibration_world import NOISE_T, Errors, moved_scan, scene, tool_of
 
-from anser_ros.calibration.calibrate import Options, _better, correct_scan, fit_scan
+from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
 from anser_ros.calibration.held_out import factor_of
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.population import Likelihood, Population
@@ -143,13 +142,3 @@ def test_blocks_that_were_held_out_say_how_much_too_small_a_covariance_is():
     assert factor_of(expected, 9.0 * expected) == pytest.approx(3.0)
     assert factor_of(expected, 0.1 * expected) == 1.0
     assert factor_of(expected[:5], 9.0 * expected[:5]) == 1.0
-
-
-def test_a_third_of_the_dipoles_may_leave_a_seventh_more():
-    def pair(score, dipoles):
-        return None, SimpleNamespace(score_t=score, n_dipoles=dipoles)
-
-    few, many = pair(1.1, 50), pair(1.0, 150)
-    assert _better([few, many]) is few
-    nearly_as_many = pair(1.1, 140)
-    assert _better([nearly_as_many, many]) is many
