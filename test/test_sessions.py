@@ -34,24 +34,17 @@ CHANNEL, GAIN = 4, 0.97
 LIGHT = SearchSettings(most_effects=1, finalists=2, iterations=4)
 
 
+def recorded(name):
+    """Return a fixture of one of the package's own recordings."""
+    return pytest.fixture(lambda: load_session(REPO / 'bags' / f'{name}.mcap'), scope='module')
+
+
+moving, factory, metal = map(recorded, ('moving', 'factory', 'metal'))
+
+
 @pytest.fixture(scope='module')
 def model():
     return load_model(REPO / 'config' / 'demo_model.yaml')
-
-
-@pytest.fixture(scope='module')
-def moving():
-    return load_session(REPO / 'bags' / 'moving.mcap')
-
-
-@pytest.fixture(scope='module')
-def factory():
-    return load_session(REPO / 'bags' / 'factory.mcap')
-
-
-@pytest.fixture(scope='module')
-def metal():
-    return load_session(REPO / 'bags' / 'metal.mcap')
 
 
 def with_gain(session):
