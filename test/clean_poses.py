@@ -34,16 +34,14 @@ def _smooth(rng: np.random.Generator, knots: np.ndarray, size: float) -> np.ndar
     return rng.normal(0, size, (knots.size, 3))
 
 
-def by_hand(rng: np.random.Generator, duration: float) -> Course:
-    """Up and down and about as a hand does it, a turn in less than a second."""
-    knots = _knots(duration, 0.7)
-    return knots, _smooth(rng, knots, 0.06), _smooth(rng, knots, 0.25)
+def wandering(step_s: float, place_m: float, turn_rad: float) -> Callable[..., Course]:
+    """Up and down and about as a hand does it, with a knot every so many seconds."""
 
+    def course(rng: np.random.Generator, duration: float) -> Course:
+        knots = _knots(duration, step_s)
+        return knots, _smooth(rng, knots, place_m), _smooth(rng, knots, turn_rad)
 
-def slowly(rng: np.random.Generator, duration: float) -> Course:
-    """A hand that takes some seconds for each way."""
-    knots = _knots(duration, 2.5)
-    return knots, _smooth(rng, knots, 0.06), _smooth(rng, knots, 0.3)
+    return course
 
 
 def in_rows(rng: np.random.Generator, duration: float) -> Course:
@@ -97,23 +95,14 @@ def far_and_near(rng: np.random.Generator, duration: float) -> Course:
     return knots, place, _smooth(rng, knots, 0.3)
 
 
-def in_a_corner(rng: np.random.Generator, duration: float) -> Course:
-    """Within two centimetres, as in a phantom, with as many turns as elsewhere."""
-    knots = _knots(duration, 0.8)
-    return knots, _smooth(rng, knots, 0.015), _smooth(rng, knots, 0.3)
-
-
-def carried(rng: np.random.Generator, duration: float) -> Course:
-    """Carried about and hardly turned, so that lever arms stay unknown."""
-    knots = _knots(duration, 0.8)
-    return knots, _smooth(rng, knots, 0.06), _smooth(rng, knots, 0.02)
-
-
 MOTIONS: dict[str, Callable[[np.random.Generator, float], Course]] = {
-    'by hand': by_hand, 'slowly': slowly, 'in rows': in_rows, 'in circles': in_circles,
-    'with stops': with_stops, 'about a tip': about_a_tip, 'far and near': far_and_near,
-    'in a corner': in_a_corner, 'carried': carried,
+    'by hand': wandering(0.7, 0.06, 0.25), 'slowly': wandering(2.5, 0.06, 0.3),
+    'in rows': in_rows, 'in circles': in_circles, 'with stops': with_stops,
+    'about a tip': about_a_tip, 'far and near': far_and_near,
+    'in a corner': wandering(0.8, 0.015, 0.3), 'carried': wandering(0.8, 0.06, 0.02),
 }  # fmt: skip
+"""A hand that takes a second or some for each way, holds a tool within two centimetres with as
+many turns as elsewhere, or hardly turns it, so that lever arms stay unknown; and other ways."""
 
 
 def _between(rng: np.random.Generator, least: float, most: float) -> float:

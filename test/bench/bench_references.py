@@ -78,6 +78,17 @@ def judged(series: Sequence[PoseSeries], jitter_m: float) -> dict[str, float]:
     }
 
 
+def followed(
+    session: Session, model: Any, baseline: Session, count: int, witnesses: bool, jitter_m: float
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """Figures of coils and body with so many references."""
+    witnesses &= count > 0
+    given = few(session, count)
+    found = track_session(given, model, baseline=baseline, refit=True, witnesses=witnesses)
+    for what, series in (('coils', found.sensors), ('body', found.bodies)):
+        yield what, judged(list(series.values()), jitter_m)
+
+
 def of_recordings(counts: Sequence[int], every: int, witnesses: bool) -> Iterator[harness.Row]:
     """Both online sessions, single coils and the body."""
     scan, paths = harness.online_recordings()
@@ -86,13 +97,8 @@ def of_recordings(counts: Sequence[int], every: int, witnesses: bool) -> Iterato
     for name in (name for name in paths if name.startswith('online/')):
         session = thinned(load_session(paths[name]), every)
         for count in counts:
-            found = track_session(
-                few(session, count), model, baseline=baseline, refit=True,
-                witnesses=witnesses and count > 0,
-            )  # fmt: skip
-
-            for what, series in (('coils', found.sensors), ('body', found.bodies)):
-                figures = judged(list(series.values()), JITTER_M)
+            told = followed(session, model, baseline, count, witnesses, JITTER_M)
+            for what, figures in told:
                 target = TARGETS.get((name.split('/')[1], what, count))
                 yield harness.row(
                     f'{name}, {count} references, {what}: position RMSE', figures['rms'], 'mm',
@@ -149,15 +155,11 @@ def of_scenes(
             baseline = load_session(scan)
             model = harness.calibrated(baseline)
             for kind in kinds:
-                told = [seed, index, 2, *kind.encode()]
-                session = exact(*scene(board, kind, told, folder))
+                own = [seed, index, 2, *kind.encode()]
+                session = exact(*scene(board, kind, own, folder))
                 for count in counts:
-                    found = track_session(
-                        few(session, count), model, baseline=baseline, refit=True,
-                        witnesses=witnesses and count > 0,
-                    )  # fmt: skip
-                    for what, series in (('coils', found.sensors), ('body', found.bodies)):
-                        figures = judged(list(series.values()), 0.0)
+                    told = followed(session, model, baseline, count, witnesses, 0.0)
+                    for what, figures in told:
                         totals.setdefault((count, what), []).append(figures)
                         print(
                             f'    b{index + 1} {kind}, {count} references, {what}: '
