@@ -8,12 +8,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
-from tracking_world import certain_model, setup_of, triaxial_tool
+from tracking_world import certain_model, flux_points, setup_of, triaxial_tool
 
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.streams.clouds import CloudMaker, FluxCloud
 from anser_ros.nodes.tracker import TrackerNode
-from anser_ros.wire.points import DipolePoints, FluxPoints, encode_field_model
+from anser_ros.wire.points import DipolePoints, encode_field_model
 from anser_ros.wire.setup import SensorSpec, dump_setup
 
 SENSORS = triaxial_tool()
@@ -39,6 +39,8 @@ def reference_specs(count=8):
 
 class Bench:
     """The test's own end of the graph."""
+
+    points = staticmethod(flux_points)
 
     def __init__(self, ros, node):
         self.peer = ros.create_node('bench', namespace='anser')
@@ -107,15 +109,6 @@ class Bench:
     def say_model(self, model, stamp_ns=5):
         packed = encode_field_model(DipolePoints(model.positions, model.directions, model.moments))
         self.model.publish(CloudMaker().message(packed, 'fg', stamp_ns))
-
-    def points(self, flux, flags=None, channels=None):
-        count = len(flux)
-        nothing = np.full((count, 3), np.nan)
-        return FluxPoints(
-            np.arange(count) if channels is None else channels,
-            np.zeros(count, dtype=int) if flags is None else flags,
-            flux, nothing, nothing,
-        )  # fmt: skip
 
     def say_flux(self, flux, flags=None, stamp_ns=None):
         self.stamp_ns += 20_000_000

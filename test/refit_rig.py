@@ -8,14 +8,13 @@ from rclpy.parameter import Parameter
 from refit_world import anser_world, metal_block
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from tracking_world import setup_of
+from tracking_world import flux_points, setup_of
 from visualization_msgs.msg import MarkerArray
 
 from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.sessions.starting_model import save_model
-from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import dump_setup
 
 HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
@@ -64,11 +63,7 @@ class Rig:
         assert spins, self.node.counters
 
     def message(self, channels, flux, flags=None):
-        count = len(flux)
-        nothing = np.full((count, 3), np.nan)
-        flags = np.zeros(count, dtype=int) if flags is None else flags
-        points = FluxPoints(np.asarray(channels), flags, flux, nothing, nothing)
-        return self.cloud.message(points, self.stamp_ns)
+        return self.cloud.message(flux_points(flux, flags, channels), self.stamp_ns)
 
     def say(self, change, fault=None):
         """One frame of the references."""

@@ -5,13 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import REPO
+from tracking_world import flux_points
 
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.points import encode_flux
 from anser_ros.wire.recorded import unit_quaternions
 
 START = 1_700_000_000_000_000_000
@@ -34,9 +35,7 @@ sensors:
 
 def cloud(channels, frame: int, emitters: int = 2) -> tuple:
     flux = np.array([[100 * c + k + 1j * frame for k in range(emitters)] for c in channels]) * 1e-9
-    empty = np.full((len(channels), 3), np.nan)
-    points = FluxPoints(np.array(channels), np.zeros(len(channels), int), flux, empty, empty)
-    fields, step, data = encode_flux(points)
+    fields, step, data = encode_flux(flux_points(flux, channels=channels))
     return fields, step, len(channels), data
 
 

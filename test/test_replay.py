@@ -17,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
+from tracking_world import flux_points
 
 from anser_ros.errors import AnserError
 from anser_ros.nodes import replay
@@ -25,7 +26,7 @@ from anser_ros.nodes.streams import readiness
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_writer import BagWriter, SessionWriter
-from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.points import encode_flux
 from anser_ros.wire.text_files import read_config
 
 START_NS = 1_750_000_000 * 10**9
@@ -35,9 +36,7 @@ PERIOD_NS = 20_000_000
 def flux_cloud(n):
     rng = np.random.default_rng(n)
     flux = 1e-6 * (rng.normal(size=(3, 8)) + 1j * rng.normal(size=(3, 8)))
-    nothing = np.full((3, 3), np.nan)
-    points = FluxPoints(np.arange(1, 4), np.zeros(3, int), flux, nothing, nothing)
-    fields, step, data = encode_flux(points)
+    fields, step, data = encode_flux(flux_points(flux, channels=np.arange(1, 4)))
     return fields, step, 3, data
 
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
+from tracking_world import flux_points
 
 from anser_ros.nodes.monitor import Monitor
 from anser_ros.nodes.pose_output import PoseTopic
@@ -13,7 +14,7 @@ from anser_ros.nodes.recorder import Recorder
 from anser_ros.nodes.replay import Replay
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.points import encode_flux
 from anser_ros.wire.recorded import optical_topic
 
 BAG = Path(__file__).resolve().parents[1] / 'bags' / 'moving.mcap'
@@ -87,13 +88,10 @@ def test_frames_have_their_boards_prefix(ros):
 def test_a_bag_has_its_optical_poses_whatever_their_namespace(tmp_path, optical):
     bag = read_bag(BAG)
     count = bag.tool.channel.size
-    nothing = np.full((count, 3), np.nan)
     with SessionWriter(tmp_path / 'left.mcap') as writer:
         stamp = int(bag.tool.stamp_ns[0])
         writer.write_setup(bag.setup_text, stamp)
-        points = FluxPoints(
-            bag.tool.channel, np.zeros(count, int), bag.tool.flux[0], nothing, nothing
-        )
+        points = flux_points(bag.tool.flux[0], channels=bag.tool.channel)
         fields, step, data = encode_flux(points)
         writer.write_flux('/left/tool/flux', stamp, fields, step, count, data)
         track = bag.optical['tool_a']

@@ -9,7 +9,7 @@ from conftest import REPO
 from geometry_msgs.msg import PoseStamped
 from refit_world import NOISE_T, anser_world, metal_block, metal_flux
 from tracked_tool import CHANNELS, MODEL
-from tracking_world import triaxial_tool
+from tracking_world import flux_points, triaxial_tool
 
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError
@@ -31,7 +31,6 @@ from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.sessions.tracked_session import track_session
 from anser_ros.settings import RefitSettings, ToolSettings
-from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import read_config
 
@@ -221,9 +220,7 @@ def flux(stamp_ns, level):
     """A frame of all of the tool's channels, each emitter with the same flux."""
     values = np.full((len(CHANNELS), 8), level, dtype=np.complex128)
     values[2] = np.nan
-    flags, nowhere = np.zeros(len(CHANNELS), np.int64), np.full((len(CHANNELS), 3), np.nan)
-    points = FluxPoints(np.asarray(CHANNELS), flags, values, nowhere, nowhere)
-    return HandedFlux(stamp_ns, 'fg', points)
+    return HandedFlux(stamp_ns, 'fg', flux_points(values, channels=CHANNELS))
 
 
 def pose(stamp_ns, x, frame_id='fg'):

@@ -8,6 +8,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import Board, build_board
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 NOISE_T = 60e-12
@@ -78,6 +79,14 @@ def fluxes(
     if rng is not None:
         flux = flux + noise_t * (rng.normal(size=flux.shape) + 1j * rng.normal(size=flux.shape))
     return flux
+
+
+def flux_points(flux, flags=None, channels=None) -> FluxPoints:
+    """A frame of fluxes (S, K) as acquisition sends it, of channels 0, 1, ... unless told."""
+    nothing = np.full((len(flux), 3), np.nan)
+    flags = np.zeros(len(flux), dtype=int) if flags is None else flags
+    channels = np.arange(len(flux)) if channels is None else np.asarray(channels)
+    return FluxPoints(channels, flags, flux, nothing, nothing)
 
 
 def setup_of(sensors: SensorTable, references: tuple[SensorSpec, ...] = ()) -> Setup:
