@@ -59,10 +59,12 @@ def check_parameter_file(document):
 
 
 @pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
-def test_every_node_and_key_is_known(path):
+def test_every_node_and_key_is_known_and_setups_are_valid(path):
     document = yaml.safe_load(path.read_text())
     if is_parameter_file(document):
         check_parameter_file(document)
+    elif str(document.get('schema', '')).startswith('anser_setup'):
+        parse_setup(path.read_text())
 
 
 @pytest.mark.parametrize(
@@ -95,13 +97,6 @@ def test_every_parameter_is_read_and_every_node_has_the_name_of_its_module():
     assert not {name: sorted(names) for name, names in unread.items() if names}
     for name in NODES:
         assert name == node_class(name).NAME
-
-
-@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
-def test_setup_documents_are_valid(path):
-    text = path.read_text()
-    if str(yaml.safe_load(text).get('schema', '')).startswith('anser_setup'):
-        parse_setup(text)
 
 
 def private_names(path, name='Node'):

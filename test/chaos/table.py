@@ -10,6 +10,7 @@ from pathlib import Path
 BEGIN, END = '<!-- chaos: begin -->', '<!-- chaos: end -->'
 ALLOWED_S = 1.0
 """Time within which poses have to be back after a fault has gone, s."""
+HEAD = '| fault | said | after, s | wrong of ok poses | back after, s |'
 WORDS = 90
 """Characters of a state's words that the table shows."""
 FOLDER = re.compile(r'/tmp/[^/\s]+/')
@@ -29,9 +30,7 @@ class Row:
     wrong: int
     worst_m: float | None  # the largest error of a wrong pose
     sigma_m: float | None  # the sigma that it stated
-    back_s: (
-        float | None
-    )  # time from the fault's end until poses were back; None: they did not come
+    back_s: float | None  # time from the fault's end until poses came again, if they did
     crashed: tuple[str, ...] = ()  # what ended by itself, or answered as it should not
     skipped: int = 0  # poses that were not judged, since the simulated unit itself was late
     heard: tuple[str, ...] = ()  # all new states that told of it, whichever node was first
@@ -91,18 +90,10 @@ def load(path: Path) -> list[Row]:
 
 def write_docs(path: Path, rows: Sequence[Row], seed: int, rate_hz: float) -> None:
     """Write the table between its two marks of a document."""
-    out = [
-        BEGIN,
-        '',
-        f'Written by `make chaos ARGS=--write-docs` (seed {seed}, {rate_hz:g} Hz).',
-        '',
-    ]
+    words = f'Written by `make chaos ARGS=--write-docs` (seed {seed}, {rate_hz:g} Hz).'
+    out = [BEGIN, '', words, '']
     for group, some in groupby(rows, key=lambda row: row.group):
-        out += [f'### {group.capitalize()}', '']
-        out += [
-            '| fault | said | after, s | wrong of ok poses | back after, s |',
-            '|---|---|---|---|---|',
-        ]
+        out += [f'### {group.capitalize()}', '', HEAD, '|---' * HEAD.count(' | ') + '|---|']
         for row in some:
             said = FOLDER.sub('', row.said).replace('|', '/').replace('<', '&lt;')
             said = said[:WORDS] or 'nothing'

@@ -144,7 +144,8 @@ def test_poses_and_states_reach_clients(start, tracker, connect):
 
 
 class TestServer:
-    def test_a_taken_port_is_said_in_one_line(self, start):
+    def test_it_listens_to_this_host_only_and_a_taken_port_is_said_in_one_line(self, start):
+        assert OpenIGTLinkParameters.host == '127.0.0.1'
         with socket.create_server(('127.0.0.1', 0)) as taken:
             port = taken.getsockname()[1]
             process = start('openigtlink', '--ros-args', '-p', f'port:={port}')
@@ -267,10 +268,6 @@ def take(client):
     body = read(client, header.body_bytes)
     assert struct.unpack('>Q', first[50:])[0] == igtl.crc64(body)
     return header.kind, header.device, body
-
-
-def test_it_listens_to_this_host_only():
-    assert OpenIGTLinkParameters.host == '127.0.0.1'
 
 
 class TestNames:
