@@ -228,7 +228,7 @@ def test_a_body_that_stands_elsewhere_than_stated_is_reported():
 def test_what_no_fold_finds_is_not_corrected():
     """The evidence of all frames alone gave this sound plate tilts of 0.4 mrad."""
     measured, _, _ = recorded(13, gain=0.0, tilt=0.0, bend=0.0, off=np.zeros((4, 6)), emitters=3)
-    fit = StillFitter(measured, CENTRES, KINDS, STATED).fit()
+    fit = StillFitter(measured, CENTRES, ('axes',), STATED).fit()
     assert 'axes' in fit.evidence
-    scan = calibrated(measured, (*KINDS, 'poses')).scan
+    scan = calibrated(measured, ('axes', 'poses')).scan
     assert not (*scan.corrections, *scan.reported_effects)

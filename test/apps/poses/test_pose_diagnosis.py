@@ -176,7 +176,6 @@ def read_as(order, sign=1):
 @pytest.mark.parametrize(
     ('change', 'convention'),
     [
-        (read_as([3, 0, 1, 2]), 'wxyz'),
         (read_as([0, 1, 2, 3], -1), 'conjugate'),
         (read_as([3, 0, 1, 2], -1), 'wxyz_conjugate'),
     ],
