@@ -18,7 +18,7 @@ from anser_ros.physics.pose_track import PoseTrack
 
 
 def found(names: str, seed: int, size: str = 'medium') -> tuple[Diagnosis, dict]:
-    rng, target, truth = np.random.default_rng(seed), world(seed, frames=375), {}
+    rng, target, truth = np.random.default_rng(seed), world(seed, frames=375, emitters=2), {}
     every = {**LISTED, **UNLISTED}
     for injection in sorted((every[n] for n in names.split('+')), key=lambda i: i.stage):
         truth |= injection.put(target, rng, SIZES[size])

@@ -15,8 +15,6 @@ from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.stamps import stamp_of
 
-pytestmark = pytest.mark.usefixtures('shared_tables')
-
 
 @pytest.fixture
 def server(ros, tmp_path):
