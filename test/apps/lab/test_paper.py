@@ -32,7 +32,7 @@ from anser_ros.errors import BagError
 
 @pytest.fixture(scope='module')
 def recordings(tmp_path_factory):
-    return simulate_recordings(tmp_path_factory.mktemp('recordings'), seed=3, share=0.2)
+    return simulate_recordings(tmp_path_factory.mktemp('recordings'), seed=3, share=0.3)
 
 
 @pytest.fixture(scope='module')
