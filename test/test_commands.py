@@ -12,6 +12,7 @@ import sys
 from dataclasses import fields
 
 import pytest
+from chain import beginning
 from conftest import REPO
 from rclpy.utilities import remove_ros_args
 
@@ -117,13 +118,16 @@ def test_help_has_examples_that_hold_and_a_document_for_programs(name, capsys):
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 def test_the_first_example_runs_as_it_is_written(tmp_path, monkeypatch, capsys):
-    for folder in ('bags', 'config', 'examples'):
+    for folder in ('config', 'examples'):
         (tmp_path / folder).symlink_to(REPO / folder)
+    shutil.copytree(REPO / 'bags', tmp_path / 'bags', ignore=lambda *_: ['metal.mcap'])
+    beginning(REPO / 'bags' / 'metal.mcap', tmp_path / 'bags' / 'metal.mcap', 3.0)
     monkeypatch.chdir(tmp_path)
+    kept = {tmp_path / name for name in ('bags', 'refit', 'frozen')}
     for name in RUN:
         _, arguments = next(examples_of(name))
         assert main([name, *arguments]) == 0, (name, capsys.readouterr().err)
-        for made in set(tmp_path.iterdir()) - {tmp_path / kept for kept in ('refit', 'frozen')}:
+        for made in {*tmp_path.iterdir()} - kept:
             if not made.is_symlink():
                 shutil.rmtree(made) if made.is_dir() else made.unlink()
         if name == 'evaluate':

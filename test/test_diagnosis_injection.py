@@ -17,11 +17,11 @@ from anser_ros.diagnosis.screening import clean_start, outlying_share
 from anser_ros.physics.pose_track import PoseTrack
 
 
-def found(names: str, seed: int, size: str = 'medium') -> tuple[Diagnosis, dict]:
-    rng, target, truth = np.random.default_rng(seed), world(seed, frames=375), {}
+def found(names: str, seed: int, emitters: int = 2) -> tuple[Diagnosis, dict]:
+    rng, target, truth = np.random.default_rng(seed), world(seed, 375, emitters), {}
     every = {**LISTED, **UNLISTED}
     for injection in sorted((every[n] for n in names.split('+')), key=lambda i: i.stage):
-        truth |= injection.put(target, rng, SIZES[size])
+        truth |= injection.put(target, rng, SIZES['medium'])
     return diagnose(target.problem(), target.model), truth
 
 
@@ -56,7 +56,7 @@ def test_an_effect_of_no_table_gets_a_name_of_its_own(name, called):
 @pytest.mark.long
 @pytest.mark.parametrize('name', ['quantised', 'channel_lag'])
 def test_what_nothing_describes_stays_unexplained(name):
-    result, _ = found(name, 5)
+    result, _ = found(name, 5, emitters=4)
     assert not {f.record.name for f in result.findings} & set(CATALOGUE)
     assert result.unexplained > 0.9
     assert result.depends_on

@@ -88,7 +88,7 @@ def test_a_worker_that_dies_loses_nothing(sessions, alone, tmp_path, capfd):
         workers = cluster.scheduler.workers
         assert wait(lambda: any(one.processing for one in workers.values()))
         os.kill(first, signal.SIGKILL)
-        batch.join(60.0)
+        batch.join()
         assert cluster.workers[0].pid != first
     assert done == [EXIT_BAD_INPUT]
     rows = check(tmp_path, sessions)
