@@ -108,8 +108,10 @@ def test_start_from_the_coils_own_poses(rng):
     start = start_from_coils(two, points[:2], axes[:2], np.ones(2))
     assert start is not None
     np.testing.assert_allclose(start[1], rotation, atol=1e-12)
-    assert start_from_coils(COILS.subset([0]), points[:1], axes[:1], np.ones(1)) is None
-    assert start_from_coils(COILS.subset([]), points[:0], axes[:0], np.ones(0)) is None
+    assert start_from_coils(COILS.subset(np.array([0])), points[:1], axes[:1], np.ones(1)) is None
+    assert (
+        start_from_coils(COILS.subset(np.array([], int)), points[:0], axes[:0], np.ones(0)) is None
+    )
 
 
 def test_refusals():

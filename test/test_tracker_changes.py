@@ -220,10 +220,9 @@ def test_a_misfit_that_lasts_from_frame_to_frame_is_no_noise(rng):
         noisy.add(4.0, 2.0 * noise, 11)
         wrong.add(4.0, noise + np.sqrt(3.0) * misfit, 11)
         among_metal.add(0.9, 0.5 * misfit, 11)
-    assert noisy.misfit(0.0) == 0.0
-    assert wrong.misfit(0.0) == pytest.approx(2.9, abs=0.25)
     usual = 17.3 / 11.0
     assert noisy.of_frame(4.0, usual, 2.2, 0.0, False) == pytest.approx(4.0, rel=0.01)
     for ratio in (1.0, 4.0):  # what the frames before had, this one has too
         assert wrong.of_frame(ratio, usual, 2.2, 0.0, False) > 10.0
-    assert among_metal.misfit(0.25) == 0.0, 'the model states it'
+    stated = among_metal.of_frame(0.9, usual, 2.2, 0.25, True)
+    assert stated == pytest.approx(1.0 + 0.25 * 3.0, rel=1e-6), 'the model states it'

@@ -1,6 +1,7 @@
 """Follows a rigid tool through time by all of its usable coils, without those that disagree."""
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -9,15 +10,9 @@ from numpy.typing import NDArray
 from anser_ros import pose_states as states
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.stamps import NANO
-from anser_ros.tracking.coil_track import (
-    CoilResult,
-    Freedom,
-    SolveFrame,
-    Start,
-    Track,
-    take_errors,
-)
-from anser_ros.tracking.estimate import PoseEstimate
+from anser_ros.tracking.coil_step import MOST_STEPS, SUSPICIOUS_JUMP_M
+from anser_ros.tracking.coil_track import CoilResult, CoilTracks
+from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import (
     BodyCoils,
     BodySolution,
@@ -29,7 +24,7 @@ from anser_ros.tracking.rigid import (
 )
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import bounded_inverse
-from anser_ros.tracking.solve_verdict import RARE
+from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
 
 Array = NDArray[np.float64]
 
@@ -49,8 +44,44 @@ LEFT_OUT_S = 1.0
 """How long a coil that disagreed stays out before it is tried again."""
 
 
+Start = tuple[Array, Array]
+"""A position, and a unit axis or a rotation matrix."""
+
+
 @dataclass
-class BodyTrack(Track[BodySolution]):
+class Track:
+    """Remembers the last two good solutions of one thing, and its noise scale."""
+
+    good: BodySolution | None = None
+    good_ns: int = 0
+    before: tuple[int, BodySolution] | None = None
+    noise: NoiseScale = field(default_factory=NoiseScale)
+
+    def forget(self) -> None:
+        """Drop the last poses, so that the next solve starts cold."""
+        self.good = self.before = None
+
+    def fresh(self, stamp_ns: int, settings: TrackerSettings) -> BodySolution | None:
+        """Return the last good solution; None where there is none, or it is too old."""
+        return self.good if (stamp_ns - self.good_ns) * NANO <= settings.warm_age_s else None
+
+    def steps(self, stamp_ns: int) -> float:
+        """Return how many of the last good step's durations have passed since; 0 for too many."""
+        if self.before is None:
+            return 0.0
+        steps = (stamp_ns - self.good_ns) / max(self.good_ns - self.before[0], 1)
+        return steps if 0.0 < steps <= MOST_STEPS else 0.0
+
+    def remember(self, solution: BodySolution, stamp_ns: int) -> None:
+        """Take in a good solution."""
+        last, self.before = self.good, None
+        if last is not None and math.dist(last.position, solution.position) < SUSPICIOUS_JUMP_M:
+            self.before = (self.good_ns, last)
+        self.good, self.good_ns = solution, stamp_ns
+
+
+@dataclass
+class BodyTrack(Track):
     """Remembers one body: its last good poses, its noise scale, the coils that disagreed."""
 
     left_out: frozenset[int] = frozenset()
@@ -102,10 +133,14 @@ class BodyResult:
 
 @dataclass
 class BodyFrame(SolveFrame):
-    """Holds a body's fluxes (S, 2K), its coils, and what each of these found by itself."""
+    """Holds a body's fluxes (S, 2K), its coils, what each of these found by itself, and their rows
+    among the tracks.
+    """
 
     coils: BodyCoils
     single: list[CoilResult]
+    rows: NDArray[np.int64]
+    tracks: CoilTracks
 
     @property
     def usable(self) -> NDArray[np.int64]:
@@ -128,17 +163,9 @@ class BodyFrame(SolveFrame):
             return common_factor(gains, weights)
         coils, (position, rotation) = self.coils.subset(used), start
         points, axes = coils.offsets @ rotation.T + position, coils.axes @ rotation.T
-        known = [self.single[i].error for i in used.tolist()]
-        far = [
-            i for i, error in enumerate(known)
-            if error is None or not error.holds(self.context, points[i], axes[i])
-        ]  # fmt: skip
-        if far:
-            fresh = take_errors(self.context, points[far], axes[far], coils.lengths[far])
-            for i, error in zip(far, fresh, strict=True):
-                known[i] = error
-        shared = np.array([e.errors for e in known if e is not None])
-        return common_factor(np.concatenate([shared, gains], axis=1), weights)
+        shared = self.tracks.errors_at(self.rows[used], points, axes, coils.lengths, self.context)
+        modes = np.concatenate([shared, gains], axis=1) if gains.shape[1] else shared
+        return common_factor(modes, weights)
 
     def nearer(self, start: Start, used: NDArray[np.int64]) -> Start:
         """Return a start moved to where the coils' own good poses agree best."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
+from anser_ros.kernel_cache import inlined
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.settings import Accuracy, ToolSettings
 from anser_ros.tracking.solve import ROLL_VARIANCE
@@ -151,27 +152,50 @@ def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) ->
     )  # fmt: skip
 
 
+FRESH_NOISE = PRIOR_FRAMES, PRIOR_FRAMES, 0.0
+"""State of a noise scale before the first frame: weight, power, and power that lasts."""
+
+
+@inlined
+def scale_of_frame(noise, ratio, usual, share, model_share, follows):  # type: ignore[no-untyped-def]
+    """Return one frame's variance scale, see `NoiseScale.of_frame`."""
+    hidden, lasting = HIDDEN * share, noise[2] / noise[0]
+    misfit = max(lasting - model_share - SLIGHT, 0.0)  # beyond the model's own error
+    least = max(noise[1] / noise[0] - misfit, SLIGHT)
+    scale = max(least, 1.0) if follows else least
+    scale *= 1.0 + model_share * max(hidden - 1.0, 0.0)
+    expected = min(least, 1.0) if follows else least
+    return scale + hidden * max(misfit, ratio - usual * expected)
+
+
+@inlined
+def add_frame(noise, ratio, lasting):  # type: ignore[no-untyped-def]
+    """Take a good frame into the state (3,) of a noise scale, see `NoiseScale.add`.
+
+    ``lasting`` is the product of its whitened residuals and the last frame's per freedom.
+    """
+    keep, most = 1.0 - 1.0 / MEMORY_FRAMES, 4.0 * noise[1] / noise[0]
+    noise[0] = keep * noise[0] + 1.0
+    noise[1] = keep * noise[1] + min(ratio, most)
+    noise[2] = keep * noise[2] + min(lasting, most)
+
+
 class NoiseScale:
     """Estimates residual power over its expectation as frames pass: 1 when the noise is as stated.
 
     An exponential mean over about `MEMORY_FRAMES` good frames; it starts as if `PRIOR_FRAMES` had
     been as expected. Noise is new in each frame; what stays in the residuals from one frame to the
-    next is misfit.
+    next is misfit. ``state`` (3,) is written over, as kernels do.
     """
 
-    def __init__(self) -> None:
-        self._weight = self._power = PRIOR_FRAMES
-        self._lasting = 0.0
+    def __init__(self, state: Array | None = None) -> None:
+        self._state = np.array(FRESH_NOISE) if state is None else state
         self._last: Array | None = None
 
     @property
     def value(self) -> float:
         """Return residual power over its expectation."""
-        return self._power / self._weight
-
-    def misfit(self, model_share: float) -> float:
-        """Return the part of it that lasts, beyond the model's own error; 0 where it is slight."""
-        return max(self._lasting / self._weight - model_share - SLIGHT, 0.0)
+        return float(self._state[1] / self._state[0])
 
     def add(self, ratio: float, whitened: Array | None = None, freedom: int = 1) -> None:
         """Take in one more good frame with its residual power over the expected one.
@@ -179,14 +203,11 @@ class NoiseScale:
         ``whitened`` (2K,) are residuals in units of their sigma, with so many degrees of freedom;
         nothing is found to last without them.
         """
-        keep, most = 1.0 - 1.0 / MEMORY_FRAMES, 4.0 * self.value
         last, self._last = self._last, whitened
         lasting = 0.0
         if last is not None and whitened is not None and last.shape == whitened.shape:
-            lasting = min(float(last @ whitened) / freedom, most)
-        self._weight = keep * self._weight + 1.0
-        self._power = keep * self._power + min(ratio, most)
-        self._lasting = keep * self._lasting + lasting
+            lasting = float(last @ whitened) / freedom
+        add_frame.py_func(self._state, ratio, lasting)
 
     def of_frame(
         self, ratio: float, usual: float, share: float, model_share: float, follows: bool
@@ -201,12 +222,8 @@ class NoiseScale:
         If the model states its error by modes, which it ``follows``, no small residual takes that
         error off the pose, and no lasting misfit is taken for noise.
         """
-        hidden, misfit = HIDDEN * share, self.misfit(model_share)
-        noise = max(self.value - misfit, SLIGHT)
-        scale = max(noise, 1.0) if follows else noise
-        scale *= 1.0 + model_share * max(hidden - 1.0, 0.0)
-        expected = min(noise, 1.0) if follows else noise
-        return scale + hidden * max(misfit, ratio - usual * expected)
+        state = self._state.tolist()
+        return float(scale_of_frame.py_func(state, ratio, usual, share, model_share, follows))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import inlined, kernel
@@ -239,7 +238,7 @@ class BodyCoils:
         """Return the coils of a mask or of ascending indices; all of them are these coils
         themselves.
         """
-        if len(self.offsets[keep]) == len(self.offsets):
+        if (keep.sum() if keep.dtype == np.bool_ else len(keep)) == len(self.offsets):
             return self
         return BodyCoils(
             np.ascontiguousarray(self.offsets[keep]),
@@ -269,21 +268,41 @@ class BodySolution:
     converged: bool
 
 
+@kernel
+def _common(modes, inverse_sigma, out):  # type: ignore[no-untyped-def]
+    """Write what `common_factor` returns; False where the modes are not finite."""
+    coils, count, width = modes.shape
+    for s in range(coils):
+        for r in range(count):
+            for k in range(width):
+                out[r, s * width + k] = modes[s, r, k] * inverse_sigma[s, k]
+    factor = np.dot(out, out.T)
+    for i in range(count):
+        for j in range(i + 1):
+            total = factor[i, j] + (i == j)
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if not math.isfinite(total):
+                return False
+            factor[i, j] = total / factor[j, j] if j < i else math.sqrt(total)
+        for k in range(i):
+            for m in range(out.shape[1]):
+                out[i, m] -= factor[i, k] * out[k, m]
+        for m in range(out.shape[1]):
+            out[i, m] /= factor[i, i]
+    return True
+
+
 def common_factor(modes: Array, inverse_sigma: Array) -> Array:
     """Return E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
 
     ``modes`` (S, R, 2K) are flux errors of one standard deviation each that several coils share,
     T; ``inverse_sigma`` (S, 2K) is in 1/T. Raises `TrackingError` when the modes are not finite.
     """
-    count = modes.shape[1]
-    whitened = (modes * inverse_sigma[:, None]).swapaxes(0, 1).reshape(count, inverse_sigma.size)
-    if count == 0:
-        return whitened
-    gram = whitened @ whitened.T
-    if not np.isfinite(gram).all():
+    common = np.empty((modes.shape[1], inverse_sigma.size))
+    if not _common(modes, inverse_sigma, common):
         raise TrackingError('the model covariance must be finite')
-    factor = np.linalg.cholesky(gram + np.eye(count))
-    return np.ascontiguousarray(solve_triangular(factor, whitened, lower=True, check_finite=False))
+    return common
 
 
 def solve_body(

@@ -137,37 +137,6 @@ def solve_coil(
     return CoilSolution(r, n, chi2, normal, residual, int(used), bool(converged))
 
 
-def solve_coils(
-    field: RealField,
-    flux: Array,
-    whitening: Array,
-    positions: Array,
-    axes: Array,
-    low: Array,
-    high: Array,
-    lengths: Array,
-) -> list[CoilSolution]:
-    """Fit the poses of S coils, each from a start near it, which is written over.
-
-    The arguments are those of `solve_coil` with an axis of coils in front, and nothing is checked.
-    """
-    normals, residuals, found = (
-        np.empty((len(flux), 6, 6)),
-        np.empty(flux.shape),
-        np.empty((len(flux), 3)),
-    )
-    descend(
-        positions, axes, lengths, flux, whitening, field.columns, field.moments, low, high,
-        MAX_EVALUATIONS, normals, residuals, found,
-    )  # fmt: skip
-    return [
-        CoilSolution(position, axis, chi2, normal, residual, int(used), bool(converged))
-        for position, axis, normal, residual, (chi2, used, converged) in zip(
-            positions, axes, normals, residuals, found.tolist(), strict=True
-        )
-    ]
-
-
 ROLL_VARIANCE = math.pi**2 / 3.0
 """Variance (rad^2) of an angle that may be anything in +-pi."""
 

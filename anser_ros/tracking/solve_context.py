@@ -9,6 +9,7 @@ import hashlib
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,16 +32,29 @@ less, and no layout has neighbours within a millimetre."""
 
 
 @kernel
-def _fill_whitening(errors, sigma, out):  # type: ignore[no-untyped-def]
-    """Write the inverse Cholesky factors of ``diag(sigma)^2 + E^T E``; False if one is missing.
+def fill_model_errors(  # type: ignore[no-untyped-def]
+    points, axes, lengths, dipoles, spacing, modes, sigma, errors, whitening, near
+):  # fmt: skip
+    """Write what `error_whitening` returns; False where a covariance is not finite.
 
-    ``errors`` (S, R, 2K) are the E of each of S coils, ``out`` is (S, 2K, 2K).
+    ``errors`` (S, R, 2K) are the flux errors E of each of S coils, ``whitening`` (S, 2K, 2K) the
+    inverse Cholesky factors of ``diag(sigma)^2 + E^T E``, ``near`` (S, 2) the last two results.
     """
-    width = sigma.shape[0]
-    factor, scaled = np.empty((width, width)), np.empty((width, errors.shape[1]))
-    for s in range(errors.shape[0]):
+    width, count = sigma.shape[0], errors.shape[1]
+    factor, scaled = np.empty((width, width)), np.empty((width, count))
+    basis = np.empty((1, dipoles.shape[1]))
+    for s in range(points.shape[0]):
+        fill_flux_basis(points[s : s + 1], axes[s : s + 1], lengths[s : s + 1], dipoles, basis)
+        flux, out, square, among = np.dot(basis, modes), whitening[s], math.inf, 0.0
+        for j in range(dipoles.shape[1]):
+            away = 0.0
+            for i in range(3):
+                away += (points[s, i] - dipoles[i, j]) ** 2
+            square, among = min(square, away), max(among, spacing[j] ** 2 / away)
+        near[s, 0], near[s, 1] = math.sqrt(square), math.sqrt(among)
         for i in range(width):
-            for r in range(errors.shape[1]):
+            for r in range(count):
+                errors[s, r, i] = flux[0, r * width + i]
                 scaled[i, r] = errors[s, r, i] / sigma[i]
         gram = np.dot(scaled, scaled.T)
         for i in range(width):
@@ -57,16 +71,16 @@ def _fill_whitening(errors, sigma, out):  # type: ignore[no-untyped-def]
                     return False
         for j in range(width):
             for i in range(j):
-                out[s, i, j] = 0.0
-            out[s, j, j] = 1.0 / factor[j, j]
+                out[i, j] = 0.0
+            out[j, j] = 1.0 / factor[j, j]
             for i in range(j + 1, width):
                 total = 0.0
                 for k in range(j, i):
-                    total += factor[i, k] * out[s, k, j]
-                out[s, i, j] = -total / factor[i, i]
+                    total += factor[i, k] * out[k, j]
+                out[i, j] = -total / factor[i, i]
         for i in range(width):
             for j in range(i + 1):
-                out[s, i, j] /= sigma[j]
+                out[i, j] /= sigma[j]
     return True
 
 
@@ -107,14 +121,13 @@ def error_whitening(
     finite.
     """
     count, width = len(points), len(sigma)
-    basis, whitening = np.empty((count, len(modes))), np.empty((count, width, width))
-    fill_flux_basis(points, axes, lengths, dipoles, basis)
-    errors = (basis @ modes).reshape(count, -1, width)
-    if not _fill_whitening(errors, sigma, whitening):
+    errors, near = np.empty((count, modes.shape[1] // width, width)), np.empty((count, 2))
+    whitening = np.empty((count, width, width))
+    if not fill_model_errors(
+        points, axes, lengths, dipoles, spacing, modes, sigma, errors, whitening, near
+    ):  # fmt: skip
         raise TrackingError('the model covariance must be finite')
-    square = ((points[:, :, None] - dipoles[:3]) ** 2).sum(axis=1)
-    away, among = np.sqrt(square.min(axis=1)), np.sqrt((spacing**2 / square).max(axis=1))
-    return errors, whitening, away, among
+    return errors, whitening, near[:, 0], near[:, 1]
 
 
 ComplexArray = NDArray[np.complex128]
@@ -213,6 +226,20 @@ class ErrorModes:
         return replace(self, moments=np.ascontiguousarray(parts.reshape(len(self.rows), -1)))
 
 
+class ModelArrays(NamedTuple):
+    """Holds a model and its uncertainty, as the compiled steps need them; see `SolveContext`."""
+
+    columns: Array
+    moments: Array
+    sigma: Array
+    uncertain: Array  # (6, M), the dipoles whose moments are uncertain, as in `columns`
+    spacing: Array
+    modes: Array  # (M, R 2K); (0, 0) without uncertainty
+    low: Array
+    high: Array
+    share: float
+
+
 @dataclass(frozen=True)
 class SolveContext:
     """Holds what every solve of a frame shares."""
@@ -257,25 +284,29 @@ class SolveContext:
         return float(np.sqrt(np.median(power)))
 
     @cached_property
-    def _uncertain(self) -> Array:
-        """The dipoles whose moments are uncertain, as in `RealField.columns`."""
-        assert self.modes is not None
-        return self.field.columns.take(self.modes.rows, axis=1)
+    def arrays(self) -> ModelArrays:
+        """Return what the compiled steps need."""
+        modes, columns = self.modes, self.field.columns
+        uncertain, spacing, moments = np.empty((6, 0)), np.empty(0), np.empty((0, 0))
+        if modes is not None:
+            uncertain, spacing = columns.take(modes.rows, axis=1), modes.spacing
+            moments = modes.moments
+        return ModelArrays(
+            columns, self.field.moments, self.sigma, uncertain, spacing, moments, self.low,
+            self.high, self.model_share,
+        )  # fmt: skip
 
     def make_ready(self) -> None:
         """Work out what a warm solve needs of the field and its uncertainty."""
-        _ = self.readings, self.symmetry, self.field.columns
-        if self.modes is not None:
-            _ = self._uncertain
+        _ = self.readings, self.symmetry, self.arrays
 
     def error_whitening(
         self, points: Array, axes: Array, lengths: Array
     ) -> tuple[Array, Array, Array, Array]:
         """Return what the model's error does to coils at some poses; see `error_whitening`."""
-        modes = self.modes
-        assert modes is not None
+        of = self.arrays
         return error_whitening(
-            points, axes, lengths, self._uncertain, modes.spacing, modes.moments, self.sigma
+            points, axes, lengths, of.uncertain, of.spacing, of.modes, self.sigma
         )
 
 

@@ -7,13 +7,22 @@ explains the fluxes equally well. Coils and frames are compared with each other 
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
-from anser_ros.tracking.estimate import USUAL_GATE, NoiseScale, TrackerSettings
+from anser_ros.kernel_cache import inlined
+from anser_ros.tracking.estimate import (
+    USUAL_GATE,
+    NoiseScale,
+    PoseEstimate,
+    TrackerSettings,
+    no_pose,
+)
 from anser_ros.tracking.solve import chi2_limit
 from anser_ros.tracking.solve_context import SolveContext
 
@@ -30,6 +39,24 @@ of one that only a gate wider than the usual one lets pass. A wrong gain moves a
 noise of the same residual: by up to 8 of its sigmas with a factor of 4 (2 to 20 %, on one coil,
 simulated). Smaller, and 3 sigma do not hold there; larger, and poses that are asked for in spite
 of their misfit are called more uncertain than they are."""
+
+
+SOUND, MISFIT, OUTSIDE, UNENDED, UNCERTAIN, IN_METAL = range(6)
+"""What may be wrong with a solved pose by itself, in the order in which it is looked at."""
+
+
+@inlined
+def fault_of(ratio, gate, is_inside, converged, sigma_m, most_m, in_metal):  # type: ignore[no-untyped-def]
+    """Return what is wrong with a solved pose by itself: the first that holds."""
+    if not ratio <= gate * gate:
+        return MISFIT
+    if not is_inside:
+        return OUTSIDE
+    if not converged:
+        return UNENDED
+    if sigma_m > most_m:
+        return UNCERTAIN
+    return IN_METAL if in_metal else SOUND
 
 
 def variance_scale(
@@ -80,19 +107,24 @@ def verdict(
     name in the reason; they are looked at only where the pose is good by itself.
     """
     ratio = chi2 / freedom
-    if not ratio <= settings.gate**2:
+    most_m = settings.max_sigma_m * settings.max_sigma_factor(scale)
+    fault = fault_of.py_func(
+        ratio, settings.gate, settings.box.contains(place), converged, sigma_m, most_m,
+        in_metal and settings.has_gate,
+    )  # fmt: skip
+    if fault == MISFIT:
         times = math.sqrt(ratio)
         return (
             states.RESIDUAL,
             f'residual {residual_t:.3g} T is {times:.3g} times the expected one',
         )
-    if not settings.box.contains(place):
+    if fault == OUTSIDE:
         return states.OUTSIDE_VOLUME, f'at {millimetres(place)} mm'
-    if not converged:
+    if fault == UNENDED:
         return states.AMBIGUOUS, 'the solve did not converge'
-    if sigma_m > settings.max_sigma_m * settings.max_sigma_factor(scale):
+    if fault == UNCERTAIN:
         return states.AMBIGUOUS, f'{what} uncertain by {1e3 * sigma_m:.3g} mm'
-    if in_metal and settings.has_gate:
+    if fault == IN_METAL:
         return states.AMBIGUOUS, 'where there may be metal'
     margin = settings.margin(ratio)
     for other_chi2, words in rivals:
@@ -104,3 +136,81 @@ def verdict(
 def millimetres(place: Array) -> str:
     """Return coordinates of a place given in m as text in mm."""
     return ', '.join(f'{1e3 * v:.1f}' for v in place)
+
+
+class Solution(Protocol):
+    """States where the solve of any tracked thing ended."""
+
+    @property
+    def position(self) -> Array:
+        """Return the position, m, frame fg."""
+
+    @property
+    def chi2(self) -> float:
+        """Return the sum of squared whitened residuals."""
+
+    @property
+    def residual(self) -> Array:
+        """Return measured minus modelled flux, T."""
+
+    @property
+    def converged(self) -> bool:
+        """Return whether the last step was negligible."""
+
+
+class Freedom(NamedTuple):
+    """Degrees of freedom of a residual, the pose's unknowns, and the probability of a misfit
+    beyond which it counts as more than noise.
+    """
+
+    of_residual: int
+    unknowns: int
+    seldom: float
+
+
+@dataclass
+class SolveFrame:
+    """Holds what a thing is tracked with in one frame: its fluxes, T, the model, the settings."""
+
+    name: str
+    stamp_ns: int
+    flux: Array
+    context: SolveContext
+    settings: TrackerSettings
+
+    def no_pose(self, state: str, reason: str) -> PoseEstimate:
+        """Return the estimate of a thing that has no pose in this frame."""
+        return no_pose(self.name, self.stamp_ns, state, self.context.model_id, reason)
+
+    def estimate(
+        self,
+        noise: NoiseScale,
+        solution: Solution,
+        freedom: Freedom,
+        pose: tuple[Array, Array, Array | None],
+        covariance: Callable[[float], Array],
+        rivals: Iterable[tuple[float, str]],
+        place: Array,
+        what: str = 'position',
+        in_metal: bool = False,
+    ) -> PoseEstimate:
+        """Judge a solution by itself: its covariance, its state, and the reason for it.
+
+        ``pose`` are position, axis, and rotation or None, as the estimate has them. ``covariance``
+        returns the pose's (6, 6) before the scale, which it is given. The last four are those of
+        `verdict`.
+        """
+        settings, chi2 = self.settings, solution.chi2
+        scale = variance_scale(noise, chi2, *freedom, self.context, settings)
+        scaled = scale * covariance(scale)
+        sigma = math.sqrt(scaled[0, 0] + scaled[1, 1] + scaled[2, 2])
+        flat = solution.residual.ravel()
+        residual = math.sqrt(float(flat @ flat) / flat.size)
+        state, reason = verdict(
+            settings, chi2, freedom.of_residual, residual, place, solution.converged, sigma,
+            scale, what, in_metal, rivals,
+        )  # fmt: skip
+        return PoseEstimate(
+            self.name, self.stamp_ns, state, *pose, scaled, sigma, residual,
+            chi2 / freedom.of_residual, self.context.model_id, reason,
+        )  # fmt: skip

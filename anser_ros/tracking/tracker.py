@@ -29,7 +29,7 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import Withheld
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, track_body
-from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTrack, solve_warm, track_coil
+from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTracks, track_coil
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
 from anser_ros.tracking.rigid import BodyCoils
@@ -67,7 +67,7 @@ class Past:
 
     def __init__(self, sensors: SensorTable, observers: Sequence[Observer]) -> None:
         self.counters: Counter[str] = Counter()
-        self.coils = {name: CoilTrack() for name in sensors.name}
+        self.coils = CoilTracks(len(sensors))
         self.bodies = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
         self.observers = observers
         # It holds the counters and not the tracker: in a cycle, a tracker that was replaced would
@@ -81,8 +81,7 @@ class Past:
     def forget(self) -> None:
         """Forget all warm starts, and what was seen of the sensors and bodies."""
         self.judgement.forget()
-        for coil in self.coils.values():
-            coil.forget()
+        self.coils.forget()
         for body in self.bodies.values():
             body.forget()
         for observer in self.observers:
@@ -311,7 +310,10 @@ class Tracker:
         frames, bodies = [], []
         for name, (rows, table) in self._scene.bodies.items():
             single = [coils[i] for i in rows]
-            frame = BodyFrame(name, stamp_ns, values[rows], context, self.settings, table, single)
+            frame = BodyFrame(
+                name, stamp_ns, values[rows], context, self.settings, table, single, rows,
+                self._past.coils,
+            )  # fmt: skip
             frames.append(frame)
             if context.symmetry is not None:
                 reason = 'the field is the same all around its axis: a turn about it stays unknown'
@@ -332,14 +334,13 @@ class Tracker:
     ) -> list[CoilResult]:
         """Solve each sensor by itself, from flux components (S, 2K)."""
         table, past, settings, results = self._scene.table, self._past, self.settings, []
-        tracks = [past.coils[name] for name in table.name]
-        warm = solve_warm(tracks, table.length, stamp_ns, values, codes == GOOD, context, settings)
-        lengths = table.length.tolist()
+        tracks, lengths = past.coils, table.length.tolist()
+        followed = tracks.follow(stamp_ns, values, codes == GOOD, table.length, context, settings)
         for i, (name, code) in enumerate(zip(table.name, codes.tolist(), strict=True)):
             fault = FAULTS[code]
-            frame = CoilFrame(name, stamp_ns, values[i], context, settings, lengths[i])
+            frame = CoilFrame(name, stamp_ns, values[i], context, settings, lengths[i], i, tracks)
             if fault is None:
-                result = track_coil(tracks[i], frame, warm[i])
+                result = track_coil(frame, followed)
                 past.counters['cold_starts'] += result.cold
             else:
                 past.counters[f'readings_{fault.kind}'] += 1

@@ -20,13 +20,13 @@ from anser_ros.physics.dipole import field_basis
 from anser_ros.physics.rotations import nearest_rotation, rotation_of_vector
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.tracked_session import PoseSeries, pose_series
-from anser_ros.tracking.body_track import BodyFrame
-from anser_ros.tracking.coil_track import UNKNOWNS, Freedom, SolveFrame, Start, Track
+from anser_ros.tracking.body_track import BodyFrame, Start, Track
+from anser_ros.tracking.coil_step import UNKNOWNS
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate
 from anser_ros.tracking.rigid import BodyCoils, BodySolution, common_factor, solve_body
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import ROLL_VARIANCE, RealField, bounded_inverse
-from anser_ros.tracking.solve_verdict import RARE
+from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def _vector_basis(coils: BodyCoils, places: Array) -> Array:
 
 
 @dataclass
-class SourceTrack(Track[BodySolution]):
+class SourceTrack(Track):
     """Remembers one body: its scan, the last good pose, the noise scale."""
 
     scan: SourceScan | None = None
