@@ -10,7 +10,7 @@ from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.rigid import BodyCoils, common_factor, solve_body, start_from_coils
 from anser_ros.tracking.solve import RealField, bounded_inverse
-from anser_ros.tracking.solve_context import error_whitening, source_spacing
+from anser_ros.tracking.solve_context import NOT_FINITE, fill_model_errors, source_spacing
 
 SEED = 41
 MODEL = certain_model()
@@ -128,6 +128,16 @@ def columns_of(model):
     return RealField.of(model.positions, model.directions, model.moments).columns
 
 
+def written_errors(points, axes, lengths, dipoles, spacing, modes, sigma):
+    count, width = len(points), len(sigma)
+    errors, near = np.empty((count, modes.shape[1] // width, width)), np.empty((count, 2))
+    weights = np.empty((count, width, width))
+    written = errors, weights, near
+    is_finite = fill_model_errors(points, axes, lengths, dipoles, spacing, modes, sigma, *written)
+    assert is_finite, NOT_FINITE
+    return errors, weights, near[:, 0], near[:, 1]
+
+
 def both(modes, sigma, length):
     model = certain_model()
     span = np.array([length])
@@ -137,7 +147,7 @@ def both(modes, sigma, length):
         np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(len(model.positions), -1)
     )
     # Another coil beside it, so that the two are not mixed up.
-    errors, weights, away, among = error_whitening(
+    errors, weights, away, among = written_errors(
         np.stack([POINT + 0.01, POINT]), np.stack([AXIS[::-1], AXIS]), np.array([0.0, length]),
         columns_of(model), np.full(len(model.positions), 0.03), laid_out, sigma,
     )  # fmt: skip
@@ -164,8 +174,8 @@ def test_what_is_not_finite_is_refused():
     modes = np.full((1, count, 8), np.inf + 0j)
     model = certain_model()
     laid_out = np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(count, -1)
-    with np.errstate(all='ignore'), pytest.raises(TrackingError, match='finite'):
-        error_whitening(
+    with np.errstate(all='ignore'), pytest.raises(AssertionError, match='finite'):
+        written_errors(
             POINT[None], AXIS[None], np.zeros(1), columns_of(model), np.zeros(count),
             np.ascontiguousarray(laid_out), np.full(16, 60e-12),
         )  # fmt: skip

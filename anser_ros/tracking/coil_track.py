@@ -34,10 +34,9 @@ from anser_ros.tracking.coil_step import (
 from anser_ros.tracking.estimate import FRESH_NOISE, NoiseScale, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import CoilSolution, coil_covariance, solve_coil, whitening_of
-from anser_ros.tracking.solve_context import SolveContext
+from anser_ros.tracking.solve_context import NOT_FINITE, SolveContext
 from anser_ros.tracking.solve_verdict import SOUND, Freedom, SolveFrame, millimetres
 
-NOT_FINITE = 'the model covariance must be finite'
 FIRST_RETRY_S, LAST_RETRY_S = 0.05, 0.25
 """Pauses after a scan without a good pose, s: the first one, which doubles from scan to scan, and
 the longest. Scans cost far more than warm solves, and a long distortion would ask for one in every
@@ -139,7 +138,7 @@ class CoilTracks:
         far = np.flatnonzero((moved >= memory.reach_m[rows]) | (turned >= ERROR_REACH))
         shared: Array = memory.errors[rows]
         if far.size:
-            shared[far], *_ = context.error_whitening(points[far], axes[far], lengths[far])
+            shared[far] = context.errors_at(points[far], axes[far], lengths[far])
         return shared
 
 

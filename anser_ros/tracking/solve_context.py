@@ -31,14 +31,25 @@ SAME_PLACE_M = 1e-6
 less, and no layout has neighbours within a millimetre."""
 
 
+NOT_FINITE = 'the model covariance must be finite'
+
+
 @kernel
 def fill_model_errors(  # type: ignore[no-untyped-def]
     points, axes, lengths, dipoles, spacing, modes, sigma, errors, whitening, near
 ):  # fmt: skip
-    """Write what `error_whitening` returns; False where a covariance is not finite.
+    """Write the model's error at S coils, and the factors that make their residuals white.
 
-    ``errors`` (S, R, 2K) are the flux errors E of each of S coils, ``whitening`` (S, 2K, 2K) the
-    inverse Cholesky factors of ``diag(sigma)^2 + E^T E``, ``near`` (S, 2) the last two results.
+    The coils have centres ``points`` (m), unit ``axes`` (S, 3), frame fg, and ``lengths``, m. The
+    N ``dipoles``, rows of `RealField.columns`, have uncertain moments: ``modes`` (N, R 2K) are
+    errors of one standard deviation each, A m^2, ``spacing`` is `source_spacing`, m. ``sigma``
+    (2K,) is each flux component's standard deviation, T.
+
+    Written are flux errors E (S, R, 2K) of one standard deviation each, T; the ``whitening``
+    (S, 2K, 2K), 1/T, the inverse Cholesky factor of ``diag(sigma)^2 + E^T E``; and ``near``
+    (S, 2): the distance from the nearest of the dipoles, m, and spacing over distance of the
+    dipole for which that is largest: above 1 a coil is where the dipoles are no description of the
+    field. Returns False where a covariance is not finite.
     """
     width, count = sigma.shape[0], errors.shape[1]
     factor, scaled = np.empty((width, width)), np.empty((width, count))
@@ -96,38 +107,6 @@ def source_spacing(positions: Array, floor_m: float) -> Array:
     square[square <= SAME_PLACE_M**2] = np.inf
     nearest = np.sqrt(square.min(axis=1, initial=np.inf))
     return np.where((nearest < np.inf) & (positions[:, 2] >= floor_m), nearest, 0.0)
-
-
-def error_whitening(
-    points: Array,
-    axes: Array,
-    lengths: Array,
-    dipoles: Array,
-    spacing: Array,
-    modes: Array,
-    sigma: Array,
-) -> tuple[Array, Array, Array, Array]:
-    """Return the model's error at coils, and the factors that make their residuals white.
-
-    The S coils have centres ``points`` (m), unit ``axes`` (S, 3), frame fg, and ``lengths``, m.
-    The N ``dipoles``, rows of `RealField.columns`, have uncertain moments: ``modes`` (N, R 2K) are
-    errors of one standard deviation each, A m^2, ``spacing`` is `source_spacing`, m. ``sigma``
-    (2K,) is each flux component's standard deviation, T.
-
-    The results are flux errors (S, R, 2K) of one standard deviation each, T; the whitening
-    (S, 2K, 2K), 1/T, lower triangular; the distance (S,) from the nearest of the dipoles, m; and
-    spacing over distance (S,) of the dipole for which that is largest: above 1 a coil is where the
-    dipoles are no description of the field. Raises `TrackingError` where the covariance is not
-    finite.
-    """
-    count, width = len(points), len(sigma)
-    errors, near = np.empty((count, modes.shape[1] // width, width)), np.empty((count, 2))
-    whitening = np.empty((count, width, width))
-    if not fill_model_errors(
-        points, axes, lengths, dipoles, spacing, modes, sigma, errors, whitening, near
-    ):  # fmt: skip
-        raise TrackingError('the model covariance must be finite')
-    return errors, whitening, near[:, 0], near[:, 1]
 
 
 ComplexArray = NDArray[np.complex128]
@@ -300,14 +279,19 @@ class SolveContext:
         """Work out what a warm solve needs of the field and its uncertainty."""
         _ = self.readings, self.symmetry, self.arrays
 
-    def error_whitening(
-        self, points: Array, axes: Array, lengths: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Return what the model's error does to coils at some poses; see `error_whitening`."""
-        of = self.arrays
-        return error_whitening(
-            points, axes, lengths, of.uncertain, of.spacing, of.modes, self.sigma
-        )
+    def errors_at(self, points: Array, axes: Array, lengths: Array) -> Array:
+        """Return flux errors (S, R, 2K), T, of coils at poses; see `fill_model_errors`.
+
+        Raises `TrackingError` where a covariance is not finite.
+        """
+        of, count, width = self.arrays, len(points), self.sigma.size
+        errors = np.empty((count, of.modes.shape[1] // width, width))
+        if not fill_model_errors(
+            points, axes, lengths, of.uncertain, of.spacing, of.modes, self.sigma, errors,
+            np.empty((count, width, width)), np.empty((count, 2)),
+        ):  # fmt: skip
+            raise TrackingError(NOT_FINITE)
+        return errors
 
 
 def model_digest(model: FieldModel) -> str:
