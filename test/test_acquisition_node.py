@@ -210,7 +210,8 @@ class TestStream:
     def push(self, stream, k, late_ms=0.0, **options):
         """Push the block that began after k ms; it comes at its end, or later."""
         block = SampleBlock(k, 1000 * k, self.codes(k))
-        return stream.push(block, 10**12 + round(10**6 * (k + 1 + late_ms)), **options)
+        arrival_ns = 10**12 + round(10**6 * (k + 1 + late_ms))
+        return stream.push([block], [arrival_ns], **options)
 
     def frames(self, stream, blocks, edit=lambda codes: None, skip=(), ticks=lambda k: 1000 * k):
         """Frames of blocks of 1 ms, after a start that was answered at once."""
@@ -220,7 +221,8 @@ class TestStream:
             codes = self.codes(k)
             edit(codes)
             if k not in skip:
-                found += stream.push(SampleBlock(k, ticks(k), codes), 10**12 + 10**6 * (k + 1))
+                arrival_ns = 10**12 + 10**6 * (k + 1)
+                found += stream.push([SampleBlock(k, ticks(k), codes)], [arrival_ns])
         return found
 
     def test_flags(self):
@@ -261,7 +263,7 @@ class TestStream:
             codes = self.codes(k if k < 100 else k % 50)
             late_ns = 0 if k < 120 else 50_000_000
             arrival_ns = 10**12 + 10**6 * (k + 1) + late_ns
-            frames += stream.push(SampleBlock(k, 1000 * k, codes), arrival_ns)
+            frames += stream.push([SampleBlock(k, 1000 * k, codes)], [arrival_ns])
         assert [frame.repeats for frame in frames] == 5 * [False] + 15 * [True]
         assert all((frame.flags == STALE).all() for frame in frames[5:])
         assert frames[-1].host_ns == pytest.approx(10**12 + 390 * 10**6, abs=10**5)
@@ -317,17 +319,18 @@ class TestStream:
         frames = []
         for k in range(40):
             block = SampleBlock(k, 7000 + 1000 * k, self.codes(500 + k))
-            frames += stream.push(block, 2 * 10**12 + 10**6 * (k + 1))
+            frames += stream.push([block], [2 * 10**12 + 10**6 * (k + 1)])
         assert stream.counters.restarts == 1 and not frames, 'nothing bounds the new line yet'
         stream.answered(2 * 10**12 + 39 * 10**6)
-        (frame, _) = stream.push(SampleBlock(40, 47_000, self.codes(540)), 2 * 10**12 + 41 * 10**6)
+        block = SampleBlock(40, 47_000, self.codes(540))
+        (frame, _) = stream.push([block], [2 * 10**12 + 41 * 10**6])
         assert frame.host_ns == pytest.approx(2 * 10**12 + 10**7, abs=10**5)
 
     def test_what_does_not_fit_the_setup_is_named_left_alone_or_refused(self):
         stream = new_stream(NUMBERS[:-3])
         assert [s.name for s in stream.missing] == ['ref/14/1', 'ref/15/0', 'ref/15/1']
         assert len(stream.sensors) == 38
-        assert stream.push(SampleBlock(0, 0, self.codes(columns=5)), 1) == []
+        assert stream.push([SampleBlock(0, 0, self.codes(columns=5))], [1]) == []
         with pytest.raises(SetupError, match='none of the channels'):
             new_stream([500])
         with pytest.raises(SetupError, match='drives 2 coils'):

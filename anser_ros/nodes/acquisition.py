@@ -7,7 +7,9 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
@@ -108,6 +110,10 @@ WAIT_S = 0.1
 """Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
 
 
+def _is_block(pair: tuple[Record, int]) -> bool:
+    return isinstance(pair[0].payload, SampleBlock)
+
+
 class Acquisition(AnserNode):
     """Publishes ``setup``, ``tool/flux`` and ``reference/flux``."""
 
@@ -204,22 +210,26 @@ class Acquisition(AnserNode):
             self._control.reset()
             self._drop_stream()
             return
-        for record, arrival_ns in zip(batch.records, batch.arrivals_ns, strict=True):
-            self._control.take(record, arrival_ns)
-            self._dispatch(record, arrival_ns)
-        port.want(1 if self._stream is None else self._stream.blocks_wanted)
+        pairs = zip(batch.records, batch.arrivals_ns, strict=True)
+        for is_block, group in groupby(pairs, key=_is_block):
+            records, arrivals_ns = zip(*group, strict=True)
+            if is_block:
+                self._control.take(records[-1], arrivals_ns[-1])
+                if self._control.started:  # those before are left over from before the connection
+                    self._take_blocks([record.payload for record in records], arrivals_ns)
+                continue
+            for record, arrival_ns in zip(records, arrivals_ns, strict=True):
+                self._control.take(record, arrival_ns)
+                self._dispatch(record)
+        stream = self._stream
+        if stream is None:
+            port.want(1)
+        else:
+            port.want(stream.blocks_wanted, stream.block_s)
 
-    def _dispatch(self, record: Record, arrival_ns: int) -> None:
+    def _dispatch(self, record: Record) -> None:
         payload = record.payload
-        # Before the start they are left over in a buffer from before the connection.
-        if isinstance(payload, SampleBlock) and self._control.started:
-            if self._rebuild:
-                self._drop_stream()
-            if self._stream is None and not self._refusal:
-                self._make_stream()
-            if self._stream is not None:
-                self._take_block(self._stream, payload, arrival_ns)
-        elif isinstance(payload, Hello):
+        if isinstance(payload, Hello):
             if payload != self._hello:
                 self._drop_stream()
             self._hello = payload
@@ -228,15 +238,23 @@ class Acquisition(AnserNode):
         elif isinstance(payload, Reply) and payload.code is ReplyCode.OK:
             self._take_answer(payload.command, record.tag)
 
-    def _take_block(self, stream: FluxStream, block: SampleBlock, arrival_ns: int) -> None:
-        """Publish the frames that a block completes; those late beyond hope give way to newer."""
-        begin_ns = time.monotonic_ns()
-        skips = self._backlog.is_hopeless((begin_ns - arrival_ns) / 1e9)
-        for frame in stream.push(block, arrival_ns, skips=skips):
-            self._publish_frame(stream, frame, arrival_ns)
-            now_ns = time.monotonic_ns()
-            self._backlog.worked((now_ns - begin_ns) / 1e9)
-            begin_ns = now_ns
+    def _take_blocks(self, blocks: Sequence[SampleBlock], arrivals_ns: Sequence[int]) -> None:
+        """Publish the frames that blocks complete; those late beyond hope give way to newer."""
+        if self._rebuild:
+            self._drop_stream()
+        if self._stream is None and not self._refusal:
+            self._make_stream()
+        stream, done = self._stream, 0
+        while stream is not None and done < len(blocks):
+            begin_ns = time.monotonic_ns()
+            run = slice(done, done + stream.run_length(blocks[done:]))
+            done, arrival_ns = run.stop, arrivals_ns[run.stop - 1]
+            skips = self._backlog.is_hopeless((begin_ns - arrival_ns) / 1e9)
+            for frame in stream.push(blocks[run], arrivals_ns[run], skips=skips):
+                self._publish_frame(stream, frame, arrival_ns)
+                now_ns = time.monotonic_ns()
+                self._backlog.worked((now_ns - begin_ns) / 1e9)
+                begin_ns = now_ns
 
     def _take_answer(self, command: int, tag: int) -> None:
         """Take from an answer that what follows it was sampled after the command had left."""

@@ -35,6 +35,9 @@ _WRITE_TIMEOUT_S = 0.2
 """Longest time that a write may take, s; commands are short, so that a longer one is a fault."""
 _READ_BYTES = 1 << 16
 """Largest number of bytes of one read: more than a line of 12 Mbaud brings in 50 ms."""
+_LONGEST_REST_S = 3e-3
+"""Longest time, s, that bytes are left to gather while no window is due: a terminal holds 4 kB and
+its driver about 16 kB more, and at 4 ms arrivals would not be punctual."""
 OPEN_FAILURES = {
     errno.EAGAIN: 'another program uses it',
     errno.EBUSY: 'another program uses it',
@@ -175,7 +178,7 @@ class ControlUnitPort:
         self.reason = ''
         self._baud = baud
         self._silence_s = silence_s
-        self.blocks_wanted = 1
+        self.blocks_wanted, self._block_s = 1, 0.0
         self._queue_blocks = queue_blocks
         self._holding = threading.RLock()
         self._held: list[Record] = []
@@ -210,10 +213,12 @@ class ControlUnitPort:
         if self._thread is not None:
             self._thread.join(timeout_s)
 
-    def want(self, blocks: int) -> None:
-        """Set how many blocks to collect; those that are there already are not waited for."""
+    def want(self, blocks: int, block_s: float = 0.0) -> None:
+        """Set how many blocks to collect, and their length, s, where they need not be read one by
+        one; those that are there already are not waited for.
+        """
         with self._holding:
-            self.blocks_wanted = blocks
+            self.blocks_wanted, self._block_s = blocks, block_s
             if self._held_blocks >= blocks:
                 self._hand_over()
 
@@ -310,6 +315,7 @@ class ControlUnitPort:
                     last_record, garbage_bytes = now, 0
                     self.state = PortState.RECEIVING
                     self._take(records, arrival_ns)
+                    self._rest(arrival_ns)
             elif self._held:
                 self._hand_over()
             elif now - last_byte > self._silence_s:
@@ -320,6 +326,13 @@ class ControlUnitPort:
                 self.counters.wrong_baud += 1
                 self.state = PortState.WRONG_BAUD
                 last_record, garbage_bytes = now, 0
+
+    def _rest(self, arrival_ns: int) -> None:
+        """Let blocks gather, but none beyond the last that is wanted."""
+        rest_s = min((self.blocks_wanted - self._held_blocks - 1) * self._block_s, _LONGEST_REST_S)
+        rest_s -= (time.monotonic_ns() - arrival_ns) / 1e9
+        if rest_s > 0:
+            time.sleep(rest_s)
 
     def _take(self, records: list[Record], arrival_ns: int) -> None:
         """Hold blocks until there are as many as wanted; anything else goes on at once."""
