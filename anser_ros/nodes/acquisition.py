@@ -312,10 +312,12 @@ class Acquisition(AnserNode):
         # The system's clock may be set while we run; the offset is taken again for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
         self._hand_over_flux(self._tool_publisher, frame.tool, stamp_ns)
-        if len(frame.tool.channel):
-            self._tool_publisher.publish(self._cloud.message(frame.tool, stamp_ns))
-        if len(frame.reference.channel):
-            self._reference_publisher.publish(self._cloud.message(frame.reference, stamp_ns))
+        for publisher, points in (
+            (self._tool_publisher, frame.tool),
+            (self._reference_publisher, frame.reference),
+        ):  # in a composed process nobody else may want them
+            if len(points.channel) and publisher.get_subscription_count():
+                publisher.publish(self._cloud.packed(points, stamp_ns))
         # The model is refitted once poses and messages are on their way, if no frame waits.
         age_s = (time.monotonic_ns() - arrival_ns) / 1e9
         if self.hands_over and self._backlog.gives_way(age_s):

@@ -397,9 +397,10 @@ class TrackerNode(AnserNode):
         changed = [topic.note(estimate, now_ns) for topic, estimate in found]
         for topic, _ in found:
             topic.publish_covariance()
-        moved = [topic for topic, estimate in found if estimate.state == OK]
-        if self._transforms is not None and moved:
-            self._transforms.publish(transform_message(moved))
+        if self._transforms is not None and self._transforms.get_subscription_count():
+            moved = [topic for topic, estimate in found if estimate.state == OK]
+            if moved:
+                self._transforms.publish(transform_message(moved))
         return any(changed)
 
     # What is reported ---------------------------------------------------------------------
