@@ -213,19 +213,14 @@ class Acquisition(AnserNode):
         pairs = zip(batch.records, batch.arrivals_ns, strict=True)
         for is_block, group in groupby(pairs, key=_is_block):
             records, arrivals_ns = zip(*group, strict=True)
-            if is_block:
-                self._control.take(records[-1], arrivals_ns[-1])
-                if self._control.started:  # those before are left over from before the connection
-                    self._take_blocks([record.payload for record in records], arrivals_ns)
-                continue
             for record, arrival_ns in zip(records, arrivals_ns, strict=True):
                 self._control.take(record, arrival_ns)
-                self._dispatch(record)
+                if not is_block:
+                    self._dispatch(record)
+            if is_block and self._control.started:  # else they are left over in a buffer
+                self._take_blocks([record.payload for record in records], arrivals_ns)
         stream = self._stream
-        if stream is None:
-            port.want(1)
-        else:
-            port.want(stream.blocks_wanted, stream.block_s)
+        port.want(*(1, 0.0) if stream is None else (stream.blocks_wanted, stream.block_s))
 
     def _dispatch(self, record: Record) -> None:
         payload = record.payload
@@ -312,10 +307,8 @@ class Acquisition(AnserNode):
         # The system's clock may be set while we run; the offset is taken again for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
         self._hand_over_flux(self._tool_publisher, frame.tool, stamp_ns)
-        for publisher, points in (
-            (self._tool_publisher, frame.tool),
-            (self._reference_publisher, frame.reference),
-        ):  # in a composed process nobody else may want them
+        publishers = self._tool_publisher, self._reference_publisher
+        for publisher, points in zip(publishers, (frame.tool, frame.reference), strict=True):
             if len(points.channel) and publisher.get_subscription_count():
                 publisher.publish(self._cloud.packed(points, stamp_ns))
         # The model is refitted once poses and messages are on their way, if no frame waits.

@@ -107,7 +107,9 @@ class PoseTopic:
             self._pose.publish(self._plain.packed(estimate.stamp_ns, *self._values))
 
     def note(self, estimate: PoseEstimate, now_ns: int) -> bool:
-        """Count an estimate of a time, ns; return whether the state is another than before."""
+        """Count an estimate of a time, ns, and publish a good one once more, with its covariance;
+        return whether the state is another than before.
+        """
         changed = self.estimate is None or self.estimate.state != estimate.state
         self.estimate = estimate
         self.states[estimate.state] += 1
@@ -117,20 +119,15 @@ class PoseTopic:
             self.tally.poses += 1
             if is_live(estimate.stamp_ns, now_ns) and estimate.stamp_ns <= now_ns:
                 self.tally.latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
+            if self._uncertain.get_subscription_count():
+                numbers = *self._values, *estimate.covariance.ravel().tolist()
+                self._uncertain.publish(self._full.packed(estimate.stamp_ns, *numbers))
         return changed
 
-    def publish_covariance(self) -> None:
-        """Publish the good pose just noted once more, with its covariance."""
-        known = self.estimate
-        if known is None or known.state != OK or not self._uncertain.get_subscription_count():
-            return
-        numbers = *self._values, *known.covariance.ravel().tolist()
-        self._uncertain.publish(self._full.packed(known.stamp_ns, *numbers))
-
-    def transform(self) -> TransformStamped:
-        """Return the transform of the good pose just published."""
+    def transform(self, stamp_ns: int) -> TransformStamped:
+        """Return the transform of the good pose just published, which had a stamp, ns."""
         moved = self._transform
-        set_stamp(moved.header.stamp, 0 if self.estimate is None else self.estimate.stamp_ns)
+        set_stamp(moved.header.stamp, stamp_ns)
         place, turn = moved.transform.translation, moved.transform.rotation
         place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = self._values
         return moved
@@ -173,6 +170,6 @@ def transform_publisher(node: Any) -> Any:
     return None if TFMessage is None else node.create_publisher(TFMessage, '/tf', qos.EVENTS)
 
 
-def transform_message(topics: list[PoseTopic]) -> Any:
+def transform_message(topics: list[PoseTopic], stamp_ns: int) -> Any:
     """Return one /tf message with the transforms of these topics."""
-    return TFMessage(transforms=[topic.transform() for topic in topics])
+    return TFMessage(transforms=[topic.transform(stamp_ns) for topic in topics])

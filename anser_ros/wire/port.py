@@ -38,6 +38,8 @@ _READ_BYTES = 1 << 16
 _LONGEST_REST_S = 3e-3
 """Longest time, s, that bytes are left to gather while no window is due: a terminal holds 4 kB and
 its driver about 16 kB more, and at 4 ms arrivals would not be punctual."""
+_TERMINAL_BYTES = 4095
+"""Most bytes that a terminal hands out at a time: after fewer there are no more."""
 OPEN_FAILURES = {
     errno.EAGAIN: 'another program uses it',
     errno.EBUSY: 'another program uses it',
@@ -76,7 +78,8 @@ def receiver_of(port: serial.SerialBase) -> Callable[[], bytes]:
     """Return a function that waits for bytes and takes all there are; empty when time is over.
 
     pyserial's own read costs several system calls and an extra byte for every wake-up. A terminal
-    hands out 4 kB at a time; all of it is taken before any is looked at.
+    hands out 4 kB at a time; all of it is taken before any is looked at. pyserial has made the
+    descriptor one whose reads don't wait.
     """
     try:
         descriptor = port.fileno()
@@ -89,11 +92,11 @@ def receiver_of(port: serial.SerialBase) -> Callable[[], bytes]:
         data = os.read(descriptor, _READ_BYTES)
         if not data:
             raise serial.SerialException('the device is gone')
-        while len(data) < _READ_BYTES and select.select([descriptor], [], [], 0.0)[0]:
-            more = os.read(descriptor, _READ_BYTES)
-            if not more:
-                break  # the next read will find it gone
-            data += more
+        piece = data
+        with contextlib.suppress(BlockingIOError):
+            while len(piece) >= _TERMINAL_BYTES and len(data) < _READ_BYTES:
+                piece = os.read(descriptor, _READ_BYTES)
+                data += piece
         return data
 
     return receive
@@ -328,10 +331,10 @@ class ControlUnitPort:
                 last_record, garbage_bytes = now, 0
 
     def _rest(self, arrival_ns: int) -> None:
-        """Let blocks gather, but none beyond the last that is wanted."""
+        """Let blocks gather behind those that are held, up to the last that is wanted."""
         rest_s = min((self.blocks_wanted - self._held_blocks - 1) * self._block_s, _LONGEST_REST_S)
         rest_s -= (time.monotonic_ns() - arrival_ns) / 1e9
-        if rest_s > 0:
+        if self._held and rest_s > 0:
             time.sleep(rest_s)
 
     def _take(self, records: list[Record], arrival_ns: int) -> None:
