@@ -110,10 +110,6 @@ WAIT_S = 0.1
 """Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
 
 
-def _is_block(pair: tuple[Record, int]) -> bool:
-    return isinstance(pair[0].payload, SampleBlock)
-
-
 class Acquisition(AnserNode):
     """Publishes ``setup``, ``tool/flux`` and ``reference/flux``."""
 
@@ -211,7 +207,9 @@ class Acquisition(AnserNode):
             self._drop_stream()
             return
         pairs = zip(batch.records, batch.arrivals_ns, strict=True)
-        for is_block, group in groupby(pairs, key=_is_block):
+        for is_block, group in groupby(
+            pairs, lambda pair: isinstance(pair[0].payload, SampleBlock)
+        ):
             records, arrivals_ns = zip(*group, strict=True)
             for record, arrival_ns in zip(records, arrivals_ns, strict=True):
                 self._control.take(record, arrival_ns)
@@ -284,7 +282,7 @@ class Acquisition(AnserNode):
         except AnserError as error:
             self._refusal = str(error)
             raise
-        self._accuracy.reset()
+        self._accuracy = MeasuredAccuracy()
         self._backlog = Backlog(1 / self._stream.rate_hz)
         if self._start_sent_ns is not None:
             self._stream.clock.bound(0, self._start_sent_ns)

@@ -179,9 +179,7 @@ class FluxStream:
         self.clock.bound(self._cutter.end_sample + self._block_samples, sent_ns)
 
     def run_length(self, blocks: Sequence[SampleBlock]) -> int:
-        """Return how many blocks may be pushed at once: they follow, and none but the last
-        completes a window.
-        """
+        """Return how many blocks to push at once: they follow, up to the end of a window."""
         first, shape = blocks[0].sequence, (self._block_samples, self._cutter.columns)
         if not self._cutter.expects(first):
             return 1
@@ -193,8 +191,7 @@ class FluxStream:
     def push(
         self, blocks: Sequence[SampleBlock], arrivals_ns: Sequence[int], *, skips: bool = False
     ) -> list[FluxFrame]:
-        """Take a block, or a run of them, and return the frames that are complete and whose
-        stamps are good.
+        """Take a run of blocks and return the frames that are complete and have good stamps.
 
         A frame may wait for its stamp, and be withheld; see `WaitingFrames`. If it ``skips``, a
         complete window is only counted, in favour of newer ones.
@@ -309,13 +306,9 @@ _FACTOR = 2.0
 
 
 class MeasuredAccuracy:
-    """Follows the noise of the first fluxes, and the uncertainty of the stamps."""
+    """Follows the noise of a stream's first fluxes, and the uncertainty of its stamps."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Start again: the stream is another one."""
         self._noise_t: float | None = None
         self._begun_s = -math.inf
         self._stated_s = Accuracy.stamp_sigma_s
