@@ -27,17 +27,16 @@ from anser_ros.wire.text_files import read_config
 SETUP = parse_setup(read_config('demo_setup.yaml'))
 CHANNELS = parse_channels(read_config('demo_channels.yaml'))
 NUMBERS = [sensor.channel for sensor in SETUP.sensors]
-OPTIONS = (0.02, 50.0)
 LASTING_S = {'unplug': 2.0, 'wrong_baud': 5.0}
 """From these faults on the period is longer, s: they last for half of it at most."""
 
 
-def new_stream(numbers=NUMBERS, tones=SETUP.frequencies_hz):
+def new_stream(numbers=NUMBERS, tones=SETUP.frequencies_hz, rate_hz=50.0):
     """Return the stream of a unit that says hello with these channels and tones."""
     channels = [Channel(n, ChannelKind.SENSE, 5.0) for n in numbers]
     current = Channel(99, ChannelKind.CURRENT, 2.5)
     hello = Hello('t', 40e3, 1e6, 40, (*channels, current), tones, (0.25,) * len(tones))
-    return FluxStream(hello, SETUP, CHANNELS, *OPTIONS)
+    return FluxStream(hello, SETUP, CHANNELS, 0.02, rate_hz)
 
 
 class Listener:
@@ -312,6 +311,33 @@ class TestStream:
             [10**12 + 10 * 10**6, 10**12 + 90 * 10**6], abs=10**5
         )
         assert (stream.counters.windows, stream.counters.windows_skipped) == (2, 3)
+
+    @pytest.mark.parametrize('rate_hz', [50.0, 37.0, 400.0])
+    def test_runs_of_blocks_give_what_single_blocks_give(self, rate_hz):
+        """Whatever is lost, comes twice, is late or has wrong ticks."""
+        order = [k for k in range(400) if k not in {31, 90} and not 120 < k < 160]
+        order[200:200] = [order[199], order[150]]
+        wrong = {300: 70_000, 301: 70_000}
+        blocks = [SampleBlock(k, 1000 * k + wrong.get(k, 0), self.codes(k)) for k in order]
+        read_ns = [10**12 + 10**6 * (3 * (k // 3) + 3 + 20 * (220 < k < 250)) for k in order]
+        arrivals_ns = np.maximum.accumulate(read_ns).tolist()
+
+        def found(most):
+            stream, done, frames = new_stream(rate_hz=rate_hz), 0, []
+            stream.restart(10**12)
+            while done < len(blocks):
+                count = stream.run_length(blocks[done : done + most])
+                run = slice(done, done + count)
+                frames += stream.push(blocks[run], arrivals_ns[run])
+                done += count
+            told = [(f.tool.flux.tobytes(), f.flags.tobytes(), f.repeats) for f in frames]
+            faults = stream.clock.jumps, stream.waiting.withheld, stream.ticks.disagreements
+            return told, faults, vars(stream.counters), [f.host_ns for f in frames]
+
+        *single, stamps = found(1)
+        *runs, others = found(30)
+        assert runs == single and len(stamps) > 5
+        assert others == pytest.approx(stamps, abs=2000)
 
     def test_a_restarted_stream_has_new_stamps(self):
         stream = new_stream()

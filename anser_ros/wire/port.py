@@ -35,9 +35,9 @@ _WRITE_TIMEOUT_S = 0.2
 """Longest time that a write may take, s; commands are short, so that a longer one is a fault."""
 _READ_BYTES = 1 << 16
 """Largest number of bytes of one read: more than a line of 12 Mbaud brings in 50 ms."""
-_LONGEST_REST_S = 3e-3
-"""Longest time, s, that bytes are left to gather while no window is due: a terminal holds 4 kB and
-its driver about 16 kB more, and at 4 ms arrivals would not be punctual."""
+_LONGEST_REST_S, _GATHERED_BYTES = 3e-3, 12_000
+"""Longest time, s, that blocks are left to gather while no window is due, and most bytes: at 4 ms
+arrivals would not be punctual; a terminal holds 4 kB and its driver about 16 kB more."""
 _TERMINAL_BYTES = 4095
 """Most bytes that a terminal hands out at a time: after fewer there are no more."""
 OPEN_FAILURES = {
@@ -332,10 +332,13 @@ class ControlUnitPort:
 
     def _rest(self, arrival_ns: int) -> None:
         """Let blocks gather behind those that are held, up to the last that is wanted."""
-        rest_s = min((self.blocks_wanted - self._held_blocks - 1) * self._block_s, _LONGEST_REST_S)
-        rest_s -= (time.monotonic_ns() - arrival_ns) / 1e9
-        if self._held and rest_s > 0:
-            time.sleep(rest_s)
+        newest = self._held[-1:]
+        if newest and isinstance(block := newest[0].payload, SampleBlock):
+            left = self.blocks_wanted - self._held_blocks - 1
+            rest_s = min(left, _GATHERED_BYTES / max(block.codes.nbytes, 1)) * self._block_s
+            rest_s = min(rest_s, _LONGEST_REST_S) - (time.monotonic_ns() - arrival_ns) / 1e9
+            if rest_s > 0:
+                time.sleep(rest_s)
 
     def _take(self, records: list[Record], arrival_ns: int) -> None:
         """Hold blocks until there are as many as wanted; anything else goes on at once."""
