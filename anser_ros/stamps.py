@@ -1,5 +1,6 @@
 """Converts stamps: whole nanoseconds, from a ROS message and back, and what makes them seconds."""
 
+import struct
 from enum import Enum
 from typing import Any
 
@@ -50,6 +51,15 @@ def stamp_of(message: Any) -> int:
 def set_stamp(stamp: Any, stamp_ns: int) -> None:
     """Write a stamp, ns, into a message's ``builtin_interfaces/Time``."""
     stamp.sec, stamp.nanosec = divmod(stamp_ns, SECOND_NS)
+
+
+_STAMP, _STAMP_OFFSET = struct.Struct('<iI'), 4
+"""How and where the bytes of a message with a header have its stamp."""
+
+
+def pack_stamp(message: bytearray, stamp_ns: int) -> None:
+    """Write a stamp, ns, into the bytes of a message that begins with a header."""
+    _STAMP.pack_into(message, _STAMP_OFFSET, *divmod(stamp_ns, SECOND_NS))
 
 
 def is_live(stamp_ns: int, now_ns: int) -> bool:

@@ -27,17 +27,16 @@ from anser_ros.wire.text_files import read_config
 SETUP = parse_setup(read_config('demo_setup.yaml'))
 CHANNELS = parse_channels(read_config('demo_channels.yaml'))
 NUMBERS = [sensor.channel for sensor in SETUP.sensors]
-OPTIONS = (0.02, 50.0)
 LASTING_S = {'unplug': 2.0, 'wrong_baud': 5.0}
 """From these faults on the period is longer, s: they last for half of it at most."""
 
 
-def new_stream(numbers=NUMBERS, tones=SETUP.frequencies_hz):
+def new_stream(numbers=NUMBERS, tones=SETUP.frequencies_hz, rate_hz=50.0):
     """Return the stream of a unit that says hello with these channels and tones."""
     channels = [Channel(n, ChannelKind.SENSE, 5.0) for n in numbers]
     current = Channel(99, ChannelKind.CURRENT, 2.5)
     hello = Hello('t', 40e3, 1e6, 40, (*channels, current), tones, (0.25,) * len(tones))
-    return FluxStream(hello, SETUP, CHANNELS, *OPTIONS)
+    return FluxStream(hello, SETUP, CHANNELS, 0.02, rate_hz)
 
 
 class Listener:
@@ -210,7 +209,8 @@ class TestStream:
     def push(self, stream, k, late_ms=0.0, **options):
         """Push the block that began after k ms; it comes at its end, or later."""
         block = SampleBlock(k, 1000 * k, self.codes(k))
-        return stream.push(block, 10**12 + round(10**6 * (k + 1 + late_ms)), **options)
+        arrival_ns = 10**12 + round(10**6 * (k + 1 + late_ms))
+        return stream.push([block], [arrival_ns], **options)
 
     def frames(self, stream, blocks, edit=lambda codes: None, skip=(), ticks=lambda k: 1000 * k):
         """Frames of blocks of 1 ms, after a start that was answered at once."""
@@ -220,7 +220,8 @@ class TestStream:
             codes = self.codes(k)
             edit(codes)
             if k not in skip:
-                found += stream.push(SampleBlock(k, ticks(k), codes), 10**12 + 10**6 * (k + 1))
+                arrival_ns = 10**12 + 10**6 * (k + 1)
+                found += stream.push([SampleBlock(k, ticks(k), codes)], [arrival_ns])
         return found
 
     def test_flags(self):
@@ -261,7 +262,7 @@ class TestStream:
             codes = self.codes(k if k < 100 else k % 50)
             late_ns = 0 if k < 120 else 50_000_000
             arrival_ns = 10**12 + 10**6 * (k + 1) + late_ns
-            frames += stream.push(SampleBlock(k, 1000 * k, codes), arrival_ns)
+            frames += stream.push([SampleBlock(k, 1000 * k, codes)], [arrival_ns])
         assert [frame.repeats for frame in frames] == 5 * [False] + 15 * [True]
         assert all((frame.flags == STALE).all() for frame in frames[5:])
         assert frames[-1].host_ns == pytest.approx(10**12 + 390 * 10**6, abs=10**5)
@@ -311,23 +312,51 @@ class TestStream:
         )
         assert (stream.counters.windows, stream.counters.windows_skipped) == (2, 3)
 
+    @pytest.mark.parametrize('rate_hz', [50.0, 37.0, 400.0])
+    def test_runs_of_blocks_give_what_single_blocks_give(self, rate_hz):
+        """Whatever is lost, comes twice, is late or has wrong ticks."""
+        order = [k for k in range(400) if k not in {31, 90} and not 120 < k < 160]
+        order[200:200] = [order[199], order[150]]
+        wrong = {300: 70_000, 301: 70_000}
+        blocks = [SampleBlock(k, 1000 * k + wrong.get(k, 0), self.codes(k)) for k in order]
+        read_ns = [10**12 + 10**6 * (3 * (k // 3) + 3 + 20 * (220 < k < 250)) for k in order]
+        arrivals_ns = np.maximum.accumulate(read_ns).tolist()
+
+        def found(most):
+            stream, done, frames = new_stream(rate_hz=rate_hz), 0, []
+            stream.restart(10**12)
+            while done < len(blocks):
+                count = stream.run_length(blocks[done : done + most])
+                run = slice(done, done + count)
+                frames += stream.push(blocks[run], arrivals_ns[run])
+                done += count
+            told = [(f.tool.flux.tobytes(), f.flags.tobytes(), f.repeats) for f in frames]
+            faults = stream.clock.jumps, stream.waiting.withheld, stream.ticks.disagreements
+            return told, faults, vars(stream.counters), [f.host_ns for f in frames]
+
+        *single, stamps = found(1)
+        *runs, others = found(30)
+        assert runs == single and len(stamps) > 5
+        assert others == pytest.approx(stamps, abs=2000)
+
     def test_a_restarted_stream_has_new_stamps(self):
         stream = new_stream()
         assert len(self.frames(stream, 110)) == 5
         frames = []
         for k in range(40):
             block = SampleBlock(k, 7000 + 1000 * k, self.codes(500 + k))
-            frames += stream.push(block, 2 * 10**12 + 10**6 * (k + 1))
+            frames += stream.push([block], [2 * 10**12 + 10**6 * (k + 1)])
         assert stream.counters.restarts == 1 and not frames, 'nothing bounds the new line yet'
         stream.answered(2 * 10**12 + 39 * 10**6)
-        (frame, _) = stream.push(SampleBlock(40, 47_000, self.codes(540)), 2 * 10**12 + 41 * 10**6)
+        block = SampleBlock(40, 47_000, self.codes(540))
+        (frame, _) = stream.push([block], [2 * 10**12 + 41 * 10**6])
         assert frame.host_ns == pytest.approx(2 * 10**12 + 10**7, abs=10**5)
 
     def test_what_does_not_fit_the_setup_is_named_left_alone_or_refused(self):
         stream = new_stream(NUMBERS[:-3])
         assert [s.name for s in stream.missing] == ['ref/14/1', 'ref/15/0', 'ref/15/1']
         assert len(stream.sensors) == 38
-        assert stream.push(SampleBlock(0, 0, self.codes(columns=5)), 1) == []
+        assert stream.push([SampleBlock(0, 0, self.codes(columns=5))], [1]) == []
         with pytest.raises(SetupError, match='none of the channels'):
             new_stream([500])
         with pytest.raises(SetupError, match='drives 2 coils'):

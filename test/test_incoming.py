@@ -13,8 +13,9 @@ from anser_ros.nodes.pose_output import PackedMessage
 from anser_ros.nodes.runtime import incoming, qos
 from anser_ros.nodes.runtime.incoming import opened
 from anser_ros.nodes.runtime.node import AnserNode
+from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.wire.cdr import cloud_bytes, string_bytes
-from anser_ros.wire.points import FLOAT32, MOST_POINTS, flux_fields
+from anser_ros.wire.points import FLOAT32, MOST_POINTS, FluxPoints, flux_fields
 
 
 def cloud(width=1, count=None, size=None):
@@ -90,3 +91,18 @@ def test_a_packed_message_is_the_message(ros, kind, frame_id):
         if count > 7:
             told.pose.covariance = np.array(numbers[7:])
         assert deserialize_message(packer.packed(stamp_ns, *numbers), message_type) == told
+
+
+@pytest.mark.parametrize('frame_id', ['', 'fg', 'boards/left/fg'])
+def test_packed_fluxes_are_the_message(ros, frame_id):
+    """Whichever topic a window is of, and whether its sensors move."""
+    cloud = FluxCloud(frame_id)
+    rng = np.random.default_rng(0)
+    for seed, (sensors, emitters) in enumerate([(9, 8), (32, 8), (9, 8), (1, 3)]):
+        flux = rng.normal(size=(sensors, emitters)) + 1j * rng.normal(size=(sensors, emitters))
+        place = rng.normal(size=(sensors, 3)) * (np.nan if seed == 2 else 1.0)
+        channel = np.arange(sensors)
+        points = FluxPoints(channel, channel % 5, 1e-7 * flux, place, place)
+        told = cloud.message(points, 1_795_419_147_667_697_521 + seed)
+        packed = cloud.packed(points, 1_795_419_147_667_697_521 + seed)
+        assert deserialize_message(packed, PointCloud2) == told

@@ -335,6 +335,30 @@ def test_control_asks_again_after_a_hello_that_contradicts_a_good_one():
     assert len(asked(HELLO, 5 * SECOND, 100)) == 4 * 60, 'a minute after the last change'
 
 
+def test_bytes_gather_only_while_no_window_is_due(monkeypatch):
+    """The last block of a window is waited for at the line, however many are wanted."""
+    rests = []
+    monkeypatch.setattr(time, 'sleep', rests.append)
+    port = ControlUnitPort('nowhere')
+    record = Record(SampleBlock(0, 0, np.zeros((1, 2), np.int16)))
+    port.want(20)
+    port._take([record], 0)
+    port._rest(time.monotonic_ns())
+    assert sum(rests) == 0, 'the length of a block is not known'
+    port.want(20, 1e-3)
+    for held, rest_s in ((17, 2e-3), (18, 1e-3), (19, 0.0), (20, 0.0)):
+        rests.clear()
+        port._take([record] * (held - port._held_blocks), 0)
+        port._rest(time.monotonic_ns())
+        assert sum(rests) == pytest.approx(rest_s, abs=5e-4), held
+    port._take([record], 0)
+    port._rest(time.monotonic_ns())
+    assert rests[-1] == pytest.approx(3e-3, abs=5e-4), 'arrivals stay punctual'
+    port._take([Record(SampleBlock(0, 0, np.zeros((3000, 2), np.int16)))], 0)
+    port._rest(time.monotonic_ns())
+    assert rests[-1] == pytest.approx(1e-3, abs=5e-4), 'the line holds no more bytes'
+
+
 def test_blocks_that_are_there_already_are_not_waited_for():
     """A receiver that worked while the last block of its window came gets it at once."""
     port = ControlUnitPort('nowhere')

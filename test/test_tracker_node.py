@@ -1,6 +1,7 @@
 """The node tracker over DDS: poses, states, parameters, and a recorded session."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -154,7 +155,8 @@ def test_transforms_where_they_are_installed(tracker, monkeypatch):
     """Stands in for tf2_msgs, which the wheels don't have."""
     sent = []
     monkeypatch.setattr(pose_output, 'TFMessage', lambda transforms: list(transforms))
-    tracker.node._transforms = type('Publisher', (), {'publish': staticmethod(sent.append)})
+    publisher = SimpleNamespace(publish=sent.append, get_subscription_count=lambda: 1)
+    tracker.node._transforms = publisher
     rng = np.random.default_rng(7)
     ready(tracker)
     position, rotation = random_pose(rng)

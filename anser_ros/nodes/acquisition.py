@@ -7,7 +7,9 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
@@ -204,22 +206,23 @@ class Acquisition(AnserNode):
             self._control.reset()
             self._drop_stream()
             return
-        for record, arrival_ns in zip(batch.records, batch.arrivals_ns, strict=True):
-            self._control.take(record, arrival_ns)
-            self._dispatch(record, arrival_ns)
-        port.want(1 if self._stream is None else self._stream.blocks_wanted)
+        pairs = zip(batch.records, batch.arrivals_ns, strict=True)
+        for is_block, group in groupby(
+            pairs, lambda pair: isinstance(pair[0].payload, SampleBlock)
+        ):
+            records, arrivals_ns = zip(*group, strict=True)
+            for record, arrival_ns in zip(records, arrivals_ns, strict=True):
+                self._control.take(record, arrival_ns)
+                if not is_block:
+                    self._dispatch(record)
+            if is_block and self._control.started:  # else they are left over in a buffer
+                self._take_blocks([record.payload for record in records], arrivals_ns)
+        stream = self._stream
+        port.want(*(1, 0.0) if stream is None else (stream.blocks_wanted, stream.block_s))
 
-    def _dispatch(self, record: Record, arrival_ns: int) -> None:
+    def _dispatch(self, record: Record) -> None:
         payload = record.payload
-        # Before the start they are left over in a buffer from before the connection.
-        if isinstance(payload, SampleBlock) and self._control.started:
-            if self._rebuild:
-                self._drop_stream()
-            if self._stream is None and not self._refusal:
-                self._make_stream()
-            if self._stream is not None:
-                self._take_block(self._stream, payload, arrival_ns)
-        elif isinstance(payload, Hello):
+        if isinstance(payload, Hello):
             if payload != self._hello:
                 self._drop_stream()
             self._hello = payload
@@ -228,15 +231,23 @@ class Acquisition(AnserNode):
         elif isinstance(payload, Reply) and payload.code is ReplyCode.OK:
             self._take_answer(payload.command, record.tag)
 
-    def _take_block(self, stream: FluxStream, block: SampleBlock, arrival_ns: int) -> None:
-        """Publish the frames that a block completes; those late beyond hope give way to newer."""
-        begin_ns = time.monotonic_ns()
-        skips = self._backlog.is_hopeless((begin_ns - arrival_ns) / 1e9)
-        for frame in stream.push(block, arrival_ns, skips=skips):
-            self._publish_frame(stream, frame, arrival_ns)
-            now_ns = time.monotonic_ns()
-            self._backlog.worked((now_ns - begin_ns) / 1e9)
-            begin_ns = now_ns
+    def _take_blocks(self, blocks: Sequence[SampleBlock], arrivals_ns: Sequence[int]) -> None:
+        """Publish the frames that blocks complete; those late beyond hope give way to newer."""
+        if self._rebuild:
+            self._drop_stream()
+        if self._stream is None and not self._refusal:
+            self._make_stream()
+        stream, done = self._stream, 0
+        while stream is not None and done < len(blocks):
+            begin_ns = time.monotonic_ns()
+            run = slice(done, done + stream.run_length(blocks[done:]))
+            done, arrival_ns = run.stop, arrivals_ns[run.stop - 1]
+            skips = self._backlog.is_hopeless((begin_ns - arrival_ns) / 1e9)
+            for frame in stream.push(blocks[run], arrivals_ns[run], skips=skips):
+                self._publish_frame(stream, frame, arrival_ns)
+                now_ns = time.monotonic_ns()
+                self._backlog.worked((now_ns - begin_ns) / 1e9)
+                begin_ns = now_ns
 
     def _take_answer(self, command: int, tag: int) -> None:
         """Take from an answer that what follows it was sampled after the command had left."""
@@ -271,7 +282,7 @@ class Acquisition(AnserNode):
         except AnserError as error:
             self._refusal = str(error)
             raise
-        self._accuracy.reset()
+        self._accuracy = MeasuredAccuracy()
         self._backlog = Backlog(1 / self._stream.rate_hz)
         if self._start_sent_ns is not None:
             self._stream.clock.bound(0, self._start_sent_ns)
@@ -294,10 +305,10 @@ class Acquisition(AnserNode):
         # The system's clock may be set while we run; the offset is taken again for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
         self._hand_over_flux(self._tool_publisher, frame.tool, stamp_ns)
-        if len(frame.tool.channel):
-            self._tool_publisher.publish(self._cloud.message(frame.tool, stamp_ns))
-        if len(frame.reference.channel):
-            self._reference_publisher.publish(self._cloud.message(frame.reference, stamp_ns))
+        publishers = self._tool_publisher, self._reference_publisher
+        for publisher, points in zip(publishers, (frame.tool, frame.reference), strict=True):
+            if len(points.channel) and publisher.get_subscription_count():
+                publisher.publish(self._cloud.packed(points, stamp_ns))
         # The model is refitted once poses and messages are on their way, if no frame waits.
         age_s = (time.monotonic_ns() - arrival_ns) / 1e9
         if self.hands_over and self._backlog.gives_way(age_s):

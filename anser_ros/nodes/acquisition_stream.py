@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 
@@ -108,11 +108,11 @@ class FluxStream:
     """Turns samples into fluxes, for one hello of the control unit.
 
     ``sensors`` are those of the setup that the unit has a channel for, tools first, ``missing``
-    the others; ``rate_hz`` is windows a second, a whole number of samples apart; ``clock`` and
-    ``ticks`` are host time of the samples, and what the device's own clock says beside them;
-    ``waiting`` are frames whose stamps are not confirmed yet. Raises `SetupError` when the unit
-    has none of the channels, or other emitters than the setup, and `ParameterError` when the
-    window cannot be demodulated.
+    the others; ``rate_hz`` is windows a second, a whole number of samples apart; ``block_s`` is
+    the length of a block, s; ``clock`` and ``ticks`` are host time of the samples, and what the
+    device's own clock says beside them; ``waiting`` are frames whose stamps are not confirmed yet.
+    Raises `SetupError` when the unit has none of the channels, or other emitters than the setup,
+    and `ParameterError` when the window cannot be demodulated.
     """
 
     def __init__(
@@ -142,12 +142,14 @@ class FluxStream:
         self.rate_hz = rate / hop
         self._sample_rate_hz = rate
         self._block_samples = hello.block_samples
+        self.block_s = hello.block_samples / rate
         self._demodulator = Demodulator(rate, self.tones_hz, window, mains_hz=mains_hz or None)
         self._current_column = [c.kind for c in hello.channels].index(ChannelKind.CURRENT)
         self._columns = np.array([columns[s.channel] for s in self.sensors])
         self._converter = self._converter_of(hello, calibration)
         self._rates = None if self._demodulator.follows_motion else FluxRates()
         self._watch = RepetitionWatch(len(hello.channels), rate, self.tones_hz)
+        self._repeats = False
         self.ticks = TickCheck(rate, hello.tick_hz)
         self._cutter = WindowCutter(window, hop, self._watch, self.ticks)
         self.counters = self._cutter.counters
@@ -176,22 +178,42 @@ class FluxStream:
         """Take in that the device has just answered a command that was sent at a host time."""
         self.clock.bound(self._cutter.end_sample + self._block_samples, sent_ns)
 
-    def push(self, block: SampleBlock, arrival_ns: int, *, skips: bool = False) -> list[FluxFrame]:
-        """Take a block and return the frames that are complete and whose stamps are good.
+    def run_length(self, blocks: Sequence[SampleBlock]) -> int:
+        """Return how many blocks to push at once: they follow, up to the end of a window."""
+        first, shape = blocks[0].sequence, (self._block_samples, self._cutter.columns)
+        if not self._cutter.expects(first):
+            return 1
+        for rank, block in enumerate(blocks[: self.blocks_wanted]):
+            if block.sequence != first + rank or block.codes.shape != shape:
+                return max(rank, 1)
+        return min(len(blocks), self.blocks_wanted)
+
+    def push(
+        self, blocks: Sequence[SampleBlock], arrivals_ns: Sequence[int], *, skips: bool = False
+    ) -> list[FluxFrame]:
+        """Take a run of blocks and return the frames that are complete and have good stamps.
 
         A frame may wait for its stamp, and be withheld; see `WaitingFrames`. If it ``skips``, a
         complete window is only counted, in favour of newer ones.
         """
-        if block.codes.shape[1] != self._cutter.columns:
+        first, arrival_ns = blocks[0], arrivals_ns[-1]
+        if first.codes.shape[1] != self._cutter.columns:
             return []
-        restarts, before = self.counters.restarts, self._cutter.end_sample
-        windows = self._cutter.push(block.sequence, block.timestamp_ticks, block.codes)
+        restarts, before, repeated = self.counters.restarts, self._cutter.end_sample, self._repeats
+        codes = np.concatenate([b.codes for b in blocks]) if len(blocks) > 1 else first.codes
+        ticks = [block.timestamp_ticks for block in blocks]
+        windows = self._cutter.push(first.sequence, ticks, codes)
+        self._repeats = self._watch.repeats
         if self.counters.restarts != restarts:
             self.waiting.forget()
             self.clock.restart()
-        # What comes twice says nothing about now.
-        if self._cutter.end_sample != before and not self._watch.repeats:
-            self.clock.observe(self._cutter.end_sample, arrival_ns)
+        # What comes twice says nothing about now, and of blocks read together the newest says all.
+        newest = self._cutter.end_sample
+        for left in range(len(blocks) - 1, 0, -1):
+            if arrivals_ns[-left - 1] != arrivals_ns[-left] and not repeated:
+                self.clock.observe(newest - left * self._block_samples, arrivals_ns[-left - 1])
+        if newest != before and not self._repeats:
+            self.clock.observe(newest, arrival_ns)
         for window in windows:
             if skips:
                 self.counters.windows -= 1
@@ -284,13 +306,9 @@ _FACTOR = 2.0
 
 
 class MeasuredAccuracy:
-    """Follows the noise of the first fluxes, and the uncertainty of the stamps."""
+    """Follows the noise of a stream's first fluxes, and the uncertainty of its stamps."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Start again: the stream is another one."""
         self._noise_t: float | None = None
         self._begun_s = -math.inf
         self._stated_s = Accuracy.stamp_sigma_s

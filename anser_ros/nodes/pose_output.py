@@ -14,7 +14,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status
 from anser_ros.physics.rotations import quaternion_of_axis, quaternion_of_rotation
 from anser_ros.pose_states import FRAMES_IN, OK, STALE
-from anser_ros.stamps import SECOND_NS, is_live, set_stamp
+from anser_ros.stamps import SECOND_NS, is_live, pack_stamp, set_stamp
 from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.wire.setup import topic_of
 
@@ -35,10 +35,6 @@ class Tally:
     latest_s: float = -math.inf
 
 
-STAMP, STAMP_OFFSET = struct.Struct('<iI'), 4
-"""How and where the bytes of a message with a header have its stamp."""
-
-
 class PackedMessage:
     """Keeps the bytes of a message that begins with a header and ends with ``count`` doubles,
     which are published in half the time of a message.
@@ -51,7 +47,7 @@ class PackedMessage:
 
     def packed(self, stamp_ns: int, *numbers: float) -> bytes:
         """Return the message's bytes with a stamp, ns, and its numbers."""
-        STAMP.pack_into(self._bytes, STAMP_OFFSET, *divmod(stamp_ns, SECOND_NS))
+        pack_stamp(self._bytes, stamp_ns)
         self._numbers.pack_into(self._bytes, self._offset, *numbers)
         return bytes(self._bytes)
 
@@ -70,9 +66,9 @@ class PoseTopic:
         board = f'{prefix}{frame_id}'
         plain.header.frame_id = full.header.frame_id = board
         self._plain, self._full = PackedMessage(plain, 7), PackedMessage(full, 7 + 36)
-        self.transform = TransformStamped()
-        self.transform.header.frame_id = board
-        self.transform.child_frame_id = f'{prefix}{stem}'
+        self._transform = TransformStamped()
+        self._transform.header.frame_id = board
+        self._transform.child_frame_id = f'{prefix}{stem}'
         self._values: tuple[float, ...] = ()
         self.estimate: PoseEstimate | None = None
         self.states: Counter[str] = Counter()
@@ -96,7 +92,10 @@ class PoseTopic:
         node.destroy_publisher(self._uncertain)
 
     def publish(self, estimate: PoseEstimate) -> None:
-        """Publish a good estimate, and nothing else, as other topics wait for it."""
+        """Publish a good estimate, and nothing else, as other topics wait for it.
+
+        What nobody subscribes to is not published: who comes later gets none of it anyway.
+        """
         if estimate.state != OK:
             return
         if estimate.rotation is None:
@@ -104,10 +103,13 @@ class PoseTopic:
         else:
             x, y, z, w = quaternion_of_rotation(estimate.rotation)
         self._values = *estimate.position.tolist(), x, y, z, w
-        self._pose.publish(self._plain.packed(estimate.stamp_ns, *self._values))
+        if self._pose.get_subscription_count():
+            self._pose.publish(self._plain.packed(estimate.stamp_ns, *self._values))
 
     def note(self, estimate: PoseEstimate, now_ns: int) -> bool:
-        """Count an estimate of a time, ns; return whether the state is another than before."""
+        """Count an estimate of a time, ns, and publish a good one once more, with its covariance;
+        return whether the state is another than before.
+        """
         changed = self.estimate is None or self.estimate.state != estimate.state
         self.estimate = estimate
         self.states[estimate.state] += 1
@@ -117,17 +119,18 @@ class PoseTopic:
             self.tally.poses += 1
             if is_live(estimate.stamp_ns, now_ns) and estimate.stamp_ns <= now_ns:
                 self.tally.latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
+            if self._uncertain.get_subscription_count():
+                numbers = *self._values, *estimate.covariance.ravel().tolist()
+                self._uncertain.publish(self._full.packed(estimate.stamp_ns, *numbers))
         return changed
 
-    def publish_covariance(self) -> None:
-        """Publish the good pose just noted once more, with its covariance."""
-        if self.estimate is None or self.estimate.state != OK:
-            return
-        stamp_ns, covariance = self.estimate.stamp_ns, self.estimate.covariance.ravel().tolist()
-        self._uncertain.publish(self._full.packed(stamp_ns, *self._values, *covariance))
-        set_stamp(self.transform.header.stamp, stamp_ns)
-        place, turn = self.transform.transform.translation, self.transform.transform.rotation
+    def transform(self, stamp_ns: int) -> TransformStamped:
+        """Return the transform of the good pose just published, which had a stamp, ns."""
+        moved = self._transform
+        set_stamp(moved.header.stamp, stamp_ns)
+        place, turn = moved.transform.translation, moved.transform.rotation
         place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = self._values
+        return moved
 
     def state(self, stale_after_s: float) -> tuple[str, str]:
         """Return the state as it is now, silence included, and its reason."""
@@ -167,6 +170,6 @@ def transform_publisher(node: Any) -> Any:
     return None if TFMessage is None else node.create_publisher(TFMessage, '/tf', qos.EVENTS)
 
 
-def transform_message(topics: list[PoseTopic]) -> Any:
+def transform_message(topics: list[PoseTopic], stamp_ns: int) -> Any:
     """Return one /tf message with the transforms of these topics."""
-    return TFMessage(transforms=[topic.transform for topic in topics])
+    return TFMessage(transforms=[topic.transform(stamp_ns) for topic in topics])

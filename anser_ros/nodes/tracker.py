@@ -395,11 +395,10 @@ class TrackerNode(AnserNode):
         for topic, estimate in found:
             topic.publish(estimate)
         changed = [topic.note(estimate, now_ns) for topic, estimate in found]
-        for topic, _ in found:
-            topic.publish_covariance()
         moved = [topic for topic, estimate in found if estimate.state == OK]
-        if self._transforms is not None and moved:
-            self._transforms.publish(transform_message(moved))
+        tf = self._transforms
+        if moved and tf is not None and tf.get_subscription_count():
+            tf.publish(transform_message(moved, found[0][1].stamp_ns))
         return any(changed)
 
     # What is reported ---------------------------------------------------------------------

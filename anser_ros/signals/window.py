@@ -6,6 +6,7 @@ blocks were lost.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,8 +67,11 @@ class TickCheck:
             return
         since, from_ticks = self._reference
         elapsed = sample - since
-        advance = self._advance(from_ticks, ticks, elapsed)
-        if abs(advance - elapsed) > _SLACK_SAMPLES + _SLACK_SHARE * elapsed:
+        slack = _SLACK_SAMPLES + _SLACK_SHARE * elapsed
+        advance = (ticks - from_ticks) * self._per_tick
+        if abs(advance - elapsed) > slack:
+            advance = self._advance(from_ticks, ticks, elapsed)
+        if abs(advance - elapsed) > slack:
             self._disagree(sample, ticks, advance, elapsed)
             self._begin(sample, ticks)
         elif elapsed > _REFERENCE_S * self._rate_hz:
@@ -195,33 +199,44 @@ class WindowCutter:
         """Return how many samples the next window still lacks."""
         return self._until_next
 
-    def push(self, sequence: int, timestamp_ticks: int, codes: NDArray[np.int16]) -> list[Window]:
+    def expects(self, sequence: int) -> bool:
+        """Return whether a block of this number follows on the newest one."""
+        return sequence == self._expected
+
+    def push(
+        self, sequence: int, timestamp_ticks: int | Sequence[int], codes: NDArray[np.int16]
+    ) -> list[Window]:
         """Add a block of samples (n, C) and return the windows that it completes.
 
-        ``sequence`` is its number modulo 2^32, the ticks are those of its first sample. Raises
-        `ParameterError` when the block has another number of channels.
+        ``sequence`` is its number modulo 2^32, the ticks are those of its first sample. Several
+        blocks of one length, of which the first is expected and the others follow, are added at
+        once by the ticks of each. Raises `ParameterError` when the block has another number of
+        channels.
         """
         if codes.shape[1] != self._codes.shape[1]:
             raise ParameterError(
                 f'a block of {codes.shape[1]} channels in a stream of {self._codes.shape[1]}'
             )
-        missing = self._missing_blocks(sequence, timestamp_ticks, codes) * len(codes)
+        ticks = (timestamp_ticks,) if isinstance(timestamp_ticks, int) else timestamp_ticks
+        block = len(codes) // len(ticks)
+        missing = self._missing_blocks(sequence, ticks[0], codes) * block
         if missing < 0:
             self.counters.duplicate_blocks += 1
             return []
         if self._expected is None:
-            self.end_sample = self._begin_sample = sequence * len(codes)
+            self.end_sample = self._begin_sample = sequence * block
         first = self.end_sample + missing
-        self._expected = (sequence + 1) % _SEQUENCES
+        self._expected = (sequence + len(ticks)) % _SEQUENCES
         windows: list[Window] = []
         if missing:
             self.counters.missing_samples += missing
             self._watch.skip(missing)
-            self._ticks.take_after_hole(first, timestamp_ticks)
+            self._ticks.take_after_hole(first, ticks[0])
             skipped = self._skip_whole_windows(missing)
             windows += self._advance(None, missing - skipped, first - missing + skipped)
         else:
-            self._ticks.take(first, timestamp_ticks)
+            for rank, each in enumerate(ticks):
+                self._ticks.take(first + rank * block, each)
         self._watch.take(codes)
         self.end_sample = first + len(codes)
         return windows + self._advance(codes, len(codes), first)

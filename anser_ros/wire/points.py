@@ -6,6 +6,7 @@ name and offset, so others may lie between them; the uncertainty has one layout 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -171,6 +172,7 @@ def phasor_names(stem: str, n_emitters: int) -> list[str]:
     return [f'{stem}{k}_{part}' for k in range(n_emitters) for part in ('re', 'im')]
 
 
+@cache
 def flux_fields(n_emitters: int) -> tuple[list[PointFieldTuple], int]:
     """Return the fields and point_step of the flux layout (92 bytes with eight emitters)."""
     geometry = [(name, FLOAT32) for name in ('x', 'y', 'z', 'nx', 'ny', 'nz')]

@@ -35,6 +35,11 @@ _WRITE_TIMEOUT_S = 0.2
 """Longest time that a write may take, s; commands are short, so that a longer one is a fault."""
 _READ_BYTES = 1 << 16
 """Largest number of bytes of one read: more than a line of 12 Mbaud brings in 50 ms."""
+_LONGEST_REST_S, _GATHERED_BYTES = 3e-3, 12_000
+"""Longest time, s, that blocks are left to gather while no window is due, and most bytes: at 4 ms
+arrivals would not be punctual; a terminal holds 4 kB and its driver about 16 kB more."""
+_TERMINAL_BYTES = 4095
+"""Most bytes that a terminal hands out at a time: after fewer there are no more."""
 OPEN_FAILURES = {
     errno.EAGAIN: 'another program uses it',
     errno.EBUSY: 'another program uses it',
@@ -73,7 +78,8 @@ def receiver_of(port: serial.SerialBase) -> Callable[[], bytes]:
     """Return a function that waits for bytes and takes all there are; empty when time is over.
 
     pyserial's own read costs several system calls and an extra byte for every wake-up. A terminal
-    hands out 4 kB at a time; all of it is taken before any is looked at.
+    hands out 4 kB at a time; all of it is taken before any is looked at. pyserial has made the
+    descriptor one whose reads don't wait.
     """
     try:
         descriptor = port.fileno()
@@ -86,11 +92,11 @@ def receiver_of(port: serial.SerialBase) -> Callable[[], bytes]:
         data = os.read(descriptor, _READ_BYTES)
         if not data:
             raise serial.SerialException('the device is gone')
-        while len(data) < _READ_BYTES and select.select([descriptor], [], [], 0.0)[0]:
-            more = os.read(descriptor, _READ_BYTES)
-            if not more:
-                break  # the next read will find it gone
-            data += more
+        piece = data
+        with contextlib.suppress(BlockingIOError):
+            while len(piece) >= _TERMINAL_BYTES and len(data) < _READ_BYTES:
+                piece = os.read(descriptor, _READ_BYTES)
+                data += piece
         return data
 
     return receive
@@ -175,7 +181,7 @@ class ControlUnitPort:
         self.reason = ''
         self._baud = baud
         self._silence_s = silence_s
-        self.blocks_wanted = 1
+        self.blocks_wanted, self._block_s = 1, 0.0
         self._queue_blocks = queue_blocks
         self._holding = threading.RLock()
         self._held: list[Record] = []
@@ -210,10 +216,12 @@ class ControlUnitPort:
         if self._thread is not None:
             self._thread.join(timeout_s)
 
-    def want(self, blocks: int) -> None:
-        """Set how many blocks to collect; those that are there already are not waited for."""
+    def want(self, blocks: int, block_s: float = 0.0) -> None:
+        """Set how many blocks to collect, and their length, s, where they need not be read one by
+        one; those that are there already are not waited for.
+        """
         with self._holding:
-            self.blocks_wanted = blocks
+            self.blocks_wanted, self._block_s = blocks, block_s
             if self._held_blocks >= blocks:
                 self._hand_over()
 
@@ -310,6 +318,7 @@ class ControlUnitPort:
                     last_record, garbage_bytes = now, 0
                     self.state = PortState.RECEIVING
                     self._take(records, arrival_ns)
+                    self._rest(arrival_ns)
             elif self._held:
                 self._hand_over()
             elif now - last_byte > self._silence_s:
@@ -320,6 +329,16 @@ class ControlUnitPort:
                 self.counters.wrong_baud += 1
                 self.state = PortState.WRONG_BAUD
                 last_record, garbage_bytes = now, 0
+
+    def _rest(self, arrival_ns: int) -> None:
+        """Let blocks gather behind those that are held, up to the last that is wanted."""
+        newest = self._held[-1:]
+        if newest and isinstance(block := newest[0].payload, SampleBlock):
+            left = self.blocks_wanted - self._held_blocks - 1
+            rest_s = min(left, _GATHERED_BYTES / max(block.codes.nbytes, 1)) * self._block_s
+            rest_s = min(rest_s, _LONGEST_REST_S) - (time.monotonic_ns() - arrival_ns) / 1e9
+            if rest_s > 0:
+                time.sleep(rest_s)
 
     def _take(self, records: list[Record], arrival_ns: int) -> None:
         """Hold blocks until there are as many as wanted; anything else goes on at once."""

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 
 from anser_ros.effects.correction import needs_correction
@@ -15,7 +16,7 @@ from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Count
 from anser_ros.nodes.runtime.handover import HandedFlux
-from anser_ros.stamps import SECOND_NS, set_stamp, stamp_of
+from anser_ros.stamps import SECOND_NS, pack_stamp, set_stamp, stamp_of
 from anser_ros.wire.points import (
     DipolePoints,
     FluxPoints,
@@ -67,17 +68,38 @@ class CloudMaker:
 
 
 class FluxCloud:
-    """Makes the messages of one flux topic; their fields are built once for all of them."""
+    """Makes the messages of flux topics; their fields are built once for all of them."""
 
     def __init__(self, frame_id: str) -> None:
         self._frame_id, self._maker = frame_id, CloudMaker()
+        # By the shape of the fluxes: the bytes of a message, and where those of its points begin.
+        self._packed: dict[tuple[int, ...], tuple[bytearray, int]] = {}
 
     def message(self, points: FluxPoints, stamp_ns: int) -> PointCloud2:
         """Return the message of a window by its middle, ns of the ROS clock, a row per sensor."""
         message = self._maker.message(encode_flux(points), self._frame_id, stamp_ns)
-        flux, place = points.flux, points.position
-        message.is_dense = not ((flux != flux).any() or (place != place).any())  # no NaN
+        message.is_dense = _is_dense(points)
         return message
+
+    def packed(self, points: FluxPoints, stamp_ns: int) -> bytes:
+        """Return the bytes of that message, which are published in a fraction of the time."""
+        shape = points.flux.shape
+        if shape not in self._packed:
+            told = self.message(points, stamp_ns)
+            told.data = array.array('B', mark := b'\xff' * len(told.data))
+            whole = bytearray(serialize_message(told))
+            self._packed[shape] = whole, whole.rindex(mark)
+        whole, begin = self._packed[shape]
+        data = encode_flux(points)[2]
+        end = begin + len(data)
+        whole[begin:end], whole[end] = data, _is_dense(points)
+        pack_stamp(whole, stamp_ns)
+        return bytes(whole)
+
+
+def _is_dense(points: FluxPoints) -> bool:
+    flux, place = points.flux, points.position
+    return not ((flux != flux).any() or (place != place).any())  # no NaN
 
 
 def layout_of(message: PointCloud2) -> tuple[list[PointFieldTuple], int, int, Any]:
