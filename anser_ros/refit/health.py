@@ -35,15 +35,14 @@ def left_out(bank: Bank, seen: FrameEvidence, hypothesis: int) -> tuple[Array, A
     freedom; then measured minus predicted (S, K, 2), in noise units.
     """
     precision, _ = bank.precision(seen.noise)
-    n, tops = len(bank.rows), seen.strength[hypothesis].argmax(axis=1).tolist()
-    scaled = seen.projected[hypothesis] * precision[hypothesis, tops].T.astype(np.float64)
-    weighted = bank.analysis[hypothesis * n : (hypothesis + 1) * n].T @ scaled
-    weighted = weighted.reshape(-1, bank.width, 2)
-    residual = np.empty_like(weighted)
+    tops = seen.strength[hypothesis].argmax(axis=1).tolist()
+    scaled = seen.projected[hypothesis].T * precision[hypothesis, tops].astype(np.float64)
+    weighted = (scaled @ bank.analysis_of(hypothesis)).reshape(2, -1, bank.width)
+    residual = np.empty((*weighted.shape[1:], 2))
     for part, top in enumerate(tops):
         blocks = bank.coil_covariances(seen.noise, hypothesis, top)
-        residual[..., part] = (blocks @ weighted[..., part, None])[..., 0]
-    return (weighted * residual).sum(axis=(1, 2)), residual
+        residual[..., part] = np.einsum('skl,sl->sk', blocks, weighted[part])
+    return np.einsum('psk,skp->s', weighted, residual), residual
 
 
 def evidence_without(
@@ -246,9 +245,10 @@ class ReferenceWatch:
         if self._before is not None:
             self.excluded, self.reason, self._good = self._before
             self._before = None
-        if readable.sum() < least:
+        count = np.count_nonzero(readable)
+        if count < least:
             self._before = self.excluded.copy(), self.reason.copy(), self._good.copy()
-        for coil in np.flatnonzero(~readable):
+        for coil in np.flatnonzero(~readable) if count < self.count else ():
             self.excluded[coil], self.reason[coil], self._good[coil] = True, reasons[coil], 0
 
     @property
@@ -273,9 +273,14 @@ class ReferenceWatch:
         return np.where(out[:, None], np.nan, flux) if out.any() else flux
 
     @property
+    def used(self) -> int:
+        """Return the number of coils in use."""
+        return self.count - int(np.count_nonzero(self.excluded))
+
+    @property
     def is_outvoted(self) -> bool:
         """Return whether more coils disagree than are in use, so that either may be wrong."""
-        return self.reason.count(DISAGREES) > self.count - int(self.excluded.sum())
+        return self.reason.count(DISAGREES) > self.used
 
     def agreed(self, coil: int, agrees: bool) -> None:
         """Count a frame in which an excluded coil was compared."""

@@ -16,9 +16,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.frame import NoiseUnits
+from anser_ros.refit.frame import NoiseUnits, power_of
 from anser_ros.refit.health import FAULT_ODDS, FAULT_SCALES, left_out
-from anser_ros.refit.posterior import STRENGTHS, Bank, FrameEvidence, log_sum, over_strengths
+from anser_ros.refit.posterior import (
+    STRENGTHS,
+    Bank,
+    FrameEvidence,
+    log_sum,
+    median,
+    over_strengths,
+)
 from anser_ros.stamps import NANO
 
 Array = NDArray[np.float64]
@@ -58,6 +65,11 @@ class Jumps(NamedTuple):
     since_s: float
 
 
+def _where(rows: NDArray[np.bool_], new: ComplexArray, old: ComplexArray) -> ComplexArray:
+    """Return new values (S, K) in some rows (S,), the old ones in the others."""
+    return new if rows.all() else np.where(rows[:, None], new, old)
+
+
 class Courses:
     """Follows where each reference's change is on its way to, and how far those that jumped are
     off.
@@ -71,7 +83,7 @@ class Courses:
         self._last_ns = np.full(count, np.nan)
         self._step_ns = np.full(count, np.nan)
         # A jump in the middle of a window shows in two frames: what was read before both.
-        self._before = np.zeros((2, count, width), dtype=np.complex128)
+        self._before = self._last, self._last
         self._away = np.zeros((count, width), dtype=np.complex128)
         self._farthest = np.zeros(count)
         # All readings before the first of the present jumps, and when that was.
@@ -89,14 +101,16 @@ class Courses:
         steps = np.where((steps > 0.0) & (steps <= FARTHEST), steps, 0.0)
         known = np.isfinite(self._last_ns)
         variance = np.where(known, 1.0 + (1.0 + steps) ** 2 + steps**2, 1.0)
-        off = change - self._last - steps[:, None] * self._step
-        read = np.isfinite(change).all(axis=1)
+        step = change - self._last
+        off = step - steps[:, None] * self._step
+        read = np.isfinite(power_of(change))
         new = read & known
-        since_s = float(np.median(ahead_ns[new])) * NANO if new.any() else np.inf
-        self._step[new] = (change - self._last)[new]
+        since_s = median(ahead_ns[new]) * NANO if new.any() else np.inf
+        self._step = _where(new, step, self._step)
         self._step_ns = np.where(new, ahead_ns, np.where(read, np.nan, self._step_ns))
-        self._before[0, read], self._before[1, read] = self._before[1, read], self._last[read]
-        self._last[read] = change[read]
+        first, second = self._before
+        self._before = _where(read, second, first), _where(read, self._last, second)
+        self._last = _where(read, change, self._last)
         self._stamp_ns = float(stamp_ns)
         self._last_ns = np.where(read, self._stamp_ns, self._last_ns)
         return Jumps(off, np.sqrt(variance), since_s)
@@ -104,7 +118,7 @@ class Courses:
     def note(self, jumps: Jumps, coils: NDArray[np.int64]) -> None:
         """Remember which references have jumped: a jump is no part of a course."""
         if not self._is_away.any():
-            self._sound = self._before[0].copy()
+            self._sound = self._before[0]
             self._sound_ns = self._stamp_ns - 2.0 * jumps.since_s / NANO
         self._step_ns[coils] = np.nan
         first = ~self._is_away[coils]

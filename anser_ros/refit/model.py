@@ -35,6 +35,8 @@ NEGLIGIBLE = 0.01
 INFLATION_STEP = 1.2
 """Ratio of neighbouring factors by which modes are inflated. The steps keep modes, and what was
 computed for them, the same for many frames."""
+Rows = NDArray[np.int64] | slice
+"""Dipoles of a layer among those of a model."""
 Uncertainty = tuple[ComplexArray | None, float]
 """Modes and flux error of a model."""
 
@@ -85,9 +87,8 @@ class Assembly:
         """
         active = [h for h in np.flatnonzero(weights > NEGLIGIBLE).tolist() if h > 0]
         place = self._dipoles_of([bank.prior(h).layer for h in active])
-        moments = np.zeros((len(place.positions), len(drift)), dtype=complex)
-        moments[: len(self.base.moments)] = self.base.moments * (1.0 + drift)
-        scale = self._scale
+        moments, scale = np.zeros((len(place.positions), len(drift)), dtype=complex), self._scale
+        np.multiply(self.base.moments, 1.0 + drift, out=moments[: len(self.base.moments)])
         parts = {h: bank.moments(seen, h) * scale for h in active}
         if witness is not None:
             parts |= {h: part + witness.moments(bank, h) * scale for h, part in parts.items()}
@@ -110,16 +111,18 @@ class Assembly:
         if self._place is not None and [*self._place.rows] == [*layers]:
             return self._place
         positions, directions = [self.base.positions], [self.base.directions]
-        rows: dict[str, NDArray[np.int64]] = {}
+        rows: dict[str, Rows] = {}
         size = len(self.base.positions)
         for name, layer in layers.items():
             # A layer that uses dipoles of the model adds only the others.
-            own = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
-            added = len(layer.positions) - own.size
-            rows[name] = np.concatenate([own, np.arange(size, size + added)])
-            positions.append(layer.positions[own.size :])
-            directions.append(layer.directions[own.size :])
-            size += added
+            own = 0 if layer.rows is None else len(layer.rows)
+            end = size + len(layer.positions) - own
+            rows[name] = slice(size, end)
+            if layer.rows is not None:
+                rows[name] = np.concatenate([layer.rows, np.arange(size, end)])
+            positions.append(layer.positions[own:])
+            directions.append(layer.directions[own:])
+            size = end
         self._place = _Dipoles(np.concatenate(positions), np.concatenate(directions), rows)
         return self._place
 
@@ -218,7 +221,7 @@ class _Dipoles(NamedTuple):
 
     positions: Array
     directions: Array
-    rows: dict[str, NDArray[np.int64]]
+    rows: dict[str, Rows]
 
 
 @dataclass(frozen=True)
@@ -238,7 +241,7 @@ class _Change:
         """Dipoles N and emitters K of the model."""
         return len(self.place.positions), len(self.scale)
 
-    def rows(self, hypothesis: int) -> NDArray[np.int64]:
+    def rows(self, hypothesis: int) -> Rows:
         """Return the rows of the dipoles of a hypothesis' layer."""
         return self.place.rows[self.bank.prior(hypothesis).layer.name]
 

@@ -138,6 +138,7 @@ class Bank:
             self.spectra[hypothesis] = values
             self._set(hypothesis, basis)
         self._synthesis: dict[int, Single] = {}
+        self._last: tuple[int, Array] | None = None
         self._blocks: dict[tuple[float, int, int], Array] = {}
         self._tables: dict[float, tuple[Single, Array]] = {}
 
@@ -145,6 +146,7 @@ class Bank:
         n = len(self.rows)
         self.bases[hypothesis] = basis
         self.analysis[hypothesis * n : (hypothesis + 1) * n] = basis.T
+        self._last = None
         self._drift_seen[hypothesis] = self.drift.T @ basis
         self.log_prior[hypothesis] = self._chosen if self.is_slot[hypothesis] else 0.0
         self._name()
@@ -221,6 +223,17 @@ class Bank:
         )  # fmt: skip
         evidence += self.log_prior
         return FrameEvidence(projected, evidence, curve, strength, noise)
+
+    def analysis_of(self, hypothesis: int) -> Array:
+        """Return a hypothesis' rows of ``analysis`` (n, n) in double precision.
+
+        Those that were asked for last are kept: the best hypothesis is mostly the same as before.
+        """
+        if self._last is None or self._last[0] != hypothesis:
+            n = len(self.rows)
+            rows = self.analysis[hypothesis * n : (hypothesis + 1) * n]
+            self._last = hypothesis, rows.astype(np.float64)
+        return self._last[1]
 
     def coefficients(self, seen: FrameEvidence, hypothesis: int) -> Array:
         """Return the coordinates (n, 2) of the posterior mean in a hypothesis' eigenvectors."""
