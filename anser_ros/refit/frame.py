@@ -165,7 +165,8 @@ class BaselineCheck:
         power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
         # T^2, below which a coil is silent; NaN without a baseline.
         self._least = np.where(np.isfinite(power), QUIET**2 * power, np.nan)
-        self._lacks = np.isnan(self._least)
+        lacks = np.isnan(self._least)
+        self._lacks = lacks if lacks.any() else None
 
     def read(self, frame: Frame) -> tuple[NDArray[np.bool_], list[str]]:
         """Return which readings (S,) of a judged frame can be used, and why others cannot.
@@ -174,11 +175,11 @@ class BaselineCheck:
         """
         flux, codes = frame.flux, frame.codes
         is_silent = power_of(flux) < self._least
-        if not (self._lacks.any() or is_silent.any() or codes.any()):
-            return ~is_silent, []
         codes = np.where((codes == faults.GOOD) & is_silent, SILENT_CODE, codes)
-        codes = np.where(self._lacks, NO_BASELINE_CODE, codes)
-        return codes == faults.GOOD, [_REASONS[code] for code in codes.tolist()]
+        if self._lacks is not None:
+            codes = np.where(self._lacks, NO_BASELINE_CODE, codes)
+        readable = codes == faults.GOOD
+        return readable, [] if readable.all() else [_REASONS[code] for code in codes.tolist()]
 
 
 class NoiseUnits:

@@ -34,12 +34,9 @@ def left_out(bank: Bank, seen: FrameEvidence, hypothesis: int) -> tuple[Array, A
     First the squared distances (S,) in units of the prediction's covariance, of 2 K degrees of
     freedom; then measured minus predicted (S, K, 2), in noise units.
     """
-    precision, _ = bank.precision(seen.noise)
-    tops = seen.strength[hypothesis].argmax(axis=1).tolist()
-    scaled = seen.projected[hypothesis].T * precision[hypothesis, tops].astype(np.float64)
-    weighted = (scaled @ bank.analysis_of(hypothesis)).reshape(2, -1, bank.width)
+    weighted = bank.weighted(seen, hypothesis).reshape(2, -1, bank.width)
     residual = np.empty((*weighted.shape[1:], 2))
-    for part, top in enumerate(tops):
+    for part, top in enumerate(seen.strength[hypothesis].argmax(axis=1).tolist()):
         blocks = bank.coil_covariances(seen.noise, hypothesis, top)
         residual[..., part] = np.einsum('skl,sl->sk', blocks, weighted[part])
     return np.einsum('psk,skp->s', weighted, residual), residual

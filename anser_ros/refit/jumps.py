@@ -179,12 +179,14 @@ def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
     evidence, strength = over_strengths(seen.curve[..., :count])
     whole = np.zeros_like(seen.strength)
     whole[:, :, :count] = strength
-    return replace(seen, log_evidence=evidence + bank.log_prior, strength=whole)
+    evidence += bank.log_prior
+    best = int(evidence.argmax())
+    return replace(seen, log_evidence=evidence, strength=whole, best=best, weighted=None)
 
 
 def _is_predicted(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
     """Return whether each coil's jump is what the others predict, as when metal is put down."""
-    _, residual = left_out(bank, seen, int(seen.log_evidence.argmax()))
+    _, residual = left_out(bank, seen, seen.best)
     noise = LEAST_JUMP_POWER * jumps[0].size * seen.noise**2
     off = (residual**2).sum(axis=(1, 2))
     size = (jumps**2).sum(axis=(1, 2)) + ((jumps - residual) ** 2).sum(axis=(1, 2))
@@ -247,7 +249,7 @@ def faults_have_ended(
     parts = units.of(change)[readable] / spread
     bank = bank_of(readable)[0]
     seen = bank.evaluate(parts.reshape(-1, 2), level)
-    mean, variance = bank.drifts(seen, int(seen.log_evidence.argmax()))
+    mean, variance = bank.drifts(seen, seen.best)
     step = np.hypot(*mean.T) + SURE * np.sqrt(variance.max(axis=1))
     if (spread * drift * step > COMMON).any():
         return False
@@ -257,7 +259,7 @@ def faults_have_ended(
 
 def _is_common_gain(bank: Bank, seen: FrameEvidence, jumps: Array, drift: float) -> bool:
     """Return whether all emitters have stepped alike, which is the references' doing."""
-    mean, _ = bank.drifts(seen, int(seen.log_evidence.argmax()))
+    mean, _ = bank.drifts(seen, seen.best)
     step = drift * (mean @ np.array([1.0, 1.0j]))
     left = jumps.reshape(-1, 2) - bank.drift @ mean
     explained = float((left**2).sum()) < UNPREDICTED * float((jumps**2).sum())

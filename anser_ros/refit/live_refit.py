@@ -109,7 +109,7 @@ class LiveRefit:
         bank, slots = self._bank()
         readings = np.zeros((len(bank.rows), 2))
         seen = bank.evaluate(readings, 1.0)
-        left_out(bank, seen, int(seen.log_evidence.argmax()))
+        left_out(bank, seen, seen.best)
         evidence_without(bank, seen, np.arange(1))
         slots.warm_up(readings, 1.0)
         weights = np.zeros(len(bank.names))
@@ -238,8 +238,7 @@ class LiveRefit:
             used = values[coils].reshape(-1, 2)
             slots.fill(used, noise, stamp_ns)
             seen = bank.evaluate(used, noise)
-            best = int(seen.log_evidence.argmax())
-            self._distance, self._residual = left_out(bank, seen, best)
+            self._distance, self._residual = left_out(bank, seen, seen.best)
             if len(coils) <= self.settings.min_references:
                 return bank, seen
             power = np.einsum('ij,ij->i', *[used.reshape(len(coils), -1)] * 2) / noise**2
@@ -262,7 +261,7 @@ class LiveRefit:
         """Readmit excluded coils that agree with the others again."""
         if self._watch.used == self._watch.count:
             return
-        best, k = int(seen.log_evidence.argmax()), bank.width
+        best, k = seen.best, bank.width
         for coil in np.flatnonzero(self._watch.excluded & readable):
             rows = coil * k + np.arange(k)
             distance = distance_of(bank, seen, best, rows, values[coil], level)

@@ -85,7 +85,7 @@ class Assembly:
         the emitters' strength; ``typical`` is the left-out chi-square per degree of freedom of
         the typical coil. A ``witness`` knows the hypotheses' errors from tools.
         """
-        active = [h for h in np.flatnonzero(weights > NEGLIGIBLE).tolist() if h > 0]
+        active = [h for h, w in enumerate(weights.tolist()) if h > 0 and w > NEGLIGIBLE]
         place = self._dipoles_of([bank.prior(h).layer for h in active])
         moments, scale = np.zeros((len(place.positions), len(drift)), dtype=complex), self._scale
         np.multiply(self.base.moments, 1.0 + drift, out=moments[: len(self.base.moments)])

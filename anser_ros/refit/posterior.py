@@ -51,6 +51,8 @@ class FrameEvidence:
     curve: Array
     strength: Array  # (H, 2, A), probability of each strength
     noise: float
+    best: int  # the most likely hypothesis
+    weighted: Array | None  # (2, n), `Bank.weighted` of it; None where it must be worked out
 
 
 def log_sum(values: Array) -> float:
@@ -138,15 +140,13 @@ class Bank:
             self.spectra[hypothesis] = values
             self._set(hypothesis, basis)
         self._synthesis: dict[int, Single] = {}
-        self._last: tuple[int, Array] | None = None
         self._blocks: dict[tuple[float, int, int], Array] = {}
-        self._tables: dict[float, tuple[Single, Array]] = {}
+        self._tables: dict[float, tuple[Single, Array, set[int]]] = {}
 
     def _set(self, hypothesis: int, basis: Array) -> None:
         n = len(self.rows)
         self.bases[hypothesis] = basis
         self.analysis[hypothesis * n : (hypothesis + 1) * n] = basis.T
-        self._last = None
         self._drift_seen[hypothesis] = self.drift.T @ basis
         self.log_prior[hypothesis] = self._chosen if self.is_slot[hypothesis] else 0.0
         self._name()
@@ -174,9 +174,8 @@ class Bank:
         self.spectra[hypothesis] = eigenbasis.values
         self._set(hypothesis, eigenbasis.basis)
         self._synthesis[hypothesis] = eigenbasis.synthesis
-        for noise, (inverse, log_det) in self._tables.items():
-            changed = slice(hypothesis, hypothesis + 1)
-            inverse[changed], log_det[changed] = _precision(self.spectra[changed], noise)
+        for *_, replaced in self._tables.values():
+            replaced.add(hypothesis)
         for key in [key for key in self._blocks if key[1] == hypothesis]:
             del self._blocks[key]
 
@@ -203,8 +202,12 @@ class Bank:
         """Return inverse variances (H, A, n) and log determinants (H, A) at a noise level."""
         if noise not in self._tables:
             make_room(self._tables, MOST_TABLES)
-            self._tables[noise] = _precision(self.spectra, noise)
-        return self._tables[noise]
+            self._tables[noise] = *_precision(self.spectra, noise), set()
+        inverse, log_det, replaced = self._tables[noise]
+        while replaced:  # since this level was last seen
+            h = replaced.pop()
+            (inverse[h],), (log_det[h],) = _precision(self.spectra[h : h + 1], noise)
+        return inverse, log_det
 
     def evaluate(self, readings: Array, noise: float) -> FrameEvidence:
         """Return the evidence of every hypothesis.
@@ -215,25 +218,22 @@ class Bank:
         precision, log_det = self.precision(noise)
         count, n = self.spectra.shape
         projected = np.zeros((count, n, 2), dtype=np.float32)
-        curve, evidence = np.zeros((count, 2, len(STRENGTHS))), np.zeros(count)
-        strength = np.zeros(curve.shape)
-        fill_evidence(
-            self.analysis, _rows(readings), precision, log_det, np.isfinite(self.log_prior),
-            projected, curve, strength, evidence,
+        curve, strength = np.zeros((2, count, 2, len(STRENGTHS)))
+        evidence, weighted = self.log_prior.copy(), np.zeros((2, n))
+        best = fill_evidence(
+            self.analysis, _rows(readings), precision, log_det, projected, curve, strength,
+            evidence, weighted,
         )  # fmt: skip
-        evidence += self.log_prior
-        return FrameEvidence(projected, evidence, curve, strength, noise)
+        return FrameEvidence(projected, evidence, curve, strength, noise, best, weighted)
 
-    def analysis_of(self, hypothesis: int) -> Array:
-        """Return a hypothesis' rows of ``analysis`` (n, n) in double precision.
-
-        Those that were asked for last are kept: the best hypothesis is mostly the same as before.
-        """
-        if self._last is None or self._last[0] != hypothesis:
-            n = len(self.rows)
-            rows = self.analysis[hypothesis * n : (hypothesis + 1) * n]
-            self._last = hypothesis, rows.astype(np.float64)
-        return self._last[1]
+    def weighted(self, seen: FrameEvidence, hypothesis: int) -> Array:
+        """Return the readings weighted by their inverse covariance under a hypothesis, (2, n)."""
+        if hypothesis == seen.best and seen.weighted is not None:
+            return seen.weighted
+        precision, n = self.precision(seen.noise)[0][hypothesis], len(self.rows)
+        tops = seen.strength[hypothesis].argmax(axis=1)
+        scaled = seen.projected[hypothesis].T * precision[tops].astype(np.float64)
+        return np.asarray(scaled @ self.analysis[hypothesis * n : (hypothesis + 1) * n])
 
     def coefficients(self, seen: FrameEvidence, hypothesis: int) -> Array:
         """Return the coordinates (n, 2) of the posterior mean in a hypothesis' eigenvectors."""
@@ -346,7 +346,7 @@ class PosteriorModes:
 
 def error_level(seen: FrameEvidence, hypothesis: int) -> ErrorLevel:
     """Return the noise and strengths, rounded up, for which an uncertainty is computed."""
-    noise = 2.0 ** float(np.ceil(np.log2(seen.noise) - 0.1))
+    noise = 2.0 ** math.ceil(math.log2(seen.noise) - 0.1)
     real, imaginary = (int(part.argmax()) for part in seen.strength[hypothesis])
     strengths = min(real + real % 2, MOST), min(imaginary + imaginary % 2, MOST)
     return ErrorLevel(noise, strengths)
