@@ -310,14 +310,11 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
             continue
         count = _fill_terms(flux[s], least, terms)
         for d in range(filled):
-            at, exact, scaled = newest - d, 0.0, 0.0
-            if at < 0:
-                at += depth
+            exact, scaled = 0.0, 0.0
             for i in range(count):
                 k = int(terms[i, 0])
-                then = ring[s, k, at]
-                x, y = flux[s, k].real - then.real, flux[s, k].imag - then.imag
-                square = x * x + y * y
+                off = flux[s, k] - ring[s, k, newest - d]  # from the end where it is negative
+                square = off.real * off.real + off.imag * off.imag
                 if not square < math.inf:  # the older one was no reading
                     exact = scaled = HOPELESS
                     break

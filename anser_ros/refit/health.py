@@ -28,16 +28,16 @@ RISE, REACH = 0.5, 1000.0
 how far behind the best a hypothesis may be to be worked out so: a verdict turns on a hundred."""
 
 
-def left_out(bank: Bank, seen: FrameEvidence, hypothesis: int) -> tuple[Array, Array]:
-    """Return how far each coil's readings are from what all others predict.
+def left_out(bank: Bank, seen: FrameEvidence) -> tuple[Array, Array]:
+    """Return how far each coil's readings are from what all others predict, most likely.
 
     First the squared distances (S,) in units of the prediction's covariance, of 2 K degrees of
     freedom; then measured minus predicted (S, K, 2), in noise units.
     """
-    weighted = bank.weighted(seen, hypothesis).reshape(2, -1, bank.width)
+    weighted = seen.weighted.reshape(2, -1, bank.width)
     residual = np.empty((*weighted.shape[1:], 2))
-    for part, top in enumerate(seen.strength[hypothesis].argmax(axis=1).tolist()):
-        blocks = bank.coil_covariances(seen.noise, hypothesis, top)
+    for part, top in enumerate(seen.strength[seen.best].argmax(axis=1).tolist()):
+        blocks = bank.coil_covariances(seen.noise, seen.best, top)
         residual[..., part] = np.einsum('skl,sl->sk', blocks, weighted[part])
     return np.einsum('psk,skp->s', weighted, residual), residual
 
@@ -75,12 +75,7 @@ def evidence_without(
 
 
 def distance_of(
-    bank: Bank,
-    seen: FrameEvidence,
-    hypothesis: int,
-    rows: NDArray[np.int64],
-    readings: Array,
-    noise: float,
+    bank: Bank, seen: FrameEvidence, rows: NDArray[np.int64], readings: Array, noise: float
 ) -> float:
     """Return how far readings of an excluded coil are from what those in use predict.
 
@@ -88,7 +83,7 @@ def distance_of(
     ``rows`` (K,) are the coil's rows of the priors' covariance; its ``readings`` (K, 2) are not
     averaged, so their ``noise`` is not that of the evidence.
     """
-    precision, _ = bank.precision(seen.noise)
+    precision, hypothesis = bank.precision(seen.noise)[0], seen.best
     basis, variance = bank.bases[hypothesis], seen.noise**2
     ahead = bank.all_drift[rows]
     shared = variance * (ahead @ bank.drift.T)
@@ -156,13 +151,9 @@ class ReferenceHealth(NamedTuple):
 
 
 def judge_references(
-    names: Sequence[str],
-    reasons: Sequence[str],
-    used: NDArray[np.bool_],
-    chi2: Array,
-    residual: Array,
-    flux_noise_t: float,
-) -> tuple[ReferenceHealth, ...]:
+    names: Sequence[str], reasons: Sequence[str], used: NDArray[np.bool_], chi2: Array,
+    residual: Array, flux_noise_t: float,
+) -> tuple[ReferenceHealth, ...]:  # fmt: skip
     """Return the health of every reference in one frame.
 
     ``chi2`` (U,) and ``residual`` (U, K, 2) are those of `left_out` for the coils that

@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 
 from anser_ros.refit.frame import NoiseUnits, power_of
 from anser_ros.refit.health import FAULT_ODDS, FAULT_SCALES, left_out
-from anser_ros.refit.posterior import (
-    STRENGTHS,
-    Bank,
-    FrameEvidence,
-    log_sum,
-    median,
-    over_strengths,
-)
+from anser_ros.refit.posterior import STRENGTHS, Bank, FrameEvidence, log_sum, median
 from anser_ros.stamps import NANO
 
 Array = NDArray[np.float64]
@@ -176,17 +169,19 @@ class Courses:
 def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
     """Return the evidence for metal that changes readings by no more than so many noise units."""
     count = max(1, int(np.count_nonzero(largest**2 >= STRENGTHS)))
-    evidence, strength = over_strengths(seen.curve[..., :count])
-    whole = np.zeros_like(seen.strength)
-    whole[:, :, :count] = strength
-    evidence += bank.log_prior
-    best = int(evidence.argmax())
-    return replace(seen, log_evidence=evidence, strength=whole, best=best, weighted=None)
+    curve, strength = seen.curve[..., :count], np.zeros_like(seen.strength)
+    top = curve.max(axis=2, keepdims=True)
+    weight = np.exp(curve - top)
+    total = weight.sum(axis=2, keepdims=True)
+    evidence = (top + np.log(total / len(STRENGTHS))).sum(axis=(1, 2)) + bank.log_prior
+    strength[:, :, :count] = weight / total
+    best, unknown = int(evidence.argmax()), np.empty(0)
+    return replace(seen, log_evidence=evidence, strength=strength, best=best, weighted=unknown)
 
 
 def _is_predicted(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
     """Return whether each coil's jump is what the others predict, as when metal is put down."""
-    _, residual = left_out(bank, seen, seen.best)
+    _, residual = left_out(bank, seen)
     noise = LEAST_JUMP_POWER * jumps[0].size * seen.noise**2
     off = (residual**2).sum(axis=(1, 2))
     size = (jumps**2).sum(axis=(1, 2)) + ((jumps - residual) ** 2).sum(axis=(1, 2))
@@ -225,12 +220,9 @@ def jumped(
 
 
 def faults_have_ended(
-    courses: Courses,
-    units: NoiseUnits,
-    bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]],
-    level: float,
-    drift: float,
-) -> bool:
+    courses: Courses, units: NoiseUnits,
+    bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]], level: float, drift: float,
+) -> bool:  # fmt: skip
     """Return whether jumps are over: metal alone explains how all has changed since before them.
 
     Some references must be off by jumps, and the newest frame go on from the two before it. Near

@@ -77,15 +77,10 @@ class LiveRefit:
     """
 
     def __init__(
-        self,
-        model: FieldModel,
-        references: SensorTable,
-        baseline: ComplexArray,
-        settings: RefitSettings | None = None,
-        drawing: FieldFunction | None = None,
-        volume: TrackedVolume | None = None,
-        tables: refit_tables.RefitTables | None = None,
-    ) -> None:
+        self, model: FieldModel, references: SensorTable, baseline: ComplexArray,
+        settings: RefitSettings | None = None, drawing: FieldFunction | None = None,
+        volume: TrackedVolume | None = None, tables: refit_tables.RefitTables | None = None,
+    ) -> None:  # fmt: skip
         self.model, self.references = model, references
         self.settings = settings or RefitSettings()
         self.baseline = checked_baseline(model, references, baseline)
@@ -109,7 +104,7 @@ class LiveRefit:
         bank, slots = self._bank()
         readings = np.zeros((len(bank.rows), 2))
         seen = bank.evaluate(readings, 1.0)
-        left_out(bank, seen, seen.best)
+        left_out(bank, seen)
         evidence_without(bank, seen, np.arange(1))
         slots.warm_up(readings, 1.0)
         weights = np.zeros(len(bank.names))
@@ -146,12 +141,9 @@ class LiveRefit:
         self._last_ns = 0
 
     def update(
-        self,
-        stamp_ns: int,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
+        self, stamp_ns: int, channels: NDArray[np.generic], flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
-    ) -> RefitResult:
+    ) -> RefitResult:  # fmt: skip
         """Take in one frame of reference fluxes and return the result of the refit.
 
         ``channels`` (S,) may come in any order, and unknown ones are passed over; ``flux`` (S, K)
@@ -238,7 +230,7 @@ class LiveRefit:
             used = values[coils].reshape(-1, 2)
             slots.fill(used, noise, stamp_ns)
             seen = bank.evaluate(used, noise)
-            self._distance, self._residual = left_out(bank, seen, seen.best)
+            self._distance, self._residual = left_out(bank, seen)
             if len(coils) <= self.settings.min_references:
                 return bank, seen
             power = np.einsum('ij,ij->i', *[used.reshape(len(coils), -1)] * 2) / noise**2
@@ -251,20 +243,16 @@ class LiveRefit:
             self._average.forget()
 
     def _readmit(
-        self,
-        bank: Bank,
-        seen: FrameEvidence,
-        values: Array,
-        readable: NDArray[np.bool_],
+        self, bank: Bank, seen: FrameEvidence, values: Array, readable: NDArray[np.bool_],
         level: float,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Readmit excluded coils that agree with the others again."""
         if self._watch.used == self._watch.count:
             return
-        best, k = seen.best, bank.width
+        k = bank.width
         for coil in np.flatnonzero(self._watch.excluded & readable):
             rows = coil * k + np.arange(k)
-            distance = distance_of(bank, seen, best, rows, values[coil], level)
+            distance = distance_of(bank, seen, rows, values[coil], level)
             self._watch.agreed(int(coil), distance < health.AGREEMENT_CHI2 * 2 * k)
         self._watch.readmit()
 

@@ -70,15 +70,9 @@ class Assembly:
         self._last = self._interim = None
 
     def model(
-        self,
-        stamp_ns: int,
-        bank: Bank,
-        seen: FrameEvidence,
-        weights: Array,
-        drift: ComplexArray,
-        typical: float,
-        witness: Witness | None = None,
-    ) -> FieldModel:
+        self, stamp_ns: int, bank: Bank, seen: FrameEvidence, weights: Array,
+        drift: ComplexArray, typical: float, witness: Witness | None = None,
+    ) -> FieldModel:  # fmt: skip
         """Return the refitted model of one frame.
 
         ``weights`` (H,) are the hypotheses' probabilities, ``drift`` (K,) the relative change of
@@ -97,13 +91,9 @@ class Assembly:
             moments[change.rows(h)] += weights[h] * part
         modes, rest = self._uncertainty(change, typical, witness)
         return replace(
-            self.base,
-            positions=place.positions,
-            directions=place.directions,
-            moments=moments,
-            modes=modes,
-            flux_error_t=rest,
-        )
+            self.base, positions=place.positions, directions=place.directions, moments=moments,
+            modes=modes, flux_error_t=rest,
+        )  # fmt: skip
 
     def _dipoles_of(self, given: list[Layer]) -> '_Dipoles':
         """Return the dipoles with some layers, in the same arrays while the layers stay."""

@@ -52,7 +52,7 @@ class FrameEvidence:
     strength: Array  # (H, 2, A), probability of each strength
     noise: float
     best: int  # the most likely hypothesis
-    weighted: Array | None  # (2, n), `Bank.weighted` of it; None where it must be worked out
+    weighted: Array  # (2, n), readings by their inverse covariance under it, at its top strengths
 
 
 def log_sum(values: Array) -> float:
@@ -66,15 +66,6 @@ def median(values: Array) -> float:
     ordered = sorted(values.tolist())
     middle = len(ordered) // 2
     return float(0.5 * (ordered[middle] + ordered[-1 - middle]))
-
-
-def over_strengths(curve: Array) -> tuple[Array, Array]:
-    """Return log evidence (H,) and strength probabilities of the curves, both (H, 2, A)."""
-    top = curve.max(axis=2, keepdims=True)
-    weight = np.exp(curve - top)
-    total = weight.sum(axis=2, keepdims=True)
-    evidence = (top + np.log(total / len(STRENGTHS))).sum(axis=(1, 2))
-    return evidence, weight / total
 
 
 MOST_TABLES, MOST_BLOCKS = 12, 128
@@ -225,15 +216,6 @@ class Bank:
             evidence, weighted,
         )  # fmt: skip
         return FrameEvidence(projected, evidence, curve, strength, noise, best, weighted)
-
-    def weighted(self, seen: FrameEvidence, hypothesis: int) -> Array:
-        """Return the readings weighted by their inverse covariance under a hypothesis, (2, n)."""
-        if hypothesis == seen.best and seen.weighted is not None:
-            return seen.weighted
-        precision, n = self.precision(seen.noise)[0][hypothesis], len(self.rows)
-        tops = seen.strength[hypothesis].argmax(axis=1)
-        scaled = seen.projected[hypothesis].T * precision[tops].astype(np.float64)
-        return np.asarray(scaled @ self.analysis[hypothesis * n : (hypothesis + 1) * n])
 
     def coefficients(self, seen: FrameEvidence, hypothesis: int) -> Array:
         """Return the coordinates (n, 2) of the posterior mean in a hypothesis' eigenvectors."""
