@@ -169,10 +169,7 @@ class BaselineCheck:
         self._lacks = lacks if lacks.any() else None
 
     def read(self, frame: Frame) -> tuple[NDArray[np.bool_], list[str]]:
-        """Return which readings (S,) of a judged frame can be used, and why others cannot.
-
-        The reasons are empty where all can.
-        """
+        """Return which readings (S,) of a frame can be used, and why not, if any cannot."""
         flux, codes = frame.flux, frame.codes
         is_silent = power_of(flux) < self._least
         codes = np.where((codes == faults.GOOD) & is_silent, SILENT_CODE, codes)

@@ -210,10 +210,10 @@ class Bank:
         count, n = self.spectra.shape
         projected = np.zeros((count, n, 2), dtype=np.float32)
         curve, strength = np.zeros((2, count, 2, len(STRENGTHS)))
-        evidence, weighted = self.log_prior.copy(), np.zeros((2, n))
+        evidence, weighted = np.zeros(count), np.zeros((2, n))
         best = fill_evidence(
-            self.analysis, _rows(readings), precision, log_det, projected, curve, strength,
-            evidence, weighted,
+            self.analysis, _rows(readings), precision, log_det, self.log_prior, projected, curve,
+            strength, evidence, weighted,
         )  # fmt: skip
         return FrameEvidence(projected, evidence, curve, strength, noise, best, weighted)
 
