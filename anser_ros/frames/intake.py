@@ -291,14 +291,14 @@ def _fill_terms(now, least, terms):  # type: ignore[no-untyped-def]
 
 @kernel
 def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # type: ignore[no-untyped-def]
-    """Compare readings (S, K) with those of the ring (D, S, K), and put them into it.
+    """Compare readings (S, K) with those of the ring (S, K, D), and put them into it.
 
     ``codes`` (S,): readings with another than 0 are not looked at. ``filled``: how many frames the
     ring holds; ``newest``: the place of the last one. ``sums`` (S, D, 2), the runs' odds by
     distance in frames, goes on. ``ages`` (S,): how many frames ago the reading was the same, 0 for
     a new one. Returns whether there is any that is not new.
     """
-    depth, width = ring.shape[0], flux.shape[1]
+    width, depth = ring.shape[1:]
     terms, place, some = np.empty((width, 5)), (newest + 1) % depth, False
     for s in range(flux.shape[0]):
         ages[s] = 0
@@ -306,15 +306,15 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
             for d in range(depth):
                 sums[s, d, 0] = sums[s, d, 1] = 0.0
             for k in range(width):
-                ring[place, s, k] = complex(math.nan, math.nan)
+                ring[s, k, place] = complex(math.nan, math.nan)
             continue
         count = _fill_terms(flux[s], least, terms)
         for d in range(filled):
-            then, exact, scaled = ring[(newest - d) % depth, s], 0.0, 0.0
+            exact, scaled = 0.0, 0.0
             for i in range(count):
                 k = int(terms[i, 0])
-                x, y = flux[s, k].real - then[k].real, flux[s, k].imag - then[k].imag
-                square = x * x + y * y
+                off = flux[s, k] - ring[s, k, newest - d]  # from the end where it is negative
+                square = off.real * off.real + off.imag * off.imag
                 if not square < math.inf:  # the older one was no reading
                     exact = scaled = HOPELESS
                     break
@@ -328,7 +328,7 @@ def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # t
                 ages[s] = d + 1
                 some = True
         for k in range(width):
-            ring[place, s, k] = flux[s, k]
+            ring[s, k, place] = flux[s, k]
     return some
 
 
@@ -343,7 +343,7 @@ class Freshness:
         self._forget((0, 0))
 
     def _forget(self, shape: tuple[int, int]) -> None:
-        self._ring = np.full((DEPTH, *shape), np.nan, dtype=np.complex128)
+        self._ring = np.full((*shape, DEPTH), np.nan, dtype=np.complex128)
         self._stamps = np.zeros(DEPTH, dtype=np.int64)
         self._sums = np.zeros((shape[0], DEPTH, 2))
         self.age_s = np.zeros(shape[0])
@@ -355,7 +355,7 @@ class Freshness:
 
         ``noise_t`` is the stated noise of a phasor component, T.
         """
-        if frame.goes_back or self._ring.shape[1:] != frame.flux.shape:
+        if frame.goes_back or self._ring.shape[:2] != frame.flux.shape:
             self._forget(frame.flux.shape)
         some = compare(
             frame.flux, frame.codes, self._ring, self._filled, self._newest, self._sums,

@@ -100,6 +100,12 @@ class ReadingWindow:
         return mean
 
 
+def power_of(values: ComplexArray) -> Array:
+    """Return the sum of the squared magnitudes of each row (S, K), which may overflow."""
+    parts = values.view(np.float64)
+    return np.asarray(np.einsum('sk,sk->s', parts, parts))
+
+
 def check_enough(baseline: ComplexArray, needed: int) -> int:
     """Return the number of sensors that have a value in a baseline of shape (S, K).
 
@@ -159,15 +165,18 @@ class BaselineCheck:
         power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
         # T^2, below which a coil is silent; NaN without a baseline.
         self._least = np.where(np.isfinite(power), QUIET**2 * power, np.nan)
+        lacks = np.isnan(self._least)
+        self._lacks = lacks if lacks.any() else None
 
     def read(self, frame: Frame) -> tuple[NDArray[np.bool_], list[str]]:
-        """Return which readings (S,) of a judged frame can be used, and why others cannot."""
+        """Return which readings (S,) of a frame can be used, and why not, if any cannot."""
         flux, codes = frame.flux, frame.codes
-        with np.errstate(over='ignore', invalid='ignore'):  # of readings that are absurd
-            is_silent = (flux.real**2 + flux.imag**2).sum(axis=1) < self._least
+        is_silent = power_of(flux) < self._least
         codes = np.where((codes == faults.GOOD) & is_silent, SILENT_CODE, codes)
-        codes = np.where(np.isnan(self._least), NO_BASELINE_CODE, codes)
-        return codes == faults.GOOD, [_REASONS[code] for code in codes.tolist()]
+        if self._lacks is not None:
+            codes = np.where(self._lacks, NO_BASELINE_CODE, codes)
+        readable = codes == faults.GOOD
+        return readable, [] if readable.all() else [_REASONS[code] for code in codes.tolist()]
 
 
 class NoiseUnits:
@@ -242,7 +251,7 @@ class NoiseLevel:
         """
         if len(self._previous) == 2:
             bend = flux - 2.0 * self._previous[1] + self._previous[0]
-            power = (bend.real**2 + bend.imag**2).mean(axis=1)
+            power = power_of(bend) / bend.shape[1]
             power = power[np.isfinite(power)]
             if power.size:
                 # The median over coils, so that a coil that jumps does not count.

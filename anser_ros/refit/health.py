@@ -28,22 +28,18 @@ RISE, REACH = 0.5, 1000.0
 how far behind the best a hypothesis may be to be worked out so: a verdict turns on a hundred."""
 
 
-def left_out(bank: Bank, seen: FrameEvidence, hypothesis: int) -> tuple[Array, Array]:
-    """Return how far each coil's readings are from what all others predict.
+def left_out(bank: Bank, seen: FrameEvidence) -> tuple[Array, Array]:
+    """Return how far each coil's readings are from what all others predict, most likely.
 
     First the squared distances (S,) in units of the prediction's covariance, of 2 K degrees of
     freedom; then measured minus predicted (S, K, 2), in noise units.
     """
-    precision, _ = bank.precision(seen.noise)
-    n, tops = len(bank.rows), seen.strength[hypothesis].argmax(axis=1).tolist()
-    scaled = seen.projected[hypothesis] * precision[hypothesis, tops].T.astype(np.float64)
-    weighted = bank.analysis[hypothesis * n : (hypothesis + 1) * n].T @ scaled
-    weighted = weighted.reshape(-1, bank.width, 2)
-    residual = np.empty_like(weighted)
-    for part, top in enumerate(tops):
-        blocks = bank.coil_covariances(seen.noise, hypothesis, top)
-        residual[..., part] = (blocks @ weighted[..., part, None])[..., 0]
-    return (weighted * residual).sum(axis=(1, 2)), residual
+    weighted = seen.weighted.reshape(2, -1, bank.width)
+    residual = np.empty((*weighted.shape[1:], 2))
+    for part, top in enumerate(seen.strength[seen.best].argmax(axis=1).tolist()):
+        blocks = bank.coil_covariances(seen.noise, seen.best, top)
+        residual[..., part] = np.einsum('skl,sl->sk', blocks, weighted[part])
+    return np.einsum('psk,skp->s', weighted, residual), residual
 
 
 def evidence_without(
@@ -79,12 +75,7 @@ def evidence_without(
 
 
 def distance_of(
-    bank: Bank,
-    seen: FrameEvidence,
-    hypothesis: int,
-    rows: NDArray[np.int64],
-    readings: Array,
-    noise: float,
+    bank: Bank, seen: FrameEvidence, rows: NDArray[np.int64], readings: Array, noise: float
 ) -> float:
     """Return how far readings of an excluded coil are from what those in use predict.
 
@@ -92,7 +83,7 @@ def distance_of(
     ``rows`` (K,) are the coil's rows of the priors' covariance; its ``readings`` (K, 2) are not
     averaged, so their ``noise`` is not that of the evidence.
     """
-    precision, _ = bank.precision(seen.noise)
+    precision, hypothesis = bank.precision(seen.noise)[0], seen.best
     basis, variance = bank.bases[hypothesis], seen.noise**2
     ahead = bank.all_drift[rows]
     shared = variance * (ahead @ bank.drift.T)
@@ -160,13 +151,9 @@ class ReferenceHealth(NamedTuple):
 
 
 def judge_references(
-    names: Sequence[str],
-    reasons: Sequence[str],
-    used: NDArray[np.bool_],
-    chi2: Array,
-    residual: Array,
-    flux_noise_t: float,
-) -> tuple[ReferenceHealth, ...]:
+    names: Sequence[str], reasons: Sequence[str], used: NDArray[np.bool_], chi2: Array,
+    residual: Array, flux_noise_t: float,
+) -> tuple[ReferenceHealth, ...]:  # fmt: skip
     """Return the health of every reference in one frame.
 
     ``chi2`` (U,) and ``residual`` (U, K, 2) are those of `left_out` for the coils that
@@ -246,9 +233,10 @@ class ReferenceWatch:
         if self._before is not None:
             self.excluded, self.reason, self._good = self._before
             self._before = None
-        if readable.sum() < least:
+        count = np.count_nonzero(readable)
+        if count < least:
             self._before = self.excluded.copy(), self.reason.copy(), self._good.copy()
-        for coil in np.flatnonzero(~readable):
+        for coil in np.flatnonzero(~readable) if count < self.count else ():
             self.excluded[coil], self.reason[coil], self._good[coil] = True, reasons[coil], 0
 
     @property
@@ -273,9 +261,14 @@ class ReferenceWatch:
         return np.where(out[:, None], np.nan, flux) if out.any() else flux
 
     @property
+    def used(self) -> int:
+        """Return the number of coils in use."""
+        return self.count - int(np.count_nonzero(self.excluded))
+
+    @property
     def is_outvoted(self) -> bool:
         """Return whether more coils disagree than are in use, so that either may be wrong."""
-        return self.reason.count(DISAGREES) > self.count - int(self.excluded.sum())
+        return self.reason.count(DISAGREES) > self.used
 
     def agreed(self, coil: int, agrees: bool) -> None:
         """Count a frame in which an excluded coil was compared."""

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.frame import NoiseUnits
+from anser_ros.refit.frame import NoiseUnits, power_of
 from anser_ros.refit.health import FAULT_ODDS, FAULT_SCALES, left_out
-from anser_ros.refit.posterior import STRENGTHS, Bank, FrameEvidence, log_sum, over_strengths
+from anser_ros.refit.posterior import STRENGTHS, Bank, FrameEvidence, log_sum, median
 from anser_ros.stamps import NANO
 
 Array = NDArray[np.float64]
@@ -58,6 +58,11 @@ class Jumps(NamedTuple):
     since_s: float
 
 
+def _where(rows: NDArray[np.bool_], new: ComplexArray, old: ComplexArray) -> ComplexArray:
+    """Return new values (S, K) in some rows (S,), the old ones in the others."""
+    return new if rows.all() else np.where(rows[:, None], new, old)
+
+
 class Courses:
     """Follows where each reference's change is on its way to, and how far those that jumped are
     off.
@@ -71,7 +76,7 @@ class Courses:
         self._last_ns = np.full(count, np.nan)
         self._step_ns = np.full(count, np.nan)
         # A jump in the middle of a window shows in two frames: what was read before both.
-        self._before = np.zeros((2, count, width), dtype=np.complex128)
+        self._before = self._last, self._last
         self._away = np.zeros((count, width), dtype=np.complex128)
         self._farthest = np.zeros(count)
         # All readings before the first of the present jumps, and when that was.
@@ -89,14 +94,16 @@ class Courses:
         steps = np.where((steps > 0.0) & (steps <= FARTHEST), steps, 0.0)
         known = np.isfinite(self._last_ns)
         variance = np.where(known, 1.0 + (1.0 + steps) ** 2 + steps**2, 1.0)
-        off = change - self._last - steps[:, None] * self._step
-        read = np.isfinite(change).all(axis=1)
+        step = change - self._last
+        off = step - steps[:, None] * self._step
+        read = np.isfinite(power_of(change))
         new = read & known
-        since_s = float(np.median(ahead_ns[new])) * NANO if new.any() else np.inf
-        self._step[new] = (change - self._last)[new]
+        since_s = median(ahead_ns[new]) * NANO if new.any() else np.inf
+        self._step = _where(new, step, self._step)
         self._step_ns = np.where(new, ahead_ns, np.where(read, np.nan, self._step_ns))
-        self._before[0, read], self._before[1, read] = self._before[1, read], self._last[read]
-        self._last[read] = change[read]
+        first, second = self._before
+        self._before = _where(read, second, first), _where(read, self._last, second)
+        self._last = _where(read, change, self._last)
         self._stamp_ns = float(stamp_ns)
         self._last_ns = np.where(read, self._stamp_ns, self._last_ns)
         return Jumps(off, np.sqrt(variance), since_s)
@@ -104,7 +111,7 @@ class Courses:
     def note(self, jumps: Jumps, coils: NDArray[np.int64]) -> None:
         """Remember which references have jumped: a jump is no part of a course."""
         if not self._is_away.any():
-            self._sound = self._before[0].copy()
+            self._sound = self._before[0]
             self._sound_ns = self._stamp_ns - 2.0 * jumps.since_s / NANO
         self._step_ns[coils] = np.nan
         first = ~self._is_away[coils]
@@ -162,15 +169,19 @@ class Courses:
 def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
     """Return the evidence for metal that changes readings by no more than so many noise units."""
     count = max(1, int(np.count_nonzero(largest**2 >= STRENGTHS)))
-    evidence, strength = over_strengths(seen.curve[..., :count])
-    whole = np.zeros_like(seen.strength)
-    whole[:, :, :count] = strength
-    return replace(seen, log_evidence=evidence + bank.log_prior, strength=whole)
+    curve, strength = seen.curve[..., :count], np.zeros_like(seen.strength)
+    top = curve.max(axis=2, keepdims=True)
+    weight = np.exp(curve - top)
+    total = weight.sum(axis=2, keepdims=True)
+    evidence = (top + np.log(total / len(STRENGTHS))).sum(axis=(1, 2)) + bank.log_prior
+    strength[:, :, :count] = weight / total
+    best, unknown = int(evidence.argmax()), np.empty(0)
+    return replace(seen, log_evidence=evidence, strength=strength, best=best, weighted=unknown)
 
 
 def _is_predicted(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
     """Return whether each coil's jump is what the others predict, as when metal is put down."""
-    _, residual = left_out(bank, seen, int(seen.log_evidence.argmax()))
+    _, residual = left_out(bank, seen)
     noise = LEAST_JUMP_POWER * jumps[0].size * seen.noise**2
     off = (residual**2).sum(axis=(1, 2))
     size = (jumps**2).sum(axis=(1, 2)) + ((jumps - residual) ** 2).sum(axis=(1, 2))
@@ -209,12 +220,9 @@ def jumped(
 
 
 def faults_have_ended(
-    courses: Courses,
-    units: NoiseUnits,
-    bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]],
-    level: float,
-    drift: float,
-) -> bool:
+    courses: Courses, units: NoiseUnits,
+    bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]], level: float, drift: float,
+) -> bool:  # fmt: skip
     """Return whether jumps are over: metal alone explains how all has changed since before them.
 
     Some references must be off by jumps, and the newest frame go on from the two before it. Near
@@ -233,7 +241,7 @@ def faults_have_ended(
     parts = units.of(change)[readable] / spread
     bank = bank_of(readable)[0]
     seen = bank.evaluate(parts.reshape(-1, 2), level)
-    mean, variance = bank.drifts(seen, int(seen.log_evidence.argmax()))
+    mean, variance = bank.drifts(seen, seen.best)
     step = np.hypot(*mean.T) + SURE * np.sqrt(variance.max(axis=1))
     if (spread * drift * step > COMMON).any():
         return False
@@ -243,7 +251,7 @@ def faults_have_ended(
 
 def _is_common_gain(bank: Bank, seen: FrameEvidence, jumps: Array, drift: float) -> bool:
     """Return whether all emitters have stepped alike, which is the references' doing."""
-    mean, _ = bank.drifts(seen, int(seen.log_evidence.argmax()))
+    mean, _ = bank.drifts(seen, seen.best)
     step = drift * (mean @ np.array([1.0, 1.0j]))
     left = jumps.reshape(-1, 2) - bank.drift @ mean
     explained = float((left**2).sum()) < UNPREDICTED * float((jumps**2).sum())

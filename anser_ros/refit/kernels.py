@@ -42,17 +42,19 @@ def _fill_probabilities(curve, probability):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath=FAST)
 def fill_evidence(  # type: ignore[no-untyped-def]
-    analysis, readings, precision, log_det, there, projected, curve, strength, log_evidence
+    analysis, readings, precision, log_det, log_prior, projected, curve, strength, log_evidence,
+    weighted,
 ):  # fmt: skip
     """Write what readings (2, n) say about all hypotheses; see `FrameEvidence`.
 
-    ``analysis`` (H n, n), ``precision`` (H, A, n), ``log_det`` (H, A); ``there`` (H,) is False for
-    empty slots, of which nothing is written.
+    ``analysis`` (H n, n), ``precision`` (H, A, n), ``log_det`` (H, A); ``log_prior`` (H,) is minus
+    infinity for empty slots, of which nothing else is written. On entry ``log_evidence`` (H,) and
+    ``weighted`` (2, n) are zero. Returns the most likely hypothesis.
     """
     count, strengths, n = precision.shape
-    first, second = np.empty(n, np.float32), np.empty(n, np.float32)
+    first, second, best = np.empty(n, np.float32), np.empty(n, np.float32), 0
     for h in range(count):
-        if not there[h]:
+        if log_prior[h] == -math.inf:
             continue
         fill_products(analysis[h * n : (h + 1) * n], readings, projected[h])
         for i in range(n):
@@ -67,6 +69,20 @@ def fill_evidence(  # type: ignore[no-untyped-def]
             curve[h, 1, a] = -0.5 * (imaginary + log_det[h, a])
         log_evidence[h] = _fill_probabilities(curve[h, 0], strength[h, 0])
         log_evidence[h] += _fill_probabilities(curve[h, 1], strength[h, 1])
+    for h in range(count):
+        log_evidence[h] += log_prior[h]
+        if log_evidence[h] > log_evidence[best]:
+            best = h
+    for part in range(2):
+        top = 0
+        for a in range(strengths):
+            if strength[best, part, a] > strength[best, part, top]:
+                top = a
+        for i in range(n):
+            scaled = np.float64(projected[best, i, part]) * precision[best, top, i]
+            for j in range(n):
+                weighted[part, j] += scaled * analysis[best * n + i, j]
+    return best
 
 
 @kernel(nogil=True, fastmath=FAST)

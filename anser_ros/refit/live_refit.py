@@ -77,15 +77,10 @@ class LiveRefit:
     """
 
     def __init__(
-        self,
-        model: FieldModel,
-        references: SensorTable,
-        baseline: ComplexArray,
-        settings: RefitSettings | None = None,
-        drawing: FieldFunction | None = None,
-        volume: TrackedVolume | None = None,
-        tables: refit_tables.RefitTables | None = None,
-    ) -> None:
+        self, model: FieldModel, references: SensorTable, baseline: ComplexArray,
+        settings: RefitSettings | None = None, drawing: FieldFunction | None = None,
+        volume: TrackedVolume | None = None, tables: refit_tables.RefitTables | None = None,
+    ) -> None:  # fmt: skip
         self.model, self.references = model, references
         self.settings = settings or RefitSettings()
         self.baseline = checked_baseline(model, references, baseline)
@@ -109,7 +104,7 @@ class LiveRefit:
         bank, slots = self._bank()
         readings = np.zeros((len(bank.rows), 2))
         seen = bank.evaluate(readings, 1.0)
-        left_out(bank, seen, int(seen.log_evidence.argmax()))
+        left_out(bank, seen)
         evidence_without(bank, seen, np.arange(1))
         slots.warm_up(readings, 1.0)
         weights = np.zeros(len(bank.names))
@@ -146,12 +141,9 @@ class LiveRefit:
         self._last_ns = 0
 
     def update(
-        self,
-        stamp_ns: int,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
+        self, stamp_ns: int, channels: NDArray[np.generic], flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
-    ) -> RefitResult:
+    ) -> RefitResult:  # fmt: skip
         """Take in one frame of reference fluxes and return the result of the refit.
 
         ``channels`` (S,) may come in any order, and unknown ones are passed over; ``flux`` (S, K)
@@ -176,7 +168,7 @@ class LiveRefit:
         usable = ordered if readable.all() else np.where(readable[:, None], ordered, np.nan)
         level = self._noise.update(self._watch.without_excluded(usable))
         self._look_for_jumps(stamp_ns, usable - self.baseline, level)
-        if np.count_nonzero(self._in_use()) < self.settings.min_references:
+        if self._watch.used < self.settings.min_references:
             self._watch.wait(readable)
             return self._too_few(stamp_ns, level)
         used = self._watch.without_excluded(ordered)
@@ -186,7 +178,7 @@ class LiveRefit:
         noise = level / math.sqrt(frames)
         values = self._units.of(mean - self.baseline)
         bank, seen = self._judged(stamp_ns, values, noise)
-        if np.count_nonzero(self._in_use()) < self.settings.min_references:
+        if self._watch.used < self.settings.min_references:
             return self._too_few(stamp_ns, level)
         result = self._result(stamp_ns, bank, seen, level)
         self._readmit(bank, seen, values, readable, level)
@@ -196,10 +188,11 @@ class LiveRefit:
         """Leave out coils whose change (S, K) has just jumped by itself."""
         jumps = self._courses.follow(stamp_ns, change)
         parts = self._units.of(jumps.off) / jumps.spread[:, None, None]
-        jumping = (parts**2).mean(axis=(1, 2)) > LEAST_JUMP_POWER * level**2
-        away, coils = self._courses.away(), np.flatnonzero(self._in_use())
+        power = np.einsum('skp,skp->s', parts, parts) / parts[0].size
+        jumping, away = power > LEAST_JUMP_POWER * level**2, self._courses.away()
         if not (jumping.any() or away.size):
             return
+        coils = np.flatnonzero(self._in_use())
         self._courses.note(jumps, away[jumping[away]])
         back = self._courses.returned(level * self.settings.accuracy.flux_noise_t)
         few = coils.size < self.settings.min_references or self._watch.is_outvoted
@@ -237,11 +230,10 @@ class LiveRefit:
             used = values[coils].reshape(-1, 2)
             slots.fill(used, noise, stamp_ns)
             seen = bank.evaluate(used, noise)
-            best = int(seen.log_evidence.argmax())
-            self._distance, self._residual = left_out(bank, seen, best)
+            self._distance, self._residual = left_out(bank, seen)
             if len(coils) <= self.settings.min_references:
                 return bank, seen
-            power = (used.reshape(len(coils), -1) ** 2).sum(axis=1) / noise**2
+            power = np.einsum('ij,ij->i', *[used.reshape(len(coils), -1)] * 2) / noise**2
             suspects = self._watch.suspects(self._distance, power, 2 * bank.width)
             faulty = health.find_faults(bank, seen, suspects)
             if not faulty.size:
@@ -251,18 +243,16 @@ class LiveRefit:
             self._average.forget()
 
     def _readmit(
-        self,
-        bank: Bank,
-        seen: FrameEvidence,
-        values: Array,
-        readable: NDArray[np.bool_],
+        self, bank: Bank, seen: FrameEvidence, values: Array, readable: NDArray[np.bool_],
         level: float,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Readmit excluded coils that agree with the others again."""
-        best, k = int(seen.log_evidence.argmax()), bank.width
+        if self._watch.used == self._watch.count:
+            return
+        k = bank.width
         for coil in np.flatnonzero(self._watch.excluded & readable):
             rows = coil * k + np.arange(k)
-            distance = distance_of(bank, seen, best, rows, values[coil], level)
+            distance = distance_of(bank, seen, rows, values[coil], level)
             self._watch.agreed(int(coil), distance < health.AGREEMENT_CHI2 * 2 * k)
         self._watch.readmit()
 
@@ -272,7 +262,7 @@ class LiveRefit:
         best = int(weights.argmax())
         typical = median(self._distance) / (2 * bank.width)
         mean, variance = bank.drifts(seen, best)
-        drift = self.settings.emitter_drift * (mean @ np.array([1.0, 1.0j]))
+        drift = self.settings.emitter_drift * mean.view(np.complex128)[:, 0]
         sure = (np.abs(mean) > DRIFT_SIGMAS * np.sqrt(np.maximum(variance, 1e-30))).any(axis=1)
         if not moving:
             drift[~sure] = 0.0
@@ -329,7 +319,7 @@ class LiveRefit:
         self._average.forget()
         if self._witness is not None:
             self._witness.forget()
-        count, need = int(self._in_use().sum()), self.settings.min_references
+        count, need = self._watch.used, self.settings.min_references
         self._distance = self._residual = np.empty(0)
         state = REFERENCES_DOUBTFUL if self._watch.is_outvoted else FEW_REFERENCES
         reason = f'{count} usable references, {need} are needed'

@@ -35,6 +35,8 @@ NEGLIGIBLE = 0.01
 INFLATION_STEP = 1.2
 """Ratio of neighbouring factors by which modes are inflated. The steps keep modes, and what was
 computed for them, the same for many frames."""
+Rows = NDArray[np.int64] | slice
+"""Dipoles of a layer among those of a model."""
 Uncertainty = tuple[ComplexArray | None, float]
 """Modes and flux error of a model."""
 
@@ -68,26 +70,19 @@ class Assembly:
         self._last = self._interim = None
 
     def model(
-        self,
-        stamp_ns: int,
-        bank: Bank,
-        seen: FrameEvidence,
-        weights: Array,
-        drift: ComplexArray,
-        typical: float,
-        witness: Witness | None = None,
-    ) -> FieldModel:
+        self, stamp_ns: int, bank: Bank, seen: FrameEvidence, weights: Array,
+        drift: ComplexArray, typical: float, witness: Witness | None = None,
+    ) -> FieldModel:  # fmt: skip
         """Return the refitted model of one frame.
 
         ``weights`` (H,) are the hypotheses' probabilities, ``drift`` (K,) the relative change of
         the emitters' strength; ``typical`` is the left-out chi-square per degree of freedom of
         the typical coil. A ``witness`` knows the hypotheses' errors from tools.
         """
-        active = [h for h in np.flatnonzero(weights > NEGLIGIBLE).tolist() if h > 0]
+        active = [h for h, w in enumerate(weights.tolist()) if h > 0 and w > NEGLIGIBLE]
         place = self._dipoles_of([bank.prior(h).layer for h in active])
-        moments = np.zeros((len(place.positions), len(drift)), dtype=complex)
-        moments[: len(self.base.moments)] = self.base.moments * (1.0 + drift)
-        scale = self._scale
+        moments, scale = np.zeros((len(place.positions), len(drift)), dtype=complex), self._scale
+        np.multiply(self.base.moments, 1.0 + drift, out=moments[: len(self.base.moments)])
         parts = {h: bank.moments(seen, h) * scale for h in active}
         if witness is not None:
             parts |= {h: part + witness.moments(bank, h) * scale for h, part in parts.items()}
@@ -96,13 +91,9 @@ class Assembly:
             moments[change.rows(h)] += weights[h] * part
         modes, rest = self._uncertainty(change, typical, witness)
         return replace(
-            self.base,
-            positions=place.positions,
-            directions=place.directions,
-            moments=moments,
-            modes=modes,
-            flux_error_t=rest,
-        )
+            self.base, positions=place.positions, directions=place.directions, moments=moments,
+            modes=modes, flux_error_t=rest,
+        )  # fmt: skip
 
     def _dipoles_of(self, given: list[Layer]) -> '_Dipoles':
         """Return the dipoles with some layers, in the same arrays while the layers stay."""
@@ -110,16 +101,18 @@ class Assembly:
         if self._place is not None and [*self._place.rows] == [*layers]:
             return self._place
         positions, directions = [self.base.positions], [self.base.directions]
-        rows: dict[str, NDArray[np.int64]] = {}
+        rows: dict[str, Rows] = {}
         size = len(self.base.positions)
         for name, layer in layers.items():
             # A layer that uses dipoles of the model adds only the others.
-            own = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
-            added = len(layer.positions) - own.size
-            rows[name] = np.concatenate([own, np.arange(size, size + added)])
-            positions.append(layer.positions[own.size :])
-            directions.append(layer.directions[own.size :])
-            size += added
+            own = 0 if layer.rows is None else len(layer.rows)
+            end = size + len(layer.positions) - own
+            rows[name] = slice(size, end)
+            if layer.rows is not None:
+                rows[name] = np.concatenate([layer.rows, np.arange(size, end)])
+            positions.append(layer.positions[own:])
+            directions.append(layer.directions[own:])
+            size = end
         self._place = _Dipoles(np.concatenate(positions), np.concatenate(directions), rows)
         return self._place
 
@@ -218,7 +211,7 @@ class _Dipoles(NamedTuple):
 
     positions: Array
     directions: Array
-    rows: dict[str, NDArray[np.int64]]
+    rows: dict[str, Rows]
 
 
 @dataclass(frozen=True)
@@ -238,7 +231,7 @@ class _Change:
         """Dipoles N and emitters K of the model."""
         return len(self.place.positions), len(self.scale)
 
-    def rows(self, hypothesis: int) -> NDArray[np.int64]:
+    def rows(self, hypothesis: int) -> Rows:
         """Return the rows of the dipoles of a hypothesis' layer."""
         return self.place.rows[self.bank.prior(hypothesis).layer.name]
 

@@ -51,6 +51,8 @@ class FrameEvidence:
     curve: Array
     strength: Array  # (H, 2, A), probability of each strength
     noise: float
+    best: int  # the most likely hypothesis
+    weighted: Array  # (2, n), readings by their inverse covariance under it, at its top strengths
 
 
 def log_sum(values: Array) -> float:
@@ -64,15 +66,6 @@ def median(values: Array) -> float:
     ordered = sorted(values.tolist())
     middle = len(ordered) // 2
     return float(0.5 * (ordered[middle] + ordered[-1 - middle]))
-
-
-def over_strengths(curve: Array) -> tuple[Array, Array]:
-    """Return log evidence (H,) and strength probabilities of the curves, both (H, 2, A)."""
-    top = curve.max(axis=2, keepdims=True)
-    weight = np.exp(curve - top)
-    total = weight.sum(axis=2, keepdims=True)
-    evidence = (top + np.log(total / len(STRENGTHS))).sum(axis=(1, 2))
-    return evidence, weight / total
 
 
 MOST_TABLES, MOST_BLOCKS = 12, 128
@@ -139,7 +132,7 @@ class Bank:
             self._set(hypothesis, basis)
         self._synthesis: dict[int, Single] = {}
         self._blocks: dict[tuple[float, int, int], Array] = {}
-        self._tables: dict[float, tuple[Single, Array]] = {}
+        self._tables: dict[float, tuple[Single, Array, set[int]]] = {}
 
     def _set(self, hypothesis: int, basis: Array) -> None:
         n = len(self.rows)
@@ -172,9 +165,8 @@ class Bank:
         self.spectra[hypothesis] = eigenbasis.values
         self._set(hypothesis, eigenbasis.basis)
         self._synthesis[hypothesis] = eigenbasis.synthesis
-        for noise, (inverse, log_det) in self._tables.items():
-            changed = slice(hypothesis, hypothesis + 1)
-            inverse[changed], log_det[changed] = _precision(self.spectra[changed], noise)
+        for *_, replaced in self._tables.values():
+            replaced.add(hypothesis)
         for key in [key for key in self._blocks if key[1] == hypothesis]:
             del self._blocks[key]
 
@@ -201,8 +193,12 @@ class Bank:
         """Return inverse variances (H, A, n) and log determinants (H, A) at a noise level."""
         if noise not in self._tables:
             make_room(self._tables, MOST_TABLES)
-            self._tables[noise] = _precision(self.spectra, noise)
-        return self._tables[noise]
+            self._tables[noise] = *_precision(self.spectra, noise), set()
+        inverse, log_det, replaced = self._tables[noise]
+        while replaced:  # since this level was last seen
+            h = replaced.pop()
+            (inverse[h],), (log_det[h],) = _precision(self.spectra[h : h + 1], noise)
+        return inverse, log_det
 
     def evaluate(self, readings: Array, noise: float) -> FrameEvidence:
         """Return the evidence of every hypothesis.
@@ -213,14 +209,13 @@ class Bank:
         precision, log_det = self.precision(noise)
         count, n = self.spectra.shape
         projected = np.zeros((count, n, 2), dtype=np.float32)
-        curve, evidence = np.zeros((count, 2, len(STRENGTHS))), np.zeros(count)
-        strength = np.zeros(curve.shape)
-        fill_evidence(
-            self.analysis, _rows(readings), precision, log_det, np.isfinite(self.log_prior),
-            projected, curve, strength, evidence,
+        curve, strength = np.zeros((2, count, 2, len(STRENGTHS)))
+        evidence, weighted = np.zeros(count), np.zeros((2, n))
+        best = fill_evidence(
+            self.analysis, _rows(readings), precision, log_det, self.log_prior, projected, curve,
+            strength, evidence, weighted,
         )  # fmt: skip
-        evidence += self.log_prior
-        return FrameEvidence(projected, evidence, curve, strength, noise)
+        return FrameEvidence(projected, evidence, curve, strength, noise, best, weighted)
 
     def coefficients(self, seen: FrameEvidence, hypothesis: int) -> Array:
         """Return the coordinates (n, 2) of the posterior mean in a hypothesis' eigenvectors."""
@@ -333,7 +328,7 @@ class PosteriorModes:
 
 def error_level(seen: FrameEvidence, hypothesis: int) -> ErrorLevel:
     """Return the noise and strengths, rounded up, for which an uncertainty is computed."""
-    noise = 2.0 ** float(np.ceil(np.log2(seen.noise) - 0.1))
+    noise = 2.0 ** math.ceil(math.log2(seen.noise) - 0.1)
     real, imaginary = (int(part.argmax()) for part in seen.strength[hypothesis])
     strengths = min(real + real % 2, MOST), min(imaginary + imaginary % 2, MOST)
     return ErrorLevel(noise, strengths)

@@ -205,15 +205,9 @@ def frequency_tilt(frequencies_hz: Array) -> Array:
 
 
 def build_prior(
-    cloud: Cloud,
-    response: Response,
-    layer: Layer,
-    references: SensorTable,
-    excitation: Array,
-    frequencies_hz: Array,
-    accuracy: Accuracy,
-    rng: np.random.Generator,
-) -> CloudPrior:
+    cloud: Cloud, response: Response, layer: Layer, references: SensorTable, excitation: Array,
+    frequencies_hz: Array, accuracy: Accuracy, rng: np.random.Generator,
+) -> CloudPrior:  # fmt: skip
     """Compute a hypothesis for a set of references.
 
     ``excitation`` (M, K, 3) is the field of the emitters at the sources, T; ``accuracy`` that of
