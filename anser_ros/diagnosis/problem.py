@@ -4,13 +4,14 @@ First the whitening and the problem itself with its states; then what makes one 
 emitters' field, bins of references, blocks of time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.engine import JointState
+from anser_ros.diagnosis.engine import JointState, width_of
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.correction import Fields, reference_view, tool_view
 from anser_ros.effects.effect import Remedy, Term
@@ -127,18 +128,47 @@ class Whitener:
     def __call__(self, values: Array) -> Array:
         """Return values of shape (F, n) or (F, n, q), whitened."""
         columns = values[..., None] if values.ndim == 2 else values
-        out = np.empty(columns.shape)
+
+        def weigh(rows: slice, out: Array) -> None:
+            np.multiply(columns[rows], self.weight[rows, :, None], out=out)
+
+        return self._whitened(columns.shape[2], weigh).reshape(values.shape)
+
+    def columns(self, groups: Sequence[ComplexArray | None], widths: Sequence[int]) -> Array:
+        """Return groups of columns (F, S, K, q) side by side, whitened, shape (F, n, all q).
+
+        ``widths``: q of each group; the columns of one that is missing are zero.
+        """
+        ends = np.cumsum(widths).tolist()
+        places = [slice(end - width, end) for end, width in zip(ends, widths, strict=True)]
+        half = self.weight.shape[1] // 2
+
+        def weigh(rows: slice, out: Array) -> None:
+            weight = self.weight[rows, :, None]
+            for group, own in zip(groups, places, strict=True):
+                if group is None:
+                    out[..., own] = 0.0
+                    continue
+                flat = group[rows].reshape(len(out), half, -1)
+                np.multiply(flat.real, weight[:, :half], out=out[:, :half, own])
+                np.multiply(flat.imag, weight[:, half:], out=out[:, half:, own])
+
+        return self._whitened(ends[-1], weigh)
+
+    def _whitened(self, width: int, weigh: Callable[[slice, Array], None]) -> Array:
+        """So many columns (F, n, q), of which each slice of frames is weighed when it is due."""
+        out = np.empty((*self.weight.shape, width))
 
         def work(mine: slice) -> None:
             for rows in slices_of(mine, FRAMES_AT_ONCE):
-                np.multiply(columns[rows], self.weight[rows, :, None], out=out[rows])
+                weigh(rows, out[rows])
                 if self.basis is not None and self.inner is not None:
                     basis = self.basis[rows]
                     moved = self.inner[rows] @ (basis.transpose(0, 2, 1) @ out[rows])
                     out[rows] -= basis @ moved
 
         in_order(work, slices(len(out), FRAMES_A_THREAD))
-        return out.reshape(values.shape)
+        return out
 
 
 @dataclass(frozen=True)
@@ -236,12 +266,22 @@ class State(JointState[Term, Part]):
 
     def design(self, term: Term, probe: bool = False) -> list[Array | None]:
         """Return whitened columns of a term, one array (F, n, q) a part, None for no columns."""
-        columns = []
-        for part in self.parts:
-            find = term.effect.probe if probe else term.effect.columns
-            raw = find(term, part.view)
-            columns.append(None if raw is None else part.whitener(parts(raw)))
-        return columns
+        find = term.effect.probe if probe else term.effect.columns
+        return self._whitened([find(term, part.view) for part in self.parts])
+
+    def designs(self, terms: Sequence[Term]) -> list[Array | None]:
+        """Return whitened columns of terms side by side, one array (F, n, q) a part, or None."""
+        views = [part.view for part in self.parts]
+        return self._whitened(*([t.effect.columns(t, view) for view in views] for t in terms))
+
+    def _whitened(self, *groups: Sequence[ComplexArray | None]) -> list[Array | None]:
+        """Columns of groups, each one array or None a part, side by side."""
+        widths = [width_of(group) for group in groups]
+        each = zip(self.parts, zip(*groups, strict=True) if groups else repeat(()), strict=False)
+        return [
+            part.whitener.columns(raws, widths) if any(r is not None for r in raws) else None
+            for part, raws in each
+        ]
 
 
 def evaluate(problem: Problem, terms: Sequence[Term]) -> State:

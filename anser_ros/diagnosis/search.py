@@ -126,7 +126,7 @@ class _FluxSelection(ForwardSelection[Fit]):
         metal = _metal_beside(best, gain, fitted)
         if metal is not None:
             # A freedom in every frame is no match for metal before that has its shape.
-            shaped = moves_or_rests(self._fitter, metal[1], fitted, self._scored, metal[0])
+            shaped = moves_or_rests(self._fitter, metal[1], fitted, self._others, metal[0])
             if scorer.held_out - shaped.held_out() > gain:
                 search.metal_gain = max(search.metal_gain, metal[0])
                 return shaped
@@ -139,7 +139,7 @@ class _FluxSelection(ForwardSelection[Fit]):
             search.metal_gain = max(search.metal_gain, gain)
         search.rivals[term.label] = _rivals(gain, best, fitted)
         if term.effect.family is Family.MOVING_METAL:
-            return moves_or_rests(self._fitter, best, fitted, self._scored, gain)
+            return moves_or_rests(self._fitter, best, fitted, self._others, gain)
         near = [f for g, f in fitted if f is not best and g > decisions.STEADY * gain]
         steady = [f.newest for f in near if f.newest.effect.family is Family.STEADY]
         search.close[term.label] = steady
@@ -212,9 +212,15 @@ class _FluxSelection(ForwardSelection[Fit]):
         self._search.rounds.append(sorted(table, key=lambda c: -c.gain))
         return fitted
 
-    def _scored(self, scorer: Scorer[State]) -> list[tuple[Term, Score]]:
+    def _others(self, scorer: Scorer[State]) -> list[tuple[Term, Score]]:
+        """All candidates but metal, best first."""
+        return self._scored(scorer, most_metals=0)
+
+    def _scored(
+        self, scorer: Scorer[State], most_metals: int = decisions.MOST_METALS
+    ) -> list[tuple[Term, Score]]:
         """All candidates that are not active already, best first."""
-        candidates = _candidates(self._fitter.problem, scorer.state.terms)
+        candidates = _candidates(self._fitter.problem, scorer.state.terms, most_metals)
 
         def scored(few: slice) -> list[tuple[Term, Score]]:
             least = decisions.DISTINGUISHABLE
@@ -226,15 +232,15 @@ class _FluxSelection(ForwardSelection[Fit]):
         return sorted(chain.from_iterable(parts), key=lambda pair: pair[1].held_out)
 
 
-def _candidates(problem: Problem, taken: Sequence[Term]) -> list[Term]:
-    """Candidates beside some active effects."""
+def _candidates(problem: Problem, taken: Sequence[Term], most_metals: int) -> list[Term]:
+    """Candidates beside some active effects, metal if fewer than so many of them are."""
     ours = problem.apparatus.tool_channels
     metals = sum(term.effect.family.is_metal for term in taken)
     moving = any(term.effect.family is Family.MOVING_METAL for term in taken)
     return [
         term
         for effect in all_effects().values()
-        if not (effect.family.is_metal and (moving or metals >= decisions.MOST_METALS))
+        if not (effect.family.is_metal and (moving or metals >= most_metals))
         for term in effect.candidates(problem.apparatus)
         # Beside metal a reference's survey error looks like a fault of its channel.
         if not is_covered(term, taken) and (not metals or set(term.channels) <= set(ours))
