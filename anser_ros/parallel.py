@@ -45,6 +45,11 @@ class _Workers:
     count = 1
 
 
+def sharing() -> int:
+    """Return how many threads share the work."""
+    return _Workers.count
+
+
 @cache
 def _threads(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix='piece')

@@ -16,13 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.layouts import Generator, Layout, fit_coaxial, place
-from anser_ros.calibration.least_squares import (
-    ComplexArray,
-    GramFactor,
-    Spectrum,
-    as_complex,
-    as_real,
-)
+from anser_ros.calibration.least_squares import ComplexArray, GramFactor, as_complex, as_real
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
 from anser_ros.calibration.placement import CoilPlacer, PositionFitter
 from anser_ros.calibration.readings import DipoleSites, basis_rows, frame_blocks, usable_readings
@@ -264,7 +258,6 @@ class LayoutFitter:
         self.measurements, self.accuracy = measurements, accuracy
         self.placer = LayoutPlacer(generator, measurements)
         self._placed: dict[Layout, tuple[DipoleSites, ComplexArray | None]] = {}
-        self._starts: dict[Layout, Spectrum] = {}
 
     def fit(
         self,
@@ -279,9 +272,7 @@ class LayoutFitter:
         fitter = MomentFitter(self.measurements, dipoles, damping, self.accuracy, prior)
         if layout.moved:
             fitter.start_at(self._rich[0])
-        if layout not in self._starts:  # the same for every damping
-            self._starts[layout] = fitter.solve(exact=False)[1]
-        fit = fitter.fit(alternations, progress, exact, self._starts[layout])
+        fit = fitter.fit(alternations, progress, exact)
         if not layout.local:
             return LayoutFit(dipoles, fit)
         moments = join_regions(self.measurements, dipoles, fit, damping, self._layer)

@@ -309,18 +309,11 @@ class MomentFitter:
             for state in other.states
         ]
 
-    def solve(
-        self, exact: bool = True, known: Spectrum | None = None
-    ) -> tuple[ComplexArray, Spectrum]:
+    def solve(self, exact: bool = True) -> tuple[ComplexArray, Spectrum]:
         """Return the moments (N, K) at the present poses and weights, with their spectrum.
 
         With ``exact`` they are solved by QR, otherwise by inner products, which is faster.
-        ``known``: the spectrum, where it is.
         """
-        spectrum = known or self._spectrum(exact)
-        return as_complex(spectrum.solve(self.damping, self.prior)), spectrum
-
-    def _spectrum(self, exact: bool) -> Spectrum:
         kind, most = (TriangularFactor, BLOCK_ROWS) if exact else (GramFactor, GRAM_ROWS)
         factor = kind(len(self.dipoles), 2 * self.emitters)
         for state in self.states:
@@ -332,7 +325,8 @@ class MomentFitter:
                 rows = basis_rows(part, self.dipoles)
                 rows *= root
                 factor.add(rows, root * right)
-        return factor.spectrum()
+        spectrum = factor.spectrum()
+        return as_complex(spectrum.solve(self.damping, self.prior)), spectrum
 
     def correct(self, moments: ComplexArray, spent: float) -> float:
         """Move all poses to their most probable values and return the new noise estimate, T.
@@ -365,18 +359,11 @@ class MomentFitter:
         return max(float(np.sqrt(power / left_over)), SMALLEST_NOISE_T)
 
     def fit(
-        self,
-        alternations: int = 5,
-        progress: Progress | None = None,
-        exact: bool = True,
-        start: Spectrum | None = None,
+        self, alternations: int = 5, progress: Progress | None = None, exact: bool = True
     ) -> MomentFit:
-        """Alternate until the noise estimate no longer changes; the last solution may be exact.
-
-        ``start``: the spectrum at the present poses and weights, where it is known.
-        """
+        """Alternate until the noise estimate no longer changes; the last solution may be exact."""
         done = 0
-        moments, spectrum = self.solve(exact=False, known=start)
+        moments, spectrum = self.solve(exact=False)
         for done in range(1, alternations + 1):
             before = self.noise_t
             self.noise_t = self.correct(moments, spectrum.freedom(self.damping))

@@ -4,9 +4,8 @@ First the whitening and the problem itself with its states; then what makes one 
 emitters' field, bins of references, blocks of time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,48 +126,36 @@ class Whitener:
 
     def __call__(self, values: Array) -> Array:
         """Return values of shape (F, n) or (F, n, q), whitened."""
-        columns = values[..., None] if values.ndim == 2 else values
-
-        def weigh(rows: slice, out: Array) -> None:
-            np.multiply(columns[rows], self.weight[rows, :, None], out=out)
-
-        return self._whitened(columns.shape[2], weigh).reshape(values.shape)
+        out = (values[..., None] if values.ndim == 2 else values) * self.weight[..., None]
+        in_order(lambda rows: self._project(out, rows), slices(len(out), FRAMES_AT_ONCE))
+        return out.reshape(values.shape)
 
     def columns(self, groups: Sequence[ComplexArray | None], widths: Sequence[int]) -> Array:
         """Return groups of columns (F, S, K, q) side by side, whitened, shape (F, n, all q).
 
         ``widths``: q of each group; the columns of one that is missing are zero.
         """
+        out, half = np.zeros((*self.weight.shape, sum(widths))), self.weight.shape[1] // 2
         ends = np.cumsum(widths).tolist()
-        places = [slice(end - width, end) for end, width in zip(ends, widths, strict=True)]
-        half = self.weight.shape[1] // 2
-
-        def weigh(rows: slice, out: Array) -> None:
-            weight = self.weight[rows, :, None]
-            for group, own in zip(groups, places, strict=True):
-                if group is None:
-                    out[..., own] = 0.0
-                    continue
-                flat = group[rows].reshape(len(out), half, -1)
-                np.multiply(flat.real, weight[:, :half], out=out[:, :half, own])
-                np.multiply(flat.imag, weight[:, half:], out=out[:, half:, own])
-
-        return self._whitened(ends[-1], weigh)
-
-    def _whitened(self, width: int, weigh: Callable[[slice, Array], None]) -> Array:
-        """So many columns (F, n, q), of which each slice of frames is weighed when it is due."""
-        out = np.empty((*self.weight.shape, width))
 
         def work(mine: slice) -> None:
             for rows in slices_of(mine, FRAMES_AT_ONCE):
-                weigh(rows, out[rows])
-                if self.basis is not None and self.inner is not None:
-                    basis = self.basis[rows]
-                    moved = self.inner[rows] @ (basis.transpose(0, 2, 1) @ out[rows])
-                    out[rows] -= basis @ moved
+                weight = self.weight[rows, :, None]
+                for group, end, width in zip(groups, ends, widths, strict=True):
+                    if group is not None:
+                        flat, own = group[rows].reshape(-1, half, width), slice(end - width, end)
+                        np.multiply(flat.real, weight[:, :half], out=out[rows, :half, own])
+                        np.multiply(flat.imag, weight[:, half:], out=out[rows, half:, own])
+                self._project(out, rows)
 
         in_order(work, slices(len(out), FRAMES_A_THREAD))
         return out
+
+    def _project(self, out: Array, rows: slice) -> None:
+        """Take off what weighted values (F, n, q) of some frames have along the basis."""
+        if self.basis is not None and self.inner is not None:
+            basis = self.basis[rows]
+            out[rows] -= basis @ (self.inner[rows] @ (basis.transpose(0, 2, 1) @ out[rows]))
 
 
 @dataclass(frozen=True)
@@ -266,21 +253,18 @@ class State(JointState[Term, Part]):
 
     def design(self, term: Term, probe: bool = False) -> list[Array | None]:
         """Return whitened columns of a term, one array (F, n, q) a part, None for no columns."""
-        find = term.effect.probe if probe else term.effect.columns
-        return self._whitened([find(term, part.view) for part in self.parts])
+        return self.designs([term], probe)
 
-    def designs(self, terms: Sequence[Term]) -> list[Array | None]:
+    def designs(self, terms: Sequence[Term], probe: bool = False) -> list[Array | None]:
         """Return whitened columns of terms side by side, one array (F, n, q) a part, or None."""
-        views = [part.view for part in self.parts]
-        return self._whitened(*([t.effect.columns(t, view) for view in views] for t in terms))
-
-    def _whitened(self, *groups: Sequence[ComplexArray | None]) -> list[Array | None]:
-        """Columns of groups, each one array or None a part, side by side."""
-        widths = [width_of(group) for group in groups]
-        each = zip(self.parts, zip(*groups, strict=True) if groups else repeat(()), strict=False)
+        raw = [
+            [(t.effect.probe if probe else t.effect.columns)(t, part.view) for t in terms]
+            for part in self.parts
+        ]
+        widths = [width_of(group) for group in zip(*raw, strict=True)]
         return [
-            part.whitener.columns(raws, widths) if any(r is not None for r in raws) else None
-            for part, raws in each
+            part.whitener.columns(own, widths) if any(r is not None for r in own) else None
+            for part, own in zip(self.parts, raw, strict=True)
         ]
 
 

@@ -29,7 +29,7 @@ from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Problem, State
 from anser_ros.diagnosis.screening import noise_scale
 from anser_ros.effects.effect import Family, Term, all_effects
-from anser_ros.parallel import in_order, slices
+from anser_ros.parallel import in_order, sharing, slices
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -200,15 +200,17 @@ class _FluxSelection(ForwardSelection[Fit]):
         starts = _finalists(scored, scorer, self._how)
         starts += moving_starts(fitter.problem, scored, scorer, fitter.blocks)
         fitted: list[tuple[float, Fit]] = []
-        for expected, term in sorted(starts + fluctuations, key=lambda pair: -pair[0]):
-            if fitted and expected < decisions.LEAST_PROBE_GAIN * max(g for g, _ in fitted):
-                continue
-            if any(at_floor(f) and term.complexity > f.newest.complexity for _, f in fitted):
-                continue
-            fit = fitter.fit([*before.terms, term])
-            gain = scorer.held_out - fit.held_out() - taken_from_others(fit)
-            fitted.append((gain, fit))
-            table.append(Candidate(fit.newest, term.complexity, gain, gain))
+        left = sorted(starts + fluctuations, key=lambda pair: -pair[0])
+        while left:
+            some, left = left[: sharing()], left[sharing() :]
+            some = [pair for pair in some if not _is_surpassed(*pair, fitted)]
+            fits = in_order(lambda pair: fitter.fit([*before.terms, pair[1]]), some)
+            for (expected, term), fit in zip(some, fits, strict=True):
+                if _is_surpassed(expected, term, fitted):  # by one that was fitted beside it
+                    continue
+                gain = scorer.held_out - fit.held_out() - taken_from_others(fit)
+                fitted.append((gain, fit))
+                table.append(Candidate(fit.newest, term.complexity, gain, gain))
         self._search.rounds.append(sorted(table, key=lambda c: -c.gain))
         return fitted
 
@@ -230,6 +232,13 @@ class _FluxSelection(ForwardSelection[Fit]):
 
         parts = in_order(scored, slices(len(candidates), CANDIDATES_A_THREAD))
         return sorted(chain.from_iterable(parts), key=lambda pair: pair[1].held_out)
+
+
+def _is_surpassed(expected: float, term: Term, fitted: Sequence[tuple[float, Fit]]) -> bool:
+    """Whether fits gain far more than expected here, or a simpler one leaves but noise."""
+    if fitted and expected < decisions.LEAST_PROBE_GAIN * max(gain for gain, _ in fitted):
+        return True
+    return any(at_floor(fit) and term.complexity > fit.newest.complexity for _, fit in fitted)
 
 
 def _candidates(problem: Problem, taken: Sequence[Term], most_metals: int) -> list[Term]:

@@ -35,9 +35,9 @@ class Fields:
     model: Dipoles  # Good where tool sensors were calibrated
     illumination: Dipoles  # Good beside and below the board: what metal and reference sensors see
     omega: Array  # (K,), rad/s
-    # what `slopes` has found last, by what it was asked for
+    # what `slopes` has found last, by what it was asked for; other fields begin with nothing
     kept: dict[tuple[bool, bytes], tuple[ComplexArray, ...]] = field(
-        default_factory=dict, repr=False, compare=False
+        default_factory=dict, init=False, repr=False, compare=False
     )
 
     def slopes(
@@ -52,17 +52,11 @@ class Fields:
         found = self.kept.get(key)
         if found is None:
             dipoles = self.illumination if far else self.model
-            found = self.kept[key] = _slopes(dipoles, points, axes, lengths)
+            sites = dipoles.positions, dipoles.directions, dipoles.moments
+            found = self.kept[key] = flux_jacobian(points, axes, lengths, *sites)
             for oldest in list(self.kept)[:-KEPT]:
                 self.kept.pop(oldest, None)
         return found
-
-
-def _slopes(
-    dipoles: Dipoles, points: Array, axes: Array, lengths: Array
-) -> tuple[ComplexArray, ...]:
-    place, direction = dipoles.positions, dipoles.directions
-    return flux_jacobian(points, axes, lengths, place, direction, dipoles.moments)
 
 
 def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View:
@@ -77,7 +71,7 @@ def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View
     flat = centres.reshape(-1, 3), axes.reshape(-1, 3), np.tile(sensors.length, body.time.size)
     flux, d_position, d_axis = fields.slopes(*flat)
     if len(added.positions):
-        more = _slopes(added, *flat)
+        more = flux_jacobian(*flat, added.positions, added.directions, added.moments)
         flux, d_position, d_axis = flux + more[0], d_position + more[1], d_axis + more[2]
     shape = (body.time.size, len(sensors))
     d_position, d_axis = d_position.reshape(*shape, 3, -1), d_axis.reshape(*shape, 3, -1)

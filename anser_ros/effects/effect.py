@@ -450,11 +450,7 @@ def pairs_of(values: ComplexArray) -> Any:
 
 def both_phases(unit: NDArray[np.inexact]) -> ComplexArray:
     """Return columns (..., m) in phase, then in quadrature, (..., 2 m)."""
-    count = unit.shape[-1]
-    out = np.empty((*unit.shape[:-1], 2 * count), dtype=complex)
-    out[..., :count] = unit
-    np.multiply(unit, 1j, out=out[..., count:])
-    return out
+    return np.concatenate([unit, 1j * unit], axis=-1)
 
 
 def unit_matrix(size: int) -> ComplexArray:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from anser_ros.field.model import Dipoles
 from anser_ros.kernel_cache import kernel
-from anser_ros.parallel import in_order, slices
 from anser_ros.physics.constants import DIPOLE_CONSTANT, MU_0
 from anser_ros.physics.dipole import GAUSS_OFFSET
 
@@ -28,8 +27,6 @@ ComplexArray = NDArray[np.complex128]
 NEGLIGIBLE = 1e-4
 """Share of the emitters' field that may lie in quadrature and is left out: less than metal is
 known to."""
-FRAMES_AT_ONCE = 16
-"""Frames whose products of amplitudes are kept at once: a megabyte, which stays in the cache."""
 UNIT = 1e-4
 """Couplings count in 1e-4 m^3; a perfectly conducting ball of 25 mm has the polarisability -1."""
 
@@ -96,7 +93,8 @@ class Shapes:
             # Emitters drive in phase with their current: the other part is nothing at all.
             light = drive.real
         if self.local:
-            return self._local_flux(ears, light * (UNIT / MU_0), modes)
+            unit = ears[..., :, None, :] * (light[..., None, :, :] * (UNIT / MU_0))
+            return np.asarray(unit @ modes)
         count, shapes = modes.shape[1], len(self.functionals)
         whole = self._operators(modes[: self.first.size])
         made = light @ whole
@@ -112,21 +110,6 @@ class Shapes:
         else:
             flux = ears @ made
         return np.asarray(flux.reshape(*flux.shape[:-1], omega.size, count))
-
-    @staticmethod
-    def _local_flux(ears: Array, light: NDArray[np.inexact], modes: Array) -> NDArray[np.inexact]:
-        """Flux (..., S, K, m) where each shape answers alone, some frames at once."""
-        frames = ears.reshape(-1, *ears.shape[-2:])
-        lights = np.broadcast_to(light, (*ears.shape[:-2], *light.shape[-2:]))
-        lights = lights.reshape(-1, *light.shape[-2:])
-        out = np.empty((*frames.shape[:2], light.shape[-2], modes.shape[1]), light.dtype)
-
-        def work(rows: slice) -> None:
-            products = frames[rows, :, None, :] * lights[rows, None, :, :]
-            out[rows] = (products.reshape(-1, len(modes)) @ modes).reshape(out[rows].shape)
-
-        in_order(work, slices(len(frames), FRAMES_AT_ONCE))
-        return out.reshape(*ears.shape[:-1], *out.shape[2:])
 
     def _operators(self, modes: Array) -> Array:
         """Each mode's T from modes of pairs (P, m), side by side: (M, M m)."""
