@@ -8,8 +8,9 @@ let other threads run meanwhile.
 import hashlib
 import os
 import socket
+import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
@@ -19,6 +20,7 @@ Result = TypeVar('Result')
 
 ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 """Variables that give BLAS one thread, if set before numpy is imported; its matrices are small."""
+_THIS = threading.local()
 
 
 def cores() -> int:
@@ -58,26 +60,28 @@ def _threads(count: int) -> ThreadPoolExecutor:
 def in_order(work: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list[Result]:
     """Return the results of all pieces, in their order.
 
-    The caller works too, and so does any other thread that is idle: the work inside a piece is
-    divided again where others have none left.
+    The caller works too. Work inside a piece is not divided again: a piece that waits for others
+    may hold what they need.
     """
     whole, most = list(pieces), _Workers.count
-    if most == 1 or len(whole) < 2:
+    if most == 1 or len(whole) < 2 or getattr(_THIS, 'is_busy', False):
         return [work(piece) for piece in whole]
     left, found = iter(range(len(whole))), {}
 
     def help_out() -> None:
-        for index in left:
-            found[index] = work(whole[index])
+        _THIS.is_busy = True
+        try:
+            for index in left:
+                found[index] = work(whole[index])
+        finally:
+            _THIS.is_busy = False
 
     helpers = [_threads(most - 1).submit(help_out) for _ in range(min(most, len(whole)) - 1)]
     try:
         help_out()
-    finally:  # a helper that has not begun is not waited for, so that none waits for another
-        begun = [helper for helper in helpers if not helper.cancel()]
-        wait(begun)
-    for helper in begun:
-        helper.result()
+    finally:
+        for helper in helpers:
+            helper.result()
     return [found[index] for index in range(len(whole))]
 
 

@@ -11,7 +11,7 @@ from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layout_fit import LayoutFitter, LayoutPlacer, ScaledNominal, rich_layout
 from anser_ros.calibration.layouts import Layout, place
 from anser_ros.calibration.least_squares import as_complex
-from anser_ros.calibration.placement import CoilPlacer, PositionFitter, basis_and_slopes
+from anser_ros.calibration.placement import CoilPlacer, PositionFitter, position_slopes
 from anser_ros.calibration.readings import DipoleSites, fold_of_frames, usable_weights
 from anser_ros.calibration.selection import LayoutScorer
 from anser_ros.field.model import FieldModel
@@ -117,7 +117,7 @@ def test_position_slopes_are_differences(rng, length):
     axes = rng.normal(size=(6, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     lengths = np.full(6, length)
-    slopes = basis_and_slopes(points, axes, lengths, world.dipoles)[:, 1:].transpose(0, 2, 1)
+    slopes = position_slopes(points, axes, lengths, world.dipoles)
     for i in range(3):
         step = np.zeros(3)
         step[i] = 1e-6

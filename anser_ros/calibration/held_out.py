@@ -152,11 +152,10 @@ def predict_held_out(
     everywhere: then it is said by which factor errors are larger than their covariance makes them.
     """
     blocks = np.unique(np.concatenate(list(folds))).tolist()
+    fits = in_order(fit, blocks)
     noise_t, flux_noise_t = reference.noise_t, reference.quadrature_noise_t
-
-    def predicted(fold: int) -> HeldOutTally:
-        part_fit = fit(fold)
-        tally = HeldOutTally(noise_t, min(noise_t, flux_noise_t), accuracy, len(part_fit.dipoles))
+    tally = HeldOutTally(noise_t, min(noise_t, flux_noise_t), accuracy, len(fits[0].dipoles))
+    for fold, part_fit in zip(blocks, fits, strict=True):
         left = None if damping is None else open_moments(part_fit, damping)
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))
@@ -165,10 +164,7 @@ def predict_held_out(
                 terms = pose_terms(part, part_fit.dipoles, part_fit.fit.moments)
                 expected = None if left is None else expected_power(left, part_fit.dipoles, part)
                 tally.add(terms, usable_weights(part), part.position, expected)
-        return tally
-
-    tallies = in_order(predicted, blocks)
-    return tallies[0].joined(tallies[1:]).result()
+    return tally.result()
 
 
 class HeldOutTally:
@@ -202,11 +198,6 @@ class HeldOutTally:
                 np.zeros(0) if expected is None else expected,
             )
         )
-
-    def joined(self, others: 'Sequence[HeldOutTally]') -> 'HeldOutTally':
-        """Return this tally with what others took in after it."""
-        self._parts += [part for other in others for part in other._parts]
-        return self
 
     def result(self) -> HeldOut:
         """Return the figures of all frames that were taken in."""

@@ -54,24 +54,23 @@ class GramFactor:
 
     def __init__(self, unknowns: int, right_sides: int) -> None:
         self.unknowns = unknowns
-        self.gram = np.zeros((unknowns, unknowns + right_sides))
+        self.gram = np.zeros((unknowns + right_sides, unknowns + right_sides))
 
     def add(self, matrix: Array, right: Array) -> None:
         """Take in rows (P, N) with their right-hand sides (P, M)."""
-        n, scaled = self.unknowns, right * RIGHT_SCALE
-        self.gram[:n, :n] += matrix.T @ matrix
-        self.gram[:n, n:] += matrix.T @ scaled
+        block = np.concatenate([matrix, right * RIGHT_SCALE], axis=1)
+        self.gram += block.T @ block
 
     def spectrum(self) -> 'Spectrum':
         """Return the singular value decomposition of the problem by eigenvectors."""
         n = self.unknowns
-        scale = np.sqrt(np.diag(self.gram))
+        scale = np.sqrt(np.diag(self.gram)[:n])
         scale[scale == 0.0] = 1.0
-        values, vectors = np.linalg.eigh(self.gram[:, :n] / np.outer(scale, scale))
+        values, vectors = np.linalg.eigh(self.gram[:n, :n] / np.outer(scale, scale))
         floor = values[-1] * np.finfo(float).eps * n
         s = np.sqrt(np.maximum(values, floor))[::-1]
         v = vectors[:, ::-1].T
-        right = self.gram[:, n:] / (scale[:, None] * RIGHT_SCALE)
+        right = self.gram[:n, n:] / (scale[:, None] * RIGHT_SCALE)
         return Spectrum(scale, s, v, (v @ right) / s[:, None])
 
 

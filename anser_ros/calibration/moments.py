@@ -27,7 +27,6 @@ from anser_ros.calibration.least_squares import (
     as_real,
 )
 from anser_ros.calibration.readings import (
-    BLOCK_ROWS,
     DipoleSites,
     basis_rows,
     flux_slopes,
@@ -37,7 +36,6 @@ from anser_ros.calibration.readings import (
 )
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
-from anser_ros.parallel import in_order, slices
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -46,8 +44,6 @@ ComplexArray = NDArray[np.complex128]
 OUTLIER_SCALE = 3.0
 """Residuals larger than this many times the median residual lose weight. A smaller value takes
 weight from good readings, a larger one lets bad readings pull at the fit."""
-SLOPES_AT_ONCE = 512
-"""Readings whose slopes a thread works out at once: half a megabyte, which stays in the cache."""
 SMALLEST_NOISE_T = 1e-13
 """Lower bound of an estimated noise, T a phasor component. It keeps divisions finite for data
 without noise and is far below the tens of picotesla of real electronics."""
@@ -91,20 +87,15 @@ def pose_slopes(
     (F, 3): the body's origin, m. ``by_place``, ``by_axis`` (F, S, 3, K): derivatives by the
     sensors' centres (T/m) and axes (T).
     """
-    frames, sensors = points.shape[:2]
-    out = np.empty((frames, sensors, 2 * by_place.shape[3], 6))
-
-    def work(rows: slice) -> None:
-        place, turn = as_real(by_place[rows]), as_real(by_axis[rows])
-        arm, axis = points[rows] - position[rows, None, :], axes[rows]
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            out[rows, ..., i] = place[:, :, i]
-            # The cross products, in a small part of the time of `numpy.cross`.
-            moved_by = arm[..., j, None] * place[:, :, k] - arm[..., k, None] * place[:, :, j]
-            turned_by = axis[..., j, None] * turn[:, :, k] - axis[..., k, None] * turn[:, :, j]
-            out[rows, ..., 3 + i] = moved_by + turned_by
-
-    in_order(work, slices(frames, max(1, SLOPES_AT_ONCE // max(sensors, 1))))
+    place, turn = as_real(by_place), as_real(by_axis)
+    arms = points - position[:, None, :]
+    out = np.empty((*place.shape[:2], place.shape[3], 6))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., i] = place[:, :, i]
+        # The cross products, in a small part of the time of `numpy.cross`.
+        moved_by = arms[..., j, None] * place[:, :, k] - arms[..., k, None] * place[:, :, j]
+        turned_by = axes[..., j, None] * turn[:, :, k] - axes[..., k, None] * turn[:, :, j]
+        out[..., 3 + i] = moved_by + turned_by
     return out
 
 
@@ -117,14 +108,7 @@ def most_probable_step(
     Returns the steps (F, 6), and the residuals (F, S, 2K) after them to first order, T.
     """
     step = PoseWhitener(terms.slope, weights, noise_t, precision).step(terms.residual, offset)
-    return step, left_after(terms, step)
-
-
-def left_after(terms: PoseTerms, step: Array) -> Array:
-    """Return the residuals (F, S, 2K) after a step (F, 6) of the poses, to first order, T."""
-    frames, sensors, parts, _ = terms.slope.shape
-    taken = terms.slope.reshape(frames, sensors * parts, 6) @ step[:, :, None]
-    return np.asarray(terms.residual - taken.reshape(terms.residual.shape))
+    return step, terms.residual - np.einsum('fsci,fi->fsc', terms.slope, step)
 
 
 def moved(measurements: Measurements, step: Array) -> Measurements:
@@ -164,10 +148,10 @@ class PoseWhitener:
     """
 
     def __init__(self, slope: Array, weights: Array, noise_t: float, precision: Array) -> None:
-        parts = slope.shape[2]
+        frames, _, parts, _ = slope.shape
         self.noise_t, self.stated = noise_t, precision
         self.root = np.repeat(np.sqrt(weights), parts, axis=1)
-        self.slope = slope.reshape(*self.root.shape, 6) * (self.root / noise_t)[:, :, None]
+        self.slope = slope.reshape(frames, -1, 6) * (self.root / noise_t)[:, :, None]
         normal = self.slope.transpose(0, 2, 1) @ self.slope
         self.precision = normal + precision[..., None] * np.eye(6)
         self.inverse = np.linalg.inv(self.precision)
@@ -175,9 +159,9 @@ class PoseWhitener:
         self.readings = self.root.astype(bool).sum(axis=1)
 
     @property
-    def freedom(self) -> Array:
-        """Return the effective number of each frame's pose parameters that its readings tell."""
-        return np.asarray(np.trace(self.share, axis1=1, axis2=2))
+    def freedom(self) -> float:
+        """Return the effective number of pose parameters that all readings determine."""
+        return float(np.trace(self.share, axis1=1, axis2=2).sum())
 
     def step(self, residual: Array, offset: Array | float = 0.0) -> Array:
         """Return the steps (F, 6) to the most probable poses; the rest as `most_probable_step`."""
@@ -187,7 +171,7 @@ class PoseWhitener:
     def _projected(self, residual: Array) -> tuple[Array, Array]:
         """Return residuals in units of the noise (F, 2KS) and their products with J (F, 6)."""
         white = residual.reshape(self.root.shape) * self.root / self.noise_t
-        return white, (self.slope.transpose(0, 2, 1) @ white[:, :, None])[..., 0]
+        return white, np.einsum('fri,fr->fi', self.slope, white)
 
     def chi_square(self, residual: Array) -> Array:
         """Return each frame's ``r^T C^-1 r``, shape (F,), of residuals (F, S, 2K) in T."""
@@ -199,7 +183,7 @@ class PoseWhitener:
         """Return the part (F, S, 2K) of residuals that no pose explains, ``sigma^2 C^-1 r``."""
         white, along = self._projected(residual)
         step = np.einsum('fij,fj->fi', self.inverse, along)
-        left = white - (self.slope @ step[:, :, None])[..., 0]
+        left = white - np.einsum('fri,fi->fr', self.slope, step)
         return np.asarray((left * self.noise_t).reshape(residual.shape))
 
     def excess_power(self, residual: Array, flux_noise_t: float | None = None) -> Array:
@@ -229,8 +213,6 @@ Progress = Callable[[str, float], None]
 
 CONVERGED = 2e-3
 """Relative change of the noise estimate below which the alternation ends."""
-GRAM_ROWS = 1024
-"""Readings whose inner products are taken at once: some megabytes, which stay in the cache."""
 LEAST_FREEDOM = 0.05
 """Least degrees of freedom of the residual, as a fraction of the phasor components: a bound for
 fits with nearly as many parameters as readings."""
@@ -314,24 +296,22 @@ class MomentFitter:
 
         With ``exact`` they are solved by QR, otherwise by inner products, which is faster.
         """
-        kind, most = (TriangularFactor, BLOCK_ROWS) if exact else (GramFactor, GRAM_ROWS)
+        kind = TriangularFactor if exact else GramFactor
         factor = kind(len(self.dipoles), 2 * self.emitters)
         for state in self.states:
             count, sensors = state.weights.shape
-            for block in frame_blocks(count, sensors, most):
+            for block in frame_blocks(count, sensors):
                 part = state.corrected.frames(block)
                 root = np.sqrt(state.weights[block].reshape(-1, 1))
                 right = as_real(part.flux).reshape(-1, 2 * self.emitters)
-                rows = basis_rows(part, self.dipoles)
-                rows *= root
-                factor.add(rows, root * right)
+                factor.add(root * basis_rows(part, self.dipoles), root * right)
         spectrum = factor.spectrum()
         return as_complex(spectrum.solve(self.damping, self.prior)), spectrum
 
-    def correct(self, moments: ComplexArray, spent: float) -> float:
+    def correct(self, moments: ComplexArray, freedom: float) -> float:
         """Move all poses to their most probable values and return the new noise estimate, T.
 
-        ``spent`` is the effective number of parameters of each right-hand side.
+        ``freedom`` is the effective number of parameters of each right-hand side.
         """
         power, turned, count, used = 0.0, 0.0, 0.0, 0.0
         precision = pose_precision(self.accuracy)
@@ -339,22 +319,19 @@ class MomentFitter:
             for block in frame_blocks(*state.weights.shape):
                 part = state.corrected.frames(block)
                 terms = pose_terms(part, self.dipoles, moments)
-                white = PoseWhitener(terms.slope, state.weights[block], self.noise_t, precision)
-                step, freedom = white.step(terms.residual, state.offset[block]), white.freedom
-                left = left_after(terms, step)
+                step, left = most_probable_step(
+                    terms, state.weights[block], self.noise_t, precision, state.offset[block]
+                )
                 state.offset[block] += step
-                weight = outlier_weights(left, state.usable[block])
-                other = (weight != state.weights[block]).any(axis=1)
-                state.weights[block] = weight
-                white = PoseWhitener(terms.slope[other], weight[other], self.noise_t, precision)
-                freedom[other] = white.freedom
+                state.weights[block] = outlier_weights(left, state.usable[block])
+                weight = state.weights[block]
                 power += float((weight[:, :, None] * left**2).sum())
                 turned += float((weight[:, :, None] * left[:, :, 1::2] ** 2).sum())
                 count += float(weight.sum()) * left.shape[2]
-                used += float(freedom.sum())
+                used += PoseWhitener(terms.slope, weight, self.noise_t, precision).freedom
             state.corrected = moved(state.measured, state.offset)
-        left_over = max(count - used - spent * 2 * self.emitters, LEAST_FREEDOM * count)
-        halved = max(count / 2.0 - spent * self.emitters, LEAST_FREEDOM / 2.0 * count)
+        left_over = max(count - used - freedom * 2 * self.emitters, LEAST_FREEDOM * count)
+        halved = max(count / 2.0 - freedom * self.emitters, LEAST_FREEDOM / 2.0 * count)
         self.quadrature_noise_t = max(float(np.sqrt(turned / halved)), SMALLEST_NOISE_T)
         return max(float(np.sqrt(power / left_over)), SMALLEST_NOISE_T)
 

@@ -19,7 +19,7 @@ from anser_ros.calibration.least_squares import ComplexArray, as_real
 from anser_ros.calibration.readings import BLOCK_ROWS, DipoleSites, frame_blocks, weighted_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
-from anser_ros.physics.dipole import dipole_rows, fill_coil_basis, flux_basis
+from anser_ros.physics.dipole import GAUSS_OFFSET, dipole_rows, fill_fields, flux_basis
 
 Array = NDArray[np.float64]
 
@@ -120,19 +120,25 @@ CONVERGED = 1e-3
 """Relative fall of the sum of squares below which another step is not worth its time."""
 
 
-def basis_and_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleSites) -> Array:
-    """Return the flux basis, and its derivatives by the dipoles' positions.
+def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleSites) -> Array:
+    """Return the derivative of the flux basis by the dipoles' positions.
 
     ``points``, ``axes`` (P, 3): sensor centres (m) and unit axes, frame fg. ``lengths`` (P,): coil
     lengths, m.
-    Returns (P, 4, N): fluxes, T / (A m^2), and derivatives by x, y and z, T / (A m^3).
+    Returns (P, N, 3): derivatives, T / (A m^3).
     """
-    every = np.empty((len(points), 7, len(dipoles)))
-    rows = dipole_rows(dipoles.positions, dipoles.directions)
-    fill_coil_basis(points, axes, lengths, rows, every)
-    # The field depends on the difference of places: moving the dipole is the negative.
-    np.negative(every[:, 1:4], out=every[:, 1:4])
-    return every[:, :4]
+    out = np.zeros((points.shape[0], len(dipoles), 3))
+    fields = np.empty((points.shape[0], 9, len(dipoles)))
+    rows, (n0, n1, n2) = dipole_rows(dipoles.positions, dipoles.directions), axes.T[:, :, None]
+    half = GAUSS_OFFSET * lengths[:, None]
+    signs = (1.0, -1.0) if half.any() else (1.0,)
+    for sign in signs:
+        fill_fields(points + sign * half * axes, rows, fields)
+        for i, (x, y, z) in enumerate(((3, 4, 5), (4, 6, 7), (5, 7, 8))):
+            # The field depends on the difference of places: moving the dipole is the negative.
+            slope = n0 * fields[:, x] + n1 * fields[:, y] + n2 * fields[:, z]
+            out[:, :, i] -= slope / len(signs)
+    return out
 
 
 class PositionFitter:
@@ -184,23 +190,26 @@ class PositionFitter:
         return np.asarray(moments), max(power + fixed - float(explained), 0.0)
 
     def _normal(self, dipoles: DipoleSites, moments: Array) -> tuple[Array, Array]:
-        """Return Kaufman's normal matrix (3N, 3N) and gradient (3N,), by x, by y, then by z."""
+        """Return Kaufman's normal matrix (3N, 3N) and gradient (3N,) of the positions."""
         size = len(dipoles)
         inner = np.zeros((3 * size, 3 * size))
         cross = np.zeros((size, 3 * size))
         gram = np.zeros((size, size))
-        gradient = np.zeros((3, size))
+        gradient = np.zeros((size, 3))
         for points, axes, lengths, root, flux in self.blocks:
-            rows = basis_and_slopes(points, axes, lengths, dipoles) * root[:, None, None]
-            basis, slopes = rows[:, 0], rows[:, 1:]
-            along = (flux - basis @ moments) @ moments.T
-            gradient += (slopes * along[:, None]).sum(axis=0)
+            basis = flux_basis(points, axes, lengths, dipoles.positions, dipoles.directions)
+            basis *= root[:, None]
+            slopes = position_slopes(points, axes, lengths, dipoles) * root[:, None, None]
+            residual = flux - basis @ moments
+            along = np.einsum('pr,nr->pn', residual, moments, optimize=True)
+            gradient += np.einsum('pnc,pn->nc', slopes, along, optimize=True)
             flat = slopes.reshape(len(points), -1)
             inner += flat.T @ flat
             cross += basis.T @ flat
             gram += basis.T @ basis
         inner -= cross.T @ np.linalg.solve(gram + np.diag(self.ridge), cross)
-        return inner * np.tile(moments @ moments.T, (3, 3)), gradient.ravel()
+        pairs = np.repeat(np.repeat(moments @ moments.T, 3, axis=0), 3, axis=1)
+        return inner * pairs, gradient.ravel()
 
     def fit(self, most_steps: int = MOST_STEPS) -> DipoleSites:
         """Take Levenberg-Marquardt steps until the cost hardly falls any more."""
@@ -228,8 +237,7 @@ class PositionFitter:
         floor = 1e-9 * float(diagonal.max())
         step = np.linalg.solve(
             normal + np.diag(strength * np.maximum(diagonal, floor) + floor), gradient
-        )
-        step = step.reshape(3, -1).T
+        ).reshape(-1, 3)
         size = np.linalg.norm(step, axis=1, keepdims=True)
         step *= np.minimum(1.0, LONGEST_MOVE_M / np.maximum(size, 1e-12))
         return DipoleSites(dipoles.positions + step, dipoles.directions)

@@ -196,12 +196,8 @@ def flux_basis(
     """
     r, n, spans = _sensors(points, axes, lengths)
     q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
-    out, dipoles = np.empty((r.shape[0], q.shape[0])), dipole_rows(q, u)
-
-    def work(rows: slice) -> None:
-        fill_flux_basis(r[rows], n[rows], spans[rows], dipoles, out[rows])
-
-    in_order(work, slices(len(r), POINTS_A_THREAD))
+    out = np.empty((r.shape[0], q.shape[0]))
+    fill_flux_basis(r, n, spans, dipole_rows(q, u), out)
     return out
 
 
