@@ -47,6 +47,11 @@ class _Workers:
     count = 1
 
 
+def sharing() -> int:
+    """Return how many threads share the work."""
+    return _Workers.count
+
+
 @cache
 def _threads(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix='piece')
@@ -55,17 +60,29 @@ def _threads(count: int) -> ThreadPoolExecutor:
 def in_order(work: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list[Result]:
     """Return the results of all pieces, in their order.
 
-    Work inside a piece is not divided again.
+    The caller works too. Work inside a piece is not divided again: a piece that waits for others
+    may hold what they need.
     """
-    whole = list(pieces)
-    if _Workers.count == 1 or len(whole) < 2 or getattr(_THIS, 'is_busy', False):
+    whole, most = list(pieces), _Workers.count
+    if most == 1 or len(whole) < 2 or getattr(_THIS, 'is_busy', False):
         return [work(piece) for piece in whole]
+    left, found = iter(range(len(whole))), {}
 
-    def do(piece: Piece) -> Result:
+    def help_out() -> None:
         _THIS.is_busy = True
-        return work(piece)
+        try:
+            for index in left:
+                found[index] = work(whole[index])
+        finally:
+            _THIS.is_busy = False
 
-    return list(_threads(_Workers.count).map(do, whole))
+    helpers = [_threads(most - 1).submit(help_out) for _ in range(min(most, len(whole)) - 1)]
+    try:
+        help_out()
+    finally:
+        for helper in helpers:
+            helper.result()
+    return [found[index] for index in range(len(whole))]
 
 
 def slices(count: int, size: int) -> list[slice]:

@@ -19,6 +19,7 @@ from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, parts
 from anser_ros.diagnosis.screening import noise_scale
 from anser_ros.effects.base import View
 from anser_ros.effects.effect import INEXACT, Family, Term, all_effects
+from anser_ros.parallel import in_order
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -38,7 +39,7 @@ def _opened(
     for part in state.parts:
         raw = columns(part.view)
         if raw is not None:
-            white = part.whitener(parts(raw))
+            white = part.whitener.columns([raw], [raw.shape[-1]])
             normal.append(white.transpose(0, 2, 1) @ white)
             right.append(np.einsum('fnq,fn->fq', white, part.white))
     if not any(np.any(one) for one in normal):
@@ -233,31 +234,30 @@ def moves_or_rests(
     fitter: Fitter,
     moving: Fit,
     fitted: Sequence[tuple[float, Fit]],
-    candidates: Callable[[Scorer[State]], Sequence[tuple[Term, Score]]],
+    others: Callable[[Scorer[State]], Sequence[tuple[Term, Score]]],
     explained: float,
 ) -> Fit:
     """Return metal that moves, or at rest where that explains as much, alone or with one effect.
 
     ``moving``: with metal that moves for its newest effect; ``fitted``: all fits of the round;
-    those with metal at rest for their newest effect are the rivals; ``candidates``: all other
-    effects with their scores, best first, from a scorer; ``explained``: what the metal that moves
+    those with metal at rest for their newest effect are the rivals; ``others``: all effects but
+    metal with their scores, best first, from a scorer; ``explained``: what the metal that moves
     takes off the held-out sum of squares.
 
     Returns a settled fit (`anser_ros.diagnosis.fit`).
     """
-    shaped = settled(fitter, moving.terms)
     resting = [(g, f) for g, f in fitted if f.newest.effect.family is Family.METAL_AT_REST]
     gain, rest = max(resting, key=lambda pair: pair[0], default=(0.0, moving))
     if gain < decisions.NO_RIVAL * explained:
-        return shaped
-    rest = settled(fitter, rest.terms)
+        return settled(fitter, moving.terms)
+    shaped, rest = in_order(lambda fit: settled(fitter, fit.terms), [moving, rest])
     limit = _limit(fitter, shaped, explained)
     if rest.held_out() < limit:
         return rest
     scorer = Scorer(rest.state, fitter.blocks)
     tried: set[str] = set()
-    for term, score in candidates(scorer):
-        if term.effect.family.is_metal or term.effect.name in tried:
+    for term, score in others(scorer):
+        if term.effect.name in tried:
             continue
         # A linear score is only a promise: the fit may still bring down what is within these.
         hopeless = (

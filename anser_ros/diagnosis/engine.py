@@ -203,9 +203,9 @@ def joined(groups: Sequence[Columns]) -> list[Array | None]:
     return out
 
 
-def width_of(group: Columns) -> int:
+def width_of(group: Sequence[NDArray[Any] | None]) -> int:
     """Return the number of columns of a group, 0 where it has none in any part."""
-    return next((c.shape[2] for c in group if c is not None), 0)
+    return next((c.shape[-1] for c in group if c is not None), 0)
 
 
 TermT = TypeVar('TermT', bound=BaseTerm)
@@ -238,7 +238,7 @@ class JointState(Generic[TermT, PartT]):
         """Return the state of the same problem with other terms."""
         raise NotImplementedError
 
-    @property
+    @cached_property
     def sum_of_squares(self) -> float:
         """Return the sum of squares of the whitened residuals."""
         return float(sum(np.sum(part.white**2) for part in self.parts))
@@ -265,8 +265,12 @@ class JointState(Generic[TermT, PartT]):
 
     def sums(self, blocks: Ints) -> BlockSums:
         """Return the normal equations of all terms, block by block."""
-        columns = joined([self.design(term) for term in self.terms]) if self.terms else None
-        return block_sums(self.parts, columns or [None] * len(self.parts), blocks)
+        return block_sums(self.parts, self.designs(self.terms), blocks)
+
+    def designs(self, terms: Sequence[TermT]) -> list[Array | None]:
+        """Return whitened columns of terms side by side, one array (F, n, q) a part, or None."""
+        groups = [self.design(term) for term in terms]
+        return joined(groups) if groups else [None] * len(self.parts)
 
 
 StateT = TypeVar('StateT', bound=JointState[Any, Any])
@@ -277,8 +281,18 @@ class JointFit(Generic[StateT]):
     """Holds a state at the joint optimum of its terms."""
 
     state: StateT
-    sums: BlockSums
-    prior: Array  # (q,)
+    blocks: Ints  # of time, those that take part
+    made: BlockSums | None = None  # the state's sums, where the last step has made them
+
+    @cached_property
+    def sums(self) -> BlockSums:
+        """Return the normal equations at the optimum, made when they are first asked for."""
+        return self.state.sums(self.blocks) if self.made is None else self.made
+
+    @cached_property
+    def prior(self) -> Array:
+        """Return the standard deviations of all terms' parameters, shape (q,)."""
+        return self.state.prior()
 
     @property
     def misfit(self) -> float:
@@ -309,21 +323,24 @@ class JointFit(Generic[StateT]):
 FitT = TypeVar('FitT', bound=JointFit[Any])
 
 
-def descended(state: StateT, blocks: Ints, iterations: int) -> tuple[StateT, BlockSums, Array]:
+def descended(
+    state: StateT, blocks: Ints, iterations: int
+) -> tuple[StateT, Ints, BlockSums | None]:
     """Lower a sum of squares by damped Gauss-Newton steps until it has settled.
 
-    Returns the state, its sums over ``blocks`` and its prior; ``iterations``: steps at most.
+    ``iterations``: steps at most. Returns the state, ``blocks``, and the state's sums over these
+    if they were made.
     """
-    sums, prior, damping = state.sums(blocks), state.prior(), 0.0
-    for _ in range(iterations if prior.size else 0):
-        better, damping = _better(state, sums, prior, damping)
+    damping = 0.0
+    for _ in range(iterations if state.prior().size else 0):
+        sums = state.sums(blocks)
+        better, damping = _better(state, sums, state.prior(), damping)
         if better is None:
-            break
+            return state, blocks, sums
         before, state = state.sum_of_squares, better
-        sums, prior = state.sums(blocks), state.prior()
         if before - state.sum_of_squares < SETTLED * before:
             break
-    return state, sums, prior
+    return state, blocks, None
 
 
 def _better(
@@ -368,8 +385,7 @@ class Scorer(Generic[StateT]):
     def __init__(self, state: StateT, blocks: Ints) -> None:
         self.state, self.blocks = state, blocks
         terms = [t for t in state.terms if t.theta.size <= MOST_COLUMNS]
-        empty: Columns = [None] * len(state.parts)
-        self._active = joined([state.design(t) for t in terms]) if terms else empty
+        self._active = state.designs(terms)
         self.prior = state.prior(terms)
         self.sums = block_sums(state.parts, self._active, blocks)
         self.held_out = self.sums.held_out(self.prior, state.folds) + state.penalty

@@ -15,7 +15,7 @@ from anser_ros.diagnosis.decisions import (
     TIME_FOLDS,
 )
 from anser_ros.diagnosis.engine import BlockSums, JointFit, block_sums, descended, joined
-from anser_ros.diagnosis.problem import Problem, State, evaluate, parts, tools_misfit
+from anser_ros.diagnosis.problem import Problem, State, evaluate, tools_misfit
 from anser_ros.diagnosis.screening import noise_scale
 from anser_ros.effects.base import View
 from anser_ros.effects.effect import (
@@ -75,7 +75,8 @@ def rich_modes(
     vectors = vectors[:, leading]
     vectors_of = widest[:, None] * vectors
     group: list[Array | None] = [
-        part.whitener(parts(both_phases(unit(part.view, vectors_of)))) for part in few.parts
+        part.whitener.columns([both_phases(unit(part.view, vectors_of))], [2 * vectors.shape[1]])
+        for part in few.parts
     ]
     columns, prior = known
     sums = block_sums(few.parts, joined([columns, group]), blocks)
@@ -148,7 +149,7 @@ def _information(state: State, unit: Unit, count: int) -> Array:
     for part in state.parts:
         half = part.frames(np.arange(0, part.view.time.size, 2))
         flux = unit(half.view, np.eye(count))
-        flat = half.whitener(parts(flux.astype(complex))).reshape(-1, count)
+        flat = half.whitener.columns([flux.astype(complex)], [count]).reshape(-1, count)
         normal += 2 * (flat.T @ flat)
     return normal
 
@@ -327,7 +328,7 @@ class Shaping:
         """The couplings about metal at rest that predict best, given the other terms."""
         fitter, few = self.fitter, thinned(fit.state, self.fitter.blocks)
         centre = _resting(term).centre
-        known = joined([few.design(t) for t in beside]), few.prior(beside)
+        known = few.designs(beside), few.prior(beside)
 
         def unit_of_shapes(kind: Shapes) -> Unit:
             return lambda view, modes: Couplings(kind, centre, modes).unit(view)

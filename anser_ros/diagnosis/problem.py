@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.engine import JointState
+from anser_ros.diagnosis.engine import JointState, width_of
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.correction import Fields, reference_view, tool_view
 from anser_ros.effects.effect import Remedy, Term
@@ -126,19 +126,36 @@ class Whitener:
 
     def __call__(self, values: Array) -> Array:
         """Return values of shape (F, n) or (F, n, q), whitened."""
-        columns = values[..., None] if values.ndim == 2 else values
-        out = np.empty(columns.shape)
+        out = (values[..., None] if values.ndim == 2 else values) * self.weight[..., None]
+        in_order(lambda rows: self._project(out, rows), slices(len(out), FRAMES_AT_ONCE))
+        return out.reshape(values.shape)
+
+    def columns(self, groups: Sequence[ComplexArray | None], widths: Sequence[int]) -> Array:
+        """Return groups of columns (F, S, K, q) side by side, whitened, shape (F, n, all q).
+
+        ``widths``: q of each group; the columns of one that is missing are zero.
+        """
+        out, half = np.zeros((*self.weight.shape, sum(widths))), self.weight.shape[1] // 2
+        ends = np.cumsum(widths).tolist()
 
         def work(mine: slice) -> None:
             for rows in slices_of(mine, FRAMES_AT_ONCE):
-                np.multiply(columns[rows], self.weight[rows, :, None], out=out[rows])
-                if self.basis is not None and self.inner is not None:
-                    basis = self.basis[rows]
-                    moved = self.inner[rows] @ (basis.transpose(0, 2, 1) @ out[rows])
-                    out[rows] -= basis @ moved
+                weight = self.weight[rows, :, None]
+                for group, end, width in zip(groups, ends, widths, strict=True):
+                    if group is not None:
+                        flat, own = group[rows].reshape(-1, half, width), slice(end - width, end)
+                        np.multiply(flat.real, weight[:, :half], out=out[rows, :half, own])
+                        np.multiply(flat.imag, weight[:, half:], out=out[rows, half:, own])
+                self._project(out, rows)
 
         in_order(work, slices(len(out), FRAMES_A_THREAD))
-        return out.reshape(values.shape)
+        return out
+
+    def _project(self, out: Array, rows: slice) -> None:
+        """Take off what weighted values (F, n, q) of some frames have along the basis."""
+        if self.basis is not None and self.inner is not None:
+            basis = self.basis[rows]
+            out[rows] -= basis @ (self.inner[rows] @ (basis.transpose(0, 2, 1) @ out[rows]))
 
 
 @dataclass(frozen=True)
@@ -236,12 +253,19 @@ class State(JointState[Term, Part]):
 
     def design(self, term: Term, probe: bool = False) -> list[Array | None]:
         """Return whitened columns of a term, one array (F, n, q) a part, None for no columns."""
-        columns = []
-        for part in self.parts:
-            find = term.effect.probe if probe else term.effect.columns
-            raw = find(term, part.view)
-            columns.append(None if raw is None else part.whitener(parts(raw)))
-        return columns
+        return self.designs([term], probe)
+
+    def designs(self, terms: Sequence[Term], probe: bool = False) -> list[Array | None]:
+        """Return whitened columns of terms side by side, one array (F, n, q) a part, or None."""
+        raw = [
+            [(t.effect.probe if probe else t.effect.columns)(t, part.view) for t in terms]
+            for part in self.parts
+        ]
+        widths = [width_of(group) for group in zip(*raw, strict=True)]
+        return [
+            part.whitener.columns(own, widths) if any(r is not None for r in own) else None
+            for part, own in zip(self.parts, raw, strict=True)
+        ]
 
 
 def evaluate(problem: Problem, terms: Sequence[Term]) -> State:

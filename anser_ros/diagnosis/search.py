@@ -29,7 +29,7 @@ from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Problem, State
 from anser_ros.diagnosis.screening import noise_scale
 from anser_ros.effects.effect import Family, Term, all_effects
-from anser_ros.parallel import in_order, slices
+from anser_ros.parallel import in_order, sharing, slices
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -126,7 +126,7 @@ class _FluxSelection(ForwardSelection[Fit]):
         metal = _metal_beside(best, gain, fitted)
         if metal is not None:
             # A freedom in every frame is no match for metal before that has its shape.
-            shaped = moves_or_rests(self._fitter, metal[1], fitted, self._scored, metal[0])
+            shaped = moves_or_rests(self._fitter, metal[1], fitted, self._others, metal[0])
             if scorer.held_out - shaped.held_out() > gain:
                 search.metal_gain = max(search.metal_gain, metal[0])
                 return shaped
@@ -139,7 +139,7 @@ class _FluxSelection(ForwardSelection[Fit]):
             search.metal_gain = max(search.metal_gain, gain)
         search.rivals[term.label] = _rivals(gain, best, fitted)
         if term.effect.family is Family.MOVING_METAL:
-            return moves_or_rests(self._fitter, best, fitted, self._scored, gain)
+            return moves_or_rests(self._fitter, best, fitted, self._others, gain)
         near = [f for g, f in fitted if f is not best and g > decisions.STEADY * gain]
         steady = [f.newest for f in near if f.newest.effect.family is Family.STEADY]
         search.close[term.label] = steady
@@ -200,21 +200,29 @@ class _FluxSelection(ForwardSelection[Fit]):
         starts = _finalists(scored, scorer, self._how)
         starts += moving_starts(fitter.problem, scored, scorer, fitter.blocks)
         fitted: list[tuple[float, Fit]] = []
-        for expected, term in sorted(starts + fluctuations, key=lambda pair: -pair[0]):
-            if fitted and expected < decisions.LEAST_PROBE_GAIN * max(g for g, _ in fitted):
-                continue
-            if any(at_floor(f) and term.complexity > f.newest.complexity for _, f in fitted):
-                continue
-            fit = fitter.fit([*before.terms, term])
-            gain = scorer.held_out - fit.held_out() - taken_from_others(fit)
-            fitted.append((gain, fit))
-            table.append(Candidate(fit.newest, term.complexity, gain, gain))
+        left = sorted(starts + fluctuations, key=lambda pair: -pair[0])
+        while left:
+            some, left = left[: sharing()], left[sharing() :]
+            some = [pair for pair in some if not _is_surpassed(*pair, fitted)]
+            fits = in_order(lambda pair: fitter.fit([*before.terms, pair[1]]), some)
+            for (expected, term), fit in zip(some, fits, strict=True):
+                if _is_surpassed(expected, term, fitted):  # by one that was fitted beside it
+                    continue
+                gain = scorer.held_out - fit.held_out() - taken_from_others(fit)
+                fitted.append((gain, fit))
+                table.append(Candidate(fit.newest, term.complexity, gain, gain))
         self._search.rounds.append(sorted(table, key=lambda c: -c.gain))
         return fitted
 
-    def _scored(self, scorer: Scorer[State]) -> list[tuple[Term, Score]]:
+    def _others(self, scorer: Scorer[State]) -> list[tuple[Term, Score]]:
+        """All candidates but metal, best first."""
+        return self._scored(scorer, most_metals=0)
+
+    def _scored(
+        self, scorer: Scorer[State], most_metals: int = decisions.MOST_METALS
+    ) -> list[tuple[Term, Score]]:
         """All candidates that are not active already, best first."""
-        candidates = _candidates(self._fitter.problem, scorer.state.terms)
+        candidates = _candidates(self._fitter.problem, scorer.state.terms, most_metals)
 
         def scored(few: slice) -> list[tuple[Term, Score]]:
             least = decisions.DISTINGUISHABLE
@@ -226,15 +234,22 @@ class _FluxSelection(ForwardSelection[Fit]):
         return sorted(chain.from_iterable(parts), key=lambda pair: pair[1].held_out)
 
 
-def _candidates(problem: Problem, taken: Sequence[Term]) -> list[Term]:
-    """Candidates beside some active effects."""
+def _is_surpassed(expected: float, term: Term, fitted: Sequence[tuple[float, Fit]]) -> bool:
+    """Whether fits gain far more than expected here, or a simpler one leaves but noise."""
+    if fitted and expected < decisions.LEAST_PROBE_GAIN * max(gain for gain, _ in fitted):
+        return True
+    return any(at_floor(fit) and term.complexity > fit.newest.complexity for _, fit in fitted)
+
+
+def _candidates(problem: Problem, taken: Sequence[Term], most_metals: int) -> list[Term]:
+    """Candidates beside some active effects, metal if fewer than so many of them are."""
     ours = problem.apparatus.tool_channels
     metals = sum(term.effect.family.is_metal for term in taken)
     moving = any(term.effect.family is Family.MOVING_METAL for term in taken)
     return [
         term
         for effect in all_effects().values()
-        if not (effect.family.is_metal and (moving or metals >= decisions.MOST_METALS))
+        if not (effect.family.is_metal and (moving or metals >= most_metals))
         for term in effect.candidates(problem.apparatus)
         # Beside metal a reference's survey error looks like a fault of its channel.
         if not is_covered(term, taken) and (not metals or set(term.channels) <= set(ours))

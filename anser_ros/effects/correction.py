@@ -6,7 +6,7 @@ the field are in the model's dipoles already, and effects that cannot be correct
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,9 @@ from anser_ros.physics.sensor import SensorTable
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+KEPT = 6
+"""Sets of sensors whose slopes are kept, some megabytes each."""
+
 
 @dataclass(frozen=True)
 class Fields:
@@ -32,6 +35,28 @@ class Fields:
     model: Dipoles  # Good where tool sensors were calibrated
     illumination: Dipoles  # Good beside and below the board: what metal and reference sensors see
     omega: Array  # (K,), rad/s
+    # what `slopes` has found last, by what it was asked for; other fields begin with nothing
+    kept: dict[tuple[bool, bytes], tuple[ComplexArray, ...]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def slopes(
+        self, points: Array, axes: Array, lengths: Array, far: bool = False
+    ) -> tuple[ComplexArray, ...]:
+        """Return fluxes (P, K) of the model, or of the illumination where sensors are ``far``.
+
+        With their derivatives (P, 3, K) by place and axis. A fit asks for the same sensors again
+        and again: the last answers are kept, and must not be changed.
+        """
+        key = far, b''.join(array.tobytes() for array in (points, axes, lengths))
+        found = self.kept.get(key)
+        if found is None:
+            dipoles = self.illumination if far else self.model
+            sites = dipoles.positions, dipoles.directions, dipoles.moments
+            found = self.kept[key] = flux_jacobian(points, axes, lengths, *sites)
+            for oldest in list(self.kept)[:-KEPT]:
+                self.kept.pop(oldest, None)
+        return found
 
 
 def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View:
@@ -41,13 +66,13 @@ def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View
     for term in terms:
         sensors = term.effect.table(term, sensors)
     centres, axes = sensors.placed(position, rotation)
-    dipoles = _with_sources(fields.model, terms, fields)
+    added = _sources(terms, fields, fields.model)
     light = changed_illumination(terms, fields.illumination)
-    lengths = np.tile(sensors.length, body.time.size)
-    flux, d_position, d_axis = flux_jacobian(
-        centres.reshape(-1, 3), axes.reshape(-1, 3), lengths,
-        dipoles.positions, dipoles.directions, dipoles.moments,
-    )  # fmt: skip
+    flat = centres.reshape(-1, 3), axes.reshape(-1, 3), np.tile(sensors.length, body.time.size)
+    flux, d_position, d_axis = fields.slopes(*flat)
+    if len(added.positions):
+        more = flux_jacobian(*flat, added.positions, added.directions, added.moments)
+        flux, d_position, d_axis = flux + more[0], d_position + more[1], d_axis + more[2]
     shape = (body.time.size, len(sensors))
     d_position, d_axis = d_position.reshape(*shape, 3, -1), d_axis.reshape(*shape, 3, -1)
     lever = (centres - position[:, None, :])[..., :, None]
@@ -56,7 +81,8 @@ def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View
         time=body.time, sensors=sensors, position=position, rotation=rotation, velocity=velocity,
         centres=centres, axes=axes, linear=flux.reshape(*shape, -1),
         flux=flux.reshape(*shape, -1), d_position=d_position, d_axis=d_axis, d_turn=d_turn,
-        dipoles=dipoles, illumination=light, omega=fields.omega, is_reference=False,
+        dipoles=fields.model.joined(added), illumination=light, omega=fields.omega,
+        is_reference=False,
     )  # fmt: skip
     return _measured(_with_motion(view, terms), terms)
 
@@ -67,11 +93,10 @@ def reference_view(
     """Predict the reference sensors: their clean readings (S, K) and what the effects change."""
     sensors, frames = reference.sensors, reference.time.size
     base = fields.illumination
-    added = _with_sources(Dipoles.none(base.moments.shape[1]), terms, fields, base)
-    flux, d_position, d_axis = flux_jacobian(
-        sensors.position, sensors.axis, sensors.length,
-        base.positions, base.directions, base.moments,
-    )  # fmt: skip
+    added = _sources(terms, fields, base)
+    flux, d_position, d_axis = fields.slopes(
+        sensors.position, sensors.axis, sensors.length, far=True
+    )
     change = np.zeros_like(flux)
     if added.positions.shape[0]:
         change = added.flux(sensors.position, sensors.axis, sensors.length)
@@ -118,12 +143,12 @@ def changed_illumination(terms: Sequence[Term], illumination: Dipoles) -> Dipole
     return illumination
 
 
-def _with_sources(
-    start: Dipoles, terms: Sequence[Term], fields: Fields, base: Dipoles | None = None
-) -> Dipoles:
-    out, light = start, changed_illumination(terms, fields.illumination)
+def _sources(terms: Sequence[Term], fields: Fields, base: Dipoles) -> Dipoles:
+    """The dipoles that the effects add where the emitters' own are ``base``."""
+    out = Dipoles.none(base.moments.shape[1])
+    light = changed_illumination(terms, fields.illumination)
     for term in terms:
-        added = term.effect.sources(term, base or fields.model, light, fields.omega)
+        added = term.effect.sources(term, base, light, fields.omega)
         if added is not None:
             out = out.joined(added)
     return out

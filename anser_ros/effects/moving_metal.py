@@ -19,7 +19,6 @@ from anser_ros.effects.effect import (
     Effect,
     Family,
     Remedy,
-    both_phases,
     needed,
     pairs_of,
     sigmas,
@@ -333,7 +332,9 @@ class MovingMetal(Effect[MovingTerm]):
         """Return derivatives by the path (differences, chained) and by the amplitudes (exact)."""
         unit = term.unit(view)
         out = view.columns(term.theta.size)
-        out[..., term.placed :] = both_phases(unit)
+        ends = term.placed, term.placed + unit.shape[-1]
+        out[..., ends[0] : ends[1]] = unit
+        np.multiply(unit, 1j, out=out[..., ends[1] :])
         if term.held:
             return out
         steps = STEP * np.eye(3)

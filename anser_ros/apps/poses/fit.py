@@ -129,7 +129,7 @@ def with_time_constants(fit: PoseFit) -> PoseFit:
         if not all(1 / NEAR_TAU < factor < NEAR_TAU for factor in moved):
             return fit
         state = state.moved(terms)
-    return PoseFit(state, state.sums(state.numbers), fit.prior)
+    return PoseFit(state, state.numbers)
 
 
 def robust_fit(problem: PoseProblem, terms: Sequence[PoseTerm]) -> PoseFit:
