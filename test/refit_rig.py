@@ -55,8 +55,8 @@ class Rig:
         self.cloud, self.stamp_ns = FluxCloud('fg'), FIRST_NS
         self.rng = np.random.default_rng(1)
         # Why poses are withheld with each model that is told, in codes.
-        self.codes, write = [], self.node._output.new_error
-        self.node._output.new_error = lambda *given: self.codes.append(given[-1]) or write(*given)
+        self.codes, write = [], self.node._output.given
+        self.node._output.given = lambda *given: self.codes.append(given[-1]) or write(*given)
 
     def until(self, condition):
         spins = wait(condition, lambda: self.executor.spin_once(timeout_sec=0.02))

@@ -17,7 +17,8 @@ from anser_ros.field.model import (
 )
 from anser_ros.field.nominal import nominal_model
 from anser_ros.fingerprint import fingerprint_of
-from anser_ros.nodes.tracker_models import ActiveModel, GivenModel
+from anser_ros.nodes.streams.clouds import GivenModel
+from anser_ros.nodes.tracker_models import ActiveModel
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import code_of
 from anser_ros.sessions.starting_model import (
@@ -216,7 +217,7 @@ def test_dipoles_and_effects_have_to_be_of_one_model(own, served, effects, state
     told = '' if served is None else models[served].fingerprint
     error = ModelError(0.0, np.zeros((0, 1, 8), complex), fingerprint=told, effects=effects)
     given = GivenModel(
-        5, b'', DipolePoints(*(getattr(models[0], n) for n in ('positions', 'directions',
+        5, DipolePoints(*(getattr(models[0], n) for n in ('positions', 'directions',
                                                                'moments'))), error
     )  # fmt: skip
     in_force.put(given, in_force.field_of(given))
@@ -245,7 +246,7 @@ def test_the_drawing_gives_poses_only_where_it_may(allowed, state):
     )
     error = ModelError(0.0, np.zeros((0, 1, 8), complex), withheld=code_of('uncalibrated'))
     points = DipolePoints(model.positions, model.directions, model.moments)
-    given = GivenModel(5, b'', points, error)
+    given = GivenModel(5, points, error)
     in_force.put(given, in_force.field_of(given))
     withheld = in_force.at(10).withheld
     assert (withheld.state if withheld else '') == state

@@ -23,8 +23,16 @@ def uncertain(n):
 def messages(numbers):
     """Uncertainty and dipoles of some models, with the stamps of their numbers."""
     writer = ModelWriter()
-    errors = {n: writer.error(uncertain(n), 'fg', FIRST_NS + n, True) for n in numbers}
-    return errors, {n: writer.dipoles(uncertain(n), 'fg', FIRST_NS + n) for n in numbers}
+    models = {n: writer.given(uncertain(n), FIRST_NS + n, True) for n in numbers}
+    errors = {n: writer.error(model, 'fg') for n, model in models.items()}
+    return errors, {n: writer.dipoles(model, 'fg') for n, model in models.items()}
+
+
+def taken(intake, maker, *of_model):
+    """The model of two messages."""
+    given = maker.given(*of_model)
+    intake.take_error(maker.error(given, 'fg'))
+    return intake.take(maker.dipoles(given, 'fg'))
 
 
 def size_of(given):
@@ -46,6 +54,20 @@ def test_an_uncertainty_that_comes_after_its_model_is_put_right():
     assert size_of(intake.take(models[0])) == 1
     assert size_of(intake.take(models[1])) == 1
     assert size_of(intake.take_error(errors[1])) == 2
+
+
+def test_a_model_that_is_handed_over_is_the_one_of_its_messages():
+    maker, intake = ModelWriter(), ModelIntake()
+    given = maker.given(uncertain(1), FIRST_NS, True, 2)
+    read = taken(ModelIntake(), maker, uncertain(1), FIRST_NS, True, 2)
+    assert intake.take(given) is given is intake.newest and intake.has_error
+    assert maker.given(uncertain(1), FIRST_NS + 1, True).error is not given.error
+    for name in ('stamp_ns', 'follows', 'withheld'):
+        assert getattr(given, name) == getattr(read, name)
+    assert (given.error.fingerprint, given.error.effects) == ('', 0)
+    for one, other in ((given.points, read.points), (given.error, read.error)):
+        for name in sorted(vars(one).keys() - {'fingerprint'}):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-6)
 
 
 def test_one_whose_model_was_lost_is_passed_over():
@@ -74,8 +96,7 @@ def test_the_model_in_force_ages_by_the_clock_of_the_frames():
     assert force.at(10**9).model is None and force.at(10**9).withheld is None
 
     def publish(stamp_ns, follows=True, withheld=0):
-        intake.take_error(maker.error(model, 'fg', stamp_ns, follows, withheld))
-        given = intake.take(maker.dipoles(model, 'fg', stamp_ns))
+        given = taken(intake, maker, model, stamp_ns, follows, withheld)
         force.put(given, force.field_of(given))
 
     first, second = 10**12, 10**9
@@ -102,8 +123,7 @@ def test_the_model_for_the_next_frame_is_aged_before_it_comes():
     assert force.soon() is None
     for frame in range(2):
         model = replace(MODEL, moments=(1.0 + 0.01 * frame) * MODEL.moments)
-        intake.take_error(maker.error(model, 'fg', now + frame, True))
-        given = intake.take(maker.dipoles(model, 'fg', now + frame))
+        given = taken(intake, maker, model, now + frame, True)
         force.put(given, force.field_of(given))
     aged = force.soon()
     assert aged is not force.field and aged.modes is not None
@@ -118,8 +138,7 @@ def test_an_answer_to_an_old_frame_is_late_however_old_the_frame(late_s):
     now = 10**12
     force.at(now)
     stamp = now - late_s * 10**9
-    intake.take_error(maker.error(model, 'fg', stamp, True, 0))
-    given = intake.take(maker.dipoles(model, 'fg', stamp))
+    given = taken(intake, maker, model, stamp, True)
     force.put(given, force.field_of(given))
     assert force.at(now + 1).withheld.state == 'references_lost'
 

@@ -102,6 +102,12 @@ def symmetry_axis(
     if not used.any():
         return None
     places = positions[used]
+    offsets = places - places[0]
+    squares = (offsets * offsets).sum(axis=1)
+    far = offsets[squares.argmax()]
+    across = squares * (far @ far) - (offsets @ far) ** 2
+    if across.max() > (10.0 * OFF_AXIS) ** 2 * (far @ far):  # most fields: they are on no line
+        return None
     vectors = (moments.real @ np.ones(moments.shape[1]))[:, None] * directions
     total = vectors.sum(axis=0)
     if np.linalg.norm(total) < OFF_AXIS * size.sum():

@@ -42,7 +42,7 @@ from anser_ros.sessions.follower import ToolPose, tool_readings
 from anser_ros.sessions.kept_tables import DAMAGED, read_arrays, used_s, write_arrays
 from anser_ros.sessions.session import sensor_table, tracking_noise
 from anser_ros.stamps import set_stamp, stamp_of
-from anser_ros.wire.points import FluxPoints
+from anser_ros.wire.points import FluxPoints, ModelError
 from anser_ros.wire.recorded import pose_numbers, unit_quaternions
 from anser_ros.wire.setup import Setup, topic_of
 
@@ -69,23 +69,22 @@ class ModelOutput(ModelWriter):
     def __init__(self, node: AnserNode) -> None:
         super().__init__()
         self._node = node
+        self._published: ModelError | None = None
         self.models = node.create_publisher(PointCloud2, 'field_model', qos.MODELS)
         self.errors = node.create_publisher(PointCloud2, 'field_model_error', qos.MODEL_ERRORS)
-        node.offer(self.errors, lasts=True)
+        node.offer(self.errors)  # nothing is: a model is handed over with its uncertainty
         node.offer(self.models, lasts=True)
 
     def publish(
         self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool, withheld: str
     ) -> None:
         """Publish a model, and before it its uncertainty where that is news."""
-        error = self.new_error(model, frame_id, stamp_ns, follows, code_of(withheld))
-        sent = [(self.models, self.dipoles(model, frame_id, stamp_ns))]
-        if error is not None:
-            sent.insert(0, (self.errors, error))
-        for publisher, message in sent:
-            self._node.hand_over(publisher, message)
-        for publisher, message in sent:
-            publisher.publish(message)
+        given = self.given(model, stamp_ns, follows, code_of(withheld))
+        self._node.hand_over(self.models, given)
+        if given.error is not self._published:
+            self._published = given.error
+            self.errors.publish(self.error(given, frame_id))
+        self.models.publish(self.dipoles(given, frame_id))
 
 
 LEAST_SHOWN_DENSITY = 0.15

@@ -25,7 +25,7 @@ from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import STALE_AFTER_S, parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.streams.clouds import read_frame
+from anser_ros.nodes.streams.clouds import GivenModel, read_frame
 from anser_ros.nodes.streams.one_source import (
     NewestSource,
     OneSource,
@@ -34,7 +34,7 @@ from anser_ros.nodes.streams.one_source import (
     too_slow,
 )
 from anser_ros.nodes.streams.readiness import digest_of
-from anser_ros.nodes.tracker_models import ActiveModel, AnsweredFrames, GivenModel, ModelIntake
+from anser_ros.nodes.tracker_models import ActiveModel, AnsweredFrames, ModelIntake
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OK, TWO_SOURCES, Withheld
 from anser_ros.sessions.prepared import settings_for
@@ -264,7 +264,7 @@ class TrackerNode(AnserNode):
             self._tracker = self._tracker.with_settings(settings_for(setup, same))
 
     def _take_model(
-        self, take: Callable[[PointCloud2], GivenModel | None], message: PointCloud2
+        self, take: Callable[[Any], GivenModel | None], message: PointCloud2 | GivenModel
     ) -> None:
         try:
             given = take(message)
@@ -333,9 +333,11 @@ class TrackerNode(AnserNode):
         if frame is not None:
             self._track(frame)
 
-    def _lasting(self, message: PointCloud2) -> bytes | None:
+    def _lasting(self, message: PointCloud2 | GivenModel) -> bytes | None:
         """Return what a model says until there is another; None while each frame has its own."""
-        return None if self._frames.follows else bytes(message.data.tobytes())
+        if self._frames.follows or isinstance(message, GivenModel):
+            return None
+        return bytes(message.data.tobytes())
 
     def _on_wait(self) -> None:
         """Go on with frames whose model does not come."""

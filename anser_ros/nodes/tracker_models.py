@@ -8,7 +8,7 @@ as offline.
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
@@ -16,62 +16,15 @@ from sensor_msgs.msg import PointCloud2
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.model_age import FrameModel, ModelAge
-from anser_ros.nodes.streams.clouds import read_dipoles, read_error
+from anser_ros.nodes.streams.clouds import GivenModel, read_dipoles, read_error
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld, state_of
+from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.points import DipolePoints, ModelError
 from anser_ros.wire.setup import Setup
 
 MOST_EARLY = 32
 """Uncertainties kept until their models come; the older ones are those whose models got lost."""
-
-
-@dataclass(frozen=True)
-class GivenModel:
-    """Holds a model as it came; ``error`` is None if its uncertainty is not stated."""
-
-    stamp_ns: int
-    data: bytes
-    points: DipolePoints
-    error: ModelError | None
-
-    @property
-    def follows(self) -> bool:
-        """Return whether every frame of the references is answered by a model of its stamp."""
-        return self.error is not None and self.error.follows
-
-    @property
-    def withheld(self) -> str:
-        """Return the state for which the server wants no pose to be given; empty where none is."""
-        code = 0 if self.error is None else self.error.withheld
-        return state_of(code)
-
-    def is_same_as(self, other: 'GivenModel | None') -> bool:
-        """Return whether only the stamp differs."""
-        return other is not None and self.points is other.points and self.error is other.error
-
-    def field_model(self, setup: Setup, file_model: FieldModel | None) -> FieldModel:
-        """Return the model for a setup, with the effects of the model file.
-
-        Raises `LayoutError` when it has other emitters than the setup.
-        """
-        points, count = self.points, len(setup.emitter_names)
-        if points.moments.shape[1] != count:
-            raise LayoutError(
-                f'the field model has {points.moments.shape[1]} emitters, the setup {count}'
-            )
-        own: dict[str, Any] = {}
-        if file_model is not None:
-            names = 'flux_error_t', 'shift_sigma_m', 'effects'
-            own = {name: getattr(file_model, name) for name in names}
-        if self.error is not None:
-            modes = self.error.modes if len(self.error.modes) else None
-            own |= {'flux_error_t': self.error.flux_error_t, 'modes': modes}
-        return FieldModel(
-            points.positions, points.directions, points.moments, setup.emitter_names,
-            setup.frequencies_hz, **own,
-        )  # fmt: skip
 
 
 class ModelIntake:
@@ -82,6 +35,7 @@ class ModelIntake:
 
     def __init__(self) -> None:
         self.newest: GivenModel | None = None
+        self._data = b''  # Of the newest model's dipoles, where it came as a message
         self._read: tuple[int, ModelError] | None = None
         # Uncertainties that came before their models, in the order of their arrival.
         self._early: deque[PointCloud2] = deque(maxlen=MOST_EARLY)
@@ -91,18 +45,24 @@ class ModelIntake:
         """Return whether an uncertainty has come."""
         return self._read is not None or bool(self._early)
 
-    def take(self, message: PointCloud2) -> GivenModel:
-        """Read a ``field_model`` message.
+    def take(self, message: PointCloud2 | GivenModel) -> GivenModel:
+        """Read a ``field_model`` message, or take a model that was handed over.
 
         Raises `LayoutError` when it is not a field model, or has no stamp.
         """
+        if isinstance(message, GivenModel):
+            if message.error is not None:
+                self._read = len(message.points.positions), message.error
+            self.newest, self._data = message, b''
+            return message
         stamp_ns, newest = stamp_of(message), self.newest
         if stamp_ns <= 0:
             raise LayoutError('the field model has no stamp')
         data = message.data.tobytes()
-        same = newest is not None and newest.data == data
+        same = newest is not None and self._data == data
         points = newest.points if newest is not None and same else read_dipoles(message)
-        return self._joined(stamp_ns, data, points)
+        self._data = data
+        return self._joined(stamp_ns, points)
 
     def take_error(self, message: PointCloud2) -> GivenModel | None:
         """Keep an uncertainty; return the newest model with it where it is of that model.
@@ -113,11 +73,11 @@ class ModelIntake:
         newest = self.newest
         if newest is None or stamp_of(message) != newest.stamp_ns:
             return None
-        return self._joined(newest.stamp_ns, newest.data, newest.points)
+        return self._joined(newest.stamp_ns, newest.points)
 
-    def _joined(self, stamp_ns: int, data: bytes, points: DipolePoints) -> GivenModel:
+    def _joined(self, stamp_ns: int, points: DipolePoints) -> GivenModel:
         error = self._error_of(stamp_ns, *points.moments.shape)
-        self.newest = GivenModel(stamp_ns, data, points, error)
+        self.newest = GivenModel(stamp_ns, points, error)
         return self.newest
 
     def _error_of(self, stamp_ns: int, n_dipoles: int, n_emitters: int) -> ModelError | None:

@@ -177,27 +177,38 @@ class ErrorModes:
     given: ComplexArray
     rows: NDArray[np.int64]  # (M,), the dipoles whose moments are uncertain
     moments: Array  # (M, R' 2K), of the modes that are not zero, A m^2
+    places: Array  # (M, 3), m
     spacing: Array  # (M,), see `source_spacing`, m
 
     @classmethod
     def of(
-        cls, given: ComplexArray | None, positions: Array, floor_m: float
+        cls,
+        given: ComplexArray | None,
+        positions: Array,
+        floor_m: float,
+        before: 'ErrorModes | None' = None,
     ) -> 'ErrorModes | None':
         """Lay out modes (R, N, K), A m^2; None where there is no uncertainty.
 
         ``positions`` (N, 3) are the dipoles', m; those over the height ``floor_m`` are where tools
-        may be.
+        may be. Spacings are those of ``before`` where its dipoles are at the same places.
         """
         if given is None:
             return None
-        there = given != 0.0
-        some = given[there.any(axis=(1, 2))]
-        if not len(some):
+        there = (given != 0.0).any(axis=2)
+        if not there.any():
             return None
-        rows = np.flatnonzero(there.any(axis=(0, 2)))
-        real = np.ascontiguousarray(some[:, rows], dtype=np.complex128).view(np.float64)
-        moments = np.ascontiguousarray(real.swapaxes(0, 1).reshape(rows.size, -1))
-        return cls(given, rows, moments, source_spacing(positions[rows], floor_m))
+        rows, some = np.flatnonzero(there.any(axis=0)), there.any(axis=1)
+        real = np.asarray(given if some.all() else given[some], dtype=np.complex128)
+        if rows.size < len(positions):
+            real = real[:, rows]
+        moments = np.ascontiguousarray(real.swapaxes(0, 1)).view(np.float64)
+        places = positions[rows]
+        if before is not None and np.array_equal(places, before.places):
+            spacing = before.spacing
+        else:
+            spacing = source_spacing(places, floor_m)
+        return cls(given, rows, moments.reshape(rows.size, -1), places, spacing)
 
     def of_components(self, kept: NDArray[np.bool_]) -> 'ErrorModes':
         """Return the modes' part in some of the 2K flux components."""
@@ -325,7 +336,7 @@ def build_context(
     modes = None if previous is None else previous.modes
     if modes is None or modes.given is not model.modes:
         floor_m = 0.5 * settings.box.low[2]
-        modes = ErrorModes.of(model.modes, field.positions, floor_m)
+        modes = ErrorModes.of(model.modes, field.positions, floor_m, modes)
     name = model_digest(model) if model_id is None else model_id
     low, high = settings.box.grown(BOX_MARGIN_M)
     starts = Starts(settings.box, settings.grid_spacing_m)

@@ -133,7 +133,8 @@ def _models(change: Callable[[FieldModel], FieldModel]) -> Callable[..., Off]:
 def _cloud_of(model: FieldModel) -> Any:
     from anser_ros.nodes.streams.clouds import ModelWriter
 
-    return ModelWriter().dipoles(model, 'fg', time.time_ns())
+    writer = ModelWriter()
+    return writer.dipoles(writer.given(model, time.time_ns(), False), 'fg')
 
 
 def _models_of_nan(rig: Rig) -> Callable[[], Any]:

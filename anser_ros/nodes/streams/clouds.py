@@ -5,6 +5,7 @@ messages: its dipoles and their uncertainty.
 
 import array
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Count
 from anser_ros.nodes.runtime.handover import HandedFlux
+from anser_ros.pose_states import state_of
 from anser_ros.stamps import SECOND_NS, pack_stamp, set_stamp, stamp_of
 from anser_ros.wire.points import (
     DipolePoints,
@@ -29,6 +31,7 @@ from anser_ros.wire.points import (
     encode_flux,
     encode_model_error,
 )
+from anser_ros.wire.setup import Setup
 
 FLUX_NOISE, STAMP_SIGMA, FLUX_RATE = 'flux_noise_t', 'stamp_sigma_s', 'flux_rate_hz'
 """Keys of the setup document that acquisition measures: by what the components of fluxes scatter,
@@ -139,52 +142,98 @@ def read_frame(
     return stamp_ns, decode_flux(*layout_of(message), bool(message.is_bigendian))
 
 
+@dataclass(frozen=True)
+class GivenModel:
+    """Holds a model as its readers have it; ``error`` is None if no uncertainty is stated."""
+
+    stamp_ns: int
+    points: DipolePoints
+    error: ModelError | None
+
+    @property
+    def follows(self) -> bool:
+        """Return whether every frame of the references is answered by a model of its stamp."""
+        return self.error is not None and self.error.follows
+
+    @property
+    def withheld(self) -> str:
+        """Return the state for which the server wants no pose to be given; empty where none is."""
+        code = 0 if self.error is None else self.error.withheld
+        return state_of(code)
+
+    def is_same_as(self, other: 'GivenModel | None') -> bool:
+        """Return whether only the stamp differs."""
+        return other is not None and self.points is other.points and self.error is other.error
+
+    def field_model(self, setup: Setup, file_model: FieldModel | None) -> FieldModel:
+        """Return the model for a setup, with the effects of the model file.
+
+        Raises `LayoutError` when it has other emitters than the setup.
+        """
+        points, count = self.points, len(setup.emitter_names)
+        if points.moments.shape[1] != count:
+            raise LayoutError(
+                f'the field model has {points.moments.shape[1]} emitters, the setup {count}'
+            )
+        own: dict[str, Any] = {}
+        if file_model is not None:
+            names = 'flux_error_t', 'shift_sigma_m', 'effects'
+            own = {name: getattr(file_model, name) for name in names}
+        if self.error is not None:
+            modes = self.error.modes if len(self.error.modes) else None
+            own |= {'flux_error_t': self.error.flux_error_t, 'modes': modes}
+        return FieldModel(
+            points.positions, points.directions, points.moments, setup.emitter_names,
+            setup.frequencies_hz, **own,
+        )  # fmt: skip
+
+
 class ModelWriter:
-    """Makes the two messages of a model."""
+    """Lays models out for their readers, and makes the two messages of each."""
 
     def __init__(self) -> None:
         self._maker = CloudMaker()
-        self._encoded: tuple[FieldModel, PointCloud2] | None = None
-        self._uncertainty: tuple[object, float, int, bool, int, str, int] | None = None
+        self._laid_out: tuple[FieldModel, DipolePoints] | None = None
+        self._encoded: tuple[DipolePoints, PointCloud2] | None = None
+        self._uncertainty: tuple[tuple[Any, ...], ModelError] | None = None
         self._origin = '', 0
 
     def name_origin(self, base: FieldModel) -> None:
         """Tell from now on which model the served ones are made from."""
         self._origin = base.fingerprint, sum(needs_correction(record) for record in base.effects)
 
-    def dipoles(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
-        """Return the ``field_model`` message; for the model of the last one, that one renamed."""
-        if self._encoded is not None and self._encoded[0] is model:
+    def given(
+        self, model: FieldModel, stamp_ns: int, follows: bool, withheld: int = 0
+    ) -> GivenModel:
+        """Return a model as its readers have it; what is the same as of the last is shared."""
+        if self._laid_out is None or self._laid_out[0] is not model:
+            points = DipolePoints(model.positions, model.directions, model.moments)
+            self._laid_out = model, points
+        known, modes = self._uncertainty, model.modes
+        now = model.flux_error_t, len(model.positions), follows, withheld, *self._origin
+        if known is None or known[0][0] is not modes or known[0][1:] != now:
+            if modes is None:
+                modes = np.zeros((0, *model.moments.shape), dtype=complex)
+            error = ModelError(float(model.flux_error_t), modes, follows, withheld, *self._origin)
+            self._uncertainty = known = (model.modes, *now), error
+        return GivenModel(stamp_ns, self._laid_out[1], known[1])
+
+    def dipoles(self, given: GivenModel, frame_id: str) -> PointCloud2:
+        """Return the ``field_model`` message; of the same dipoles, the last one renamed."""
+        points = given.points
+        if self._encoded is not None and self._encoded[0] is points:
             message = self._encoded[1]
             message.header.frame_id = frame_id
-            set_stamp(message.header.stamp, stamp_ns)
+            set_stamp(message.header.stamp, given.stamp_ns)
             return message
-        points = DipolePoints(model.positions, model.directions, model.moments)
-        message = self._maker.message(encode_field_model(points), frame_id, stamp_ns)
-        self._encoded = (model, message)
+        message = self._maker.message(encode_field_model(points), frame_id, given.stamp_ns)
+        self._encoded = points, message
         return message
 
-    def new_error(
-        self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool, withheld: int = 0
-    ) -> PointCloud2 | None:
-        """Return the ``field_model_error`` message; None where the last one still holds."""
-        kept = self._uncertainty
-        size = len(model.positions)
-        now = (model.modes, model.flux_error_t, size, follows, withheld, *self._origin)
-        if kept is not None and kept[0] is now[0] and kept[1:] == now[1:]:
-            return None
-        self._uncertainty = now
-        return self.error(model, frame_id, stamp_ns, follows, withheld)
-
-    def error(
-        self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool, withheld: int = 0
-    ) -> PointCloud2:
+    def error(self, given: GivenModel, frame_id: str) -> PointCloud2:
         """Return the ``field_model_error`` message."""
-        modes = model.modes
-        if modes is None:
-            modes = np.zeros((0, *model.moments.shape), dtype=complex)
-        error = ModelError(float(model.flux_error_t), modes, follows, withheld, *self._origin)
-        return self._maker.message(encode_model_error(error), frame_id, stamp_ns)
+        assert given.error is not None
+        return self._maker.message(encode_model_error(given.error), frame_id, given.stamp_ns)
 
 
 def read_dipoles(message: PointCloud2) -> DipolePoints:
