@@ -29,8 +29,6 @@ DIRECTIONS = 16
 """Directions about a point in which its name is tried."""
 MARGIN_PT = 2.0
 """Least distance of a name from another one and from what is drawn, points."""
-POINTS_PER_INCH = 72.0
-"""A point is a 72nd of an inch."""
 
 
 class Label(NamedTuple):
@@ -48,7 +46,7 @@ def name_points(axes: Axes, labels: Sequence[Label], drawn: ArrayLike, size: flo
     scale. Texts of the axes, and points ``drawn``, shape (n, 2), are not covered.
     """
     figure = axes.figure.figure  # not a figure inside it; older versions have no other way
-    dots = figure.dpi / POINTS_PER_INCH
+    dots = figure.dpi / 72.0  # pixels in a point
     margin = MARGIN_PT * dots
     taken = [_box(text) for text in axes.texts]
     covered = axes.transData.transform(np.asarray(drawn, dtype=np.float64).reshape(-1, 2))
@@ -84,9 +82,7 @@ def _best(
     here: Array, away: Array, half: Array, dots: float, margin: float, frame: Array,
     taken: Sequence[Array], covered: Array,
 ) -> tuple[Array, float]:  # fmt: skip
-    """Shift of a name from its point, pixels, and its distance, points: the nearest free one, in
-    the direction that is nearest to the wanted one.
-    """
+    """Nearest free shift of a name, pixels, in the direction nearest to the wanted; its length."""
     begin = float(np.arctan2(away[1], away[0])) if away.any() else -0.75 * np.pi
     turns = np.arange(DIRECTIONS)
     angle = begin + 2.0 * np.pi / DIRECTIONS * np.where(turns % 2, (turns + 1) // 2, -(turns // 2))

@@ -88,7 +88,8 @@ def draw(results: Results, path: Path) -> None:
 
     figure = Figure(figsize=(12, 7), layout='constrained')
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.6))
-    shown = _shown_target(results)
+    counts = [len(results[f'stamp_0_{i}']) for i in range(len(results['names']))]
+    shown = len(counts) - 1 if counts[-1] else int(np.argmax(counts))  # a body, if it has poses
     views = []
     for row, (first, second) in enumerate(((0, 1), (0, 2))):
         views.append(figure.add_subplot(grid[row, 0]))
@@ -103,12 +104,6 @@ def draw(results: Results, path: Path) -> None:
     )  # fmt: skip
     figure.suptitle(f'{results["names"][shown]}: simulated control unit, true and tracked')
     save(figure, path)
-
-
-def _shown_target(results: Results) -> int:
-    """Return the index of the last body if it has poses, else of what has the most poses."""
-    counts = [len(results[f'stamp_0_{i}']) for i in range(len(results['names']))]
-    return len(counts) - 1 if counts[-1] else int(np.argmax(counts))
 
 
 def _chains(results: Results) -> list[tuple[int, str, str]]:

@@ -139,7 +139,7 @@ def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
     except BrokenPipeError:
         raise
     except Exception as error:  # noqa: BLE001 - the outermost place: whatever is left is a defect
-        if isinstance(error, ModuleNotFoundError) and may_be_missing(error.name):
+        if isinstance(error, ModuleNotFoundError) and str(error.name).split('.')[0] in PYPI:
             return EXIT_BAD_INPUT, None, missing_words(str(error.name))
         # A file that is not there or can't be written is the caller's input, not a defect.
         if isinstance(error, OSError) and error.filename is not None:
@@ -192,11 +192,6 @@ def check_packages(node: str) -> None:
     for module in (ROS, *NEEDED.get(node, ())):
         if not find_spec(module):
             raise MissingPackageError(missing_words(module))
-
-
-def may_be_missing(module: str | None) -> bool:
-    """Return whether a module is of a package that may be missing."""
-    return module is not None and module.split('.')[0] in PYPI
 
 
 def missing_words(module: str) -> str:

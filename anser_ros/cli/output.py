@@ -26,8 +26,6 @@ from rich.table import Table
 
 from anser_ros.errors import ParameterError
 
-# Nothing that needs numpy is imported here: doctor reports where that is missing.
-
 
 def add_out(parser: argparse.ArgumentParser, what: str = '', **options: Any) -> None:
     """Declare ``--out``, a folder for what is written; required unless stated otherwise."""

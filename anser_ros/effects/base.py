@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
-ComplexArray = NDArray[np.complex128]
-
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 AnyTerm = TypeVar('AnyTerm', bound='BaseTerm')
 
 

@@ -20,7 +20,6 @@ from anser_ros.effects.effect import (
     needed,
     recorded_site,
     sigmas,
-    unit_matrix,
     whole_numbers,
 )
 from anser_ros.errors import ModelFileError
@@ -405,7 +404,7 @@ class SensorGainSpread(SensorSpread):
 
     def channel_matrix(self, term: SpreadTerm, channels: NDArray[np.int64]) -> ComplexArray | None:
         parts = term.of(channels)
-        return np.asarray(unit_matrix(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
+        return np.asarray(np.eye(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
 
     def gain_changes(self, term: SpreadTerm, sensors: SensorTable) -> Array | None:
         """Return a change for each place; sensors at one place have their gains in common.

@@ -49,16 +49,8 @@ class Measurements:
 
     def frames(self, rows: NDArray[np.generic] | slice) -> 'Measurements':
         """Return the measurements of the frames given by index, mask or slice."""
-        return replace(
-            self,
-            time=self.time[rows],
-            flux=self.flux[rows],
-            valid=self.valid[rows],
-            flags=self.flags[rows],
-            position=self.position[rows],
-            rotation=self.rotation[rows],
-            has_pose=self.has_pose[rows],
-        )
+        each = ('time', 'flux', 'valid', 'flags', 'position', 'rotation', 'has_pose')
+        return replace(self, **{name: getattr(self, name)[rows] for name in each})
 
     def with_track(self, track: PoseTrack) -> 'Measurements':
         """Return the measurements with the poses that another track has at their times."""
@@ -67,13 +59,8 @@ class Measurements:
 
     def sensors_only(self, rows: NDArray[np.generic]) -> 'Measurements':
         """Return the measurements of the sensors given by index or mask."""
-        return replace(
-            self,
-            sensors=self.sensors.select(rows),
-            flux=self.flux[:, rows],
-            valid=self.valid[:, rows],
-            flags=self.flags[:, rows],
-        )
+        each = {name: getattr(self, name)[:, rows] for name in ('flux', 'valid', 'flags')}
+        return replace(self, sensors=self.sensors.select(rows), **each)
 
     def placed(self) -> tuple[Array, Array]:
         """Return the sensors' centres (m) and axes in fg, each of shape (F, S, 3)."""

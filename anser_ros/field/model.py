@@ -73,9 +73,8 @@ OFF_AXIS = 1e-6
 """Moment across the axis, as a fraction of the whole, and distance from the axis as a fraction of
 a metre, up to which a dipole is on it: far below what anybody can measure."""
 STEP_M = 1e-3
-"""Way along the axis over which a second derivative is a difference, m. Its relative error is 2.5
-times the square of the way over the distance of the sensor, 0.3 % at 3 cm; a far smaller way makes
-moments so large that rounding is seen."""
+"""Way along the axis over which a second derivative is a difference, m: it errs by 0.3 % at 3 cm.
+A far smaller way makes moments so large that rounding is seen."""
 
 
 @dataclass(frozen=True)
@@ -162,11 +161,9 @@ def size_parameters(
 
 
 def plain(value: Any) -> Any:
-    """Return the value with arrays and tuples as lists, numpy's numbers as Python's, keys as
-    strings.
+    """Return the value as JSON and YAML know it: lists, Python's numbers, keys as strings.
 
-    A complex number becomes the list of its real and imaginary part, because neither JSON nor
-    YAML knows complex numbers.
+    A complex number becomes the list of its real and imaginary part.
     """
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
@@ -250,16 +247,8 @@ class ScanGaps:
         return np.asarray(np.sqrt(squares).reshape(frames, sensors))
 
 
-def gaps_document(gaps: ScanGaps) -> list[list[float]]:
-    """Return gaps as plain lists, a row per dipole: place, direction and its R moments."""
-    table: list[list[float]] = np.concatenate(
-        [gaps.positions, gaps.directions, gaps.moments.T], axis=1
-    ).tolist()
-    return table
-
-
 def parse_gaps(document: Any) -> ScanGaps:
-    """Return what `gaps_document` wrote; raises `ModelFileError` with the rule it breaks."""
+    """Return gaps of a row per dipole: place, direction, R moments; raises `ModelFileError`."""
     try:
         table = np.array(document, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -425,7 +414,8 @@ def to_document(model: FieldModel) -> dict[str, Any]:
     if model.references is not None:
         document['references'] = readings_document(model.references)
     if model.gaps is not None:
-        document['gaps'] = gaps_document(model.gaps)
+        columns = [model.gaps.positions, model.gaps.directions, model.gaps.moments.T]
+        document['gaps'] = np.concatenate(columns, axis=1).tolist()
     if model.modes is not None:
         modes = np.ascontiguousarray(model.modes, dtype=np.complex128)
         document['modes'] = modes.view(np.float64).tolist()

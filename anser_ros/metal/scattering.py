@@ -51,9 +51,7 @@ class Shapes:
 
     @property
     def size(self) -> int:
-        """Return how many couplings there are: the pairs', then what the sloped ones gain with log
-        f.
-        """
+        """Return how many couplings there are: the pairs', then the slopes with log f."""
         return int(self.first.size + self.sloped.size)
 
     def driven(self, field: ComplexArray) -> ComplexArray:

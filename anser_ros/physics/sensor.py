@@ -38,9 +38,7 @@ class Windings:
 
     @staticmethod
     def of(rows: Sequence[Sequence[Sequence[float]]]) -> 'Windings | None':
-        """Return windings of lists of (x, y, z, weight), a list a sensor; None where all are
-        empty.
-        """
+        """Return windings of a list of (x, y, z, weight) a sensor; None where all are empty."""
         most = max((len(row) for row in rows), default=0)
         if most == 0:
             return None
@@ -187,9 +185,7 @@ class PlacedPoints:
 
     @staticmethod
     def of(sensors: SensorTable, position: Array, rotation: Array) -> 'PlacedPoints':
-        """Return the points of a table's sensors, its body at a position (3,) and rotation
-        (3, 3).
-        """
+        """Return a table's points, its body at a position (3,), m, and a rotation (3, 3)."""
         centres, axes = sensors.placed(position, rotation)
         row, arm = np.arange(len(sensors)), np.zeros((len(sensors), 3))
         weight = np.ones(len(sensors))

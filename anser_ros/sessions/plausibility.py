@@ -148,10 +148,8 @@ def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Meas
 
 
 def _chosen(tool: Measurements) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Frames and columns of readings with a pose, of some frames over the whole recording.
-
-    Fluxes in a small unit are beyond what counts as valid, so only flags and NaN exclude one.
-    """
+    """Frames and columns of readings with a pose, of some frames over the whole recording."""
+    # Fluxes in a small unit are beyond what counts as valid: only flags and NaN exclude one.
     whole = np.isfinite(tool.flux).all(axis=2) & (tool.flags == 0) & tool.has_pose[:, None]
     frames = np.flatnonzero(whole.any(axis=1))
     frames = frames[:: max(1, -(-frames.size // MOST_FRAMES))]

@@ -51,13 +51,10 @@ class FrontEnd:
     """Describes the analogue side of a control unit with its converter."""
 
     sample_rate_hz: float = 40e3  # samples a second and channel
-    # full_scale_v, full_scale_a: voltage and current at code 32768, V and A
-    full_scale_v: float = 5.0
-    full_scale_a: float = 2.5
-    # noise_codes, current_noise_codes: white noise before the converter of the sensors and of the
-    # currents, codes rms a sample
-    noise_codes: float = 2.4
-    current_noise_codes: float = 0.5
+    full_scale_v: float = 5.0  # voltage at code 32768
+    full_scale_a: float = 2.5  # current at code 32768
+    noise_codes: float = 2.4  # white noise before the converter, codes rms a sample
+    current_noise_codes: float = 0.5  # the same of the currents
     current_drift: float = 0.02  # fraction by which the currents fall while the coils warm up
     warm_up_s: float = 60.0  # time constant of the warming, from the first start on, s
 

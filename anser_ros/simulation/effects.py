@@ -10,7 +10,7 @@ parameters at random, for tests that do not know the answer.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -82,9 +82,7 @@ def compressing(column: int, limit_v: float) -> OneSensor:
 
 
 def crossing_over(column: int, dead_v: float) -> OneSensor:
-    """Return crossover distortion, which no diagnosis knows: v becomes ``v - dead * tanh(v /
-    dead)``, so that of weak tones a larger fraction is lost.
-    """
+    """Return crossover distortion, which no diagnosis knows: ``v - dead * tanh(v / dead)``."""
     return OneSensor(column, lambda _, volts: volts - dead_v * np.tanh(volts / dead_v))
 
 
@@ -164,7 +162,7 @@ class Drawn:
     # its parameters as plain data, named as in docs/interfaces.md where the effect is there
     parameters: dict[str, Any]
     effects: tuple[RawEffect, ...] = ()  # what puts the effect into the signals
-    metal: tuple[MetalBody, ...] = field(default=())  # what puts it into the world
+    metal: tuple[MetalBody, ...] = ()  # what puts it into the world
     # names under which a diagnosis may rightly report the effect; empty where it has no such
     # effect and only ``unexplained`` is right
     answers: tuple[str, ...] = ()

@@ -1,6 +1,4 @@
-"""Writes MCAP bags that survive a crash and a full disk, with or without ROS. The steps: an
-account is kept of topics, counts and times, which becomes rosbag2's ``metadata.yaml``; messages
-are gathered in chunks; a session is setup, fluxes and poses.
+"""Writes MCAP bags that survive a crash and a full disk, with or without ROS.
 
 Whatever happens, the data up to the last flush stay readable: a flush hands all messages to the
 system as a small chunk behind the file, and a write that fails is taken back. After some seconds
@@ -154,10 +152,7 @@ LIBRARY = 'anser_ros'
 
 
 class _Segments:
-    """The stream under the MCAP writer: collects, and writes a whole segment at each flush.
-
-    Drafts lie behind all segments until the next one takes their place.
-    """
+    """The stream under the MCAP writer: whole segments, and drafts behind them until the next."""
 
     def __init__(self, raw: BinaryIO) -> None:
         self._raw = raw

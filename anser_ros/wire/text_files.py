@@ -161,9 +161,6 @@ def write_document(path: str | os.PathLike[str], document: Any) -> None:
         raise ModelFileError(f'{name}: {error.strerror}') from error
 
 
-_PACKAGE = 'anser_ros'
-
-
 def config_path(name: str) -> Path:
     """Return the path of a file: `name` itself, or else in `config/`; raises `SetupError`."""
     given = Path(name).expanduser()
@@ -171,7 +168,7 @@ def config_path(name: str) -> Path:
         return given
     if given.name == name:
         for folder in Path(__file__).resolve().parents:
-            for candidate in (folder / 'config', folder / 'share' / _PACKAGE / 'config'):
+            for candidate in (folder / 'config', folder / 'share/anser_ros/config'):
                 if (candidate / name).is_file():
                     return candidate / name
     raise SetupError(f'no file {name}, and none of that name among the files of config/')
