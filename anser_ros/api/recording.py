@@ -1,6 +1,4 @@
-"""Makes setup documents and sessions of what a script has: plain data, YAML text, files,
-arrays.
-"""
+"""Makes setup documents and sessions of plain data, YAML text, files and arrays."""
 
 import os
 import time as clock

@@ -227,11 +227,7 @@ def _asked(args: argparse.Namespace) -> dict[str, str]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo and return the exit code.
-
-    Raises `ParameterError` when the duration or the rate is out of range, the folder to draw from
-    has no demo, or another demo has the stated ROS domain.
-    """
+    """Run the demo and return the exit code; raises `ParameterError` on what cannot be run."""
     if args.draw is not None:
         if not (args.draw / DATA).is_file():
             raise ParameterError(f'{args.draw} holds no {DATA} of a demo that showed poses')

@@ -31,11 +31,7 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb with its arguments, by default those of the process.
-
-    The exit code is 0 done, 2 bad usage or bad input (one clear line on stderr), 1 a defect (a
-    traceback).
-    """
+    """Run one verb with its arguments, by default those of the process; return the exit code."""
     for variable in ONE_THREAD:  # before anything imports numpy
         os.environ.setdefault(variable, '1')
     try:

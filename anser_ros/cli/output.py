@@ -1,8 +1,6 @@
 """Carries a command out: shared options, folders of results, how far it is, and what it has done.
 
-The steps: options are declared, folders are made before the work begins, progress is shown while
-it lasts, files are written, and the `Result` is shown. Nothing here needs numpy, so that `doctor`
-can tell where that is missing.
+Nothing here needs numpy, so that `doctor` can tell where that is missing.
 """
 
 import argparse

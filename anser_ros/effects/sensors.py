@@ -409,9 +409,8 @@ class SensorGainSpread(SensorSpread):
     def gain_changes(self, term: SpreadTerm, sensors: SensorTable) -> Array | None:
         """Return a change for each place; sensors at one place have their gains in common.
 
-        One session cannot show how far a gain changes until the next. The differences among
-        sensors of a kind give the natural size of such a change; the axes of one chip change
-        together.
+        One session cannot show how far a gain changes until the next: the differences among
+        sensors of a kind give the natural size of such a change.
         """
         if term.shared < LEAST_SHARED:
             return None

@@ -38,11 +38,7 @@ class Measurements:
 
     @property
     def is_followed(self) -> bool:
-        """Return whether the optical tracker followed the body, so that clocks can be compared.
-
-        A recording with one pose for each point of rest contains no information about clocks, and
-        each place once.
-        """
+        """Return whether the optical tracker followed the body, so that clocks can be compared."""
         if self.track is None or self.track.time.size < 2:
             return False
         return float(np.median(np.diff(self.track.time))) <= LONGEST_GAP_S

@@ -1,5 +1,4 @@
-"""Makes the nominal field model, which expresses the Biot-Savart field of a drawn board by
-dipoles.
+"""Makes the nominal field model: the Biot-Savart field of a drawn board, by dipoles.
 
 A flat coil has the field of a magnetised sheet over its area. A few vertical dipoles on that area
 represent the sheet, as the nodes of a quadrature represent an integral; two horizontal dipoles in

@@ -1,5 +1,4 @@
-"""Turns and compares directions and rotations: planes across an axis, angles, vectors,
-quaternions.
+"""Turns and compares directions and rotations: tangents, angles, vectors, quaternions.
 
 Angles are in rad, by arctangent: small ones are exact too. Functions of scipy's ``Rotation`` are
 repeated for speed: trackers convert one rotation at a time, several times per pose and frame. One

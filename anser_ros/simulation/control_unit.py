@@ -62,11 +62,9 @@ class FrontEnd:
 class Sampler:
     """Samples all sensors and the sum of the currents, one stretch of time after the other.
 
-    Within a stretch the phasors change linearly between the world's at its two ends, so that
-    stretches of 5 ms follow a tool at 0.1 m/s to some 10 pT.
-
-    ``calibration`` is the true response of the channels, ``nominal_current_a`` the peak current
-    that the world's fluxes are given for, A.
+    Within a stretch the phasors change linearly, so that stretches of 5 ms follow a tool at 0.1
+    m/s to some 10 pT. ``calibration`` is the channels' true response, ``nominal_current_a`` the
+    peak current that the world's fluxes are given for, A.
     """
 
     def __init__(
@@ -188,11 +186,7 @@ class Piece:
 
 
 class ControlUnit:
-    """Speaks the protocol of `docs/cu_protocol.md` as a control unit does.
-
-    ``world`` has the true fluxes of the sensors that it is connected to, ``calibration`` the true
-    response of its channels.
-    """
+    """Speaks the protocol of `docs/cu_protocol.md`, by its channels' true ``calibration``."""
 
     def __init__(
         self,

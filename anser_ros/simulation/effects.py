@@ -1,10 +1,8 @@
 """Puts simulated faults of sensors, coils, amplifiers and clocks into a control unit's signals.
 
-An effect overrides the stage at which it acts. The stages run in the order of the methods: the
-world's fluxes, the coil currents, the voltages of all samples before the converter, the device
-time of the records. Times count from the first drive of the coils, s, except for the device's
-clock. An effect does not know which analysis will look at the result; `draw` draws one and its
-parameters at random, for tests that do not know the answer.
+An effect overrides the stage at which it acts. The stages run in the order of the methods. Times
+count from the first drive of the coils, s, except for the device's clock. `draw` draws an effect
+and its parameters at random, for tests that do not know the answer.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Simulates the world around a control unit: a board, moving tools, reference coils and metal.
 
-It gives the true flux of every sensor at any time. Bodies move on paths; metal is a rigid cloud of
-conducting and permeable spheres; the board's field is that of all tracks of its coils, which may
-differ from the nominal board as manufactured boards do. Samples, noise and bytes come later.
+It gives the true flux of every sensor at any time. Metal is a rigid cloud of conducting and
+permeable spheres; the board's field is that of all tracks of its coils.
 """
 
 from __future__ import annotations
@@ -116,11 +115,7 @@ def at_rest(place: Array) -> Path:
 
 
 def steel_disc(path: Path | None = None, *, radius_m: float = 0.06, rings: int = 3) -> MetalBody:
-    """Return a disc of touching steel balls, like the foot of a stand or the head of a C-arm.
-
-    ``path``: pose over time; by default it approaches and leaves again. ``radius_m``: radius of
-    the disc, m. ``rings``: rings of balls around the one in the middle.
-    """
+    """Return a disc of touching steel balls, in rings about one; by default it comes and goes."""
     ball = radius_m / (2 * rings + 1)
     centres = [np.zeros(3)]
     for ring in range(1, rings + 1):

@@ -261,8 +261,7 @@ class BagWriter:
         """Announce a topic by its absolute name and return its channel.
 
         The definition of its type is followed by those of all types in it; ``qos`` is what its
-        publishers offer (:func:`qos_profile`), and the hash, of REP 2011, empty when it is not
-        known.
+        publishers offer (:func:`qos_profile`), the hash that of REP 2011 where it is known.
         """
         if type_name not in self._schemas:
             self._schemas[type_name] = self._writer.register_schema(

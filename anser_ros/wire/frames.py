@@ -175,12 +175,7 @@ class Record:
 
 
 def check_hello(hello: Hello) -> None:
-    """Refuse a hello that no receiver could use.
-
-    Raises `FrameError` when a rate, scale or tone is not finite and positive or absurdly large, a
-    tone is not below half the sample rate, a channel number appears twice, there is not exactly
-    one current channel, or a block does not fit one record.
-    """
+    """Refuse a hello that no receiver could use; raises `FrameError` with what is wrong."""
     scales = [channel.full_scale for channel in hello.channels]
     positive = [hello.sample_rate_hz, hello.tick_hz, *scales, *hello.frequencies_hz]
     if not all(isfinite(value) and value > 0 for value in [*positive, *hello.currents_a]):

@@ -1,5 +1,4 @@
-"""Runs the control unit's serial port: a reader thread that survives cables, and names every
-fault.
+"""Runs the control unit's serial port: a reader thread that survives cables and names faults.
 
 One line is opened and read as fast as pyserial can. The thread reads, finds records and queues
 them; it never waits for the receiver. A receiver that is too slow loses whole blocks, counted as

@@ -1,5 +1,4 @@
-"""Reads text files from anybody: plain text, tables, lists of points, YAML within bounds, model
-files.
+"""Reads files from anybody: text, tables, points, YAML within bounds, model files.
 
 A file that cannot be read, or is no text of its kind, is one clear line.
 """
