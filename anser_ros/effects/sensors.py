@@ -94,7 +94,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
             turn = Rotation.from_rotvec(term.theta).as_matrix()
             rows = np.isin(sensors.channel, term.site['channels'])
             axis[rows] = axis[rows] @ turn.T
-        return sensors.with_geometry(axis=axis)
+        return replace(sensors, axis=axis)
 
     def _tilted(self, term: SensorAxisTerm) -> Array:
         surveyed = np.array(term.surveyed)
@@ -156,7 +156,7 @@ class PlacedElsewhere(Effect[Term]):
 
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
         rows = self.rows(term, sensors)[:, None]
-        return sensors.with_geometry(position=sensors.position + rows * term.theta)
+        return replace(sensors, position=sensors.position + rows * term.theta)
 
 
 class SensorPosition(PlacedElsewhere):
@@ -254,7 +254,7 @@ class SensorSize(Effect[SensorSizeTerm]):
             if channel in term.surveyed:
                 squared = term.surveyed[channel] ** 2 + SIZE_UNIT * term.theta[0]
                 length[row] = np.sqrt(max(squared, 0.0))
-        return sensors.with_geometry(length=length)
+        return replace(sensors, length=length)
 
     def record(self, term: SensorSizeTerm, covariance: Array) -> EffectRecord:
         base = float(np.mean(np.square(list(term.surveyed.values()))))
@@ -434,7 +434,7 @@ class SensorAxisSpread(SensorSpread):
     faultless = (0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
-        return sensors.with_geometry(axis=tilted(sensors.axis, term.of(sensors.channel)))
+        return replace(sensors, axis=tilted(sensors.axis, term.of(sensors.channel)))
 
 
 class SensorPlaceSpread(SensorSpread):
@@ -448,7 +448,7 @@ class SensorPlaceSpread(SensorSpread):
     faultless = (0.0, 0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
-        return sensors.with_geometry(position=sensors.position + term.of(sensors.channel))
+        return replace(sensors, position=sensors.position + term.of(sensors.channel))
 
 
 class SensorPickupSpread(SensorSpread):

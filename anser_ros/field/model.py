@@ -58,7 +58,7 @@ class Dipoles:
         return dipole_field(points, self.positions, self.directions, self.moments)
 
     def flux(self, points: Array, axes: Array, lengths: Array | None) -> ComplexArray:
-        """Return each emitter's flux (P, K), T, along unit axes at places (m), both (P, 3) in fg."""
+        """Return each emitter's flux (P, K), T, along unit axes at places, m, (P, 3) in fg."""
         basis = flux_basis(points, axes, lengths, self.positions, self.directions)
         return np.asarray(basis @ self.moments)
 
@@ -332,7 +332,7 @@ class FieldModel:
         )  # fmt: skip
 
     def flux(self, points: Array, axes: Array, lengths: Array | None = None) -> ComplexArray:
-        """Return each emitter's flux (..., K), T, along unit axes at places (m), (..., 3) in fg."""
+        """Return each emitter's flux (..., K), T, along unit axes at places, m, in fg."""
         flat = points.reshape(-1, 3)
         spans = None if lengths is None else np.broadcast_to(lengths, points.shape[:-1]).ravel()
         basis = flux_basis(flat, axes.reshape(-1, 3), spans, self.positions, self.directions)

@@ -6,7 +6,7 @@ length.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,17 +123,6 @@ class SensorTable:
             axis=np.concatenate([table.axis for table in tables]),
             length=np.concatenate([table.length for table in tables]),
             windings=joined_windings(tables),
-        )
-
-    def with_geometry(
-        self, position: Array | None = None, axis: Array | None = None, length: Array | None = None
-    ) -> 'SensorTable':
-        """Return the same sensors with other positions, axes or lengths where these are given."""
-        return replace(
-            self,
-            position=self.position if position is None else position,
-            axis=self.axis if axis is None else axis,
-            length=self.length if length is None else length,
         )
 
     def placed(self, position: Array, rotation: Array) -> tuple[Array, Array]:
