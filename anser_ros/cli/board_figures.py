@@ -104,8 +104,6 @@ SIDES = ((0, 1, 'from above'), (0, 2, 'from the side'))
 """Panels: the two coordinates that each shows, and its title."""
 ARROW = 0.08
 """Length of a coil's axis as drawn, as a part of what the panel shows."""
-LETTERS_PT = 6.0
-"""Size of the coils' names, points."""
 LEVEL = 0.05
 """Largest part of an axis in a panel of a coil that points at the viewer."""
 LINE_POINTS = 20
@@ -142,7 +140,7 @@ def setup_figure(setup: Setup) -> Figure:
             panel.grid(alpha=0.3)
     figure.draw_without_rendering()
     for panel, labels, drawn in named:
-        name_points(panel, labels, drawn, LETTERS_PT)
+        name_points(panel, labels, drawn, size=6.0)
     return figure
 
 
@@ -220,8 +218,6 @@ PLACE_ARROW = 0.15
 """Length of an axis in the picture, in halves of the board."""
 ARROW_POINTS = 8
 """Points of an arrow that no number should cover."""
-NUMBERS_PT = 8.0
-"""Size of the coils' numbers, points."""
 
 
 def places_figure(
@@ -245,7 +241,7 @@ def places_figure(
         legend_under(panel, 0.14, columns=2)
     figure.draw_without_rendering()
     for axes, labels, drawn in named:
-        name_points(axes, labels, drawn, NUMBERS_PT)
+        name_points(axes, labels, drawn, size=8.0)
     return figure
 
 

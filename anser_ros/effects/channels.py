@@ -277,9 +277,6 @@ POINTS, GENERATOR = 1021, 331
 SHAPES = ('cubic', 'tanh')
 FLUX, VOLTAGE = 'flux', 'voltage'
 """What the amplifier may see."""
-CURVE = 0.2
-"""Share (0 to 1) of a saturation's power that its model may miss: the true curve is none of those
-that are tried. It was chosen by hand on injected effects (`docs/log.md`)."""
 
 
 def third_order(flux: ComplexArray) -> ComplexArray:
@@ -325,7 +322,7 @@ class Saturation(Effect[SaturationTerm]):
     plausible = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
     typical = 3.0  # full scales down to the size of the signals
-    inexact = CURVE
+    inexact = 0.2  # the true curve is none of those that are tried (`docs/log.md`)
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SaturationTerm]:
         """Try every channel of a tool; references don't see signals of different size."""

@@ -209,11 +209,6 @@ class CoilCrosstalk(Effect[Term]):
         return Term(self, site, np.array([eps, across]))
 
 
-GRADIENT_ERROR = 0.07
-"""Relative error of what an emitter's shift changes at a reference close to it. Smaller lets
-references outvote the tools with gradients that the model only guesses."""
-
-
 class CoilMoved(Effect[Term]):
     """Theta is the shift of one emitter, m, frame fg."""
 
@@ -223,7 +218,7 @@ class CoilMoved(Effect[Term]):
     plausible = {'shift_m': (-0.03, 0.03)}
     remedy = Remedy.FIELD
     typical = 3e-3  # emitters shift by some millimetres
-    gradient_error = GRADIENT_ERROR
+    gradient_error = 0.07  # less lets references outvote tools with gradients that are guesses
     recorded = {'shift_m': (3, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:

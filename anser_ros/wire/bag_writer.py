@@ -148,7 +148,6 @@ CHUNK_NS = 4_000_000_000
 memory with twelve topics and 4 with forty, ten times that with a chunk for each flush."""
 RESERVE_BYTES = 1024 * 1024
 """Disk space that is reserved at the start, bytes, for the end of a recording on a full disk."""
-LIBRARY = 'anser_ros'
 
 
 class _Segments:
@@ -232,7 +231,7 @@ class BagWriter:
         self._flushed = 0
         self._chunk_began_ns = 0
         self._schemas: dict[str, int] = {}
-        self._writer.start(profile=Profile.ROS2, library=LIBRARY)
+        self._writer.start(profile=Profile.ROS2, library='anser_ros')
         self._segments.flush()
 
     def __enter__(self) -> Self:
