@@ -1,7 +1,6 @@
 """Defines every error that this package raises on purpose: one root, one child a kind of cause.
 
-A message is one clear line that names the rule and what was found instead; so is that of the
-parser of command lines.
+A message is one clear line that names the rule and what was found instead.
 """
 
 import argparse

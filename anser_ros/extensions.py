@@ -38,12 +38,6 @@ def tables(name: str) -> Iterator[Any]:
     return (vars(one)[name] for one in _extensions() if hasattr(one, name))
 
 
-def entries(table: str) -> Iterator[Any]:
-    """Yield the entries of a table of all applications as they are stated."""
-    for stated in tables(table):
-        yield from stated
-
-
 def loaded(table: str, is_wanted: Callable[[str], Any] = bool) -> Iterator[Any]:
     """Yield the modules or objects that a table names; of a mapping, the values of wanted keys."""
     for extension in _extensions():

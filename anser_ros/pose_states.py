@@ -1,8 +1,4 @@
-"""Names every state of a pose: why a frame has one, or why it is withheld.
-
-This is the only list of states; the packages that withhold poses say the reasons in their own
-words.
-"""
+"""Names every state of a pose, why a frame has one or why it is withheld: the only list."""
 
 from typing import NamedTuple
 
@@ -57,14 +53,10 @@ FRAMES_IN = 'frames_'
 
 
 class Withheld(NamedTuple):
-    """Names one reason for which all poses of a frame are withheld.
+    """Names one reason for which all poses of a frame are withheld."""
 
-    The state is one of `OF_MODEL`, or `TWO_SOURCES`; the reason is for `/diagnostics`, with
-    figures.
-    """
-
-    state: str
-    reason: str
+    state: str  # one of `OF_MODEL`, or `TWO_SOURCES`
+    reason: str  # for `/diagnostics`, with figures
 
 
 def code_of(state: str) -> int:

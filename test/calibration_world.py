@@ -87,7 +87,7 @@ def moved_scan(world, table, rng, seconds, errors, turn_rad=0.6, flat=False):
     place -= place.mean(axis=0)
     time = np.arange(round(25.0 * seconds)) / 25.0
     position, turn = hand(time, turn_rad, flat)
-    points, axes = table.with_geometry(table.position + place + lever, axis).placed(
+    points, axes = replace(table, position=table.position + place + lever, axis=axis).placed(
         position, turn.as_matrix()
     )
     flux = world.flux(points.reshape(-1, 3), axes.reshape(-1, 3)).reshape(time.size, count, -1)

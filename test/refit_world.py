@@ -198,7 +198,7 @@ def share_left(world, model, points):
 def replace_geometry(table, places, axes):
     """The references' table cut or repeated to other places."""
     rows = np.arange(len(places)) % len(table)
-    return table.select(rows).with_geometry(places, axes, np.zeros(len(places)))
+    return replace(table.select(rows), position=places, axis=axes, length=np.zeros(len(places)))
 
 
 def rms(values):

@@ -18,7 +18,7 @@ from metal_world import dipole_field
 from tracking_world import GEOMETRY, anser_board
 
 from anser_ros.errors import FitError, SetupError
-from anser_ros.field.nominal import Tolerances, nominal_model
+from anser_ros.field.nominal import nominal_model
 from anser_ros.physics import board as boards
 from anser_ros.physics.board import (
     Board,
@@ -224,7 +224,7 @@ def test_modes_are_boards_that_are_off_by_a_tolerance(row, shift, tilt, gain):
         whole.names[:1], whole.frequencies_hz[:1], whole.shape, whole.current_a,
         np.zeros((1, 3)), np.eye(3)[None],
     )  # fmt: skip
-    model = nominal_model(board, Tolerances(0.02, 5e-4, 5e-3))
+    model = nominal_model(board)
     points = np.random.default_rng(1).uniform([-0.1, -0.1, 0.1], [0.1, 0.1, 0.2], (50, 3))
     moved = whole.shape + np.array(shift) + np.cross(np.array(tilt), whole.shape)
     change = (1 + gain) * loop_field(moved, points, whole.current_a)

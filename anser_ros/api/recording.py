@@ -1,6 +1,4 @@
-"""Makes setup documents and sessions of what a script has: plain data, YAML text, files,
-arrays.
-"""
+"""Makes setup documents and sessions of plain data, YAML text, files and arrays."""
 
 import os
 import time as clock
@@ -126,7 +124,13 @@ def write_session(
     (5, 1, 1)
     """
     checked = load_setup(setup)
-    seconds, values = _checked_flux(checked, times, flux)
+    seconds = _ascending(times, 'times')
+    values = np.asarray(flux, dtype=np.complex128)
+    wanted = (seconds.size, len(checked.sensors), len(checked.emitter.coils))
+    if values.shape != wanted:
+        raise ParameterError(
+            f'flux must be (times, sensors, coils) = {wanted} by the setup, got {values.shape}'
+        )
     tracks = _checked_poses(checked, poses or {})
     origin = clock.time_ns() if start_ns is None else start_ns
     stamps = [origin + round(t / NANO) for t in seconds.tolist()]
@@ -156,19 +160,6 @@ def _ascending(times: ArrayLike, what: str) -> Array:
     if not (np.diff(seconds) > 0.0).all():
         raise ParameterError(f'{what} must ascend')
     return seconds
-
-
-def _checked_flux(
-    setup: Setup, times: ArrayLike, flux: ArrayLike
-) -> tuple[Array, NDArray[np.complex128]]:
-    seconds = _ascending(times, 'times')
-    values = np.asarray(flux, dtype=np.complex128)
-    wanted = (seconds.size, len(setup.sensors), len(setup.emitter.coils))
-    if values.shape != wanted:
-        raise ParameterError(
-            f'flux must be (times, sensors, coils) = {wanted} by the setup, got {values.shape}'
-        )
-    return seconds, values
 
 
 def _checked_poses(

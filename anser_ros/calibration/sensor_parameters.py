@@ -84,8 +84,8 @@ class BodyErrors:
         out = replace(
             measurements,
             flux=(measurements.flux - self.pickup) / self.gain[:, None],
-            sensors=sensors.with_geometry(
-                sensors.position + self.place + self.lever_arm, self.axis
+            sensors=replace(
+                sensors, position=sensors.position + self.place + self.lever_arm, axis=self.axis
             ),
         )
         if measurements.track is None or (self.offset_s == 0.0 and self.rate == 0.0):

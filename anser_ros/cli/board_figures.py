@@ -29,8 +29,6 @@ DIRECTIONS = 16
 """Directions about a point in which its name is tried."""
 MARGIN_PT = 2.0
 """Least distance of a name from another one and from what is drawn, points."""
-POINTS_PER_INCH = 72.0
-"""A point is a 72nd of an inch."""
 
 
 class Label(NamedTuple):
@@ -48,7 +46,7 @@ def name_points(axes: Axes, labels: Sequence[Label], drawn: ArrayLike, size: flo
     scale. Texts of the axes, and points ``drawn``, shape (n, 2), are not covered.
     """
     figure = axes.figure.figure  # not a figure inside it; older versions have no other way
-    dots = figure.dpi / POINTS_PER_INCH
+    dots = figure.dpi / 72.0  # pixels in a point
     margin = MARGIN_PT * dots
     taken = [_box(text) for text in axes.texts]
     covered = axes.transData.transform(np.asarray(drawn, dtype=np.float64).reshape(-1, 2))
@@ -84,9 +82,7 @@ def _best(
     here: Array, away: Array, half: Array, dots: float, margin: float, frame: Array,
     taken: Sequence[Array], covered: Array,
 ) -> tuple[Array, float]:  # fmt: skip
-    """Shift of a name from its point, pixels, and its distance, points: the nearest free one, in
-    the direction that is nearest to the wanted one.
-    """
+    """Nearest free shift of a name, pixels, in the direction nearest to the wanted; its length."""
     begin = float(np.arctan2(away[1], away[0])) if away.any() else -0.75 * np.pi
     turns = np.arange(DIRECTIONS)
     angle = begin + 2.0 * np.pi / DIRECTIONS * np.where(turns % 2, (turns + 1) // 2, -(turns // 2))
@@ -108,8 +104,6 @@ SIDES = ((0, 1, 'from above'), (0, 2, 'from the side'))
 """Panels: the two coordinates that each shows, and its title."""
 ARROW = 0.08
 """Length of a coil's axis as drawn, as a part of what the panel shows."""
-LETTERS_PT = 6.0
-"""Size of the coils' names, points."""
 LEVEL = 0.05
 """Largest part of an axis in a panel of a coil that points at the viewer."""
 LINE_POINTS = 20
@@ -146,7 +140,7 @@ def setup_figure(setup: Setup) -> Figure:
             panel.grid(alpha=0.3)
     figure.draw_without_rendering()
     for panel, labels, drawn in named:
-        name_points(panel, labels, drawn, LETTERS_PT)
+        name_points(panel, labels, drawn, size=6.0)
     return figure
 
 
@@ -224,8 +218,6 @@ PLACE_ARROW = 0.15
 """Length of an axis in the picture, in halves of the board."""
 ARROW_POINTS = 8
 """Points of an arrow that no number should cover."""
-NUMBERS_PT = 8.0
-"""Size of the coils' numbers, points."""
 
 
 def places_figure(
@@ -249,7 +241,7 @@ def places_figure(
         legend_under(panel, 0.14, columns=2)
     figure.draw_without_rendering()
     for axes, labels, drawn in named:
-        name_points(axes, labels, drawn, NUMBERS_PT)
+        name_points(axes, labels, drawn, size=8.0)
     return figure
 
 

@@ -88,7 +88,8 @@ def draw(results: Results, path: Path) -> None:
 
     figure = Figure(figsize=(12, 7), layout='constrained')
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.6))
-    shown = _shown_target(results)
+    counts = [len(results[f'stamp_0_{i}']) for i in range(len(results['names']))]
+    shown = len(counts) - 1 if counts[-1] else int(np.argmax(counts))  # a body, if it has poses
     views = []
     for row, (first, second) in enumerate(((0, 1), (0, 2))):
         views.append(figure.add_subplot(grid[row, 0]))
@@ -103,12 +104,6 @@ def draw(results: Results, path: Path) -> None:
     )  # fmt: skip
     figure.suptitle(f'{results["names"][shown]}: simulated control unit, true and tracked')
     save(figure, path)
-
-
-def _shown_target(results: Results) -> int:
-    """Return the index of the last body if it has poses, else of what has the most poses."""
-    counts = [len(results[f'stamp_0_{i}']) for i in range(len(results['names']))]
-    return len(counts) - 1 if counts[-1] else int(np.argmax(counts))
 
 
 def _chains(results: Results) -> list[tuple[int, str, str]]:
@@ -232,11 +227,7 @@ def _asked(args: argparse.Namespace) -> dict[str, str]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo and return the exit code.
-
-    Raises `ParameterError` when the duration or the rate is out of range, the folder to draw from
-    has no demo, or another demo has the stated ROS domain.
-    """
+    """Run the demo and return the exit code; raises `ParameterError` on what cannot be run."""
     if args.draw is not None:
         if not (args.draw / DATA).is_file():
             raise ParameterError(f'{args.draw} holds no {DATA} of a demo that showed poses')

@@ -52,11 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
-    """Diagnose the session of the arguments into its folder, by the way that it needs.
-
-    A session of another tracker has a way of its own. One of too few poses to test a field model
-    has the field estimated anew, all others are tested against the model.
-    """
+    """Diagnose the session of the arguments into its folder, by the way that its kind needs."""
     if kind := named_kind(args):
         done: output.Result = kind.diagnose(args, tell)
         return done

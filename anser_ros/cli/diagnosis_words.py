@@ -11,8 +11,6 @@ LONGEST = 9
 in diagnosis.json, paths in a table of the report too."""
 MOST_CHARACTERS = 400
 """Characters that a verdict is kept below: about five lines of a terminal."""
-
-
 FLUX_UNITS = ((1e-8, 1e12, 'pT'), (1e-5, 1e9, 'nT'), (1e-2, 1e6, 'uT'), (1e9, 1e3, 'mT'))
 """Up to which size, T, fluxes are shown with which factor in which unit."""
 
@@ -45,16 +43,13 @@ def verdict(document: dict[str, Any]) -> str:
     Effects are named with their parameters if there is room, otherwise without.
     """
     effects = document['effects']
-    for names in (', '.join(map(_named, effects)), _by_name(effects)):
+    counts = Counter(str(effect['name']) for effect in effects)
+    short = [name if n == 1 else f'{name} ({n} times)' for name, n in counts.items()]
+    for names in (', '.join(map(_named, effects)), ', '.join(short)):
         text = _paragraph(document, names)
         if len(text) < MOST_CHARACTERS:
             return text
     return _paragraph(document, 'see the table of effects')
-
-
-def _by_name(effects: list[dict[str, Any]]) -> str:
-    counts = Counter(str(effect['name']) for effect in effects)
-    return ', '.join(name if n == 1 else f'{name} ({n} times)' for name, n in counts.items())
 
 
 def _paragraph(document: dict[str, Any], names: str) -> str:

@@ -31,11 +31,7 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb with its arguments, by default those of the process.
-
-    The exit code is 0 done, 2 bad usage or bad input (one clear line on stderr), 1 a defect (a
-    traceback).
-    """
+    """Run one verb with its arguments, by default those of the process; return the exit code."""
     for variable in ONE_THREAD:  # before anything imports numpy
         os.environ.setdefault(variable, '1')
     try:
@@ -139,7 +135,7 @@ def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
     except BrokenPipeError:
         raise
     except Exception as error:  # noqa: BLE001 - the outermost place: whatever is left is a defect
-        if isinstance(error, ModuleNotFoundError) and may_be_missing(error.name):
+        if isinstance(error, ModuleNotFoundError) and str(error.name).split('.')[0] in PYPI:
             return EXIT_BAD_INPUT, None, missing_words(str(error.name))
         # A file that is not there or can't be written is the caller's input, not a defect.
         if isinstance(error, OSError) and error.filename is not None:
@@ -192,11 +188,6 @@ def check_packages(node: str) -> None:
     for module in (ROS, *NEEDED.get(node, ())):
         if not find_spec(module):
             raise MissingPackageError(missing_words(module))
-
-
-def may_be_missing(module: str | None) -> bool:
-    """Return whether a module is of a package that may be missing."""
-    return module is not None and module.split('.')[0] in PYPI
 
 
 def missing_words(module: str) -> str:

@@ -1,8 +1,6 @@
 """Carries a command out: shared options, folders of results, how far it is, and what it has done.
 
-The steps: options are declared, folders are made before the work begins, progress is shown while
-it lasts, files are written, and the `Result` is shown. Nothing here needs numpy, so that `doctor`
-can tell where that is missing.
+Nothing here needs numpy, so that `doctor` can tell where that is missing.
 """
 
 import argparse
@@ -25,8 +23,6 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
 from anser_ros.errors import ParameterError
-
-# Nothing that needs numpy is imported here: doctor reports where that is missing.
 
 
 def add_out(parser: argparse.ArgumentParser, what: str = '', **options: Any) -> None:

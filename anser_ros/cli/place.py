@@ -103,9 +103,8 @@ def propose(
     """Choose reference coils of a setup.
 
     ``origin`` is ``setup``, ``frame``, ``plane=Z`` or the path of a CSV file, ``kinds`` are of
-    `KINDS`, and ``error_m`` is the error of poses, m, that each metal makes uncorrected.
-
-    Raises `ParameterError` when there are not as many places, or the list of them can't be read,
+    `KINDS`, and ``error_m`` is the error of poses, m, that each metal makes uncorrected. Raises
+    `ParameterError` when there are not as many places, or the list of them can't be read,
     `SetupError` when the board can't be drawn from the setup.
     """
     field = NominalBoard.of(setup).field

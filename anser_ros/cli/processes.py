@@ -27,9 +27,7 @@ LAST_DOMAIN = 101
 def own_domain(preferred: Iterable[int]) -> Iterator[int]:
     """Name to the nodes to come the first domain that no other simulation has, and hold it.
 
-    Where the environment states one, it is this one or none.
-
-    Raises `ParameterError` when all of them are taken, or the stated one is.
+    One that is stated is the only one. Raises `ParameterError` when none is free.
     """
     stated = os.environ.get(VARIABLE, '')
     if stated and not stated.isdecimal():

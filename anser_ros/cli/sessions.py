@@ -1,6 +1,4 @@
-"""Runs commands on sessions: of which kind one is, many of them by themselves, and their
-summary.
-"""
+"""Runs commands on sessions: which kind one is, many of them alone, and their summary."""
 
 import argparse
 import contextlib

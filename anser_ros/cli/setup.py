@@ -419,19 +419,13 @@ def _document(args: argparse.Namespace) -> Document:
             raise ParameterError('the Anser board has its own coils; name another kind of board')
         emitter = anser_emitter()
     else:
-        emitter = emitter_of(args.board, _geometry(args.geometry), coils)
+        stated = [entry.partition('=') for entry in args.geometry]
+        geometry = {key: number_of(value, f'--geometry {key}') for key, _, value in stated}
+        emitter = emitter_of(args.board, geometry, coils)
     rows = [*args.sensor, *(row for path in args.sensors for row in rows_of(path, SENSOR_COLUMNS))]
     volume = None if args.volume is None else numbers_of(args.volume, 6, '--volume')
     sensors = [sensor_of(row) for row in rows]
     return document_of(emitter, sensors, args.rate, volume, output.stated_values(args))
-
-
-def _geometry(entries: list[str]) -> dict[str, float]:
-    found = {}
-    for entry in entries:
-        key, _, value = entry.partition('=')
-        found[key] = number_of(value, f'--geometry {key}')
-    return found
 
 
 def _write(args: argparse.Namespace, text: str, setup: Setup) -> int:

@@ -361,7 +361,7 @@ LEAST_ERROR = 1e-5
 """Relative error that references have at least, so that exact ones do not divide by zero."""
 DRAWING_ERROR = 0.05
 """Prior spread of the sheet's moments about the drawn ones, as a share of their rms: a coil's
-moment is off by 2 % (`nominal.Tolerances`), and half a millimetre moves a few percent of it."""
+moment is off by 2 % (`field.nominal.GAIN`), and half a millimetre moves a few percent of it."""
 
 
 def board_box(model: FieldModel) -> Array:

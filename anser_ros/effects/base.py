@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
-ComplexArray = NDArray[np.complex128]
-
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 AnyTerm = TypeVar('AnyTerm', bound='BaseTerm')
 
 
@@ -158,22 +157,16 @@ class View:
 
     time: Array  # (F,), s since the session's start
     sensors: SensorTable  # The sensors as the effects say that they are
-    # position, rotation: (F, 3) and (F, 3, 3), pose of the body, m, frame fg
-    position: Array
-    rotation: Array
+    position: Array  # (F, 3), of the body, m, frame fg
+    rotation: Array  # (F, 3, 3), from the body's frame to fg
     velocity: Array  # (F, 6), m/s and rad/s along the axes of fg, of the body's origin
-    # centres, axes: (F, S, 3), places (m) and unit axes of the sensors, frame fg
-    centres: Array
-    axes: Array
+    centres: Array  # (F, S, 3), of the sensors, m, frame fg
+    axes: Array  # (F, S, 3), their unit axes, frame fg
     linear: ComplexArray  # (F, S, K), flux before offsets and compression, T
     flux: ComplexArray  # (F, S, K), flux as it is read, T
-    # d_position, d_axis: (F, S, 3, K), derivatives of the flux by the sensor's centre (T/m) and by
-    # its axis vector (T)
-    d_position: ComplexArray
-    d_axis: ComplexArray
-    # (F, S, 3, K), derivative of the flux by a turn of the body about its origin, along fg's axes,
-    # T/rad
-    d_turn: ComplexArray
+    d_position: ComplexArray  # (F, S, 3, K), derivative of the flux by the sensor's centre, T/m
+    d_axis: ComplexArray  # (F, S, 3, K), the same by its axis vector, T
+    d_turn: ComplexArray  # (F, S, 3, K), the same by a turn of the body about its origin, T/rad
     dipoles: Dipoles  # The field that the sensors see, without what moves
     illumination: Dipoles  # The emitters' own field, as metal sees it
     omega: Array  # (K,), angular drive frequencies, rad/s

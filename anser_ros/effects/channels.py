@@ -10,7 +10,6 @@ induces, in which a tone counts in proportion to its frequency.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,6 @@ from anser_ros.effects.effect import (
     pairs_of,
     recorded_site,
     sigmas,
-    unit_matrix,
 )
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
@@ -42,7 +40,13 @@ class ComplexGain(Effect[Term]):
     typical = 0.3  # gains are within some ten percent of one
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        figures, deviations = figures_of(term.theta, covariance)
+        """Record modulus and argument of the gain, each with its deviation along its own way."""
+        gain = 1 + complex(*term.theta)
+        along = np.array([gain.real, gain.imag]) / abs(gain)
+        across = np.array([-along[1], along[0]]) / abs(gain)
+        sigma_gain, sigma_rad = (np.sqrt(way @ covariance @ way) for way in (along, across))
+        figures = {'gain': abs(gain), 'phase_deg': float(np.degrees(np.angle(gain)))}
+        deviations = {'gain': float(sigma_gain), 'phase_deg': float(np.degrees(sigma_rad))}
         return EffectRecord(self.name, {**recorded_site(term), **figures}, deviations)
 
     def term(self, record: EffectRecord) -> Term:
@@ -50,21 +54,6 @@ class ComplexGain(Effect[Term]):
         phase = np.radians(float(record.parameters.get('phase_deg', 0.0)))
         gain = float(needed(record, 'gain')) * np.exp(1j * phase)
         return Term(self, self.site_of(record), np.array([gain.real - 1, gain.imag]))
-
-
-def figures_of(theta: Array, covariance: Array) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return ``gain`` and ``phase_deg`` of a record, and their standard deviations.
-
-    ``theta`` (2,) is the real and imaginary part of (gain - 1).
-    """
-    gain = 1 + complex(*theta)
-    along = np.array([gain.real, gain.imag]) / abs(gain)
-    across = np.array([-along[1], along[0]]) / abs(gain)
-    sigma_gain, sigma_rad = (np.sqrt(way @ covariance @ way) for way in (along, across))
-    return (
-        {'gain': abs(gain), 'phase_deg': float(np.degrees(np.angle(gain)))},
-        {'gain': float(sigma_gain), 'phase_deg': float(np.degrees(sigma_rad))},
-    )
 
 
 class GainOfChannels(ComplexGain):
@@ -184,7 +173,7 @@ class ChannelCrosstalk(Effect[Term]):
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
         """Mix the cluster's channels; one that is not there leaks nothing."""
-        matrix, block = unit_matrix(channels.size), self._matrix(term)
+        matrix, block = np.eye(channels.size, dtype=complex), self._matrix(term)
         place = {int(c): row for row, c in enumerate(channels)}
         for i, to in enumerate(term.site['channels']):
             for j, source in enumerate(term.site['channels']):
@@ -288,9 +277,6 @@ POINTS, GENERATOR = 1021, 331
 SHAPES = ('cubic', 'tanh')
 FLUX, VOLTAGE = 'flux', 'voltage'
 """What the amplifier may see."""
-CURVE = 0.2
-"""Share (0 to 1) of a saturation's power that its model may miss: the true curve is none of those
-that are tried. It was chosen by hand on injected effects (`docs/log.md`)."""
 
 
 def third_order(flux: ComplexArray) -> ComplexArray:
@@ -336,7 +322,7 @@ class Saturation(Effect[SaturationTerm]):
     plausible = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
     typical = 3.0  # full scales down to the size of the signals
-    inexact = CURVE
+    inexact = 0.2  # the true curve is none of those that are tried (`docs/log.md`)
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SaturationTerm]:
         """Try every channel of a tool; references don't see signals of different size."""

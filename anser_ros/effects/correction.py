@@ -193,8 +193,7 @@ def _measured(view: View, terms: Sequence[Term]) -> View:
 
 DECOMPRESSION_STEPS = 12
 """Most steps of the fixed point that undoes a compression. Each leaves of the error about the
-share that the compression takes of a change of the signal; the bound keeps a hopeless one from
-looping."""
+share that the compression takes of a change of the signal."""
 
 LIVE = (Remedy.FLUX, Remedy.SENSORS)
 """Remedies of effects that a tracker undoes; those of the field are in the model's dipoles."""
@@ -318,10 +317,7 @@ class Correction:
     def _decompressed(
         terms: list[Term], channels: NDArray[np.int64], measured: ComplexArray
     ) -> ComplexArray:
-        """Fixed point of ``x = measured - (compress(x) - x)``: the loss is a small part of x.
-
-        A correction of more than half of x cannot be trusted, and is limited to that.
-        """
+        """Fixed point of ``x = measured - (compress(x) - x)``; at most half of x is corrected."""
         x = measured
         for _ in range(DECOMPRESSION_STEPS):
             behind = x[None]

@@ -34,9 +34,8 @@ from anser_ros.metal.scattering import Shapes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 
-ComplexArray = NDArray[np.complex128]
-
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 class Site(TypedDict, total=False):
@@ -112,9 +111,7 @@ class Richness:
 
 @dataclass(frozen=True, kw_only=True)
 class BodyTerm(Term):
-    """Holds metal of modes: theta is its course, then real and imaginary parts of their
-    amplitudes.
-    """
+    """Holds metal of modes: theta is its course, then their amplitudes, real and imaginary."""
 
     kind: str  # Of body (`anser_ros.metal.body.BODIES`)
     modes: Array  # (c, m), each a combination of the c couplings of the body's shapes
@@ -451,11 +448,6 @@ def pairs_of(values: ComplexArray) -> Any:
 def both_phases(unit: NDArray[np.inexact]) -> ComplexArray:
     """Return columns (..., m) in phase, then in quadrature, (..., 2 m)."""
     return np.concatenate([unit, 1j * unit], axis=-1)
-
-
-def unit_matrix(size: int) -> ComplexArray:
-    """Return the identity of this size as a complex matrix."""
-    return np.eye(size, dtype=complex)
 
 
 @cache

@@ -19,7 +19,6 @@ from anser_ros.effects.effect import (
     needed,
     recorded_site,
     sigmas,
-    unit_matrix,
 )
 from anser_ros.field.model import (
     Dipoles,
@@ -47,15 +46,14 @@ class CoilGain(ComplexGain):
         return out
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        matrix = unit_matrix(omega.size)
+        matrix = np.eye(omega.size, dtype=complex)
         matrix[term.site['coil'], term.site['coil']] = 1 + complex(*term.theta)
         return matrix[None]
 
 
 PROBED_SHARES = (0.1, 0.5, 2.5)
 """Time constants of the probe, as shares of the session: from one that has ended early to one that
-is nearly a straight line. Closer ones have nearly parallel columns; fewer miss courses between
-them."""
+is nearly a straight line. Closer ones have nearly parallel columns."""
 
 
 def _shape(time: Array, tau: float) -> Array:
@@ -133,7 +131,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
 
     def emitter_matrix(self, term: CoilDriftTerm, time: Array, omega: Array) -> ComplexArray:
         amount, log_tau = term.theta
-        matrix = np.repeat(unit_matrix(omega.size)[None], time.size, axis=0)
+        matrix = np.repeat(np.eye(omega.size, dtype=complex)[None], time.size, axis=0)
         coil = term.site['coil']
         matrix[:, coil, coil] = 1 + amount * _shape(time, float(np.exp(log_tau)))
         return matrix
@@ -187,7 +185,7 @@ class CoilCrosstalk(Effect[Term]):
 
     def _matrix(self, term: Term, emitters: int) -> ComplexArray:
         source, target = term.site['coils']
-        matrix = unit_matrix(emitters)
+        matrix = np.eye(emitters, dtype=complex)
         if term.site.get('mutual'):
             matrix[target, source] = matrix[source, target] = term.theta[0]
         else:
@@ -211,11 +209,6 @@ class CoilCrosstalk(Effect[Term]):
         return Term(self, site, np.array([eps, across]))
 
 
-GRADIENT_ERROR = 0.07
-"""Relative error of what an emitter's shift changes at a reference close to it. Smaller lets
-references outvote the tools with gradients that the model only guesses."""
-
-
 class CoilMoved(Effect[Term]):
     """Theta is the shift of one emitter, m, frame fg."""
 
@@ -225,7 +218,7 @@ class CoilMoved(Effect[Term]):
     plausible = {'shift_m': (-0.03, 0.03)}
     remedy = Remedy.FIELD
     typical = 3e-3  # emitters shift by some millimetres
-    gradient_error = GRADIENT_ERROR
+    gradient_error = 0.07  # less lets references outvote tools with gradients that are guesses
     recorded = {'shift_m': (3, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:

@@ -1,8 +1,7 @@
 """A metal object or a metal sheet rests near the volume.
 
 What its few parameters leave (finer couplings, errors of the illumination) is no effect of its
-own: the remainder belongs to the metal that it refines, so that the corrected field is as good as
-the data allow.
+own: the remainder belongs to the metal that it refines.
 """
 
 from collections.abc import Sequence

@@ -152,8 +152,7 @@ MetalPath = StraightPath | FreePath
 def spline_weights(nodes: Array, at: Array, ends: str) -> Array:
     """Return what each node's value weighs in a cubic spline's values, shape (F, N); to be read.
 
-    ``nodes`` (N,) ascend, values are wanted ``at`` (F,), ``ends`` is scipy's ``bc_type``. Many
-    splines through the same nodes are wanted at the same places: the weights are kept for a while.
+    ``nodes`` (N,) ascend, values are wanted ``at`` (F,), ``ends`` is scipy's ``bc_type``.
     """
     return _spline_weights(nodes.tobytes(), at.tobytes(), ends)
 
@@ -166,19 +165,14 @@ def _spline_weights(nodes: bytes, at: bytes, ends: str) -> Array:
     return weights
 
 
-def distance_travelled(path: MetalPath, theta: Array, time: Array) -> tuple[Array, Array]:
-    """Return fine times over those given, and the way made since the first, (T,) each, s and m."""
-    count = max(3, int((time.max() - time.min()) / FINE_STEP_S) + 1)
-    fine = np.linspace(time.min(), time.max(), count)
-    steps = np.linalg.norm(np.diff(path.centre(theta, fine), axis=0), axis=1)
-    return fine, np.concatenate([[0.0], np.cumsum(steps)])
-
-
 def moving_times(path: MetalPath, theta: Array, time: Array) -> tuple[float, float]:
     """Return when the body begins and ends its way, s."""
     if not path.knots:
         return float(theta[6]), float(theta[7])
-    fine, way = distance_travelled(path, theta, time)
+    count = max(3, int((time.max() - time.min()) / FINE_STEP_S) + 1)
+    fine = np.linspace(time.min(), time.max(), count)
+    steps = np.linalg.norm(np.diff(path.centre(theta, fine), axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
     share = way / max(float(way[-1]), 1e-9)
     first = int(np.searchsorted(share, NEGLIGIBLE_WAY))
     last = int(np.searchsorted(share, 1 - NEGLIGIBLE_WAY))
@@ -190,9 +184,8 @@ STEP = 1e-3
 PATH_SAMPLES = 21
 """Times at which a record says where the metal is: two seconds apart in a session of 40 s."""
 SHAPED = 60
-"""Parameters that moving metal counts for at least when explanations are compared: it is shaped
-with dozens of modes once it is taken, and must not win as a simple body against a fluctuation,
-which counts for 40. Chosen on an emitter that steps and was called metal (`docs/log.md`)."""
+"""Parameters that moving metal counts for at least when explanations are compared: a simple body
+must not win against a fluctuation, which counts for 40 (`docs/log.md`)."""
 SHORT_WAY = 0.02
 """Ends of the course nearer to each other than this (m) don't give a straight path a direction."""
 UPWARDS = np.array([0.0, 0.0, -0.05])
@@ -225,9 +218,7 @@ class MovingTerm(BodyTerm):
         return self.path.centre(self.course, time)
 
     def _seen(self, view: View, shift: Array) -> tuple[Array, ComplexArray]:
-        """Amplitudes about the moving centre: of the sensors (F, S, M), and of the emitters
-        (F, K, M), interpolated between nodes on the way.
-        """
+        """Amplitudes about the moving centre, of sensors (F, S, M) and of emitters (F, K, M)."""
         nodes, on_way, at = self.path.nodes(self.course, view.time)
         grid = (on_way + shift)[:, None, :] + self.shapes.offsets
         field = view.illumination.field(grid.reshape(-1, 3)).reshape(*grid.shape, -1)
@@ -405,17 +396,14 @@ def _place_sigma(term: MovingTerm, covariance: Array, time: Array) -> Array:
 def _time_sigma(
     term: MovingTerm, covariance: Array, start: float, end: float
 ) -> tuple[float, float]:
-    """Standard deviation of the times when the way begins and ends, s.
-
-    On a free path a body has certainly left its first place only when its distance from it exceeds
-    the uncertainty of its place.
-    """
+    """Standard deviation of the times when the way begins and ends, s."""
     knots = term.path.knots
     if not knots:
         first, last = sigmas(covariance)[6:8]
         return float(first), float(last)
     time = np.linspace(knots[0], knots[-1], PATH_SAMPLES * 8)
     centre = term.centres(time)
+    # A body has certainly left a place only when it is farther away than its place is uncertain.
     known = 2.0 * np.linalg.norm(_place_sigma(term, covariance, time), axis=1)
     gone = np.flatnonzero(np.linalg.norm(centre - centre[0], axis=1) > known)
     coming = np.flatnonzero(np.linalg.norm(centre - centre[-1], axis=1) > known)

@@ -103,9 +103,7 @@ class Registration(OpticalEffect[Term]):
     typical = (0.02, 0.02, 0.02, 5e-3, 5e-3, 5e-3)
 
     def slopes(self, term: Term, view: View) -> ComplexArray:
-        """Return the derivative by a turn about fg's origin and a shift, which all sensors make
-        the other way round.
-        """
+        """Return the derivative by a turn about fg's origin and a shift, made the other way."""
         back = Rotation.from_rotvec(term.theta[:3]).as_matrix().T
         turn = np.cross(view.centres[..., :, None], view.d_position, axis=2)
         turn = turn + np.cross(view.axes[..., :, None], view.d_axis, axis=2)

@@ -20,7 +20,6 @@ from anser_ros.effects.effect import (
     Term,
     needed,
     recorded_site,
-    unit_matrix,
 )
 from anser_ros.field.model import EffectRecord
 
@@ -45,7 +44,7 @@ class SwappedChannels(Wiring):
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
         """Return a permutation; channels of which one is missing stay as they are."""
         row = {int(c): i for i, c in enumerate(channels)}
-        matrix = unit_matrix(channels.size)
+        matrix = np.eye(channels.size, dtype=complex)
         if not all(c in row for c in term.site['channels']):
             return matrix
         for shown, true in zip(term.site['read_as'], term.site['channels'], strict=True):
@@ -63,7 +62,7 @@ class SwappedCoils(Wiring):
     remedy = Remedy.FLUX
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        matrix = unit_matrix(omega.size)
+        matrix = np.eye(omega.size, dtype=complex)
         for shown, true in zip(term.site['read_as'], term.site['coils'], strict=True):
             matrix[shown] = 0.0
             matrix[shown, true] = 1.0
@@ -171,11 +170,6 @@ def outliers_of(fraction: float, sigma: float, channels: Sequence[int]) -> SeenT
 
 
 EFFECTS = (
-    SWAPPED_CHANNELS,
-    SWAPPED_COILS,
-    DEAD_CHANNEL,
-    SENSOR_POLARITY,
-    EXCESS_NOISE,
-    OUTLIERS,
+    SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL, SENSOR_POLARITY, EXCESS_NOISE, OUTLIERS,
     LOOSE_CONTACT,
-)
+)  # fmt: skip

@@ -20,7 +20,6 @@ from anser_ros.effects.effect import (
     needed,
     recorded_site,
     sigmas,
-    unit_matrix,
     whole_numbers,
 )
 from anser_ros.errors import ModelFileError
@@ -95,7 +94,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
             turn = Rotation.from_rotvec(term.theta).as_matrix()
             rows = np.isin(sensors.channel, term.site['channels'])
             axis[rows] = axis[rows] @ turn.T
-        return sensors.with_geometry(axis=axis)
+        return replace(sensors, axis=axis)
 
     def _tilted(self, term: SensorAxisTerm) -> Array:
         surveyed = np.array(term.surveyed)
@@ -157,7 +156,7 @@ class PlacedElsewhere(Effect[Term]):
 
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
         rows = self.rows(term, sensors)[:, None]
-        return sensors.with_geometry(position=sensors.position + rows * term.theta)
+        return replace(sensors, position=sensors.position + rows * term.theta)
 
 
 class SensorPosition(PlacedElsewhere):
@@ -255,7 +254,7 @@ class SensorSize(Effect[SensorSizeTerm]):
             if channel in term.surveyed:
                 squared = term.surveyed[channel] ** 2 + SIZE_UNIT * term.theta[0]
                 length[row] = np.sqrt(max(squared, 0.0))
-        return sensors.with_geometry(length=length)
+        return replace(sensors, length=length)
 
     def record(self, term: SensorSizeTerm, covariance: Array) -> EffectRecord:
         base = float(np.mean(np.square(list(term.surveyed.values()))))
@@ -405,14 +404,13 @@ class SensorGainSpread(SensorSpread):
 
     def channel_matrix(self, term: SpreadTerm, channels: NDArray[np.int64]) -> ComplexArray | None:
         parts = term.of(channels)
-        return np.asarray(unit_matrix(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
+        return np.asarray(np.eye(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
 
     def gain_changes(self, term: SpreadTerm, sensors: SensorTable) -> Array | None:
         """Return a change for each place; sensors at one place have their gains in common.
 
-        One session cannot show how far a gain changes until the next. The differences among
-        sensors of a kind give the natural size of such a change; the axes of one chip change
-        together.
+        One session cannot show how far a gain changes until the next: the differences among
+        sensors of a kind give the natural size of such a change.
         """
         if term.shared < LEAST_SHARED:
             return None
@@ -436,7 +434,7 @@ class SensorAxisSpread(SensorSpread):
     faultless = (0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
-        return sensors.with_geometry(axis=tilted(sensors.axis, term.of(sensors.channel)))
+        return replace(sensors, axis=tilted(sensors.axis, term.of(sensors.channel)))
 
 
 class SensorPlaceSpread(SensorSpread):
@@ -450,7 +448,7 @@ class SensorPlaceSpread(SensorSpread):
     faultless = (0.0, 0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
-        return sensors.with_geometry(position=sensors.position + term.of(sensors.channel))
+        return replace(sensors, position=sensors.position + term.of(sensors.channel))
 
 
 class SensorPickupSpread(SensorSpread):

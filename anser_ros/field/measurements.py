@@ -38,27 +38,15 @@ class Measurements:
 
     @property
     def is_followed(self) -> bool:
-        """Return whether the optical tracker followed the body, so that clocks can be compared.
-
-        A recording with one pose for each point of rest contains no information about clocks, and
-        each place once.
-        """
+        """Return whether the optical tracker followed the body, so that clocks can be compared."""
         if self.track is None or self.track.time.size < 2:
             return False
         return float(np.median(np.diff(self.track.time))) <= LONGEST_GAP_S
 
     def frames(self, rows: NDArray[np.generic] | slice) -> 'Measurements':
         """Return the measurements of the frames given by index, mask or slice."""
-        return replace(
-            self,
-            time=self.time[rows],
-            flux=self.flux[rows],
-            valid=self.valid[rows],
-            flags=self.flags[rows],
-            position=self.position[rows],
-            rotation=self.rotation[rows],
-            has_pose=self.has_pose[rows],
-        )
+        each = ('time', 'flux', 'valid', 'flags', 'position', 'rotation', 'has_pose')
+        return replace(self, **{name: getattr(self, name)[rows] for name in each})
 
     def with_track(self, track: PoseTrack) -> 'Measurements':
         """Return the measurements with the poses that another track has at their times."""
@@ -67,13 +55,8 @@ class Measurements:
 
     def sensors_only(self, rows: NDArray[np.generic]) -> 'Measurements':
         """Return the measurements of the sensors given by index or mask."""
-        return replace(
-            self,
-            sensors=self.sensors.select(rows),
-            flux=self.flux[:, rows],
-            valid=self.valid[:, rows],
-            flags=self.flags[:, rows],
-        )
+        each = {name: getattr(self, name)[:, rows] for name in ('flux', 'valid', 'flags')}
+        return replace(self, sensors=self.sensors.select(rows), **each)
 
     def placed(self) -> tuple[Array, Array]:
         """Return the sensors' centres (m) and axes in fg, each of shape (F, S, 3)."""

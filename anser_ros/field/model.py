@@ -29,11 +29,9 @@ ComplexArray = NDArray[np.complex128]
 class Dipoles:
     """Holds a set of N dipoles with one moment for each of K emitters."""
 
-    # positions, directions: (N, 3), positions (m) and unit directions, frame fg
-    positions: Array
-    directions: Array
-    # (N, K), moments along the directions at each emitter's nominal current, A m^2
-    moments: ComplexArray
+    positions: Array  # (N, 3), m, frame fg
+    directions: Array  # (N, 3), unit vectors, frame fg
+    moments: ComplexArray  # (N, K), along these at each emitter's nominal current, A m^2
 
     @staticmethod
     def none(emitters: int) -> 'Dipoles':
@@ -60,11 +58,7 @@ class Dipoles:
         return dipole_field(points, self.positions, self.directions, self.moments)
 
     def flux(self, points: Array, axes: Array, lengths: Array | None) -> ComplexArray:
-        """Return each emitter's flux density (P, K), T, along sensors' axes.
-
-        Sensor centres (m) and unit axes (P, 3) are in the frame fg; no ``lengths`` are those of
-        points.
-        """
+        """Return each emitter's flux (P, K), T, along unit axes at places, m, (P, 3) in fg."""
         basis = flux_basis(points, axes, lengths, self.positions, self.directions)
         return np.asarray(basis @ self.moments)
 
@@ -73,9 +67,8 @@ OFF_AXIS = 1e-6
 """Moment across the axis, as a fraction of the whole, and distance from the axis as a fraction of
 a metre, up to which a dipole is on it: far below what anybody can measure."""
 STEP_M = 1e-3
-"""Way along the axis over which a second derivative is a difference, m. Its relative error is 2.5
-times the square of the way over the distance of the sensor, 0.3 % at 3 cm; a far smaller way makes
-moments so large that rounding is seen."""
+"""Way along the axis over which a second derivative is a difference, m: it errs by 0.3 % at 3 cm.
+A far smaller way makes moments so large that rounding is seen."""
 
 
 @dataclass(frozen=True)
@@ -168,11 +161,9 @@ def size_parameters(
 
 
 def plain(value: Any) -> Any:
-    """Return the value with arrays and tuples as lists, numpy's numbers as Python's, keys as
-    strings.
+    """Return the value as JSON and YAML know it: lists, Python's numbers, keys as strings.
 
-    A complex number becomes the list of its real and imaginary part, because neither JSON nor
-    YAML knows complex numbers.
+    A complex number becomes the list of its real and imaginary part.
     """
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
@@ -235,9 +226,8 @@ def parse_readings(document: Any, emitters: int) -> ReferenceReadings:
 class ScanGaps:
     """Holds what a scan leaves open of the field, alike for all emitters."""
 
-    # positions, directions: (N, 3), dipoles, m and unit vectors, frame fg
-    positions: Array
-    directions: Array
+    positions: Array  # (N, 3), of dipoles, m, frame fg
+    directions: Array  # (N, 3), unit vectors, frame fg
     # (R, N), A m^2. The variance of a phasor component of any emitter's flux is the sum of the
     # squares of the fluxes of these R combinations of the dipoles.
     moments: Array
@@ -256,16 +246,8 @@ class ScanGaps:
         return np.asarray(np.sqrt(squares).reshape(frames, sensors))
 
 
-def gaps_document(gaps: ScanGaps) -> list[list[float]]:
-    """Return gaps as plain lists, a row per dipole: place, direction and its R moments."""
-    table: list[list[float]] = np.concatenate(
-        [gaps.positions, gaps.directions, gaps.moments.T], axis=1
-    ).tolist()
-    return table
-
-
 def parse_gaps(document: Any) -> ScanGaps:
-    """Return what `gaps_document` wrote; raises `ModelFileError` with the rule it breaks."""
+    """Return gaps of a row per dipole: place, direction, R moments; raises `ModelFileError`."""
     try:
         table = np.array(document, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -356,11 +338,7 @@ class FieldModel:
         )  # fmt: skip
 
     def flux(self, points: Array, axes: Array, lengths: Array | None = None) -> ComplexArray:
-        """Return the flux (..., K), T, that each sensor has of each emitter, along its axis.
-
-        Sensor centres (m) and unit axes (..., 3) are in the frame fg; no ``lengths`` are those of
-        points.
-        """
+        """Return each emitter's flux (..., K), T, along unit axes at places, m, in fg."""
         flat = points.reshape(-1, 3)
         spans = None if lengths is None else np.broadcast_to(lengths, points.shape[:-1]).ravel()
         basis = flux_basis(flat, axes.reshape(-1, 3), spans, self.positions, self.directions)
@@ -374,11 +352,7 @@ class FieldModel:
     def with_dipoles(
         self, positions: Array, directions: Array, moments: ComplexArray
     ) -> 'FieldModel':
-        """Return this model with M further dipoles, such as those of metal, that count as certain.
-
-        ``positions`` (m) and unit ``directions`` (M, 3) are in the frame fg, ``moments`` (M, K) in
-        A m^2.
-        """
+        """Return this model with M more dipoles, whose moments (M, K), A m^2, count as certain."""
         modes = self.modes
         if modes is not None:
             pad = np.zeros((modes.shape[0], positions.shape[0], modes.shape[2]), dtype=complex)
@@ -431,7 +405,8 @@ def to_document(model: FieldModel) -> dict[str, Any]:
     if model.references is not None:
         document['references'] = readings_document(model.references)
     if model.gaps is not None:
-        document['gaps'] = gaps_document(model.gaps)
+        columns = [model.gaps.positions, model.gaps.directions, model.gaps.moments.T]
+        document['gaps'] = np.concatenate(columns, axis=1).tolist()
     if model.modes is not None:
         modes = np.ascontiguousarray(model.modes, dtype=np.complex128)
         document['modes'] = modes.view(np.float64).tolist()
@@ -469,11 +444,7 @@ def _made_for(item: Any) -> Identity | None:
 
 
 def from_document(document: Any) -> FieldModel:
-    """Return the field model that a document of plain data holds.
-
-    A document of an earlier version, without fingerprints, is accepted unchecked. Raises
-    `ModelFileError` with the rule that the document breaks.
-    """
+    """Return the field model that a document holds; raises `ModelFileError` with the rule."""
     if not isinstance(document, dict) or document.get('schema') != SCHEMA:
         got = document.get('schema') if isinstance(document, dict) else document
         raise ModelFileError(f'model: schema must be {SCHEMA!r}, got {got!r}')

@@ -1,5 +1,4 @@
-"""Makes the nominal field model, which expresses the Biot-Savart field of a drawn board by
-dipoles.
+"""Makes the nominal field model: the Biot-Savart field of a drawn board, by dipoles.
 
 A flat coil has the field of a magnetised sheet over its area. A few vertical dipoles on that area
 represent the sheet, as the nodes of a quadrature represent an integral; two horizontal dipoles in
@@ -34,23 +33,16 @@ NODE_SPREADS = np.arange(0.6, 0.96, 0.02)
 inside the coil, as the outer nodes of a quadrature are, hence nothing up to 1."""
 GOOD_MISFIT = 1.5e-4
 """Relative misfit (rms of the field vector's error over the field) at which no more dipoles are
-tried. It is far below the 2 % by which a coil's moment is off (`Tolerances`)."""
+tried. It is far below the 2 % by which a coil's moment is off (`GAIN`)."""
 LARGEST_MISFIT = 1e-2
 """Relative misfit beyond which the nominal model is refused: half of the tolerance of the gain,
 so that what a model misses is never larger than what the geometry does."""
 
 
-@dataclass(frozen=True)
-class Tolerances:
-    """Holds standard deviations of the differences between a manufactured and the nominal board.
-
-    The defaults are assumptions, not measurements. Larger ones make reported uncertainties larger
-    and let references change the model more.
-    """
-
-    gain: float = 0.02  # Relative error of each coil's moment (turns, shape, scale of the current)
-    shift_m: float = 5e-4  # Error of each coil's position along x, y and z, m
-    tilt_rad: float = 5e-3  # Tilt of each coil about its own x and y axes, rad
+GAIN, SHIFT_M, TILT_RAD = 0.02, 5e-4, 5e-3
+"""Standard deviations of a manufactured coil's moment (relative), of its place along each axis (m)
+and of its tilt about its own x and y (rad): assumptions, not measurements. Larger ones make
+reported uncertainties larger and let references change the model more."""
 
 
 @dataclass(frozen=True)
@@ -132,22 +124,22 @@ def _coil_dipoles(shape: Array, current_a: float) -> _CoilDipoles:
     return _CoilDipoles(positions, directions, moments, misfit, float(relative.max()))
 
 
-def _changes(shape: Array, current_a: float, dipoles: _CoilDipoles, allowed: Tolerances) -> Array:
+def _changes(shape: Array, current_a: float, dipoles: _CoilDipoles) -> Array:
     """Return moments (6, n) of the field's change by each tolerance, in the coil's frame."""
     points = _points(shape, 600)
     nominal = loop_field(shape, points, current_a)
     weight = 1.0 / np.linalg.norm(nominal, axis=1)
     matrix = _design(points, dipoles.positions, dipoles.directions, weight)
-    changes = [allowed.gain * dipoles.moments]
-    moved = [shape + allowed.shift_m * axis for axis in np.eye(3)]
-    moved += [shape + allowed.tilt_rad * np.cross(axis, shape) for axis in np.eye(3)[:2]]
+    changes = [GAIN * dipoles.moments]
+    moved = [shape + SHIFT_M * axis for axis in np.eye(3)]
+    moved += [shape + TILT_RAD * np.cross(axis, shape) for axis in np.eye(3)[:2]]
     for path in moved:
         change = (loop_field(path, points, current_a) - nominal) * weight[:, None]
         changes.append(_solve(matrix, change.ravel()))
     return np.array(changes)
 
 
-def nominal_model(board: Board, tolerances: Tolerances | None = None) -> FieldModel:
+def nominal_model(board: Board) -> FieldModel:
     """Express the field of a drawn board by dipoles; its tolerances become the model's ``modes``.
 
     The provenance holds ``heldout_relative_rms`` and ``heldout_relative_max``, the misfit relative
@@ -157,7 +149,7 @@ def nominal_model(board: Board, tolerances: Tolerances | None = None) -> FieldMo
     coil = _coil_dipoles(board.shape, board.current_a)
     if not coil.misfit < LARGEST_MISFIT:
         raise FitError(f'dipoles miss the nominal field of a coil by {100 * coil.misfit:.3g} %')
-    changes = _changes(board.shape, board.current_a, coil, tolerances or Tolerances())
+    changes = _changes(board.shape, board.current_a, coil)
     emitters, each = len(board.names), len(coil.positions)
     moments = np.zeros((emitters * each, emitters), dtype=np.complex128)
     modes = np.zeros((emitters * len(changes), emitters * each, emitters), dtype=np.complex128)

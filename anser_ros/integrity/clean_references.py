@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
 from anser_ros.field.model import ReferenceReadings
-from anser_ros.field.nominal import Tolerances
+from anser_ros.field.nominal import SHIFT_M, TILT_RAD
 from anser_ros.physics.rotations import tangents
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.settings import Accuracy, RefitSettings
@@ -80,13 +80,13 @@ class DrawnReadings:
 
         Six a coil: its strength, its place along x, y and z, its tilt about x and y.
         """
-        made, (sensors, count) = Tolerances(), self.flux.shape
+        sensors, count = self.flux.shape
         out = np.zeros((6 * count, sensors, count))
         for k in range(count):
             own = out[6 * k : 6 * (k + 1), :, k]
             own[0] = FREE_GAIN * self.flux[:, k]
-            own[1:4] = made.shift_m * self.by_place[:, :, k]
-            own[4:6] = made.tilt_rad * self.turned(centres[k])[:2, :, k]
+            own[1:4] = SHIFT_M * self.by_place[:, :, k]
+            own[4:6] = TILT_RAD * self.turned(centres[k])[:2, :, k]
         return out
 
 

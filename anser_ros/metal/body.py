@@ -161,9 +161,7 @@ def centre_sigma(polarisability: NDArray[np.complexfloating]) -> float:
 
 @cache
 def ball_modes() -> Array:
-    """Return couplings (`Shapes.size`, 7) of a simple body: a unit polarisability, its five
-    traceless tensors, and the quadrupoles of a ball.
-    """
+    """Return a simple body's couplings (`Shapes.size`, 7): six tensors, a ball's quadrupoles."""
     shapes = multipoles()
     where = {(i, j): n for n, (i, j) in enumerate(zip(shapes.first, shapes.second, strict=True))}
     modes = np.zeros((shapes.size, 7))
@@ -179,9 +177,7 @@ def ball_modes() -> Array:
 
 @cache
 def lattice(spacing: float) -> Shapes:
-    """Return an extended body: pieces that each answer to the field along x, y and z where they
-    are.
-    """
+    """Return an extended body: pieces that answer to the field's x, y and z where they are."""
     lateral, upright = (np.arange(6) - 2.5) * spacing, (np.arange(2) - 0.5) * spacing
     offsets = np.array([(a, b, c) for a in lateral for b in lateral for c in upright])
     functionals = np.eye(3 * len(offsets)).reshape(-1, len(offsets), 3)
@@ -297,26 +293,19 @@ def _unit_shapes() -> tuple[Shapes, Array]:
 
 
 def sheet_shapes(edge: float) -> Shapes:
-    """Return shapes of the field through a square sheet, its edge (m) a little wider than the
-    sheet.
-    """
+    """Return shapes of the field through a square a little wider than a sheet of an edge, m."""
     shapes, _ = _unit_shapes()
     size = WIDER * edge
     return replace(shapes, offsets=size * shapes.offsets, functionals=size * shapes.functionals)
 
 
-def sheet_spread(edge: float, share: float) -> Array:
-    """Return each coupling's prior size as a share of a perfect conductor's, shape
-    (`Shapes.size`,).
+def sheet_sizes(edge: float) -> tuple[Array, ...]:
+    """Return prior sizes of the couplings of a sheet to try, each of shape (`Shapes.size`,).
 
-    A perfectly conducting sheet answers a normal field of wave number k with the stream function
-    ``2 / (mu0 k)`` times it.
+    They are shares of a perfect conductor's, which answers a normal field of wave number k with
+    the stream function ``2 / (mu0 k)`` times it.
     """
     shapes, waves = _unit_shapes()
     each = np.sqrt(2 * WIDER * edge / waves)
-    return np.asarray(share / UNIT * each[shapes.first] * each[shapes.second])
-
-
-def sheet_sizes(edge: float) -> tuple[Array, ...]:
-    """Return prior sizes of the couplings of a sheet to try, each of shape (`Shapes.size`,)."""
-    return tuple(sheet_spread(edge, share) for share in SHEET_SHARES)
+    one, other = each[shapes.first], each[shapes.second]
+    return tuple(np.asarray(share / UNIT * one * other) for share in SHEET_SHARES)

@@ -38,9 +38,8 @@ class Shapes:
     offsets: Array  # (n, 3), from the centre, m
     # (M, n, 3), amplitude i is the sum of ``functionals[i]`` times the field at the offsets
     functionals: Array
-    # first, second: (P,), shapes of each pair, first <= second
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    first: NDArray[np.int64]  # (P,), a shape of each pair
+    second: NDArray[np.int64]  # (P,), the other shape, first <= second
     # The pairs, by index, whose coupling may have a part that grows as log f
     sloped: NDArray[np.int64]
 
@@ -51,9 +50,7 @@ class Shapes:
 
     @property
     def size(self) -> int:
-        """Return how many couplings there are: the pairs', then what the sloped ones gain with log
-        f.
-        """
+        """Return how many couplings there are: the pairs', then the slopes with log f."""
         return int(self.first.size + self.sloped.size)
 
     def driven(self, field: ComplexArray) -> ComplexArray:

@@ -183,10 +183,7 @@ def spiral_path(
 def _crossing(
     track: int, before: float, inset: float, side_x: float, side_y: float
 ) -> tuple[float, float]:
-    """Return x and y (m) at which a track's line crosses that of the track before it.
-
-    ``inset`` and ``before`` are the distances (m) of the two lines from the coil's outer sides.
-    """
+    """Where the lines of two tracks cross, m, at these distances (m) from the outer sides."""
     along_y = _DIRECTIONS[track % 4][0] == 0.0
     right = _DIRECTIONS[track % 4][1] - _DIRECTIONS[(track - 1) % 4][1] > 0
     if along_y:

@@ -1,5 +1,4 @@
-"""Computes field and gradient of magnetic dipoles, and the flux density that a pick-up coil
-senses.
+"""Computes field and gradient of magnetic dipoles, and the flux that a pick-up coil senses.
 
 The field of a dipole m at the offset d is the article's equation (1),
 ``B = mu0/(4 pi) (3 (m . d) d / |d|^5 - m / |d|^3)``; its gradient follows by differentiation and
@@ -185,9 +184,7 @@ def flux_basis(
     positions: NDArray[np.generic],
     directions: NDArray[np.generic],
 ) -> Array:
-    """Return the flux density along each sensor's axis for dipoles of unit moment.
-
-    This is the coupling matrix M of the article.
+    """Return the flux along each sensor's axis by dipoles of unit moment: M of the article.
 
     Sensor centres ``points`` (m), unit ``axes`` (P, 3) and dipole ``positions`` (m) with unit
     ``directions`` (N, 3) are in the frame fg; coil ``lengths`` (P,), m, are None or 0 for point

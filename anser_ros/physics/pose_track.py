@@ -16,9 +16,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 LONGEST_GAP_S = 0.25
-"""Longest gap between two optical poses, s, over which a pose is interpolated. A tracker at 60 Hz
-that is silent for longer did not see the tool, whose motion meanwhile is not known; a hand moves
-by centimetres in that time."""
+"""Longest gap between two optical poses, s, over which a pose is interpolated: a tracker that is
+silent for longer did not see the tool, and a hand moves by centimetres in that time."""
 
 VELOCITY_STEP_S = 0.02
 """Half the time, s, over which a velocity is taken: much shorter multiplies the jitter of the
@@ -27,8 +26,7 @@ poses, much longer smooths away how a hand accelerates."""
 REACH = (2, 3, 4)
 """Poses before and after an interval by which its curvature is determined: three estimates, of
 which the middle one counts, since a reflected pose is in one of them only. Nearer ones jitter
-more, farther ones miss how the acceleration changes; with these a pose's jitter grows by some
-percent."""
+more, farther ones miss how the acceleration changes."""
 
 
 @dataclass(frozen=True)

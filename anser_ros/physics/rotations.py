@@ -1,5 +1,4 @@
-"""Turns and compares directions and rotations: planes across an axis, angles, vectors,
-quaternions.
+"""Turns and compares directions and rotations: tangents, angles, vectors, quaternions.
 
 Angles are in rad, by arctangent: small ones are exact too. Functions of scipy's ``Rotation`` are
 repeated for speed: trackers convert one rotation at a time, several times per pose and frame. One
@@ -79,9 +78,7 @@ def nearest_rotation(matrices: Array) -> Array:
 
 
 def rotation_of_vector(vector: NDArray[np.generic]) -> Array:
-    """Return the matrix, shape (3, 3), of a rotation vector, shape (3,), rad (Rodrigues'
-    formula).
-    """
+    """Return the matrix (3, 3) of a rotation vector (3,), rad (Rodrigues' formula)."""
     v = np.asarray(vector, dtype=np.float64)
     angle = math.sqrt(float(v @ v))
     cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
@@ -122,9 +119,7 @@ def quaternion_of_axis(axis: NDArray[np.generic]) -> tuple[float, float, float, 
 
 
 def quaternion_of_rotation(matrix: NDArray[np.generic]) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation matrix (Shepperd's
-    method).
-    """
+    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation matrix (Shepperd)."""
     m = np.asarray(matrix, dtype=np.float64)
     trace = float(np.trace(m))
     squares = [1.0 + 2.0 * float(m[i, i]) - trace for i in range(3)] + [1.0 + trace]

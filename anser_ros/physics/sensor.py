@@ -6,7 +6,7 @@ length.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +38,7 @@ class Windings:
 
     @staticmethod
     def of(rows: Sequence[Sequence[Sequence[float]]]) -> 'Windings | None':
-        """Return windings of lists of (x, y, z, weight), a list a sensor; None where all are
-        empty.
-        """
+        """Return windings of a list of (x, y, z, weight) a sensor; None where all are empty."""
         most = max((len(row) for row in rows), default=0)
         if most == 0:
             return None
@@ -77,13 +75,10 @@ class SensorTable:
     """Holds a table of S pick-up coils with one row each."""
 
     channel: NDArray[np.int64]  # (S,), channel of the control unit that each coil is connected to
-    # name, body: length S, name of each sensor and of the body that it is fixed to (``fg`` for
-    # reference sensors)
-    name: tuple[str, ...]
-    body: tuple[str, ...]
-    # position, axis: (S, 3), centre (m) and unit sensitive axis in the frame of the sensor's body
-    position: Array
-    axis: Array
+    name: tuple[str, ...]  # length S
+    body: tuple[str, ...]  # length S, that each is fixed to; ``fg`` for reference sensors
+    position: Array  # (S, 3), centre in the frame of the sensor's body, m
+    axis: Array  # (S, 3), unit sensitive axis in that frame
     length: Array  # (S,), length of the coil along its axis, m; 0 for a point sensor
     # Points of the sensors that are sums of several; None where all are single coils
     windings: Windings | None = None
@@ -130,23 +125,10 @@ class SensorTable:
             windings=joined_windings(tables),
         )
 
-    def with_geometry(
-        self, position: Array | None = None, axis: Array | None = None, length: Array | None = None
-    ) -> 'SensorTable':
-        """Return the same sensors with other positions, axes or lengths where these are given."""
-        return replace(
-            self,
-            position=self.position if position is None else position,
-            axis=self.axis if axis is None else axis,
-            length=self.length if length is None else length,
-        )
-
     def placed(self, position: Array, rotation: Array) -> tuple[Array, Array]:
-        """Return the sensors' centres (m) and unit axes (..., S, 3) in fg for given poses of their
-        body.
+        """Return centres (m) and unit axes (..., S, 3) in fg at poses of the sensors' body.
 
-        ``position`` (..., 3) is its origin, m, ``rotation`` (..., 3, 3) turns from its frame to
-        fg.
+        ``position`` (..., 3) is its origin, m, ``rotation`` (..., 3, 3) from its frame to fg.
         """
         turned = np.einsum('...ij,sj->...si', rotation, self.position)
         return turned + position[..., None, :], np.einsum('...ij,sj->...si', rotation, self.axis)
@@ -176,20 +158,16 @@ def along_each_axis(places: Array) -> tuple[Array, Array]:
 class PlacedPoints:
     """Holds the P points of S sensors of a body at one pose, sensor by sensor."""
 
-    # points, axes: (P, 3), m, and unit vectors, frame fg
-    points: Array
-    axes: Array
-    # lengths, weights: (P,), m; factor of each point's flux density
-    lengths: Array
-    weights: Array
+    points: Array  # (P, 3), m, frame fg
+    axes: Array  # (P, 3), unit vectors, frame fg
+    lengths: Array  # (P,), m
+    weights: Array  # (P,), factor of each point's flux density
     arms: Array  # (P, 3), from the sensor's place to the point, m, frame fg
     first: NDArray[np.int64]  # (S,), the first point of each sensor
 
     @staticmethod
     def of(sensors: SensorTable, position: Array, rotation: Array) -> 'PlacedPoints':
-        """Return the points of a table's sensors, its body at a position (3,) and rotation
-        (3, 3).
-        """
+        """Return a table's points, its body at a position (3,), m, and a rotation (3, 3)."""
         centres, axes = sensors.placed(position, rotation)
         row, arm = np.arange(len(sensors)), np.zeros((len(sensors), 3))
         weight = np.ones(len(sensors))

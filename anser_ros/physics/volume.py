@@ -17,8 +17,7 @@ FLOOR, CEILING, REACH = 0.345, 2.3, 1.3225
 """The default volume, in halves of the board's larger side: heights over the board from which and
 up to which tools are tracked, and how far to the side of its middle. On the demo board that is 50
 to 350 mm high and 400 mm wide. A larger volume spreads the refit's samples over where no tool is;
-poses of tools outside a smaller one are withheld. With a box 1.15 times smaller for the refit, the
-errors of `online/approach` and `online/sweep` are the same within 0.5 % (`docs/refit.md`)."""
+poses of tools outside a smaller one are withheld (`docs/refit.md`)."""
 STEP_M = 0.01
 """The default is rounded to whole centimetres, so that boards of about the same size have the same
 volume."""
@@ -32,8 +31,7 @@ class TrackedVolume:
     board cannot be drawn. Raises `TrackingError` when the corners make no box.
     """
 
-    # low, high: Corners, low < high in x, y and z
-    low: tuple[float, float, float] = (-0.2, -0.2, 0.05)
+    low: tuple[float, float, float] = (-0.2, -0.2, 0.05)  # below ``high`` in x, y and z
     high: tuple[float, float, float] = (0.2, 0.2, 0.35)
 
     def __post_init__(self) -> None:

@@ -335,9 +335,8 @@ def calibrate_sessions(
     """Calibrate on all tool sensors of the sessions.
 
     Reference sensors are left out: their stated places are less accurate than the field model
-    becomes. The first session's setup states how accurate fluxes and poses are. What the
-    references of the first session that has them read is kept with the model, for baselines to be
-    compared.
+    becomes; what they read is kept with the model, for baselines to be compared. The first
+    session's setup states how accurate fluxes and poses are.
     """
     options = replace(options, accuracy=sessions[0].setup.accuracy)
     chosen = next(engine for engine in all_engines() if engine.accepts(sessions, options))

@@ -81,8 +81,7 @@ def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Prob
     """Return the diagnosis problem of a session that was corrected (`correct`).
 
     Readings and poses may be off by ``spread``, by default that of `spread_of`. Raises
-    `DiagnosisError` when the session has no tool fluxes, or fewer than 30 frames have fluxes and a
-    pose.
+    `DiagnosisError` when too few frames have fluxes and a pose.
     """
     session, clean = corrected.session, corrected.baseline
     if not session.tools:

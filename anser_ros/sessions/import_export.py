@@ -14,14 +14,7 @@ from numpy.typing import NDArray
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire import cdr
-from anser_ros.wire.bag import (
-    POSE_TYPE,
-    Salvage,
-    iter_messages,
-    published_poses,
-    read_fluxes,
-    read_foreign,
-)
+from anser_ros.wire.bag import Salvage, published_poses, read_fluxes, read_foreign
 from anser_ros.wire.bag_writer import SETUP_TYPE, SessionWriter
 from anser_ros.wire.recorded import PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
@@ -113,14 +106,12 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBa
     if form not in FORMATS:
         raise ParameterError(f'format must be among {", ".join(FORMATS)}, got {form!r}')
     salvage = Salvage()
-    topics = sorted({m.topic for m in iter_messages(path, salvage) if m.type_name == POSE_TYPE})
     written: dict[str, int] = {}
-    for topic, poses in published_poses(path, topics).items():
-        if poses.stamp_ns.size:
-            stem = topic.strip('/').removeprefix('anser/').removesuffix('/pose').replace('/', '_')
-            name = f'{stem}.{"txt" if form == TUM else form}'
-            _write_poses(out / name, poses, form)
-            written[name] = int(poses.stamp_ns.size)
+    for topic, poses in sorted(published_poses(path, salvage=salvage).items()):
+        stem = topic.strip('/').removeprefix('anser/').removesuffix('/pose').replace('/', '_')
+        name = f'{stem}.{"txt" if form == TUM else form}'
+        _write_poses(out / name, poses, form)
+        written[name] = int(poses.stamp_ns.size)
     if form != TUM:
         for which, fluxes in read_fluxes(path).items():
             name = f'{which}_flux.{form}'

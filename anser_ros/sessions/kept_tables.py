@@ -80,9 +80,11 @@ class KeptTables:
         self._given = setup, model, references
         self._ahead = ahead or ReadAhead(None, None)
         places = [getattr(references, f.name) for f in fields(references)]
-        stated = dict(setup.stated)
+        # What changes with the code that computes tables.
+        code = [(str(f), f.stat().st_mtime_ns, f.stat().st_size) for f in PACKAGE.rglob('*.py')]
+        made_by, stated = [np.__version__, *sorted(code)], dict(setup.stated)
         key = fingerprint_of(
-            [_code(), setup.identity.board, setup.volume, stated, model.fingerprint, places]
+            [made_by, setup.identity.board, setup.volume, stated, model.fingerprint, places]
         )
         self._folder, self._path = folder, folder / f'{_tables_name(model)}{key}'
 
@@ -109,12 +111,6 @@ class KeptTables:
 def _tables_name(model: FieldModel) -> str:
     """Return how the names of all files with tables of a model begin."""
     return f'{TABLES}{model.fingerprint}_'
-
-
-def _code() -> list[Any]:
-    """Return what changes with the code that tables are computed by."""
-    files = sorted(PACKAGE.rglob('*.py'))
-    return [np.__version__, *([str(f), f.stat().st_mtime_ns, f.stat().st_size] for f in files)]
 
 
 def used_s(path: Path) -> float:

@@ -148,10 +148,8 @@ def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Meas
 
 
 def _chosen(tool: Measurements) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Frames and columns of readings with a pose, of some frames over the whole recording.
-
-    Fluxes in a small unit are beyond what counts as valid, so only flags and NaN exclude one.
-    """
+    """Frames and columns of readings with a pose, of some frames over the whole recording."""
+    # Fluxes in a small unit are beyond what counts as valid: only flags and NaN exclude one.
     whole = np.isfinite(tool.flux).all(axis=2) & (tool.flags == 0) & tool.has_pose[:, None]
     frames = np.flatnonzero(whole.any(axis=1))
     frames = frames[:: max(1, -(-frames.size // MOST_FRAMES))]
@@ -249,11 +247,7 @@ def plausible_tools(
 
 
 def check_points(tracked: Array, true: Array) -> None:
-    """Check the points (M, 3), m, that an error map shall be learnt from; not rows with NaN.
-
-    Raises `PlausibilityError` when their extents fit no tracked volume or not each other, or one
-    of them is a point.
-    """
+    """Check the points (M, 3), m, of an error map, but for NaN; raises `PlausibilityError`."""
     good = np.isfinite(tracked).all(axis=1) & np.isfinite(true).all(axis=1)
     if not good.any():
         return
@@ -274,11 +268,7 @@ def check_points(tracked: Array, true: Array) -> None:
 
 
 def check_positions(what: str, places: Array) -> None:
-    """Check that the positions (n, 3) of a tracker can be in m; ``what`` says whose they are.
-
-    Raises `PlausibilityError` when most of them extend over more than a room, or lie where a unit
-    explains it.
-    """
+    """Check that a tracker's positions (n, 3) can be in m; raises `PlausibilityError`."""
     if not len(places):
         return
     low, high = np.percentile(places, (5, 95), axis=0)

@@ -57,11 +57,7 @@ class PreparedSession:
         return replace(self, session=session, recorded_drift=is_recorded(self.model, session))
 
     def with_model(self, model: FieldModel) -> 'PreparedSession':
-        """Return the same with another model.
-
-        Raises `ModelFileError` when the model's emitters are not the session's, or an effect of it
-        is unknown.
-        """
+        """Return the same with another model; raises `ModelFileError` when it does not fit."""
         check_fits(model, self.session)
         return replace(
             self,

@@ -177,17 +177,14 @@ def load_session(path: str | os.PathLike[str]) -> Session:
 
 def empty_session(setup: Setup, path: str) -> Session:
     """Return a session of a setup with nothing recorded yet: all arrays have no frame."""
-    tables = [sensor_table(specs) for specs in (setup.tool_sensors, setup.reference_sensors)]
-    tool, reference = (_no_fluxes(t, len(setup.emitter.coils)) if len(t) else None for t in tables)
+    streams: list[RecordedFluxes | None] = []
+    for sensors in (setup.tool_sensors, setup.reference_sensors):
+        channels, shape = SensorRows.of(sensors).channel, (0, len(sensors))
+        stamps, flags = np.zeros(0, dtype=np.int64), np.zeros(shape, dtype=np.int64)
+        flux = np.zeros((*shape, len(setup.emitter.coils)), dtype=complex)
+        streams.append(RecordedFluxes(stamps, channels, flags, flux) if sensors else None)
+    tool, reference = streams
     return session_of(Bag(path, setup, '', tool, reference, {}))
-
-
-def _no_fluxes(sensors: SensorTable, emitters: int) -> RecordedFluxes:
-    count = len(sensors)
-    return RecordedFluxes(
-        np.zeros(0, dtype=np.int64), sensors.channel, np.zeros((0, count), dtype=np.int64),
-        np.zeros((0, count, emitters), dtype=complex),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -96,9 +96,8 @@ def model_for(
 
     ``snapshot`` is whether a snapshot of a refit, which is no calibration, is accepted, and
     ``resurveyed`` names bodies whose sensors are the same, surveyed again. Raises `ModelFileError`
-    when the file is no model or a snapshot that is not wanted, or its emitters are not the
-    session's; `SetupError` when the nominal model is asked for and the setup's geometry makes
-    none.
+    when the file is no such model, or not of the session's emitters; `SetupError` when the setup's
+    geometry makes no nominal one.
     """
     if name == NOMINAL:
         return nominal_model(board_of(session.setup))
@@ -122,10 +121,9 @@ def made_for(model: FieldModel, setup: Setup) -> FieldModel:
 def with_new_survey(model: FieldModel, setup: Setup, bodies: Sequence[str]) -> FieldModel:
     """Return the model for bodies whose sensors are the same, but surveyed again.
 
-    The model's corrections of channels, such as their gains, still hold. Places and axes of
-    sensors are now those of the new survey: effects that corrected the old one are removed. Raises
-    `ModelFileError` when the setup has no such body, or the model does not state what it was made
-    for.
+    Its corrections of channels, such as their gains, still hold; those of the old survey's places
+    and axes are removed. Raises `ModelFileError` when the setup has no such body, or the model
+    does not state what it was made for.
     """
     made, kept = model.made_for, model.effects
     for body in bodies:

@@ -51,13 +51,10 @@ class FrontEnd:
     """Describes the analogue side of a control unit with its converter."""
 
     sample_rate_hz: float = 40e3  # samples a second and channel
-    # full_scale_v, full_scale_a: voltage and current at code 32768, V and A
-    full_scale_v: float = 5.0
-    full_scale_a: float = 2.5
-    # noise_codes, current_noise_codes: white noise before the converter of the sensors and of the
-    # currents, codes rms a sample
-    noise_codes: float = 2.4
-    current_noise_codes: float = 0.5
+    full_scale_v: float = 5.0  # voltage at code 32768
+    full_scale_a: float = 2.5  # current at code 32768
+    noise_codes: float = 2.4  # white noise before the converter, codes rms a sample
+    current_noise_codes: float = 0.5  # the same of the currents
     current_drift: float = 0.02  # fraction by which the currents fall while the coils warm up
     warm_up_s: float = 60.0  # time constant of the warming, from the first start on, s
 
@@ -65,11 +62,9 @@ class FrontEnd:
 class Sampler:
     """Samples all sensors and the sum of the currents, one stretch of time after the other.
 
-    Within a stretch the phasors change linearly between the world's at its two ends, so that
-    stretches of 5 ms follow a tool at 0.1 m/s to some 10 pT.
-
-    ``calibration`` is the true response of the channels, ``nominal_current_a`` the peak current
-    that the world's fluxes are given for, A.
+    Within a stretch the phasors change linearly, so that stretches of 5 ms follow a tool at 0.1
+    m/s to some 10 pT. ``calibration`` is the channels' true response, ``nominal_current_a`` the
+    peak current that the world's fluxes are given for, A.
     """
 
     def __init__(
@@ -191,11 +186,7 @@ class Piece:
 
 
 class ControlUnit:
-    """Speaks the protocol of `docs/cu_protocol.md` as a control unit does.
-
-    ``world`` has the true fluxes of the sensors that it is connected to, ``calibration`` the true
-    response of its channels.
-    """
+    """Speaks the protocol of `docs/cu_protocol.md`, by its channels' true ``calibration``."""
 
     def __init__(
         self,

@@ -1,16 +1,14 @@
 """Puts simulated faults of sensors, coils, amplifiers and clocks into a control unit's signals.
 
-An effect overrides the stage at which it acts. The stages run in the order of the methods: the
-world's fluxes, the coil currents, the voltages of all samples before the converter, the device
-time of the records. Times count from the first drive of the coils, s, except for the device's
-clock. An effect does not know which analysis will look at the result; `draw` draws one and its
-parameters at random, for tests that do not know the answer.
+An effect overrides the stage at which it acts. The stages run in the order of the methods. Times
+count from the first drive of the coils, s, except for the device's clock. `draw` draws an effect
+and its parameters at random, for tests that do not know the answer.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -82,9 +80,7 @@ def compressing(column: int, limit_v: float) -> OneSensor:
 
 
 def crossing_over(column: int, dead_v: float) -> OneSensor:
-    """Return crossover distortion, which no diagnosis knows: v becomes ``v - dead * tanh(v /
-    dead)``, so that of weak tones a larger fraction is lost.
-    """
+    """Return crossover distortion, which no diagnosis knows: ``v - dead * tanh(v / dead)``."""
     return OneSensor(column, lambda _, volts: volts - dead_v * np.tanh(volts / dead_v))
 
 
@@ -164,7 +160,7 @@ class Drawn:
     # its parameters as plain data, named as in docs/interfaces.md where the effect is there
     parameters: dict[str, Any]
     effects: tuple[RawEffect, ...] = ()  # what puts the effect into the signals
-    metal: tuple[MetalBody, ...] = field(default=())  # what puts it into the world
+    metal: tuple[MetalBody, ...] = ()  # what puts it into the world
     # names under which a diagnosis may rightly report the effect; empty where it has no such
     # effect and only ``unexplained`` is right
     answers: tuple[str, ...] = ()

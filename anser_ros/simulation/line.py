@@ -128,7 +128,9 @@ class PseudoPort:
         """Pull the cable out, so that the link disappears."""
         if self._fds is None:
             return
-        self._remove_own_link()
+        with contextlib.suppress(OSError):
+            if os.readlink(self.link) == os.ttyname(self._fds[1]):  # no other simulator's by now
+                self.link.unlink()
         for descriptor in self._fds:
             os.close(descriptor)
         self._fds, self._pending = None, b''
@@ -190,11 +192,3 @@ class PseudoPort:
             return os.read(self._fds[0], 4096)
         except BlockingIOError:
             return b''
-
-    def _remove_own_link(self) -> None:
-        """Remove the link, unless another simulator has taken it over."""
-        if self._fds is None:
-            return
-        with contextlib.suppress(OSError):
-            if os.readlink(self.link) == os.ttyname(self._fds[1]):
-                self.link.unlink()

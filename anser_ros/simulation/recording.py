@@ -72,11 +72,10 @@ def record(
     errors: Accuracy,
     rng: np.random.Generator,
 ) -> None:
-    """Write a session of a world into a bag.
+    """Write a session of a world into a bag, of so many flux ``frames``; raises `BagError`.
 
-    It has so many flux ``frames``. The optical poses begin and end `OPTICAL_MARGIN_S` outside of
-    them; without a rate of their own (a static recording) there is one at every flux stamp.
-    Raises `BagError` when the file exists or cannot be written.
+    The optical poses begin and end `OPTICAL_MARGIN_S` outside of them; without a rate of their
+    own (a static recording) there is one at every flux stamp.
     """
     stamps = {(START_NS + round(i / rate_hz * SECOND_NS), i / rate_hz) for i in range(frames)}
     with SessionWriter(path) as writer:

@@ -1,8 +1,7 @@
 """Simulates the world around a control unit: a board, moving tools, reference coils and metal.
 
-It gives the true flux of every sensor at any time. Bodies move on paths; metal is a rigid cloud of
-conducting and permeable spheres; the board's field is that of all tracks of its coils, which may
-differ from the nominal board as manufactured boards do. Samples, noise and bytes come later.
+It gives the true flux of every sensor at any time. Metal is a rigid cloud of conducting and
+permeable spheres; the board's field is that of all tracks of its coils.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.metal.body import sphere_polarisability
 from anser_ros.physics.dipole import GAUSS_OFFSET, flux_basis
 from anser_ros.sessions.nominal_board import board_of
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, Setup
 
 ComplexArray = NDArray[np.complex128]
 
@@ -33,13 +32,10 @@ Path = Callable[[float], Pose]
 class Lissajous:
     """Describes a path of a sine in each coordinate and each component of the rotation vector."""
 
-    # centre_m, amplitude_m, period_s: centre (m), amplitude (m) and period (s) of x, y and z in fg
-    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.15)
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.15)  # frame fg
     amplitude_m: tuple[float, float, float] = (0.08, 0.08, 0.03)
     period_s: tuple[float, float, float] = (9.0, 12.5, 7.0)
-    # turn_rad, turn_period_s: amplitude (rad) and period (s) of the components of the rotation
-    # vector
-    turn_rad: tuple[float, float, float] = (0.5, 0.4, 0.8)
+    turn_rad: tuple[float, float, float] = (0.5, 0.4, 0.8)  # amplitude of the rotation vector
     turn_period_s: tuple[float, float, float] = (11.0, 8.0, 17.0)
     phase_rad: float = 0.0  # phase at the start, so that two bodies need not move alike
 
@@ -68,12 +64,10 @@ def tool_paths(bodies: Sequence[str], phase_rad: float = 0.0) -> Mapping[str, Pa
 class Approach:
     """Describes a path that comes near, stays, and leaves again, each way along a smooth ramp."""
 
-    # far_m, near_m: positions between which it moves, m, frame fg
-    far_m: tuple[float, float, float] = (0.05, -0.03, -0.6)
+    far_m: tuple[float, float, float] = (0.05, -0.03, -0.6)  # frame fg
     near_m: tuple[float, float, float] = (0.05, -0.03, -0.08)
-    # start_s, travel_s, stay_s: time of the start, time for one way, and time near, s
     start_s: float = 8.0
-    travel_s: float = 5.0
+    travel_s: float = 5.0  # one way
     stay_s: float = 6.0
     period_s: float = 0.0  # time after which the visit repeats, s; 0 for a single visit
 
@@ -95,9 +89,7 @@ class MetalBody:
     """Moves a rigid cloud of equal spheres, which do not drive each other, on a path."""
 
     offsets: Array  # (M, 3): centres of the spheres in the body's frame, m
-    # radius_m, conductivity_s_per_m, relative_permeability: radius (m), conductivity (S/m) and
-    # relative permeability of each sphere
-    radius_m: float
+    radius_m: float  # of each sphere
     conductivity_s_per_m: float
     relative_permeability: float
     path: Path  # pose of the body over time
@@ -123,11 +115,7 @@ def at_rest(place: Array) -> Path:
 
 
 def steel_disc(path: Path | None = None, *, radius_m: float = 0.06, rings: int = 3) -> MetalBody:
-    """Return a disc of touching steel balls, like the foot of a stand or the head of a C-arm.
-
-    ``path``: pose over time; by default it approaches and leaves again. ``radius_m``: radius of
-    the disc, m. ``rings``: rings of balls around the one in the middle.
-    """
+    """Return a disc of touching steel balls, in rings about one; by default it comes and goes."""
     ball = radius_m / (2 * rings + 1)
     centres = [np.zeros(3)]
     for ring in range(1, rings + 1):
@@ -164,7 +152,8 @@ class World:
         tones = np.array(setup.frequencies_hz)
         self._polarisability = [body.polarisability(tones) for body in self._metal]
         self._paths: dict[str, Path] = {**tool_paths(setup.bodies), **dict(paths or {})}
-        self._groups = _by_body(self.sensors)
+        on = [sensor.body for sensor in self.sensors]
+        self._groups = {b: np.flatnonzero([b == body for body in on]) for b in dict.fromkeys(on)}
         _, self._local, self._local_axes = SensorRows.of(self.sensors)
         self._lengths = np.array([s.length_m for s in self.sensors])
         fixed = self._groups.pop(FIELD_GENERATOR, np.zeros(0, np.intp))
@@ -229,14 +218,6 @@ def _linked(field: ComplexArray, axes: Array) -> ComplexArray:
     if len(field) > len(axes):
         field = (field[: len(axes)] + field[len(axes) :]) / 2
     return np.asarray(np.einsum('pi,pik->pk', axes, field))
-
-
-def _by_body(sensors: Sequence[SensorSpec]) -> dict[str, NDArray[np.intp]]:
-    bodies = dict.fromkeys(sensor.body for sensor in sensors)
-    return {
-        body: np.array([row for row, s in enumerate(sensors) if s.body == body], np.intp)
-        for body in bodies
-    }
 
 
 def board_source(setup: Setup) -> FieldSource:

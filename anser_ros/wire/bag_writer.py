@@ -1,6 +1,4 @@
-"""Writes MCAP bags that survive a crash and a full disk, with or without ROS. The steps: an
-account is kept of topics, counts and times, which becomes rosbag2's ``metadata.yaml``; messages
-are gathered in chunks; a session is setup, fluxes and poses.
+"""Writes MCAP bags that survive a crash and a full disk, with or without ROS.
 
 Whatever happens, the data up to the last flush stay readable: a flush hands all messages to the
 system as a small chunk behind the file, and a write that fails is taken back. After some seconds
@@ -150,14 +148,10 @@ CHUNK_NS = 4_000_000_000
 memory with twelve topics and 4 with forty, ten times that with a chunk for each flush."""
 RESERVE_BYTES = 1024 * 1024
 """Disk space that is reserved at the start, bytes, for the end of a recording on a full disk."""
-LIBRARY = 'anser_ros'
 
 
 class _Segments:
-    """The stream under the MCAP writer: collects, and writes a whole segment at each flush.
-
-    Drafts lie behind all segments until the next one takes their place.
-    """
+    """The stream under the MCAP writer: whole segments, and drafts behind them until the next."""
 
     def __init__(self, raw: BinaryIO) -> None:
         self._raw = raw
@@ -237,7 +231,7 @@ class BagWriter:
         self._flushed = 0
         self._chunk_began_ns = 0
         self._schemas: dict[str, int] = {}
-        self._writer.start(profile=Profile.ROS2, library=LIBRARY)
+        self._writer.start(profile=Profile.ROS2, library='anser_ros')
         self._segments.flush()
 
     def __enter__(self) -> Self:
@@ -266,8 +260,7 @@ class BagWriter:
         """Announce a topic by its absolute name and return its channel.
 
         The definition of its type is followed by those of all types in it; ``qos`` is what its
-        publishers offer (:func:`qos_profile`), and the hash, of REP 2011, empty when it is not
-        known.
+        publishers offer (:func:`qos_profile`), the hash that of REP 2011 where it is known.
         """
         if type_name not in self._schemas:
             self._schemas[type_name] = self._writer.register_schema(

@@ -18,18 +18,17 @@ from anser_ros.wire.points import PointFieldTuple
 
 HEADER = b'\x00\x01\x00\x00'
 
-_TIME = """
+_HEADER = """
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+
 ================================================================================
 MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
-_HEADER = f"""
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_TIME}"""
 # Field lists of the three types, in the form in which MCAP carries definitions (`ros2msg`).
 DEFINITIONS = {
     'std_msgs/msg/String': 'string data\n',

@@ -19,7 +19,6 @@ from anser_ros.errors import SetupError
 from anser_ros.wire.text_files import read_own_yaml
 
 SCHEMA = 'anser_channels/1'
-_KEYS = ('area_m2', 'delay_s')
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def _number(item: Mapping[str, Any], key: str, where: str, fallback: float | Non
 def _response(item: Any, where: str, default: ChannelResponse | None) -> ChannelResponse:
     if not isinstance(item, dict):
         raise SetupError(f'channels: {where} must be a mapping, got {item!r}')
-    unknown = set(item) - {*_KEYS, 'channel'}
+    unknown = set(item) - {'area_m2', 'delay_s', 'channel'}
     if unknown:
         raise SetupError(f'channels: {where} holds the unknown key {sorted(map(str, unknown))[0]}')
     area = default.area_m2 if default else None

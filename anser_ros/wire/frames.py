@@ -175,12 +175,7 @@ class Record:
 
 
 def check_hello(hello: Hello) -> None:
-    """Refuse a hello that no receiver could use.
-
-    Raises `FrameError` when a rate, scale or tone is not finite and positive or absurdly large, a
-    tone is not below half the sample rate, a channel number appears twice, there is not exactly
-    one current channel, or a block does not fit one record.
-    """
+    """Refuse a hello that no receiver could use; raises `FrameError` with what is wrong."""
     scales = [channel.full_scale for channel in hello.channels]
     positive = [hello.sample_rate_hz, hello.tick_hz, *scales, *hello.frequencies_hz]
     if not all(isfinite(value) and value > 0 for value in [*positive, *hello.currents_a]):
@@ -301,18 +296,14 @@ def _decode_frequencies(raw: memoryview) -> SetFrequencies:
     return SetFrequencies(tones)
 
 
-def _nothing(_: object) -> bytes:
-    return b''
-
-
 _LAYOUTS: dict[int, tuple[type, Callable[..., bytes], Callable[[memoryview], Payload]]] = {
     0x01: (Hello, _encode_hello, _decode_hello),
     0x02: (SampleBlock, _encode_samples, _decode_samples),
     0x03: (DeviceStatus, _encode_status, _decode_status),
     0x04: (Reply, _encode_reply, _decode_reply),
-    0x81: (Identify, _nothing, lambda raw: Identify()),
-    0x82: (Start, _nothing, lambda raw: Start()),
-    0x83: (Stop, _nothing, lambda raw: Stop()),
+    0x81: (Identify, lambda _: b'', lambda _: Identify()),
+    0x82: (Start, lambda _: b'', lambda _: Start()),
+    0x83: (Stop, lambda _: b'', lambda _: Stop()),
     0x84: (SetFrequencies, _encode_frequencies, _decode_frequencies),
 }
 """Type, encoder and decoder of the payload of each record, by the number of its type."""

@@ -38,13 +38,11 @@ _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'
 class FluxPoints:
     """Holds the fluxes of one demodulation window with a row for each sensor."""
 
-    # (S,), channel number and flag bits (`SATURATED`, `STALE`, `DROPPED`)
-    channel: NDArray[np.int64]
-    flags: NDArray[np.int64]
+    channel: NDArray[np.int64]  # (S,)
+    flags: NDArray[np.int64]  # (S,), bits (`SATURATED`, `STALE`, `DROPPED`)
     flux: ComplexArray  # (S, K), complex, T, a column per emitter
-    # (S, 3), m and unit vector, frame fg; NaN for sensors that move
-    position: Array
-    axis: Array
+    position: Array  # (S, 3), m, frame fg; NaN for sensors that move
+    axis: Array  # (S, 3), unit vector, frame fg; NaN for sensors that move
 
 
 @dataclass(frozen=True)
@@ -138,12 +136,7 @@ def decode_flux(
     data: bytes | bytearray | memoryview,
     is_bigendian: bool = False,
 ) -> FluxPoints:
-    """Read a flux cloud.
-
-    Raises `LayoutError` when a field is missing, doubled, of an unknown type or outside the point,
-    when there are too many points, or not ``width * point_step`` bytes, when a channel appears
-    twice, or when a channel or flag is no integer.
-    """
+    """Read a flux cloud; raises `LayoutError` with what is wrong with fields, size or values."""
     records = _records(fields, point_step, width, data, is_bigendian)
     geometry = _columns(records, ('x', 'y', 'z', 'nx', 'ny', 'nz'))
     channel = _integers(records, 'channel')
@@ -290,11 +283,7 @@ def decode_model_error(
     n_dipoles: int,
     n_emitters: int,
 ) -> ModelError:
-    """Read the uncertainty of a model with so many dipoles and emitters.
-
-    Raises `LayoutError` when the cloud is not laid out as `encode_model_error` does, names a
-    dipole that the model doesn't have, or holds values that are not finite.
-    """
+    """Read the uncertainty of a model of so many dipoles and emitters; raises `LayoutError`."""
     has_origin = any(field[0] == 'fingerprint' for field in fields)
     wanted, record = _layout(n_emitters, has_origin)
     if list(fields) != wanted or point_step != record.itemsize:

@@ -1,5 +1,4 @@
-"""Runs the control unit's serial port: a reader thread that survives cables, and names every
-fault.
+"""Runs the control unit's serial port: a reader thread that survives cables and names faults.
 
 One line is opened and read as fast as pyserial can. The thread reads, finds records and queues
 them; it never waits for the receiver. A receiver that is too slow loses whole blocks, counted as
@@ -148,12 +147,10 @@ class PortCounters:
 
 
 class Batch(NamedTuple):
-    """Holds records that were received together, in the order of the stream, with the times of the
-    monotonic host clock right after the read of each; none when the connection began or ended.
-    """
+    """Holds records that were received together; none when the connection began or ended."""
 
     records: tuple[Record, ...] = ()
-    arrivals_ns: tuple[int, ...] = ()
+    arrivals_ns: tuple[int, ...] = ()  # of the host's monotonic clock, right after each read
 
 
 class ControlUnitPort:
@@ -217,9 +214,7 @@ class ControlUnitPort:
             self._thread.join(timeout_s)
 
     def want(self, blocks: int, block_s: float = 0.0) -> None:
-        """Set how many blocks to collect, and their length, s, where they need not be read one by
-        one; those that are there already are not waited for.
-        """
+        """Set how many blocks to collect, and their length, s, where they may gather unread."""
         with self._holding:
             self.blocks_wanted, self._block_s = blocks, block_s
             if self._held_blocks >= blocks:

@@ -209,6 +209,10 @@ class StreamControl:
     def __init__(self, frequencies_hz: tuple[float, ...], *, set_frequencies: bool = True) -> None:
         self._wanted = frequencies_hz
         self._may_set = set_frequencies
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new connection."""
         self.hello: frames.Hello | None = None
         self.refusal = ''
         self.started = False
@@ -216,16 +220,6 @@ class StreamControl:
         self._last_block_ns = 0
         self._doubted_ns: int | None = None
         self._last_sent: dict[type, int] = {}
-
-    def reset(self) -> None:
-        """Begin a new connection."""
-        self.hello = None
-        self.refusal = ''
-        self.started = False
-        self._refused = False
-        self._last_block_ns = 0
-        self._doubted_ns = None
-        self._last_sent.clear()
 
     @property
     def tones_agree(self) -> bool:

@@ -106,9 +106,8 @@ class SensorRows(NamedTuple):
 class Setup:
     """Holds a validated setup document.
 
-    ``volume`` holds the corners, low and high (m, frame fg), of the box in which tools are
-    tracked; None if the document leaves it to the board's size. ``tips`` holds the tips of tools,
-    by body.
+    ``volume`` holds low and high corner (m, frame fg) of the box in which tools are tracked, None
+    if the document leaves it to the board's size; ``tips`` the tips of tools, by body.
     """
 
     frame_id: str
@@ -295,12 +294,10 @@ def _parse_stated(root: dict[str, Any]) -> dict[str, float]:
 def parse_setup(text: str) -> Setup:
     """Read and check a setup document.
 
-    Two sections are optional: ``accuracy`` states how accurate the instruments are and ``refit``
-    how the live refit follows. Their keys, with units and defaults, are the fields of
-    `anser_ros.settings.Accuracy` and `anser_ros.settings.RefitSettings`; a value that is not
-    stated has its default. ``fingerprint`` is for other readers and is computed again. Any other
-    key is kept in ``extra``; one that looks like a misspelling is refused. Raises `SetupError`
-    with the rule that is broken and the key where it is.
+    The keys of the optional sections, with units and defaults, are the fields of the classes of
+    `anser_ros.settings`. ``fingerprint`` is for other readers and is computed again. Any other key
+    is kept in ``extra``; one that looks like a misspelling is refused. Raises `SetupError` with
+    the rule that is broken and the key where it is.
     """
     root = read_mapping(read_own_yaml(text, 'setup'), 'the document')
     if root.get('schema') != SCHEMA:

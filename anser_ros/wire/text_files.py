@@ -1,5 +1,4 @@
-"""Reads text files from anybody: plain text, tables, lists of points, YAML within bounds, model
-files.
+"""Reads files from anybody: text, tables, points, YAML within bounds, model files.
 
 A file that cannot be read, or is no text of its kind, is one clear line.
 """
@@ -161,9 +160,6 @@ def write_document(path: str | os.PathLike[str], document: Any) -> None:
         raise ModelFileError(f'{name}: {error.strerror}') from error
 
 
-_PACKAGE = 'anser_ros'
-
-
 def config_path(name: str) -> Path:
     """Return the path of a file: `name` itself, or else in `config/`; raises `SetupError`."""
     given = Path(name).expanduser()
@@ -171,7 +167,7 @@ def config_path(name: str) -> Path:
         return given
     if given.name == name:
         for folder in Path(__file__).resolve().parents:
-            for candidate in (folder / 'config', folder / 'share' / _PACKAGE / 'config'):
+            for candidate in (folder / 'config', folder / 'share/anser_ros/config'):
                 if (candidate / name).is_file():
                     return candidate / name
     raise SetupError(f'no file {name}, and none of that name among the files of config/')

@@ -82,8 +82,8 @@ def _tracked(
     model = fit_scan(scan, ['scan'], generator, options).model
     at = UNSEEN_S + np.arange(0.0, 20.0, 0.04)
     position, rotation = hand(at, turn)
-    points, axes = table.with_geometry(
-        table.position + truth.place + truth.lever, truth.axis
+    points, axes = replace(
+        table, position=table.position + truth.place + truth.lever, axis=truth.axis
     ).placed(position, rotation.as_matrix())
     flux = world.flux(points.reshape(-1, 3), axes.reshape(-1, 3)).reshape(at.size, coils, -1)
     flux = flux * truth.gain[:, None]

@@ -54,7 +54,7 @@ def resting(rng, *, tilt=0.01, inverted=(), noisy=(), count=60):
     """Two frames of a helmet before two coils; its sensors' axes are off by a tilt."""
     table = helmet(count, rng)
     turned = table.axis + tilt * rng.normal(size=(count, 3))
-    true = table.with_geometry(axis=turned / np.linalg.norm(turned, axis=1)[:, None])
+    true = dataclasses.replace(table, axis=turned / np.linalg.norm(turned, axis=1)[:, None])
     points = PlacedPoints.of(true, np.zeros(3), np.eye(3))
     flux = np.stack(
         [
@@ -114,10 +114,11 @@ class TestPlacedPoints:
         moments = rng.normal(size=(3, 3))
 
         def flux(shift, turn):
-            moved = table.with_geometry(position=table.position + shift)
+            moved = dataclasses.replace(table, position=table.position + shift)
             rotation = Rotation.from_rotvec(turn).as_matrix()
             own = dataclasses.replace(
-                moved.with_geometry(axis=table.axis @ rotation.T),
+                moved,
+                axis=table.axis @ rotation.T,
                 windings=Windings(table.windings.offset @ rotation.T, table.windings.weight),
             )
             return PlacedPoints.of(own, np.zeros(3), np.eye(3)).basis(*dipole) @ moments

@@ -1,5 +1,7 @@
 """The refit's ablation: references spread out, the rival without shared polarisability, a plot."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import REPO
@@ -41,7 +43,9 @@ def test_free_dipoles_correct_but_less_than_the_shared_polarisability():
     model = free.update(flux)
     places, axes = volume_points()
     table = world.references.select(np.arange(len(places)) % 16)
-    truth = world.metal(points, table.with_geometry(places, axes, np.zeros(len(places))))
+    truth = world.metal(
+        points, replace(table, position=places, axis=axes, length=np.zeros(len(places)))
+    )
     left = truth - (model.flux(places, axes) - world.model.flux(places, axes))
     share = np.linalg.norm(left) / np.linalg.norm(truth)
     shared = world.refit().update(1, world.references.channel, flux).model

@@ -152,7 +152,7 @@ class TestModel:
     def test_a_thick_body_does_not_bend(self):
         sensors = plate()
         thick = sensors.position + np.outer(np.arange(len(sensors)) % 2, [0.0, 0.0, 0.05])
-        assert SmoothBend.of(sensors.with_geometry(thick)) is None
+        assert SmoothBend.of(replace(sensors, position=thick)) is None
 
 
 class TestFit:
