@@ -93,26 +93,6 @@ def test_what_is_worked_on_aside_has_nothing_to_do_with_a_node_that_is_gone(ros)
     assert not thread.is_alive() and node.counters['callback_faults'] == 0
 
 
-def test_what_is_put_off_is_done_one_thing_a_pause_while_there_are_pauses():
-    handover, done, can = Handover(), [], [False, True]
-
-    def first():
-        done.append('first')
-        return can.pop(0)
-
-    def second():
-        done.append('second')
-        return True
-
-    assert not handover.defer(second)
-    handover.pause()
-    assert all(handover.defer(work) for work in (first, second, first))
-    assert not done
-    for _ in range(4):
-        handover.pause()
-    assert done == ['first', 'second', 'first']
-
-
 def test_handed_fluxes_are_those_that_are_published():
     rng = np.random.default_rng(3)
     flux = rng.standard_normal((4, 8)) + 1j * rng.standard_normal((4, 8))

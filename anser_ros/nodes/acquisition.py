@@ -317,7 +317,6 @@ class Acquisition(AnserNode):
             self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)
         self._frame = frame
         self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
-        self.pause()
 
     def _hand_over_flux(self, publisher: Any, points: FluxPoints, stamp_ns: int) -> None:
         if self.hands_over and len(points.channel):
