@@ -7,7 +7,6 @@ the node subscribes to topics as they appear.
 import importlib
 import json
 import os
-import re
 import statistics
 import struct
 import sys
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosidl_parser.definition import AbstractNestedType, NamespacedType
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import AnserError, BagError
@@ -29,10 +29,6 @@ from anser_ros.wire.bag_writer import BagRecord, BagWriter, qos_profile, write_m
 
 # What rosbag2 and mcap put between the definitions of a message and of its parts.
 SEPARATOR = '=' * 80
-# The integers of ROS's interface language.
-NUMBERS = {f'{kind}{bits}' for kind in ('int', 'uint') for bits in (8, 16, 32, 64)}
-PRIMITIVES = NUMBERS | {'bool', 'byte', 'char', 'float32', 'float64', 'string', 'wstring'}
-FIELD = re.compile(r'^([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w+')
 
 
 def message_class(type_name: str) -> type:
@@ -56,12 +52,10 @@ def definition(type_name: str) -> str:
     parts: list[str] = []
     names = [type_name]
     for current in names:  # which grows meanwhile
-        text = _file(current, 'msg').read_text(encoding='utf-8')
         package, _, name = _split(current)
         title = f'{SEPARATOR}\nMSG: {package}/{name}\n' if parts else ''
-        parts.append(title + text)
-        inner = dict.fromkeys(_contained(text, package))
-        names += [one for one in inner if one not in names]
+        parts.append(title + _file(current, 'msg').read_text(encoding='utf-8'))
+        names += [one for one in _contained(message_class(current)) if one not in names]
     return '\n'.join(parts)
 
 
@@ -92,16 +86,14 @@ def _file(type_name: str, ending: str) -> Path:
     raise BagError(f'no definition of {type_name} is installed')
 
 
-def _contained(text: str, package: str) -> list[str]:
-    """Return the full names of the types of a definition's fields."""
-    found = []
-    for line in text.splitlines():
-        match = FIELD.match(line.split('#', 1)[0].strip())
-        if match is None or match[1] in PRIMITIVES:
-            continue
-        tokens = match[1].split('/')
-        found.append(f'{tokens[0] if len(tokens) > 1 else package}/msg/{tokens[-1]}')
-    return found
+def _contained(message: Any) -> list[str]:
+    """Return the full names of the types of a message's fields, each once."""
+    found = {}
+    for kind in message.SLOT_TYPES:
+        part = kind.value_type if isinstance(kind, AbstractNestedType) else kind
+        if isinstance(part, NamespacedType):
+            found['/'.join(part.namespaced_name())] = None
+    return list(found)
 
 
 # Intervals from which a topic's own period is learnt.
