@@ -159,6 +159,15 @@ class FluxStream:
         self._tool = SensorRows.of(self.sensors[: self._split], fixed_only=True)
         self._reference = SensorRows.of(self.sensors[self._split :], fixed_only=True)
 
+    def counts(self) -> dict[str, int]:
+        """Return the counters of the stream by name."""
+        return {
+            **vars(self.counters),
+            'windows_withheld': self.waiting.withheld,
+            'clock_jumps': self.clock.jumps,
+            'tick_faults': self.ticks.disagreements,
+        }
+
     @property
     def blocks_wanted(self) -> int:
         """Return how many blocks until a frame may be ready: one while frames wait for it."""

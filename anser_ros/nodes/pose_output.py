@@ -4,7 +4,6 @@ import math
 import struct
 import time
 from collections import Counter
-from dataclasses import dataclass, field
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
@@ -22,17 +21,6 @@ try:
     from tf2_msgs.msg import TFMessage
 except ImportError:  # the wheels don't have it
     TFMessage = None
-
-
-@dataclass
-class Tally:
-    """Counts what happened to one sensor or body since the last diagnostics."""
-
-    begin_s: float = field(default_factory=time.monotonic)
-    frames: int = 0
-    poses: int = 0
-    latency_s: float = math.nan
-    latest_s: float = -math.inf
 
 
 class PackedMessage:
@@ -72,7 +60,8 @@ class PoseTopic:
         self._values: tuple[float, ...] = ()
         self.estimate: PoseEstimate | None = None
         self.states: Counter[str] = Counter()
-        self.tally = Tally()
+        self.latest_s, self._latency_s = -math.inf, math.nan
+        self._reported = time.monotonic(), 0, 0  # and how many frames and poses there were
 
     @property
     def listeners(self) -> int:
@@ -113,12 +102,10 @@ class PoseTopic:
         changed = self.estimate is None or self.estimate.state != estimate.state
         self.estimate = estimate
         self.states[estimate.state] += 1
-        self.tally.frames += 1
-        self.tally.latest_s = time.monotonic()
+        self.latest_s = time.monotonic()
         if estimate.state == OK:
-            self.tally.poses += 1
             if is_live(estimate.stamp_ns, now_ns) and estimate.stamp_ns <= now_ns:
-                self.tally.latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
+                self._latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
             if self._uncertain.get_subscription_count():
                 numbers = *self._values, *estimate.covariance.ravel().tolist()
                 self._uncertain.publish(self._full.packed(estimate.stamp_ns, *numbers))
@@ -136,25 +123,27 @@ class PoseTopic:
         """Return the state as it is now, silence included, and its reason."""
         if self.estimate is None:
             return STALE, 'no fluxes yet'
-        silent_s = time.monotonic() - self.tally.latest_s
+        silent_s = time.monotonic() - self.latest_s
         if silent_s > stale_after_s:
             return STALE, f'no fluxes for {silent_s:.1f} s'
         return self.estimate.state, self.estimate.reason
 
     def status(self, stale_after_s: float) -> Status:
         """Return the line of ``/diagnostics`` and begin a new interval."""
-        tally, self.tally = self.tally, Tally(latest_s=self.tally.latest_s)
+        begin_s, frames, poses = self._reported
+        self._reported = time.monotonic(), self.states.total(), self.states[OK]
+        seconds = max(self._reported[0] - begin_s, 1e-3)
+        latency_s, self._latency_s = self._latency_s, math.nan
         estimate = self.estimate
         state, reason = self.state(stale_after_s)
         if estimate is None:
             return Status(self.name, Level.STALE, state, {'reason': reason})
-        seconds = max(time.monotonic() - tally.begin_s, 1e-3)
         values: dict[str, object] = {
             'state': state,
             'reason': reason,
-            'rate_hz': tally.poses / seconds,
-            'frame_rate_hz': tally.frames / seconds,
-            'latency_s': tally.latency_s,
+            'rate_hz': (self._reported[2] - poses) / seconds,
+            'frame_rate_hz': (self._reported[1] - frames) / seconds,
+            'latency_s': latency_s,
             'sigma_position_m': estimate.sigma_position_m,
             'residual_t': estimate.residual_t,
             'chi2_per_freedom': estimate.chi2,

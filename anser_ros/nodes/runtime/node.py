@@ -71,7 +71,8 @@ class AnserNode(Node):
         **options: Any,
     ) -> None:
         # The base class already creates services, so what guards them must be there first.
-        self._handover, self._beside = handover, tuple(beside)
+        self.hands_over = handover is not None  # what it publishes, to nodes of this process
+        self._handover, self._beside = handover or Handover(), tuple(beside)
         # Where frames are handed over, they come in another thread than the executor's.
         self._aside: NewestWorker | None = None
         self._turn = threading.RLock()
@@ -124,18 +125,11 @@ class AnserNode(Node):
 
     def offer(self, publisher: Any, *, lasts: bool = False) -> None:
         """Hand over what is published, too, to the nodes of this process that want it."""
-        if self._handover is not None:
-            self._handover.offer(publisher.topic_name, lasts=lasts)
+        self._handover.offer(publisher.topic_name, lasts=lasts)
 
     def hand_over(self, publisher: Any, what: Any) -> None:
         """Give something that is published to the nodes of this process."""
-        if self._handover is not None:
-            self._handover.give(publisher.topic_name, what)
-
-    @property
-    def hands_over(self) -> bool:
-        """Return whether other nodes of this process get what this one publishes directly."""
-        return self._handover is not None
+        self._handover.give(publisher.topic_name, what)
 
     def count(self, name: str, by: int = 1) -> None:
         """Count an event for ``/diagnostics``."""
@@ -192,7 +186,7 @@ class AnserNode(Node):
         callback.
         """
         name = self.resolve_topic_name(topic)
-        if self._handover is not None and self._handover.offers(name):
+        if self._handover.offers(name):
             taker = self._guard(self._in_turn(handed or callback))
             if self.WORKS_ASIDE:
                 self._aside = self._aside or NewestWorker(lambda: self.count('frames_skipped'))
@@ -227,7 +221,7 @@ class AnserNode(Node):
 
     def destroy_subscription(self, subscription: Any) -> bool:
         """Destroy a subscription as rclpy does, or take no longer what is handed over."""
-        if isinstance(subscription, DirectSubscription) and self._handover is not None:
+        if isinstance(subscription, DirectSubscription):
             self._handover.drop(subscription)
             return True
         return super().destroy_subscription(subscription)
