@@ -105,11 +105,10 @@ NUMBER = 'publication_sequence_number'
 class OneSource:
     """Subscribes to a topic; what comes while it has several senders is not passed on.
 
-    The callback takes the message alone, or its information too where ``informed``; ``doubted``
-    takes messages that are not believed. ``lasting`` returns what a message says if that holds
-    until its sender says otherwise, else None; if that ``is_constant``, who says otherwise is
-    another sender. The ``subscription`` to a latched topic is made again once it has a single
-    sender again.
+    ``doubted`` takes messages that are not believed. ``lasting`` returns what a message says if
+    that holds until its sender says otherwise, else None; if that ``is_constant``, who says
+    otherwise is another sender. The ``subscription`` to a latched topic is made again once it has
+    a single sender again.
     """
 
     def __init__(
@@ -117,17 +116,15 @@ class OneSource:
         node: AnserNode,
         message_type: type,
         topic: str,
-        callback: Callable[..., None],
+        callback: Callable[[Any], None],
         profile: QoSProfile,
-        doubted: Callable[..., None] | None = None,
+        doubted: Callable[[Any], None] | None = None,
         lasting: Callable[[Any], Hashable] | None = None,
         is_constant: bool = False,
-        informed: bool = False,
     ) -> None:
         self._node, self._topic = node, topic
         self._name = node.resolve_topic_name(topic)
         self._callback, self._doubted, self._lasting = callback, doubted, lasting
-        self._informed = informed
         self._arguments = message_type, profile
         self._sources = Senders(topic, is_constant)
         self._publishers, self._looked_s = 0, 0.0
@@ -184,9 +181,13 @@ class OneSource:
 
     def _take(self, message: Any, info: Mapping[str, Any]) -> None:
         lasting = None if self._lasting is None else self._lasting(message)
-        callback = self._callback if self.accepts(info, lasting) else self._doubted
-        if callback is not None:
-            callback(message, *([info] if self._informed else []))
+        if self.accepts(info, lasting):
+            self._deliver(message, info)
+        elif self._doubted is not None:
+            self._doubted(message)
+
+    def _deliver(self, message: Any, _info: Mapping[str, Any]) -> None:
+        self._callback(message)
 
     def _count(self, now_s: float) -> int:
         """How many publishers the graph knows."""
@@ -220,21 +221,19 @@ class NewestSource(OneSource):
         node: AnserNode,
         topic: str,
         callback: Callable[[Any], None],
-        doubted: Callable[..., None] | None = None,
+        doubted: Callable[[Any], None] | None = None,
         works_later: bool = False,
     ) -> None:
-        self._work, self._works_later, self.backlog = callback, works_later, Backlog()
-        super().__init__(
-            node, PointCloud2, topic, self._on_frame, qos.STREAM, doubted, informed=True
-        )
+        self._works_later, self.backlog = works_later, Backlog()
+        super().__init__(node, PointCloud2, topic, callback, qos.STREAM, doubted)
 
-    def _on_frame(self, message: PointCloud2 | HandedFlux, info: Mapping[str, Any]) -> None:
+    def _deliver(self, message: PointCloud2 | HandedFlux, info: Mapping[str, Any]) -> None:
         # What is handed over has no queue.
         is_handed = isinstance(message, HandedFlux)
         newest = message if is_handed else self._newest(message, info)
         begin_s = time.perf_counter()
         if newest is not None:
-            self._work(newest)
+            self._callback(newest)
         if not self._works_later:
             self.backlog.worked(time.perf_counter() - begin_s)
 
