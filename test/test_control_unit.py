@@ -75,7 +75,7 @@ def fluxes(unit, seconds=0.1):
         for block in decode(unit.advance(200)):
             if isinstance(block, SampleBlock):
                 arrival_ns += 10**6
-                found += stream.push(block, arrival_ns)
+                found += stream.push([block], [arrival_ns])
     flux = [np.concatenate([frame.tool.flux, frame.reference.flux]) for frame in found]
     times = begin + (np.arange(len(found)) + 0.5) * WINDOW_S
     return np.array(flux), np.array([frame.window.sigma for frame in found]), times

@@ -158,9 +158,9 @@ class SampleClock:
       or the device lost time. No stamp is good then, until an arrival is in time again, or an
       answer of the device (`bound`) shows which of the two it is.
 
-    ``jumps`` counts how often the line was started again because it was refuted; ``confirmed`` is
-    the number of the newest sample that an arrival in time, or an answer, has confirmed (-inf
-    before).
+    ``jumps`` counts how often the line was started again because it was refuted; ``is_settled`` is
+    whether it is relied on, however late the newest arrivals are; ``confirmed`` is the number of
+    the newest sample that an arrival in time, or an answer, has confirmed (-inf before).
     """
 
     def __init__(self, sample_rate_hz: float) -> None:
@@ -179,7 +179,7 @@ class SampleClock:
     def _begin_anew(self) -> None:
         self._line: Envelope | None = None
         self.confirmed = -math.inf
-        self._settled = False
+        self.is_settled = False
         self._stands: tuple[int, float] = (0, 0.0)
         self._earliest: deque[tuple[int, float]] = deque(maxlen=_BUCKETS)
         self._late_from_ns: int | None = None
@@ -196,7 +196,8 @@ class SampleClock:
         offset = arrival_ns - time_ns
         late = 0.0 if self._line is None else offset - self._line.offset_at(time_ns)
         if self._line is not None and (
-            time_ns < self._line.newest_ns or (self._settled and late < -1e9 * LARGEST_LATENESS_S)
+            time_ns < self._line.newest_ns
+            or (self.is_settled and late < -1e9 * LARGEST_LATENESS_S)
         ):
             self.jumps += 1
             self._begin_anew()
@@ -208,13 +209,13 @@ class SampleClock:
         self._newest_sample = sample
         self._contradict(time_ns, offset)
         self._note_lateness(late, arrival_ns)
-        if late > 1e9 * LARGEST_LATENESS_S and self._settled:
+        if late > 1e9 * LARGEST_LATENESS_S and self.is_settled:
             self._doubt(arrival_ns)
             return
         self._late_from_ns = None
         self._line.take(time_ns, offset)
         self.confirmed = sample
-        if not self._settled:
+        if not self.is_settled:
             self._settle(time_ns, arrival_ns)
 
     def bound(self, sample: float, sent_ns: int) -> None:
@@ -240,12 +241,12 @@ class SampleClock:
         if took_ns > 1e9 * _ANSWER_S:
             self._unexplained_from_ns = self._newest_ns
         is_refuted = lower > self._line.offset_at(time_ns) + _REFUTED_NS
-        if is_refuted and (self.is_doubted or not self._settled):
-            self.jumps += self._settled
+        if is_refuted and (self.is_doubted or not self.is_settled):
+            self.jumps += self.is_settled
             self._begin_anew()
         elif is_refuted:
             return
-        elif not self._settled:
+        elif not self.is_settled:
             self._settle(time_ns, self._newest_ns)
         elif self._quickest_ns < 1e9 * LARGEST_LATENESS_S:
             self.confirmed = self._newest_sample
@@ -283,13 +284,13 @@ class SampleClock:
             self._stands = since, stood = arrival_ns, offset
         if slack is None:
             awaited = self._answers and self._false_answers < _FALSE_ANSWERS
-            self._settled = arrival_ns - since > (_SETTLE_UNPROVEN_NS if awaited else _SETTLE_NS)
+            self.is_settled = arrival_ns - since > (_SETTLE_UNPROVEN_NS if awaited else _SETTLE_NS)
         elif slack < 1e9 * LARGEST_LATENESS_S:
-            self._settled = True
+            self.is_settled = True
         elif slack > 1e9 * _ANSWER_S or max(late for _, late in self._earliest) > _SETTLED_NS:
             self._stands = arrival_ns, offset
         else:
-            self._settled = arrival_ns - since > _SETTLE_UNPROVEN_NS
+            self.is_settled = arrival_ns - since > _SETTLE_UNPROVEN_NS
 
     def _doubt(self, arrival_ns: int) -> None:
         """Note an arrival that is late."""
@@ -312,7 +313,7 @@ class SampleClock:
         """Return whether an answer of the device would help: the line is new, or late for long."""
         if self._line is None or self._false_answers >= _FALSE_ANSWERS:
             return False
-        return not self._settled or self.is_doubted
+        return not self.is_settled or self.is_doubted
 
     @property
     def is_doubted(self) -> bool:
@@ -323,7 +324,7 @@ class SampleClock:
     @property
     def state(self) -> ClockState:
         """Return what is known of the stamps now."""
-        if not self._settled:
+        if not self.is_settled:
             return ClockState.SETTLING
         return ClockState.LATE if self._late_from_ns is not None else ClockState.GOOD
 
@@ -337,18 +338,13 @@ class SampleClock:
         """Return the standard deviation of a confirmed stamp, s; infinite while the line is not
         settled.
         """
-        if not self._settled:
+        if not self.is_settled:
             return math.inf
         return math.hypot(_FLOOR_S, min(self.lateness_s, LARGEST_LATENESS_S))
 
     def is_good(self, sample: float) -> bool:
         """Return whether the host time of a sample is known to 5 ms."""
-        return self._settled and self.confirmed >= sample
-
-    @property
-    def is_settled(self) -> bool:
-        """Return whether the line is relied on, apart from how late the newest arrivals are."""
-        return self._settled
+        return self.is_settled and self.confirmed >= sample
 
     def host_ns(self, sample: float) -> int:
         """Return the host time (ns) of a sample's number; 0 before the first arrival."""

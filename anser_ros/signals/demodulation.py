@@ -91,30 +91,25 @@ class Demodulator:
         self.window_samples = window_samples
         self.window_s = length_s
         self._times_s = _times_s(sample_rate_hz, window_samples)
-        self._bias: NDArray[np.float64] | None = None
         harmonics = _kept_harmonics(mains_hz, tones, sample_rate_hz, length_s)
-
-        def prepare(motion: bool, worst: float) -> None:
-            self._design = _design_matrix(sample_rate_hz, window_samples, tones, harmonics, motion)
-            self._solution = _solve(self._design, 2 * tones.size, worst)
+        tries = [(bool(follow_motion), _WORST_VARIANCE_RATIO)]
+        if follow_motion is None:
+            tries.insert(0, (True, _AFFORDABLE_VARIANCE_RATIO))
+        for motion, worst in tries:
             self.follows_motion = motion
-            self._bias = (
-                None if motion else self._motion_bias(self._solution, self._design, self._times_s)
-            )
-
-        try:
-            if follow_motion is None:
-                try:
-                    prepare(True, _AFFORDABLE_VARIANCE_RATIO)
-                except FitError:
-                    prepare(False, _WORST_VARIANCE_RATIO)
-            else:
-                prepare(follow_motion, _WORST_VARIANCE_RATIO)
-        except FitError as error:
+            self._design = _design_matrix(sample_rate_hz, window_samples, tones, harmonics, motion)
+            try:
+                self._solution = _solve(self._design, 2 * tones.size, worst)
+                break
+            except FitError as error:
+                failure = error
+        else:
+            spacing_hz = float(np.diff(np.sort(tones)).min(initial=np.inf))
             raise ParameterError(
                 f'a window of {1e3 * length_s:.3g} ms cannot separate tones '
-                f'{_smallest_spacing(tones):.4g} Hz apart'
-            ) from error
+                f'{spacing_hz:.4g} Hz apart'
+            ) from failure
+        self._bias = self._motion_bias(self._solution, self._design, self._times_s)
 
     def demodulate(
         self, samples: NDArray[np.generic], present: NDArray[np.bool_] | None = None
@@ -129,8 +124,7 @@ class Demodulator:
         if present is not None and not present.all():
             solution = _solve(self._design[present], 2 * self.frequencies_hz.size)
             values = values[present]
-            if bias is not None:
-                bias = self._motion_bias(solution, self._design[present], self._times_s[present])
+            bias = self._motion_bias(solution, self._design[present], self._times_s[present])
         projected = solution.basis.T @ values
         coefficients = solution.to_coefficients @ projected
         energy = np.einsum('nc,nc->c', values, values) - np.einsum(
@@ -150,17 +144,13 @@ class Demodulator:
 
     def _motion_bias(
         self, solution: _Solution, design: NDArray[np.float64], times_s: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.float64] | None:
         """Return the phasors that a fit without motion finds in tones times t, (2K, 2K), s."""
+        if self.follows_motion:
+            return None
         count = 2 * self.frequencies_hz.size
         projected = solution.basis.T @ (times_s[:, None] * design[:, :count])
         return np.asarray((solution.to_coefficients @ projected)[:count])
-
-
-def _smallest_spacing(tones: NDArray[np.float64]) -> float:
-    if tones.size < 2:
-        return float('inf')
-    return float(np.diff(np.sort(tones)).min())
 
 
 def _kept_harmonics(

@@ -185,7 +185,8 @@ class RepetitionWatch:
     """Keeps the last samples of a stream, and finds in them what comes again.
 
     ``tones_hz`` (K,) are the tones of the signals, Hz: fresh samples are most alike where all of
-    them return together. ``position`` counts samples since the last reset, holes included. Raises
+    them return together. ``position`` counts samples since the last reset, holes included;
+    ``needed`` (C,) is how long a run must be to count as repeated, samples. Raises
     `ParameterError` when there is no column, or the rate is not positive.
     """
 
@@ -197,7 +198,7 @@ class RepetitionWatch:
                 f'repetitions need columns and a rate, not {columns} at {sample_rate_hz:g} S/s'
             )
         rows = min(int(HISTORY_S * sample_rate_hz), MOST_BYTES // (2 * columns), MOST_ROWS)
-        self._rate_hz = sample_rate_hz
+        self.columns, self._rate_hz = columns, sample_rate_hz
         self._history = np.zeros((max(rows, 2 * _LONGEST_STEP), columns), np.int16)
         self._slots = np.zeros((columns, SLOTS), np.uint32)
         self._worst_lag = _worst_lag(len(self._history), sample_rate_hz, tones_hz)
@@ -206,7 +207,7 @@ class RepetitionWatch:
 
     def reset(self) -> None:
         """Forget all samples and what they were found to be."""
-        columns = self._history.shape[1]
+        columns = self.columns
         self.position = self._searched = self._contiguous_from = 0
         self._slots[:] = 0
         self._fingerprint = np.zeros(columns, np.uint32)
@@ -217,25 +218,15 @@ class RepetitionWatch:
         self._judge()
 
     @property
-    def columns(self) -> int:
-        """Return how many columns a sample has."""
-        return self._history.shape[1]
-
-    @property
     def noiseless(self) -> NDArray[np.bool_]:
         """Return the columns with too little noise in their samples to distinguish new from old,
         (C,)."""
-        return self._needed > self._longest
-
-    @property
-    def needed(self) -> NDArray[np.int64]:
-        """Return how long a run of each column must be to count as repeated, samples, (C,)."""
-        return self._needed
+        return self.needed > self._longest
 
     @property
     def repeats(self) -> bool:
         """Return whether no column said anything new lately, and one repeats what it said."""
-        repeating = self._run >= self._needed
+        repeating = self._run >= self.needed
         return bool(np.all(repeating | self.noiseless) and np.any(repeating))
 
     def take(self, codes: NDArray[np.int16]) -> None:
@@ -290,7 +281,7 @@ class RepetitionWatch:
             contiguous = at - self._contiguous_from
             search(
                 self._history, first, count, at, contiguous, self._fingerprint, self._probes,
-                self._probed_at, self._slots, self._needed, self._lag, self._run, self._until,
+                self._probed_at, self._slots, self.needed, self._lag, self._run, self._until,
                 self._age,
             )  # fmt: skip
             if contiguous > self._worst_lag:
@@ -305,7 +296,7 @@ class RepetitionWatch:
         Samples at an end of the converter's range tell nothing of the noise, and neither do
         columns that repeat themselves.
         """
-        history, is_new = self._history, self._run < self._needed
+        history, is_new = self._history, self._run < self.needed
         stretch = SAMPLED_ROWS * SAMPLED_SHARE
         for start in range(at - at % stretch, at + count, stretch):
             begin, end = max(start, at), min(start + SAMPLED_ROWS, at + count)
@@ -326,7 +317,7 @@ class RepetitionWatch:
         followed = continued + _PRIOR_RUNS * np.sqrt(same)
         surprise = -np.log2(np.maximum(same, followed / (coincided + _PRIOR_RUNS)))
         samples = np.ceil(EVIDENCE_BITS / np.maximum(surprise, 1e-6))
-        self._needed = np.maximum(samples, FINGERPRINT_SAMPLES).astype(np.int64)
+        self.needed = np.maximum(samples, FINGERPRINT_SAMPLES).astype(np.int64)
         self._tally *= math.exp(-_JUDGED_SAMPLES / (MEMORY_S * self._rate_hz))
 
 

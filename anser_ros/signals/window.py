@@ -63,7 +63,7 @@ class TickCheck:
     def take(self, sample: int, ticks: int) -> None:
         """Take the ticks of a block whose first sample has a number."""
         if self._reference is None:
-            self._begin(sample, ticks)
+            self.begin(sample, ticks)
             return
         since, from_ticks = self._reference
         elapsed = sample - since
@@ -73,16 +73,12 @@ class TickCheck:
             advance = self._advance(from_ticks, ticks, elapsed)
         if abs(advance - elapsed) > slack:
             self._disagree(sample, ticks, advance, elapsed)
-            self._begin(sample, ticks)
+            self.begin(sample, ticks)
         elif elapsed > _REFERENCE_S * self._rate_hz:
-            self._begin(sample, ticks)
+            self.begin(sample, ticks)
         if not self.trusted and sample - self._agrees_from > _TRUST_S * self._rate_hz:
             self.trusted, self.words = True, ''
         self._last_ticks = ticks
-
-    def take_after_hole(self, sample: int, ticks: int) -> None:
-        """Take the ticks of the first block after a hole, which was judged already."""
-        self._begin(sample, ticks)
 
     def confirms(self, samples: int, ticks: int) -> bool:
         """Return whether a block `samples` after the last one may have these ticks."""
@@ -91,7 +87,8 @@ class TickCheck:
         advance = self._advance(self._last_ticks, ticks, samples)
         return abs(advance - samples) <= 1 + _HOLE_TOLERANCE * samples
 
-    def _begin(self, sample: int, ticks: int) -> None:
+    def begin(self, sample: int, ticks: int) -> None:
+        """Compare from a block on: the first, or one after a hole, which was judged already."""
         self._reference, self._last_ticks = (sample, ticks), ticks
 
     def _advance(self, before: int, ticks: int, samples: int) -> float:
@@ -165,7 +162,8 @@ class WindowCutter:
     A hop, the way from one window to the next, leaves samples out if it is longer than the window.
 
     ``end_sample`` is the number of the sample behind the newest block, since the device began to
-    count. Raises `ParameterError` when a length is less than one sample.
+    count; ``samples_wanted`` is how many the next window still lacks. Raises `ParameterError` when
+    a length is less than one sample.
     """
 
     def __init__(
@@ -188,16 +186,11 @@ class WindowCutter:
     def reset(self) -> None:
         """Forget the samples; the next block begins a new grid of windows."""
         self._filled = 0
-        self._until_next = self._window
+        self.samples_wanted = self._window
         self._expected: int | None = None
         self.end_sample = self._begin_sample = 0
         self._watch.reset()
         self._ticks.reset()
-
-    @property
-    def samples_wanted(self) -> int:
-        """Return how many samples the next window still lacks."""
-        return self._until_next
 
     def expects(self, sequence: int) -> bool:
         """Return whether a block of this number follows on the newest one."""
@@ -231,7 +224,7 @@ class WindowCutter:
         if missing:
             self.counters.missing_samples += missing
             self._watch.skip(missing)
-            self._ticks.take_after_hole(first, ticks[0])
+            self._ticks.begin(first, ticks[0])
             skipped = self._skip_whole_windows(missing)
             windows += self._advance(None, missing - skipped, first - missing + skipped)
         else:
@@ -274,12 +267,12 @@ class WindowCutter:
         windows: list[Window] = []
         done = 0
         while done < count:
-            step = min(self._until_next, count - done)
+            step = min(self.samples_wanted, count - done)
             self._append(None if codes is None else codes[done : done + step], step)
             done += step
-            self._until_next -= step
-            if self._until_next == 0:
-                self._until_next = self._hop
+            self.samples_wanted -= step
+            if self.samples_wanted == 0:
+                self.samples_wanted = self._hop
                 windows += self._cut(first + done)
         return windows
 
