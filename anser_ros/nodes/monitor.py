@@ -20,7 +20,6 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
-from anser_ros.nodes.runtime.incoming import seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
@@ -33,6 +32,7 @@ from anser_ros.nodes.traces import (
     middle,
     targets_of,
 )
+from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
@@ -129,7 +129,7 @@ class Monitor(AnserNode):
         now_s = time.time()
         if self._first_s is None:
             self._first_s = time.monotonic()
-        variance, stamp_s = message.pose.covariance, seconds_of(message)
+        variance, stamp_s = message.pose.covariance, stamp_of(message) * NANO
         pose = pose_numbers(message.pose.pose)
         trace.stamp_s.append(stamp_s)
         trace.position.append(pose[:3])
@@ -139,7 +139,7 @@ class Monitor(AnserNode):
 
     def _on_optical(self, trace: OpticalTrace, message: PoseStamped) -> None:
         pose = pose_numbers(message.pose)
-        trace.add(seconds_of(message), pose[:3], pose[3:])
+        trace.add(stamp_of(message) * NANO, pose[:3], pose[3:])
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         statuses = statuses_in(message)

@@ -88,12 +88,10 @@ def _file(type_name: str, ending: str) -> Path:
 
 def _contained(message: Any) -> list[str]:
     """Return the full names of the types of a message's fields, each once."""
-    found = {}
-    for kind in message.SLOT_TYPES:
-        part = kind.value_type if isinstance(kind, AbstractNestedType) else kind
-        if isinstance(part, NamespacedType):
-            found['/'.join(part.namespaced_name())] = None
-    return list(found)
+    kinds = message.SLOT_TYPES
+    parts = [k.value_type if isinstance(k, AbstractNestedType) else k for k in kinds]
+    names = ['/'.join(p.namespaced_name()) for p in parts if isinstance(p, NamespacedType)]
+    return list(dict.fromkeys(names))
 
 
 # Intervals from which a topic's own period is learnt.
@@ -182,6 +180,7 @@ DISCOVERY_PERIOD_S = 0.25
 METADATA_PERIOD_S = 2.0
 # Deep enough for a pause of seconds on a slow disk.
 DEPTH = 2000
+ROS_DISTRO = os.environ.get('ROS_DISTRO', 'jazzy')
 COMMON_TOPICS = ('/diagnostics', '/tf', '/tf_static')
 STAMPED = (
     'sensor_msgs/msg/PointCloud2',
@@ -272,7 +271,7 @@ class Recorder(AnserNode):
         self._topic_subscriptions.clear()
         try:
             bag.close()
-            write_metadata(bag.path, bag.record, _ros_distro())
+            write_metadata(bag.path, bag.record, ROS_DISTRO)
         except OSError as error:
             self._error = self._error or _reason(error)
         logs, self._logs = self._logs, {}
@@ -316,7 +315,7 @@ class Recorder(AnserNode):
         """Write what the running bag holds so far, for whoever finds it after a crash."""
         self._described_s = time.monotonic()
         try:
-            write_metadata(bag.path, bag.record, _ros_distro(), is_closed=False)
+            write_metadata(bag.path, bag.record, ROS_DISTRO, is_closed=False)
         except OSError as error:  # the next flush will stop the recording
             self.warn('metadata_errors', _reason(error))
 
@@ -408,10 +407,6 @@ def _stamp_ns(data: bytes) -> int | None:
     order = '<' if data[1] & 1 else '>'
     sec, nanosec = struct.unpack_from(f'{order}iI', data, 4)
     return int(sec) * SECOND_NS + int(nanosec)
-
-
-def _ros_distro() -> str:
-    return os.environ.get('ROS_DISTRO', 'jazzy')
 
 
 def _reason(error: OSError) -> str:

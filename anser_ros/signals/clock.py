@@ -12,11 +12,9 @@ FOLLOWED_SHARE = 1e-4
 """Largest relative rate difference at which a device's clock is followed. Two quartz clocks differ
 by less; a larger value would follow slow changes of the host's load."""
 _STRETCH_NS = 500_000_000
-"""Length (0.5 s) of a stretch of which only the earliest arrival is kept. Shorter stretches keep
-more late arrivals, longer ones give the line fewer points."""
+"""Length (0.5 s) of a stretch of which only the earliest arrival is kept."""
 _MEMORY = 120
-"""Stretches whose earliest arrivals are kept, together a minute. A longer memory makes the rate
-more certain and follows its changes with temperature more slowly."""
+"""Stretches whose earliest arrivals are kept, together a minute: rates change with temperature."""
 _FEWEST = 6
 """Stretches from which on the rate is estimated: with fewer, delays look like a rate."""
 _TYPICAL_SHARE = 3e-5
@@ -99,26 +97,22 @@ def _hull_slope(points: Sequence[tuple[float, float]]) -> float:
 
 LARGEST_LATENESS_S = 4e-3
 """Lateness, s, up to which an arrival confirms the line; one that is so much too early refutes it.
-It bounds what a stamp may be wrong by when the device lost time that it did not count: 5 ms less
-what the line itself is uncertain by. Smaller, a busy host confirms nothing for long."""
+It is the 5 ms that a stamp may be wrong by, less what the line itself is uncertain by."""
 _SETTLE_NS = 200_000_000
 """Time (0.2 s) that a new line must stand where the device never answers. Bytes that had piled up
 are worked off faster than new ones come, and push the line down meanwhile."""
 _SETTLE_UNPROVEN_NS = 3_000_000_000
-"""The same (3 s) where answers bound it only loosely, as from a device that is slow to answer, or
-where one that did answer has not yet: if everything is late, so is its answer. All of the time
-arrivals must be in time, so that a line that a busy host makes late does not count."""
+"""The same (3 s) where answers bound it only loosely, or are still awaited: if everything is late,
+so is its answer. All of the time arrivals must be in time."""
 _REFUTED_NS = 1_000_000.0
-"""By how much (1 ms) an answer must show a line to be too early to refute it: what the line itself
-is uncertain by. More lets a device lose so much time unseen."""
+"""By how much (1 ms) an answer must show a line to be too early to refute it."""
 _SETTLED_NS = 1_000_000.0
 """Fall of a new line (1 ms) that begins the time again; less is how arrivals scatter."""
 _ANSWER_S = 0.15
 """Longest time, s, that an answer of the device may take to bound nothing: it has 100 ms for it,
 and the line the rest. If it takes longer, the line itself is late."""
 _ANSWER_HOLDS_NS = 60e9
-"""Device time (60 s) after which an answer says nothing any more: two clocks may have drifted
-apart by 6 ms, more than a stamp may be wrong by."""
+"""Device time (60 s) after which two clocks may have drifted apart by more than an answer says."""
 _FALSE_ANSWERS = 3
 """Answers that arrivals have contradicted, after which none is asked for any more: the device
 answers before it has sent the samples that it has."""
@@ -126,16 +120,13 @@ _DOUBT_NS = 30_000_000
 """Time (30 ms) without a confirmation, while blocks arrive, from which on the device is asked. A
 stall of the host ends with a burst that confirms the line at once."""
 _GIVE_UP_NS = 10_000_000_000
-"""Time (10 s) of unchanged lateness after which a device that does not answer is believed to have
-lost time. A line that is late for longer is taken for such a device."""
+"""Time (10 s) of unchanged lateness after which a silent device is believed to have lost time."""
 _BUCKET_NS = 50_000_000
 """Time (50 ms) of arrivals of which the earliest one tells how well the line is confirmed."""
 _BUCKETS = 10
-"""Such times that are looked back on. Times in which nothing arrives do not count: a host that
-stalls is no evidence against the line."""
+"""Such times that are looked back on, without those in which nothing arrives."""
 _FLOOR_S = 1e-4
-"""Least uncertainty of a stamp, s: what reading a byte and taking the time cost even when nothing
-else happens."""
+"""Least uncertainty of a stamp, s: what reading a byte and taking the time cost."""
 
 
 class ClockState(Enum):

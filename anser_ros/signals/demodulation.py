@@ -26,11 +26,9 @@ LONGEST_WINDOW_S = 0.05
 """Longest window, s. A tool at 0.2 m/s moves 1 cm meanwhile, and its phasors no longer change
 linearly."""
 MAINS_HARMONICS = 5
-"""Harmonics of the mains that are fitted in addition to the tones: rectifiers make odd ones,
-weaker the higher. Fewer leave hum in the noise; more cost window length where tones are near."""
+"""Harmonics of the mains that are fitted in addition to the tones; higher ones are weaker."""
 _RANK_TOLERANCE = 1e-6
-"""Singular values below this fraction of the largest are left out. What the window determines lies
-far above it, and rounding far below."""
+"""Singular values below this fraction of the largest are left out, as rounding."""
 _LARGEST_LOSS = 1e-3
 """Largest part of a wanted coefficient that may lie in the singular vectors that are left out."""
 _WORST_VARIANCE_RATIO = 30.0
@@ -88,7 +86,6 @@ class Demodulator:
         if not SHORTEST_WINDOW_S - half_sample <= length_s <= LONGEST_WINDOW_S + half_sample:
             raise ParameterError(f'a window of {1e3 * length_s:.3g} ms is not 5 to 50 ms long')
         self.frequencies_hz = tones
-        self.window_samples = window_samples
         self.window_s = length_s
         self._times_s = _times_s(sample_rate_hz, window_samples)
         harmonics = _kept_harmonics(mains_hz, tones, sample_rate_hz, length_s)

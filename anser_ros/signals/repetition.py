@@ -27,15 +27,13 @@ FACTOR = np.uint32(0x9E3779B2)
 """Factor of the recursion h <- h * FACTOR + sample modulo 2^32: twice an odd number, the golden
 ratio's 32 bits, which spreads neighbouring codes over the whole range."""
 ANCHOR_SHARE = 64
-"""One fingerprint in so many, by its own value, is remembered and looked up: where it lies hangs
-on the samples alone, so a run that comes again has its anchors at the same samples. Fewer would
-find a repetition later; more cost time, and what they find is found a millisecond earlier."""
+"""One fingerprint in so many, by its own value, is remembered and looked up: where it lies depends
+on the samples alone, so a run that comes again has its anchors at the same samples."""
 _ANCHOR_BELOW = np.uint32(2**32 // ANCHOR_SHARE)
 """Fingerprints below this are anchors."""
 SLOTS = 2048
-"""Remembered anchors of a column, a power of 2: at 40 kS/s they are those of 3 s. A newer one
-takes the place of an older one with which it shares a slot, so a long ring is found by its second
-anchor or so. More of them leave the processor's cache, and the search takes twice the time."""
+"""Remembered anchors of a column, a power of 2: at 40 kS/s they are those of 3 s. With more of
+them, which leave the processor's cache, the search takes twice the time."""
 _SLOT_SHIFT = np.uint32(15)
 """Shift of an anchor, which is below 2^26, that leaves the number of its slot."""
 _ROW_BITS = np.uint32(20)
@@ -142,24 +140,19 @@ def search(  # type: ignore[no-untyped-def]
 
 EVIDENCE_BITS = 80.0
 """Bits of surprise that a run must hold to count as repeated. A unit of 42 columns at 40 kS/s with
-two seconds of history compares 2^37 pairs of runs a second and 2^65 in ten years, so that one
-false alarm in ten years has a probability of 2^-15 even if all tones returned at every lag. Fewer
-bits give false alarms, more need longer runs: a column of 3 bits per sample needs 27 samples for
-80."""
+two seconds of history compares 2^65 pairs of runs in ten years, so that one false alarm in them
+has a probability of 2^-15."""
 LONGEST_RUN_S = 0.025
-"""Longest run, s, that a column may need. One that needs more has less than 80 bits of noise in it
-(0.08 bits per sample at 40 kS/s, 0.06 codes rms) and is noiseless; a longer one would let whole
-windows of repeated samples pass before they are found."""
+"""Longest run, s, that a column may need. One that needs more (0.08 bits per sample at 40 kS/s,
+0.06 codes rms) is noiseless: whole windows would pass before a repetition is found."""
 HISTORY_S = 2.5
-"""How far back a repetition is found, s. Buffers that a fault of a driver or a cable can repeat
-are far shorter; a longer history costs 3.4 MB a second at 42 columns."""
+"""How far back a repetition is found, s: farther than the buffers of drivers reach."""
 MOST_BYTES = 64_000_000
 """Most memory of the history, bytes; that of a unit with very many channels is shorter."""
 _LONGEST_STEP = 2048
 """Most samples, and a power of 2, that wait to be searched; less than any history has."""
 _JUDGED_SAMPLES = 2 * _LONGEST_STEP
-"""Samples after which it is worked out again how long runs must be: every 0.1 s at 40 kS/s, far
-less than `MEMORY_S`. More often only costs time."""
+"""Samples after which it is worked out again how long runs must be: every 0.1 s at 40 kS/s."""
 SHORTEST_LAG_S = 1e-3
 """Shortest lag, s, at which fresh samples are compared: over a shorter one a tone at 1 kHz or less
 is no other than it was."""
@@ -169,11 +162,9 @@ long enough for what follows on what."""
 SAMPLED_SHARE = 16
 """One such stretch in so many is compared. All of them would cost as much as the search."""
 MEMORY_S = 1.0
-"""Time constant, s, with which coincidences are forgotten. A longer one keeps a tool's movement,
-which makes coincidences rarer, in mind when it rests; a shorter one counts few."""
+"""Time constant, s, with which coincidences are forgotten: they are rarer while a tool moves."""
 _PRIOR = 32.0
-"""Samples that the prior of the coincidences counts for, half of which coincide (one bit each). It
-holds the first 0.1 s, until there are samples at the worst lag; more would slow the start down."""
+"""Samples that the prior of the coincidences counts for, half of which coincide (one bit each)."""
 _PRIOR_RUNS = 4.0
 """Coincidences that the prior of what follows one counts for: that noise is so correlated that
 every further sample is worth half of its own surprise."""

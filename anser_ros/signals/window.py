@@ -16,24 +16,19 @@ from anser_ros.errors import ParameterError
 from anser_ros.signals.repetition import RAILS, RepetitionWatch
 
 _SLACK_SAMPLES = 2.0
-"""Difference, samples, that rounding of ticks may make. Smaller, coarse ticks are accused; larger,
-small jumps are not seen."""
+"""Difference, samples, that rounding of ticks may make."""
 _SLACK_SHARE = 5e-4
-"""Relative difference up to which ticks and samples run at one pace. What a device says of its
-rates is rounded less than that, and two quartz clocks differ by a fifth of it."""
+"""Relative difference up to which ticks and samples run at one pace; quartzes differ less."""
 _REFERENCE_S = 1.0
-"""Time, s, over which the two are compared: a wrong pace of 1 % shows after 5 ms, and one of 0.1 %
-after a tenth of this."""
+"""Time, s, over which the two are compared."""
 _TRUST_S = 0.2
 """Time, s, that ticks must agree before they are believed again about lost blocks."""
 _AGAIN_S = 0.1
 """Disagreements closer together than this, s, are a wrong pace, others are jumps."""
 _HOLE_TOLERANCE = 0.01
-"""Relative difference up to which a hole's length by ticks and by sequence number agree. It is far
-above the rate error of any clock and below one block in a hundred."""
+"""Relative difference up to which a hole's length by ticks and by sequence number agree."""
 _LONGEST_HOLE_S = 10.0
-"""Longest hole, s, that the sequence number alone may tell of while ticks are not believed. After
-a longer one little is lost by starting again."""
+"""Longest hole, s, that the sequence number alone may tell of while ticks are not believed."""
 _WRAP = 2**32
 """Ticks after which a 32-bit counter begins again."""
 

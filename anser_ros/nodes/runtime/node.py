@@ -192,7 +192,7 @@ class AnserNode(Node):
                 self._aside = self._aside or NewestWorker(lambda: self.count('frames_skipped'))
                 taker = functools.partial(self._aside.put, name, taker)
             return self._handover.take(name, taker)
-        bounded = incoming.is_bounded(msg_type) and not options.get('raw', False)
+        bounded = msg_type in incoming.MOST_BYTES and not options.get('raw', False)
 
         @functools.wraps(callback)
         def unpacked(*args: Any) -> Any:

@@ -135,7 +135,7 @@ class OneSource:
     def complaint(self) -> str:
         """Return why the topic can't be believed now; empty while it has one sender."""
         now_s = time.monotonic()
-        complaint = self._sources.look(self._count(now_s), now_s)
+        complaint = self._sources.look(self.publishers(), now_s)
         latched = self._arguments[1].durability == DurabilityPolicy.TRANSIENT_LOCAL
         if self._refused_s is not None and self._publishers > 1:
             self._refused_s = now_s
@@ -149,7 +149,10 @@ class OneSource:
 
     def publishers(self) -> int:
         """Return how many publishers the graph knows, idle ones included."""
-        return self._count(time.monotonic())
+        now_s = time.monotonic()
+        if now_s - self._looked_s > LOOK_S:
+            self._publishers, self._looked_s = self._node.count_publishers(self._name), now_s
+        return self._publishers
 
     def sender(self) -> str:
         """Return what identifies the only publisher in the graph; empty where there is another
@@ -163,7 +166,7 @@ class OneSource:
         now_s, number = time.monotonic(), info.get(NUMBER)
         if number is not None and not self._sources.continues(number):
             self._looked_s = 0.0  # the graph as it is at this moment is needed
-        is_good = self._sources.take(number, self._count(now_s), now_s, lasting)
+        is_good = self._sources.take(number, self.publishers(), now_s, lasting)
         if not is_good:
             # A successor that goes on publishing is refused again and again: the first counts.
             if self._refused_s is None or self._publishers > 1:
@@ -188,12 +191,6 @@ class OneSource:
 
     def _deliver(self, message: Any, _info: Mapping[str, Any]) -> None:
         self._callback(message)
-
-    def _count(self, now_s: float) -> int:
-        """How many publishers the graph knows."""
-        if now_s - self._looked_s > LOOK_S:
-            self._publishers, self._looked_s = self._node.count_publishers(self._name), now_s
-        return self._publishers
 
 
 def setup_source(node: AnserNode, callback: Callable[[Any], None]) -> OneSource:
