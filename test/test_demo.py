@@ -21,7 +21,7 @@ from anser_ros.cli.output import make_new_folder, remove_empty_folders
 from anser_ros.cli.processes import Supervisor, own_domain, tail
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Traces, targets_of
+from anser_ros.nodes.traces import OpticalTrace, PoseTrace, targets_of
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.text_files import read_config
@@ -123,7 +123,7 @@ class TestTraces:
 
     def test_rows_of_coils_and_their_body_without_poses_say_so(self):
         targets = targets_of(SETUP)
-        rows = Traces(targets).rows({'tool_a': OpticalTrace()}, 1.0)
+        rows = [PoseTrace(target).row(OpticalTrace().track(), 1.0) for target in targets]
         assert len(rows) == 10 and targets[-1].name == 'tool_a'
         assert all(row.rate_hz == 0 and np.isnan(row.error_m) for row in rows)
 

@@ -19,7 +19,7 @@ from anser_ros.errors import FitError, SetupError
 from anser_ros.nodes.streams.clouds import FLUX_NOISE, STAMP_SIGMA
 from anser_ros.settings import Accuracy
 from anser_ros.signals.clock import SampleClock
-from anser_ros.signals.demodulation import Demodulator, ToneFit
+from anser_ros.signals.demodulation import Demodulator
 from anser_ros.signals.flux import FluxConverter, FluxRates, FluxWindow
 from anser_ros.signals.repetition import RepetitionWatch
 from anser_ros.signals.window import TickCheck, Window, WindowCutter
@@ -147,6 +147,7 @@ class FluxStream:
         self._current_column = [c.kind for c in hello.channels].index(ChannelKind.CURRENT)
         self._columns = np.array([columns[s.channel] for s in self.sensors])
         self._converter = self._converter_of(hello, calibration)
+        # Windows too short to follow motion take it from the windows before.
         self._rates = None if self._demodulator.follows_motion else FluxRates()
         self._watch = RepetitionWatch(len(hello.channels), rate, self.tones_hz)
         self._repeats = False
@@ -255,7 +256,10 @@ class FluxStream:
 
     def _frame(self, window: Window) -> FluxFrame:
         fit = self._demodulator.demodulate(window.codes, window.present)
-        converted = self._converted(fit, window.middle_sample / self._sample_rate_hz)
+        rates, middle_s = self._rates, window.middle_sample / self._sample_rate_hz
+        converted = self._converter.convert(fit, None if rates is None else rates.at(middle_s))
+        if rates is not None:
+            rates.add(middle_s, converted.flux)
         staleness = self._staleness(window)
         saturated = window.saturated[self._columns]
         stale = window.stuck[self._columns] | window.stuck[self._current_column]
@@ -284,14 +288,6 @@ class FluxStream:
         return Staleness(
             age / self._sample_rate_hz, (noiseless | noiseless[current])[self._columns]
         )
-
-    def _converted(self, fit: ToneFit, middle_s: float) -> FluxWindow:
-        """Fluxes of a fit; one too short to follow motion takes it from the windows before."""
-        if self._rates is None:
-            return self._converter.convert(fit)
-        converted = self._converter.convert(fit, self._rates.at(middle_s))
-        self._rates.add(middle_s, converted.flux)
-        return converted
 
 
 def _points(

@@ -81,10 +81,7 @@ class PoseTopic:
         node.destroy_publisher(self._uncertain)
 
     def publish(self, estimate: PoseEstimate) -> None:
-        """Publish a good estimate, and nothing else, as other topics wait for it.
-
-        What nobody subscribes to is not published: who comes later gets none of it anyway.
-        """
+        """Publish a good estimate to subscribers, and nothing else, as other topics wait."""
         if estimate.state != OK:
             return
         if estimate.rotation is None:
