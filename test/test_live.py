@@ -4,6 +4,7 @@ import signal
 import socket
 import threading
 from dataclasses import make_dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -214,7 +215,8 @@ def test_who_is_given_up_says_good_bye_to_devices_first(monkeypatch, is_noticed)
     monkeypatch.setattr(process.os, '_exit', lambda code: done.append(code))
     signals = process._Signals.__new__(process._Signals)
     signals._noticed = threading.Event()
-    signals.abandon_calls = [fail, lambda: done.append('stopped')]
+    calls = fail, lambda: done.append('stopped')
+    signals.nodes = [SimpleNamespace(on_abandon=call) for call in calls]
     signals._reader, writer = socket.socketpair()
     writer.send(bytes([signal.SIGINT]))
     if is_noticed:

@@ -191,7 +191,7 @@ class FluxStream:
     def run_length(self, blocks: Sequence[SampleBlock]) -> int:
         """Return how many blocks to push at once: they follow, up to the end of a window."""
         first, shape = blocks[0].sequence, (self._block_samples, self._cutter.columns)
-        if not self._cutter.expects(first):
+        if self._cutter.expected != first:
             return 1
         for rank, block in enumerate(blocks[: self.blocks_wanted]):
             if block.sequence != first + rank or block.codes.shape != shape:

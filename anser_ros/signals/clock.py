@@ -258,18 +258,12 @@ class SampleClock:
             self._lower = None
             self._false_answers += 1
 
-    def _slack_ns(self, time_ns: float) -> float | None:
-        """How far the line lies above the least that it can be, ns; None without an answer."""
-        lower = self._lower_offset(time_ns)
-        return (
-            None if lower is None or self._line is None else self._line.offset_at(time_ns) - lower
-        )
-
     def _settle(self, time_ns: float, arrival_ns: int) -> None:
         """See whether a new line can be relied on."""
         assert self._line is not None
-        slack = self._slack_ns(time_ns)
-        offset = self._line.offset_at(time_ns)
+        offset, lower = self._line.offset_at(time_ns), self._lower_offset(time_ns)
+        # How far the line lies above the least that it can be, ns; None without an answer.
+        slack = None if lower is None else offset - lower
         since, stood = self._stands
         if offset < stood - _SETTLED_NS:
             self._stands = since, stood = arrival_ns, offset

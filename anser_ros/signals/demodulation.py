@@ -87,14 +87,15 @@ class Demodulator:
             raise ParameterError(f'a window of {1e3 * length_s:.3g} ms is not 5 to 50 ms long')
         self.frequencies_hz = tones
         self.window_s = length_s
-        self._times_s = _times_s(sample_rate_hz, window_samples)
+        middle = (window_samples - 1) / 2
+        self._times_s = (np.arange(window_samples) - middle) / sample_rate_hz
         harmonics = _kept_harmonics(mains_hz, tones, sample_rate_hz, length_s)
         tries = [(bool(follow_motion), _WORST_VARIANCE_RATIO)]
         if follow_motion is None:
             tries.insert(0, (True, _AFFORDABLE_VARIANCE_RATIO))
         for motion, worst in tries:
             self.follows_motion = motion
-            self._design = _design_matrix(sample_rate_hz, window_samples, tones, harmonics, motion)
+            self._design = _design_matrix(self._times_s, length_s, tones, harmonics, motion)
             try:
                 self._solution = _solve(self._design, 2 * tones.size, worst)
                 break
@@ -161,29 +162,22 @@ def _kept_harmonics(
     return kept
 
 
-def _times_s(sample_rate_hz: float, window_samples: int) -> NDArray[np.float64]:
-    """Return the times of a window's samples from its middle, s."""
-    times = (np.arange(window_samples) - (window_samples - 1) / 2) / sample_rate_hz
-    return np.asarray(times, float)
-
-
 def _design_matrix(
-    sample_rate_hz: float,
-    window_samples: int,
+    times_s: NDArray[np.float64],
+    length_s: float,
     tones: NDArray[np.float64],
     harmonics: NDArray[np.float64],
     follow_motion: bool,
 ) -> NDArray[np.float64]:
     """Return the columns: cos and -sin of the tones, the same times t, offset, slope, mains."""
-    time = _times_s(sample_rate_hz, window_samples)
-    unit = time / (window_samples / sample_rate_hz / 2)
-    angle = 2 * np.pi * time[:, None] * tones
+    unit = times_s / (length_s / 2)
+    angle = 2 * np.pi * times_s[:, None] * tones
     waves = np.hstack([np.cos(angle), -np.sin(angle)])
     columns = [waves]
     if follow_motion:
         columns.append(unit[:, None] * waves)
     columns += [np.ones_like(unit)[:, None], unit[:, None]]
-    mains = 2 * np.pi * time[:, None] * harmonics
+    mains = 2 * np.pi * times_s[:, None] * harmonics
     columns += [np.cos(mains), np.sin(mains)]
     return np.hstack(columns)
 

@@ -157,8 +157,9 @@ class WindowCutter:
     A hop, the way from one window to the next, leaves samples out if it is longer than the window.
 
     ``end_sample`` is the number of the sample behind the newest block, since the device began to
-    count; ``samples_wanted`` is how many the next window still lacks. Raises `ParameterError` when
-    a length is less than one sample.
+    count, ``expected`` the number of the block that follows on it (None: any); ``samples_wanted``
+    is how many the next window still lacks. Raises `ParameterError` when a length is less than one
+    sample.
     """
 
     def __init__(
@@ -182,14 +183,10 @@ class WindowCutter:
         """Forget the samples; the next block begins a new grid of windows."""
         self._filled = 0
         self.samples_wanted = self._window
-        self._expected: int | None = None
+        self.expected: int | None = None
         self.end_sample = self._begin_sample = 0
         self._watch.reset()
         self._ticks.reset()
-
-    def expects(self, sequence: int) -> bool:
-        """Return whether a block of this number follows on the newest one."""
-        return sequence == self._expected
 
     def push(
         self, sequence: int, timestamp_ticks: int | Sequence[int], codes: NDArray[np.int16]
@@ -211,10 +208,10 @@ class WindowCutter:
         if missing < 0:
             self.counters.duplicate_blocks += 1
             return []
-        if self._expected is None:
+        if self.expected is None:
             self.end_sample = self._begin_sample = sequence * block
         first = self.end_sample + missing
-        self._expected = (sequence + len(ticks)) % _SEQUENCES
+        self.expected = (sequence + len(ticks)) % _SEQUENCES
         windows: list[Window] = []
         if missing:
             self.counters.missing_samples += missing
@@ -236,9 +233,9 @@ class WindowCutter:
         started a new stream, and its first blocks were lost. A repeated block has the same samples
         as before, or fills a hole too late.
         """
-        if self._expected is None or sequence == self._expected:
+        if self.expected is None or sequence == self.expected:
             return 0
-        ahead, block = (sequence - self._expected) % _SEQUENCES, len(codes)
+        ahead, block = (sequence - self.expected) % _SEQUENCES, len(codes)
         if ahead >= _SEQUENCES // 2:
             place = self._watch.position - (_SEQUENCES - ahead) * block
             if self._watch.matches_history(place, codes) is not False:

@@ -9,7 +9,7 @@ import socket
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from types import FrameType
 from typing import Any
 
@@ -185,8 +185,7 @@ class _Signals:
         self.is_node_made = False
         self.caught: list[int] = []
         self._noticed = threading.Event()
-        # What devices have to be informed where the process is given up.
-        self.abandon_calls: list[Callable[[], object]] = []
+        self.nodes: list[AnserNode] = []
         for number in ENDING:
             signal.signal(number, self._catch)
         # Python's handlers wait for the main thread; this channel does not.
@@ -211,9 +210,9 @@ class _Signals:
             pass
         if self._noticed.wait(NOTICE_S):
             return
-        for on_abandon in self.abandon_calls:
+        for node in self.nodes:
             try:
-                on_abandon()
+                node.on_abandon()
             except Exception:  # noqa: BLE001 - the process ends, whatever a device says
                 traceback.print_exc()
         if not self._noticed.is_set():
@@ -241,18 +240,15 @@ def _run(
     meant: dict[str, list[str]],
     signals: _Signals,
 ) -> int:
-    nodes: list[AnserNode] = []
-    code = 0
+    nodes, code = signals.nodes, 0
     keep_in_one_piece()
     executor = make_executor()
-    shared: dict[str, Any] = (
-        {'handover': Handover(), 'beside': classes} if len(classes) > 1 else {}
-    )
+    shared: dict[str, Any] = {'handover': Handover(), 'beside': classes}
     try:
         for node_class in classes:
-            only: dict[str, Any] = {'cli_args': meant[node_class.NAME]} if shared else {}
-            nodes.append(node_class(**own, **shared, **only))
-            signals.abandon_calls.append(nodes[-1].on_abandon)
+            if len(classes) > 1:
+                own |= {**shared, 'cli_args': meant[node_class.NAME]}
+            nodes.append(node_class(**own))
         _complain(nodes, arguments)
         for node in nodes:
             executor.add_node(node)
