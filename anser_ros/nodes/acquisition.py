@@ -61,8 +61,6 @@ from anser_ros.wire.text_files import read_config
 
 @dataclass(frozen=True)
 class AcquisitionParameters:
-    """Holds the parameters of the acquisition."""
-
     device: str = parameter(
         '/dev/ttyACM0', "the control unit's port, or auto: listen on all ports for its hello"
     )
@@ -321,7 +319,6 @@ class Acquisition(AnserNode):
         self._rebuild = True
 
     def close(self) -> None:
-        """Command the control unit to stop, and end both threads."""
         self._closing.set()
         self._worker.join(2.0)
 
@@ -332,7 +329,6 @@ class Acquisition(AnserNode):
             self._port.end_stream()
 
     def status(self) -> Status:
-        """Return the state of the port and of the stream."""
         interval, self._interval = self._interval, Interval(time.monotonic())
         self._last = interval
         elapsed = max(self._interval.begin_s - interval.begin_s, 1e-3)

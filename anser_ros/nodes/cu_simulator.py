@@ -39,8 +39,6 @@ LONGEST_LAG_S = 0.25
 
 @dataclass(frozen=True)
 class CuSimulatorParameters:
-    """Holds the parameters of the simulated control unit."""
-
     link: str = parameter('/tmp/anser_cu', 'path under which the port can be opened')
     setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')
     channels_file: str = parameter(
@@ -253,7 +251,6 @@ class CuSimulator(AnserNode):
         self._injector = line.FaultInjector(new.fault, new.fault_period_s, new.seed)
 
     def status(self) -> Status:
-        """Return the state of the simulated control unit."""
         state = 'streaming' if self._unit.streaming else 'idle, waiting for a start'
         values: dict[str, object] = {'link': self.parameters.link, 'fault': self._injector.kind}
         if self.parameters.metal:
@@ -262,7 +259,6 @@ class CuSimulator(AnserNode):
         return Status('', Level.OK, state, values)
 
     def close(self) -> None:
-        """End the thread and remove the port."""
         self._closing.set()
         self._thread.join(2.0)
         self._port.unplug()

@@ -42,8 +42,6 @@ LEVELS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
 
 @dataclass(frozen=True)
 class MonitorParameters:
-    """Holds the parameters of the monitor."""
-
     duration_s: float = parameter(
         0.0, 'time from the first pose until it ends by itself; 0 for never, s', minimum=0.0
     )
@@ -252,7 +250,6 @@ class Monitor(AnserNode):
         return '  '.join(parts)
 
     def status(self) -> Status:
-        """Return how many poses came from each chain of nodes."""
         poses = {
             f'poses_{chain or "live"}': sum(len(trace.stamp_s) for trace in traces)
             for chain, traces in self._chains.items()
@@ -260,7 +257,6 @@ class Monitor(AnserNode):
         return Status('', Level.OK, self._note or 'watching', poses)
 
     def close(self) -> None:
-        """Leave the terminal in order and write the output file."""
         if self._live is not None:
             self._live.stop()
         if self.parameters.output:

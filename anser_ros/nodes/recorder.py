@@ -191,8 +191,6 @@ STAMPED = (
 
 @dataclass(frozen=True)
 class RecorderParameters:
-    """Holds the parameters of the recorder."""
-
     directory: str = parameter('recordings', 'folder that gets one folder per bag')
     name: str = parameter(
         '', "name of the bag's folder, with _1, _2 appended if it exists; empty: date and time"
@@ -234,7 +232,6 @@ class Recorder(AnserNode):
             self.start()
 
     def status(self) -> Status:
-        """Return whether it records, how much, and what went wrong."""
         if self._bag is None:
             if self._error:
                 return Status('', Level.ERROR, f'recording stopped: {self._error}')
@@ -280,7 +277,6 @@ class Recorder(AnserNode):
         return self._last_report
 
     def close(self) -> None:
-        """End the bag in order when the node ends."""
         self.stop_recording()
 
     # Callbacks ----------------------------------------------------------------------------
