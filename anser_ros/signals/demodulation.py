@@ -87,8 +87,8 @@ class Demodulator:
             raise ParameterError(f'a window of {1e3 * length_s:.3g} ms is not 5 to 50 ms long')
         self.frequencies_hz = tones
         self.window_s = length_s
-        middle = (window_samples - 1) / 2
-        self._times_s = (np.arange(window_samples) - middle) / sample_rate_hz
+        from_middle = np.arange(window_samples) - (window_samples - 1) / 2
+        self._times_s = np.asarray(from_middle / sample_rate_hz, float)
         harmonics = _kept_harmonics(mains_hz, tones, sample_rate_hz, length_s)
         tries = [(bool(follow_motion), _WORST_VARIANCE_RATIO)]
         if follow_motion is None:
