@@ -23,7 +23,15 @@ from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Row, latency_of, middle, targets_of
+from anser_ros.nodes.traces import (
+    OVERLAP,
+    OpticalTrace,
+    PoseTrace,
+    Row,
+    latency_of,
+    middle,
+    targets_of,
+)
 from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
@@ -149,6 +157,12 @@ class Monitor(AnserNode):
             chain: [trace.row(tracks.get(trace.target.body), elapsed_s) for trace in traces]
             for chain, traces in self._chains.items()
         }
+        if not self.parameters.output:  # else all are written at the end
+            for traces in self._chains.values():
+                for trace in traces:
+                    trace.forget(OVERLAP)
+            for seen in self._optical.values():
+                seen.forget(NEWEST)
         if self._live is not None:
             # It hides the cursor, so only once the node is made and will surely be closed.
             self._live.start()
@@ -251,7 +265,7 @@ class Monitor(AnserNode):
 
     def status(self) -> Status:
         poses = {
-            f'poses_{chain or "live"}': sum(len(trace.stamp_s) for trace in traces)
+            f'poses_{chain or "live"}': sum(t.forgotten + len(t.stamp_s) for t in traces)
             for chain, traces in self._chains.items()
         }
         return Status('', Level.OK, self._note or 'watching', poses)

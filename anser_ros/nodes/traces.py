@@ -15,6 +15,8 @@ from anser_ros.stamps import LIVE_WITHIN_S
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
+OVERLAP = 5
+"""Poses of the last row that the next one's error is of, too."""
 LONGEST_OPTICAL_GAP_S = 0.1
 """Gap between optical poses, s, over which none is interpolated to compare with."""
 
@@ -106,7 +108,16 @@ class PoseTrace:
     axis: list[tuple[float, ...]] = field(default_factory=list)
     sigma_m: list[float] = field(default_factory=list)
     latency_s: list[float] = field(default_factory=list)
+    forgotten: int = 0
     _shown: int = 0
+
+    def forget(self, but: int) -> None:
+        """Keep only the last ``but`` poses."""
+        gone = max(len(self.stamp_s) - but, 0)
+        for values in (self.stamp_s, self.position, self.axis, self.sigma_m, self.latency_s):
+            del values[:gone]
+        self.forgotten += gone
+        self._shown -= gone
 
     def distances(self, optical: PoseTrack, since: int = 0) -> tuple[Array, Array]:
         """Return distances (m) to the truth of the poses from number `since` on, NaN where the
@@ -132,7 +143,7 @@ class PoseTrace:
         error = float('nan')
         if count and optical is not None:
             # the last poses may be newer than the last optical one
-            error = middle(self.distances(optical, max(0, since - 5))[0])
+            error = middle(self.distances(optical, max(0, since - OVERLAP))[0])
         position = self.position[-1] if count else (float('nan'),) * 3
         sigma, latency = middle(self.sigma_m[since:]), middle(self.latency_s[since:])
         return Row(self.target.name, position, sigma, error, count / elapsed_s, latency)
