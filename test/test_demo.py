@@ -134,7 +134,7 @@ class TestTraces:
             if k % 10 == 9:
                 whole, short = (trace.row(optical.track(), 0.2) for trace in traces)
                 assert whole == short and whole.rate_hz == 50
-                traces[1].forget(OVERLAP)
+                traces[1].forget()
         assert traces[1].forgotten + len(traces[1].stamp_s) == 40
         assert len(traces[1].stamp_s) == OVERLAP
 

@@ -23,15 +23,7 @@ from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.traces import (
-    OVERLAP,
-    OpticalTrace,
-    PoseTrace,
-    Row,
-    latency_of,
-    middle,
-    targets_of,
-)
+from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Row, latency_of, middle, targets_of
 from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
@@ -160,7 +152,7 @@ class Monitor(AnserNode):
         if not self.parameters.output:  # else all are written at the end
             for traces in self._chains.values():
                 for trace in traces:
-                    trace.forget(OVERLAP)
+                    trace.forget()
             for seen in self._optical.values():
                 seen.forget(NEWEST)
         if self._live is not None:

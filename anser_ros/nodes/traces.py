@@ -111,9 +111,9 @@ class PoseTrace:
     forgotten: int = 0
     _shown: int = 0
 
-    def forget(self, but: int) -> None:
-        """Keep only the last ``but`` poses."""
-        gone = max(len(self.stamp_s) - but, 0)
+    def forget(self) -> None:
+        """Keep only the poses that the next row needs."""
+        gone = max(len(self.stamp_s) - OVERLAP, 0)
         for values in (self.stamp_s, self.position, self.axis, self.sigma_m, self.latency_s):
             del values[:gone]
         self.forgotten += gone
