@@ -152,9 +152,7 @@ class CuSimulator(AnserNode):
             )
             for body in setup.bodies
         }
-        message = PoseStamped()
-        message.header.frame_id = setup.frame_id
-        self._message = PackedMessage(message, 7)
+        self._message = PackedMessage(PoseStamped, setup.frame_id, 7)
         self._prepared: deque[Piece] = deque()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name='control_unit')

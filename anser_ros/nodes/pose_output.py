@@ -24,11 +24,13 @@ except ImportError:  # the wheels don't have it
 
 
 class PackedMessage:
-    """Keeps the bytes of a message that begins with a header and ends with ``count`` doubles,
-    which are published in half the time of a message.
+    """Keeps the bytes of a message of a frame that begins with a header and ends with ``count``
+    doubles, which are published in half the time of a message.
     """
 
-    def __init__(self, message: Any, count: int) -> None:
+    def __init__(self, kind: type, frame_id: str, count: int) -> None:
+        message = kind()
+        message.header.frame_id = frame_id
         self._bytes = bytearray(serialize_message(message))
         self._numbers = struct.Struct(f'<{count}d')
         self._offset = len(self._bytes) - self._numbers.size
@@ -50,10 +52,9 @@ class PoseTopic:
         self._uncertain = node.create_publisher(
             PoseWithCovarianceStamped, f'{stem}/pose_with_covariance', qos.STREAM
         )
-        plain, full = PoseStamped(), PoseWithCovarianceStamped()
         board = f'{prefix}{frame_id}'
-        plain.header.frame_id = full.header.frame_id = board
-        self._plain, self._full = PackedMessage(plain, 7), PackedMessage(full, 7 + 36)
+        self._plain = PackedMessage(PoseStamped, board, 7)
+        self._full = PackedMessage(PoseWithCovarianceStamped, board, 7 + 36)
         self._transform = TransformStamped()
         self._transform.header.frame_id = board
         self._transform.child_frame_id = f'{prefix}{stem}'

@@ -43,17 +43,16 @@ REFRESH_EVERY = 50
 
 class Consumers:
     """Finds the nodes that subscribe to topics; the executor of the ``node`` that asks them must
-    be spinning in another thread.
+    be spinning in another thread. All waits end when ``ending`` is set.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Node, ending: threading.Event) -> None:
+        self._node, self._ending = node, ending
         self._clients: dict[str, Any] = {}
         self._listeners: dict[tuple[str, ...], set[str]] = {}
         self._silent: set[str] = set()
         self._answered: set[str] = set()
         self._calls = 0
-        self._given_up = threading.Event()
 
     def wait(self, *topics: str, attempts: int = ATTEMPTS) -> None:
         """Wait until all listeners of the topics, by their full names, have handled what was
@@ -72,10 +71,6 @@ class Consumers:
                 self._answered.add(name)
             else:
                 self._listeners[topics].discard(name)
-
-    def give_up(self) -> None:
-        """End every wait that is going on."""
-        self._given_up.set()
 
     def _find(self, topic: str) -> set[str]:
         """Return the listeners that can be asked."""
@@ -108,7 +103,7 @@ class Consumers:
                 if answered.wait(ANSWER_POLL_S):
                     return True
                 # One that the graph does not know now is looked for again with the others.
-                if self._given_up.is_set() or not self._clients[name].service_is_ready():
+                if self._ending.is_set() or not self._clients[name].service_is_ready():
                     return False
             answered = self._ask(name)
         self._silent.add(name)
@@ -201,7 +196,7 @@ class Replay(AnserNode):
         self._ending = threading.Event()
         self._scan()
         self._ticks = self.create_publisher(Clock, self.parameters.clock, qos.STREAM)
-        self._consumers = Consumers(self)
+        self._consumers = Consumers(self, self._ending)
         self._thread = threading.Thread(target=self._play_guarded, name='replay', daemon=True)
         self._thread.start()
 
@@ -213,7 +208,6 @@ class Replay(AnserNode):
 
     def close(self) -> None:
         self._ending.set()
-        self._consumers.give_up()
         self._thread.join(LONGEST_ACK_S)
 
     # Before playing -----------------------------------------------------------------------
