@@ -294,11 +294,11 @@ class TestStream:
         assert len(self.frames(stream, 100)) == 5
         assert stream.blocks_wanted == 20
         assert not any(self.push(stream, k, 50) for k in range(100, 120))
-        assert stream.waiting and stream.blocks_wanted == 1
+        assert stream._waiting and stream.blocks_wanted == 1
         (frame,) = self.push(stream, 120)
         assert frame.host_ns == pytest.approx(10**12 + 110 * 10**6, abs=10**5)
         assert not any(self.push(stream, k, 900) for k in range(121, 1000))
-        assert stream.waiting.withheld > 20 and stream.clock.wants_answer
+        assert stream.withheld > 20 and stream.clock.wants_answer
 
     def test_windows_that_are_skipped_are_counted_and_cost_no_later_one(self):
         """A too slow computer takes the newest; what it passes over is not demodulated."""
@@ -331,7 +331,7 @@ class TestStream:
                 frames += stream.push(blocks[run], arrivals_ns[run])
                 done += count
             told = [(f.tool.flux.tobytes(), f.flags.tobytes(), f.repeats) for f in frames]
-            faults = stream.clock.jumps, stream.waiting.withheld, stream.ticks.disagreements
+            faults = stream.clock.jumps, stream.withheld, stream.ticks.disagreements
             return told, faults, vars(stream.counters), [f.host_ns for f in frames]
 
         *single, stamps = found(1)

@@ -21,7 +21,7 @@ from anser_ros.cli.output import make_new_folder, remove_empty_folders
 from anser_ros.cli.processes import Supervisor, own_domain, tail
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Traces, targets_of
+from anser_ros.nodes.traces import OVERLAP, OpticalTrace, PoseTrace, targets_of
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.text_files import read_config
@@ -121,9 +121,26 @@ class TestTraces:
         assert away[0] == pytest.approx(0.003) and np.isnan(away[1])
         assert angle[0] == pytest.approx(0.0, abs=1e-6)
 
+    def test_what_is_forgotten_changes_no_row(self):
+        optical, traces = OpticalTrace(), [PoseTrace(targets_of(SETUP)[0]) for _ in range(2)]
+        for k in range(40):
+            optical.add(0.02 * k, (0.0, 0.0, 0.15), (0.0, 0.0, 0.0, 1.0))
+            for trace in traces:
+                trace.stamp_s.append(0.02 * k)
+                trace.position.append((1e-3 * k, 0.0, 0.12))
+                trace.axis.append((0.0, 1.0, 0.0))
+                trace.sigma_m.append(1e-4 * k)
+                trace.latency_s.append(1e-3)
+            if k % 10 == 9:
+                whole, short = (trace.row(optical.track(), 0.2) for trace in traces)
+                assert whole == short and whole.rate_hz == 50
+                traces[1].forget()
+        assert traces[1].forgotten + len(traces[1].stamp_s) == 40
+        assert len(traces[1].stamp_s) == OVERLAP
+
     def test_rows_of_coils_and_their_body_without_poses_say_so(self):
         targets = targets_of(SETUP)
-        rows = Traces(targets).rows({'tool_a': OpticalTrace()}, 1.0)
+        rows = [PoseTrace(target).row(OpticalTrace().track(), 1.0) for target in targets]
         assert len(rows) == 10 and targets[-1].name == 'tool_a'
         assert all(row.rate_hz == 0 and np.isnan(row.error_m) for row in rows)
 

@@ -81,7 +81,7 @@ def test_a_packed_message_is_the_message(ros, kind, frame_id):
     count = 7 if kind == 'PoseStamped' else 43
     told = message_type()
     told.header.frame_id = frame_id
-    packer = PackedMessage(told, count)
+    packer = PackedMessage(message_type, frame_id, count)
     for seed, stamp_ns in ((0, 5), (1, 1_795_419_147_667_697_521)):
         numbers = np.random.default_rng(seed).normal(size=count).tolist()
         told.header.stamp.sec, told.header.stamp.nanosec = divmod(stamp_ns, 10**9)

@@ -4,6 +4,7 @@ import signal
 import socket
 import threading
 from dataclasses import make_dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -91,26 +92,6 @@ def test_what_is_worked_on_aside_has_nothing_to_do_with_a_node_that_is_gone(ros)
     goes_on.set()
     thread.join(10)
     assert not thread.is_alive() and node.counters['callback_faults'] == 0
-
-
-def test_what_is_put_off_is_done_one_thing_a_pause_while_there_are_pauses():
-    handover, done, can = Handover(), [], [False, True]
-
-    def first():
-        done.append('first')
-        return can.pop(0)
-
-    def second():
-        done.append('second')
-        return True
-
-    assert not handover.defer(second)
-    handover.pause()
-    assert all(handover.defer(work) for work in (first, second, first))
-    assert not done
-    for _ in range(4):
-        handover.pause()
-    assert done == ['first', 'second', 'first']
 
 
 def test_handed_fluxes_are_those_that_are_published():
@@ -234,7 +215,8 @@ def test_who_is_given_up_says_good_bye_to_devices_first(monkeypatch, is_noticed)
     monkeypatch.setattr(process.os, '_exit', lambda code: done.append(code))
     signals = process._Signals.__new__(process._Signals)
     signals._noticed = threading.Event()
-    signals.abandon_calls = [fail, lambda: done.append('stopped')]
+    calls = fail, lambda: done.append('stopped')
+    signals.nodes = [SimpleNamespace(on_abandon=call) for call in calls]
     signals._reader, writer = socket.socketpair()
     writer.send(bytes([signal.SIGINT]))
     if is_noticed:

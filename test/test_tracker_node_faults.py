@@ -191,6 +191,6 @@ def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, li
     tracker.spin_until(lambda: (said in tracker.state('anser/tracker')) is live)
     assert tracker.value('anser/tracker', 'tracked') == '10'
     for topic in node._topics.values():
-        topic.tally.latest_s -= 60.0
+        topic.latest_s -= 60.0
     node.publish_diagnostics()
     tracker.spin_until(lambda: tracker.value('anser/tracker', 'tracked') == '0')

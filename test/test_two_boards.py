@@ -74,12 +74,12 @@ def test_frames_have_their_boards_prefix(ros):
     node = ros.create_node('peer')
     try:
         first, second = (
-            PoseTopic(node, 'tool_a/0/x', 'fg', f'{board}_').transform
+            PoseTopic(node, 'tool_a/0/x', 'fg', f'{board}_')._transform
             for board in ('left', 'right')
         )
         assert (first.header.frame_id, first.child_frame_id) == ('left_fg', 'left_tool_a_0/x')
         assert second.child_frame_id == 'right_tool_a_0/x'
-        assert PoseTopic(node, 'tool_a', 'fg').transform.child_frame_id == 'tool_a'
+        assert PoseTopic(node, 'tool_a', 'fg')._transform.child_frame_id == 'tool_a'
     finally:
         node.destroy_node()
 

@@ -164,7 +164,7 @@ def test_ticks_confirm_holes_while_they_are_believed():
     assert check.confirms(400, 109_000) and not check.confirms(400, 150_000)
     check = run(lambda k: 7, 100)
     assert check.confirms(400, 7) and not check.confirms(40_000 * 11, 7)
-    check.take_after_hole(5000, 7)
+    check.begin(5000, 7)
     check.reset()
     assert check.trusted and not check.words
 

@@ -17,7 +17,6 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes.acquisition_status import (
-    FAULTS,
     Interval,
     RecentFaults,
     clock_troubles,
@@ -62,8 +61,6 @@ from anser_ros.wire.text_files import read_config
 
 @dataclass(frozen=True)
 class AcquisitionParameters:
-    """Holds the parameters of the acquisition."""
-
     device: str = parameter(
         '/dev/ttyACM0', "the control unit's port, or auto: listen on all ports for its hello"
     )
@@ -140,7 +137,6 @@ class Acquisition(AnserNode):
         self._frame: FluxFrame | None = None
         self._interval = self._last = Interval(time.monotonic())
         self._past: Counter[str] = Counter()
-        self._totals: dict[str, int] = {}
         self._backlog = Backlog()
         self._published_setup = ''
         self._logged: Level | None = None
@@ -262,17 +258,8 @@ class Acquisition(AnserNode):
     def _drop_stream(self) -> None:
         """Forget windows and refusal; the next block makes a new stream."""
         if self._stream is not None:
-            self._past.update(self._stream_counters(self._stream))
+            self._past.update(self._stream.counts())
         self._stream, self._refusal, self._rebuild = None, '', False
-
-    @staticmethod
-    def _stream_counters(stream: FluxStream) -> dict[str, int]:
-        return {
-            **vars(stream.counters),
-            'windows_withheld': stream.waiting.withheld,
-            'clock_jumps': stream.clock.jumps,
-            'tick_faults': stream.ticks.disagreements,
-        }
 
     def _make_stream(self) -> None:
         if self._hello is None or not self._control.tones_agree:
@@ -317,7 +304,6 @@ class Acquisition(AnserNode):
             self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)
         self._frame = frame
         self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
-        self.pause()
 
     def _hand_over_flux(self, publisher: Any, points: FluxPoints, stamp_ns: int) -> None:
         if self.hands_over and len(points.channel):
@@ -333,7 +319,6 @@ class Acquisition(AnserNode):
         self._rebuild = True
 
     def close(self) -> None:
-        """Command the control unit to stop, and end both threads."""
         self._closing.set()
         self._worker.join(2.0)
 
@@ -344,7 +329,6 @@ class Acquisition(AnserNode):
             self._port.end_stream()
 
     def status(self) -> Status:
-        """Return the state of the port and of the stream."""
         interval, self._interval = self._interval, Interval(time.monotonic())
         self._last = interval
         elapsed = max(self._interval.begin_s - interval.begin_s, 1e-3)
@@ -358,7 +342,7 @@ class Acquisition(AnserNode):
             values |= {'device': port.device, 'port': port.state.value, **port.fault_counters()}
         totals = self._past.copy()
         if stream is not None:
-            totals.update(self._stream_counters(stream))
+            totals.update(stream.counts())
             clock = stream.clock
             values |= {'clock': clock.state.value, 'lateness_s': clock.lateness_s}
             values['stamp_sigma_s'] = clock.sigma_s
@@ -371,10 +355,8 @@ class Acquisition(AnserNode):
                 'device_dropped_blocks': device.dropped_blocks,
                 'device_temperature_deg_c': device.temperature_deg_c,
             }
-        rises = {name: count - self._totals.get(name, 0) for name, count in totals.items()}
-        self._totals = dict(totals)
-        counters = {name: int(values.get(name, 0)) for name in FAULTS}  # type: ignore[call-overload]
-        self._faults.note(counters, time.monotonic())
+        counters = {name: count for name, count in values.items() if isinstance(count, int)}
+        rises = self._faults.note(counters, time.monotonic())
         level, message = self._verdict(interval, rises)
         self._log_change(level, message)
         return Status('', level, message, values)

@@ -76,16 +76,17 @@ class RecentFaults:
         self._seen: dict[str, int] | None = None
         self._recent: dict[str, tuple[float, int]] = {}
 
-    def note(self, counters: Mapping[str, int], now_s: float) -> None:
-        """Compare the counters with those of the last look."""
+    def note(self, counters: Mapping[str, int], now_s: float) -> dict[str, int]:
+        """Return by how much the counters rose since the last look."""
         seen = counters if self._seen is None else self._seen
         self._seen = dict(counters)
         self._recent = {n: r for n, r in self._recent.items() if now_s - r[0] < MEMORY_S}
-        for name, count in counters.items():
-            rise = count - seen.get(name, 0)
+        rises = {name: count - seen.get(name, 0) for name, count in counters.items()}
+        for name, rise in rises.items():
             if rise > 0:
                 before = self._recent.get(name, (0.0, 0))[1]
                 self._recent[name] = (now_s, before + rise)
+        return rises
 
     @property
     def words(self) -> str:
@@ -161,7 +162,7 @@ def clock_troubles(stream: FluxStream) -> list[tuple[Level, str]]:
     if clock.state is ClockState.LATE and clock.is_doubted:
         words = f'clock: everything arrives {clock.lateness_s:.2g} s late'
         found.append((Level.WARN, words))
-    elif clock.state is ClockState.SETTLING and stream.waiting.withheld:
+    elif clock.state is ClockState.SETTLING and stream.withheld:
         found.append((Level.ERROR, 'clock: settling, no stamp is good yet'))
     if stream.ticks.words:
         words = f"clock: the device's ticks {stream.ticks.words}; stamps follow its samples"

@@ -1,5 +1,5 @@
 """Turns one connection's samples into fluxes: blocks are cut into windows, these demodulated and
-converted to tesla (`FluxStream`); frames wait until their stamps are good (`WaitingFrames`).
+converted to tesla (`FluxStream`); frames wait until their stamps are good.
 `MeasuredAccuracy` measures noise and the stamps' uncertainty for the setup document.
 """
 
@@ -19,7 +19,7 @@ from anser_ros.errors import FitError, SetupError
 from anser_ros.nodes.streams.clouds import FLUX_NOISE, STAMP_SIGMA
 from anser_ros.settings import Accuracy
 from anser_ros.signals.clock import SampleClock
-from anser_ros.signals.demodulation import Demodulator, ToneFit
+from anser_ros.signals.demodulation import Demodulator
 from anser_ros.signals.flux import FluxConverter, FluxRates, FluxWindow
 from anser_ros.signals.repetition import RepetitionWatch
 from anser_ros.signals.window import TickCheck, Window, WindowCutter
@@ -59,58 +59,16 @@ class FluxFrame:
     repeats: bool = False
 
 
-class WaitingFrames:
-    """Holds frames until a block that was in time has confirmed their stamps.
-
-    On a punctual line no frame waits. A frame that nothing confirms for `PATIENCE_NS` is withheld;
-    ``withheld`` counts these.
-    """
-
-    def __init__(self, clock: SampleClock) -> None:
-        self._clock = clock
-        # Each with its middle and end in samples, and when its last block arrived, ns.
-        self._queue: deque[tuple[FluxFrame, float, float, int]] = deque()
-        self.withheld = 0
-
-    def __len__(self) -> int:
-        """Return how many frames wait."""
-        return len(self._queue)
-
-    def add(
-        self, frame: FluxFrame, middle_sample: float, end_sample: float, arrival_ns: int
-    ) -> None:
-        """Let a frame wait from the arrival of its last block on."""
-        self._queue.append((frame, middle_sample, end_sample, arrival_ns))
-
-    def release(self, now_ns: int) -> list[FluxFrame]:
-        """Return the frames that need not wait any longer, stamped."""
-        clock, frames = self._clock, []
-        while self._queue:
-            frame, middle, end, arrival_ns = self._queue[0]
-            # What repeats itself is marked so; its stamp need not be better than the line is.
-            is_good = clock.is_good(end) or (frame.repeats and clock.is_settled)
-            if not is_good and now_ns - arrival_ns < PATIENCE_NS:
-                break
-            self._queue.popleft()
-            if is_good:
-                frames.append(replace(frame, host_ns=clock.host_ns(middle)))
-            else:
-                self.withheld += 1
-        return frames
-
-    def forget(self) -> None:
-        """Withhold all that wait: their samples belong to a stream that has ended."""
-        self.withheld += len(self._queue)
-        self._queue.clear()
-
-
 class FluxStream:
     """Turns samples into fluxes, for one hello of the control unit.
 
     ``sensors`` are those of the setup that the unit has a channel for, tools first, ``missing``
     the others; ``rate_hz`` is windows a second, a whole number of samples apart; ``block_s`` is
     the length of a block, s; ``clock`` and ``ticks`` are host time of the samples, and what the
-    device's own clock says beside them; ``waiting`` are frames whose stamps are not confirmed yet.
+    device's own clock says beside them. Frames wait until a block that was in time has confirmed
+    their stamps; on a punctual line none waits. One that nothing confirms for `PATIENCE_NS` is
+    ``withheld``, which counts these.
+
     Raises `SetupError` when the unit has none of the channels, or other emitters than the setup,
     and `ParameterError` when the window cannot be demodulated.
     """
@@ -147,6 +105,7 @@ class FluxStream:
         self._current_column = [c.kind for c in hello.channels].index(ChannelKind.CURRENT)
         self._columns = np.array([columns[s.channel] for s in self.sensors])
         self._converter = self._converter_of(hello, calibration)
+        # Windows too short to follow motion take it from the windows before.
         self._rates = None if self._demodulator.follows_motion else FluxRates()
         self._watch = RepetitionWatch(len(hello.channels), rate, self.tones_hz)
         self._repeats = False
@@ -154,23 +113,33 @@ class FluxStream:
         self._cutter = WindowCutter(window, hop, self._watch, self.ticks)
         self.counters = self._cutter.counters
         self.clock = SampleClock(rate)
-        self.waiting = WaitingFrames(self.clock)
+        # Each with its middle and end in samples, and when its last block arrived, ns.
+        self._waiting: deque[tuple[FluxFrame, float, float, int]] = deque()
+        self.withheld = 0
         self._split = sum(s.body != FIELD_GENERATOR for s in self.sensors)
         self._tool = SensorRows.of(self.sensors[: self._split], fixed_only=True)
         self._reference = SensorRows.of(self.sensors[self._split :], fixed_only=True)
 
+    def counts(self) -> dict[str, int]:
+        """Return the counters of the stream by name."""
+        return {
+            **vars(self.counters),
+            'windows_withheld': self.withheld,
+            'clock_jumps': self.clock.jumps,
+            'tick_faults': self.ticks.disagreements,
+        }
+
     @property
     def blocks_wanted(self) -> int:
         """Return how many blocks until a frame may be ready: one while frames wait for it."""
-        if self.waiting:
+        if self._waiting:
             return 1
         return -(-self._cutter.samples_wanted // self._block_samples)
 
     def restart(self, sent_ns: int | None) -> None:
         """Start again: the device has answered a start, sent at a host time, with sample 0."""
-        self.waiting.forget()
         self._cutter.reset()
-        self.clock.restart()
+        self._end_stream()
         if sent_ns is not None:
             self.clock.bound(0, sent_ns)
 
@@ -181,7 +150,7 @@ class FluxStream:
     def run_length(self, blocks: Sequence[SampleBlock]) -> int:
         """Return how many blocks to push at once: they follow, up to the end of a window."""
         first, shape = blocks[0].sequence, (self._block_samples, self._cutter.columns)
-        if not self._cutter.expects(first):
+        if self._cutter.expected != first:
             return 1
         for rank, block in enumerate(blocks[: self.blocks_wanted]):
             if block.sequence != first + rank or block.codes.shape != shape:
@@ -193,8 +162,7 @@ class FluxStream:
     ) -> list[FluxFrame]:
         """Take a run of blocks and return the frames that are complete and have good stamps.
 
-        A frame may wait for its stamp, and be withheld; see `WaitingFrames`. If it ``skips``, a
-        complete window is only counted, in favour of newer ones.
+        If it ``skips``, a complete window is only counted, in favour of newer ones.
         """
         first, arrival_ns = blocks[0], arrivals_ns[-1]
         if first.codes.shape[1] != self._cutter.columns:
@@ -205,8 +173,7 @@ class FluxStream:
         windows = self._cutter.push(first.sequence, ticks, codes)
         self._repeats = self._watch.repeats
         if self.counters.restarts != restarts:
-            self.waiting.forget()
-            self.clock.restart()
+            self._end_stream()
         # What comes twice says nothing about now, and of blocks read together the newest says all.
         newest = self._cutter.end_sample
         for left in range(len(blocks) - 1, 0, -1):
@@ -226,8 +193,30 @@ class FluxStream:
                 self.counters.windows_lost += 1
                 continue
             end = window.middle_sample + len(window.codes) / 2
-            self.waiting.add(frame, window.middle_sample, end, arrival_ns)
-        return self.waiting.release(arrival_ns)
+            self._waiting.append((frame, window.middle_sample, end, arrival_ns))
+        return self._released(arrival_ns)
+
+    def _released(self, now_ns: int) -> list[FluxFrame]:
+        """Return the frames that need not wait any longer, stamped."""
+        clock, frames = self.clock, []
+        while self._waiting:
+            frame, middle, end, arrival_ns = self._waiting[0]
+            # What repeats itself is marked so; its stamp need not be better than the line is.
+            is_good = clock.is_good(end) or (frame.repeats and clock.is_settled)
+            if not is_good and now_ns - arrival_ns < PATIENCE_NS:
+                break
+            self._waiting.popleft()
+            if is_good:
+                frames.append(replace(frame, host_ns=clock.host_ns(middle)))
+            else:
+                self.withheld += 1
+        return frames
+
+    def _end_stream(self) -> None:
+        """Withhold all that wait, whose samples belong to a stream that has ended."""
+        self.withheld += len(self._waiting)
+        self._waiting.clear()
+        self.clock.restart()
 
     def _converter_of(self, hello: Hello, calibration: ChannelCalibration) -> FluxConverter:
         per_code = np.array([channel.full_scale / FULL_SCALE_CODE for channel in hello.channels])
@@ -246,7 +235,10 @@ class FluxStream:
 
     def _frame(self, window: Window) -> FluxFrame:
         fit = self._demodulator.demodulate(window.codes, window.present)
-        converted = self._converted(fit, window.middle_sample / self._sample_rate_hz)
+        rates, middle_s = self._rates, window.middle_sample / self._sample_rate_hz
+        converted = self._converter.convert(fit, None if rates is None else rates.at(middle_s))
+        if rates is not None:
+            rates.add(middle_s, converted.flux)
         staleness = self._staleness(window)
         saturated = window.saturated[self._columns]
         stale = window.stuck[self._columns] | window.stuck[self._current_column]
@@ -275,14 +267,6 @@ class FluxStream:
         return Staleness(
             age / self._sample_rate_hz, (noiseless | noiseless[current])[self._columns]
         )
-
-    def _converted(self, fit: ToneFit, middle_s: float) -> FluxWindow:
-        """Fluxes of a fit; one too short to follow motion takes it from the windows before."""
-        if self._rates is None:
-            return self._converter.convert(fit)
-        converted = self._converter.convert(fit, self._rates.at(middle_s))
-        self._rates.add(middle_s, converted.flux)
-        return converted
 
 
 def _points(

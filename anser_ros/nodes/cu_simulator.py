@@ -14,18 +14,18 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import ParameterError
+from anser_ros.nodes.pose_output import PackedMessage
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
+from anser_ros.physics.rotations import quaternion_of_rotation
 from anser_ros.simulation import line, world
 from anser_ros.simulation.control_unit import BLOCK_SAMPLES, ControlUnit, FrontEnd, Piece
 from anser_ros.simulation.effects import NONE as NO_EFFECT
 from anser_ros.simulation.effects import Drawn, draw
-from anser_ros.stamps import set_stamp
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import parse_setup
@@ -39,8 +39,6 @@ LONGEST_LAG_S = 0.25
 
 @dataclass(frozen=True)
 class CuSimulatorParameters:
-    """Holds the parameters of the simulated control unit."""
-
     link: str = parameter('/tmp/anser_cu', 'path under which the port can be opened')
     setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')
     channels_file: str = parameter(
@@ -125,10 +123,8 @@ class CuSimulator(AnserNode):
             _write_effect(Path(table.effect_file), drawn)
         self._effects = drawn.effects
         real = functools.reduce(lambda made, effect: effect.setup(made), drawn.effects, setup)
-        if table.board_seed:
-            made = world.manufactured(real, np.random.default_rng(table.board_seed))
-        else:
-            made = real
+        board_rng = np.random.default_rng(table.board_seed)
+        made = world.manufactured(real, board_rng) if table.board_seed else real
         self._begin_ns = time.monotonic_ns()
         self._stream_begin_s = math.inf
         self._metal = [*_metal(table, lambda: self._stream_begin_s), *drawn.metal]
@@ -156,7 +152,7 @@ class CuSimulator(AnserNode):
             )
             for body in setup.bodies
         }
-        self._frame_id = setup.frame_id
+        self._message = PackedMessage(PoseStamped, setup.frame_id, 7)
         self._prepared: deque[Piece] = deque()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name='control_unit')
@@ -241,17 +237,18 @@ class CuSimulator(AnserNode):
             now_ns += round(1e9 * (effect.optical_time(time_s) - time_s))
         noise_m = self.parameters.optical_noise_m
         for body, publisher in self._publishers_of.items():
+            if not publisher.get_subscription_count():
+                continue
             position, rotation = self._world.pose(body, time_s)
-            if noise_m:
-                position = position + noise_m * self._rng.standard_normal(3)
-            publisher.publish(_pose(self._frame_id, now_ns, position, rotation))
+            position = position + noise_m * self._rng.standard_normal(3)
+            numbers = *position.tolist(), *quaternion_of_rotation(rotation)
+            publisher.publish(self._message.packed(now_ns, *numbers))
 
     def on_parameters(self, old: Any, new: Any) -> None:
         """Switch to the fault that the new parameters name."""
         self._injector = line.FaultInjector(new.fault, new.fault_period_s, new.seed)
 
     def status(self) -> Status:
-        """Return the state of the simulated control unit."""
         state = 'streaming' if self._unit.streaming else 'idle, waiting for a start'
         values: dict[str, object] = {'link': self.parameters.link, 'fault': self._injector.kind}
         if self.parameters.metal:
@@ -260,7 +257,6 @@ class CuSimulator(AnserNode):
         return Status('', Level.OK, state, values)
 
     def close(self) -> None:
-        """End the thread and remove the port."""
         self._closing.set()
         self._thread.join(2.0)
         self._port.unplug()
@@ -291,16 +287,6 @@ def _metal(table: CuSimulatorParameters, begin_s: Callable[[], float]) -> list[w
     return [
         world.steel_disc(lambda time_s: path(time_s - begin_s()), radius_m=table.metal_radius_m)
     ]
-
-
-def _pose(frame_id: str, stamp_ns: int, position: np.ndarray, rotation: np.ndarray) -> PoseStamped:
-    message = PoseStamped()
-    message.header.frame_id = frame_id
-    set_stamp(message.header.stamp, stamp_ns)
-    place, turn = message.pose.position, message.pose.orientation
-    place.x, place.y, place.z = (float(v) for v in position)
-    turn.x, turn.y, turn.z, turn.w = (float(v) for v in Rotation.from_matrix(rotation).as_quat())
-    return message
 
 
 if __name__ == '__main__':

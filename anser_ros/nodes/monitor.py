@@ -20,24 +20,18 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
-from anser_ros.nodes.runtime.incoming import seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.traces import (
-    OpticalTrace,
-    PoseTrace,
-    Row,
-    Traces,
-    latency_of,
-    middle,
-    targets_of,
-)
+from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Row, latency_of, middle, targets_of
+from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 LINE_PERIOD_S = 1.0
 """Time between two lines where the output is no terminal, s."""
+NEWEST = 200
+"""Optical poses with which the newest poses are compared."""
 WIDE = 100
 """Columns of a terminal from which on all columns of the table fit."""
 STATE_WIDTH = 14
@@ -48,8 +42,6 @@ LEVELS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
 
 @dataclass(frozen=True)
 class MonitorParameters:
-    """Holds the parameters of the monitor."""
-
     duration_s: float = parameter(
         0.0, 'time from the first pose until it ends by itself; 0 for never, s', minimum=0.0
     )
@@ -85,7 +77,7 @@ class Monitor(AnserNode):
         if self._console.is_terminal:
             self._live = Live(console=self._console, auto_refresh=False)
         self._setup: Setup | None = None
-        self._chains: dict[str, Traces] = {}
+        self._chains: dict[str, list[PoseTrace]] = {}
         self._optical: dict[str, OpticalTrace] = {}
         self._statuses: dict[str, LastStatus] = {}
         self._note = ''
@@ -110,15 +102,16 @@ class Monitor(AnserNode):
         for subscription in self._pose_subscriptions:
             self.destroy_subscription(subscription)
         chains = dict.fromkeys(('', self.parameters.compare))
-        self._chains = {chain: Traces(targets_of(setup)) for chain in chains}
+        self._chains = {chain: [PoseTrace(t) for t in targets_of(setup)] for chain in chains}
         self._optical = {body: OpticalTrace() for body in setup.bodies}
         wanted: list[tuple[type, str, Any]] = [
             (PoseStamped, optical_topic(body, self.parameters.optical),
              partial(self._on_optical, seen)) for body, seen in self._optical.items()
         ]  # fmt: skip
         for chain, traces in self._chains.items():
-            for name, trace in traces.of.items():
-                topic = '/'.join(filter(None, (chain, topic_of(name), 'pose_with_covariance')))
+            for trace in traces:
+                stem = topic_of(trace.target.name)
+                topic = '/'.join(filter(None, (chain, stem, 'pose_with_covariance')))
                 wanted.append((PoseWithCovarianceStamped, topic, partial(self._on_pose, trace)))
         self._pose_subscriptions = [
             self.create_subscription(kind, topic, callback, qos.STREAM)
@@ -129,7 +122,7 @@ class Monitor(AnserNode):
         now_s = time.time()
         if self._first_s is None:
             self._first_s = time.monotonic()
-        variance, stamp_s = message.pose.covariance, seconds_of(message)
+        variance, stamp_s = message.pose.covariance, stamp_of(message) * NANO
         pose = pose_numbers(message.pose.pose)
         trace.stamp_s.append(stamp_s)
         trace.position.append(pose[:3])
@@ -139,7 +132,7 @@ class Monitor(AnserNode):
 
     def _on_optical(self, trace: OpticalTrace, message: PoseStamped) -> None:
         pose = pose_numbers(message.pose)
-        trace.add(seconds_of(message), pose[:3], pose[3:])
+        trace.add(stamp_of(message) * NANO, pose[:3], pose[3:])
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         statuses = statuses_in(message)
@@ -151,9 +144,17 @@ class Monitor(AnserNode):
     def _show(self) -> None:
         now_s = time.monotonic()
         elapsed_s, self._last_s = now_s - self._last_s, now_s
+        tracks = {body: seen.track(NEWEST) for body, seen in self._optical.items()}
         rows = {
-            chain: traces.rows(self._optical, elapsed_s) for chain, traces in self._chains.items()
+            chain: [trace.row(tracks.get(trace.target.body), elapsed_s) for trace in traces]
+            for chain, traces in self._chains.items()
         }
+        if not self.parameters.output:  # else all are written at the end
+            for traces in self._chains.values():
+                for trace in traces:
+                    trace.forget()
+            for seen in self._optical.values():
+                seen.forget(NEWEST)
         if self._live is not None:
             # It hides the cursor, so only once the node is made and will surely be closed.
             self._live.start()
@@ -255,15 +256,13 @@ class Monitor(AnserNode):
         return '  '.join(parts)
 
     def status(self) -> Status:
-        """Return how many poses came from each chain of nodes."""
         poses = {
-            f'poses_{chain or "live"}': sum(len(t.stamp_s) for t in traces.of.values())
+            f'poses_{chain or "live"}': sum(t.forgotten + len(t.stamp_s) for t in traces)
             for chain, traces in self._chains.items()
         }
         return Status('', Level.OK, self._note or 'watching', poses)
 
     def close(self) -> None:
-        """Leave the terminal in order and write the output file."""
         if self._live is not None:
             self._live.stop()
         if self.parameters.output:
@@ -274,10 +273,10 @@ class Monitor(AnserNode):
             'chains': np.array(list(self._chains), dtype=str),
             'metal': np.array(self._metal, float).reshape(-1, 2),
         }
-        names = list(self._chains[''].of) if self._chains else []
+        names = [trace.target.name for trace in self._chains.get('', [])]
         arrays['names'] = np.array(names, dtype=str)
         for rank, traces in enumerate(self._chains.values()):
-            for index, trace in enumerate(traces.of.values()):
+            for index, trace in enumerate(traces):
                 optical = self._optical[trace.target.body].track()
                 key = f'{rank}_{index}'
                 away, angle = trace.errors(optical) if optical else (np.zeros(0), np.zeros(0))

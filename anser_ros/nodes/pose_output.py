@@ -4,7 +4,6 @@ import math
 import struct
 import time
 from collections import Counter
-from dataclasses import dataclass, field
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
@@ -24,23 +23,14 @@ except ImportError:  # the wheels don't have it
     TFMessage = None
 
 
-@dataclass
-class Tally:
-    """Counts what happened to one sensor or body since the last diagnostics."""
-
-    begin_s: float = field(default_factory=time.monotonic)
-    frames: int = 0
-    poses: int = 0
-    latency_s: float = math.nan
-    latest_s: float = -math.inf
-
-
 class PackedMessage:
-    """Keeps the bytes of a message that begins with a header and ends with ``count`` doubles,
-    which are published in half the time of a message.
+    """Keeps the bytes of a message of a frame that begins with a header and ends with ``count``
+    doubles, which are published in half the time of a message.
     """
 
-    def __init__(self, message: Any, count: int) -> None:
+    def __init__(self, kind: type, frame_id: str, count: int) -> None:
+        message = kind()
+        message.header.frame_id = frame_id
         self._bytes = bytearray(serialize_message(message))
         self._numbers = struct.Struct(f'<{count}d')
         self._offset = len(self._bytes) - self._numbers.size
@@ -62,17 +52,17 @@ class PoseTopic:
         self._uncertain = node.create_publisher(
             PoseWithCovarianceStamped, f'{stem}/pose_with_covariance', qos.STREAM
         )
-        plain, full = PoseStamped(), PoseWithCovarianceStamped()
         board = f'{prefix}{frame_id}'
-        plain.header.frame_id = full.header.frame_id = board
-        self._plain, self._full = PackedMessage(plain, 7), PackedMessage(full, 7 + 36)
+        self._plain = PackedMessage(PoseStamped, board, 7)
+        self._full = PackedMessage(PoseWithCovarianceStamped, board, 7 + 36)
         self._transform = TransformStamped()
         self._transform.header.frame_id = board
         self._transform.child_frame_id = f'{prefix}{stem}'
         self._values: tuple[float, ...] = ()
         self.estimate: PoseEstimate | None = None
         self.states: Counter[str] = Counter()
-        self.tally = Tally()
+        self.latest_s, self._latency_s = -math.inf, math.nan
+        self._reported = time.monotonic(), 0, 0  # and how many frames and poses there were
 
     @property
     def listeners(self) -> int:
@@ -92,10 +82,7 @@ class PoseTopic:
         node.destroy_publisher(self._uncertain)
 
     def publish(self, estimate: PoseEstimate) -> None:
-        """Publish a good estimate, and nothing else, as other topics wait for it.
-
-        What nobody subscribes to is not published: who comes later gets none of it anyway.
-        """
+        """Publish a good estimate to subscribers, and nothing else, as other topics wait."""
         if estimate.state != OK:
             return
         if estimate.rotation is None:
@@ -113,12 +100,10 @@ class PoseTopic:
         changed = self.estimate is None or self.estimate.state != estimate.state
         self.estimate = estimate
         self.states[estimate.state] += 1
-        self.tally.frames += 1
-        self.tally.latest_s = time.monotonic()
+        self.latest_s = time.monotonic()
         if estimate.state == OK:
-            self.tally.poses += 1
             if is_live(estimate.stamp_ns, now_ns) and estimate.stamp_ns <= now_ns:
-                self.tally.latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
+                self._latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
             if self._uncertain.get_subscription_count():
                 numbers = *self._values, *estimate.covariance.ravel().tolist()
                 self._uncertain.publish(self._full.packed(estimate.stamp_ns, *numbers))
@@ -136,25 +121,27 @@ class PoseTopic:
         """Return the state as it is now, silence included, and its reason."""
         if self.estimate is None:
             return STALE, 'no fluxes yet'
-        silent_s = time.monotonic() - self.tally.latest_s
+        silent_s = time.monotonic() - self.latest_s
         if silent_s > stale_after_s:
             return STALE, f'no fluxes for {silent_s:.1f} s'
         return self.estimate.state, self.estimate.reason
 
     def status(self, stale_after_s: float) -> Status:
         """Return the line of ``/diagnostics`` and begin a new interval."""
-        tally, self.tally = self.tally, Tally(latest_s=self.tally.latest_s)
+        begin_s, frames, poses = self._reported
+        self._reported = time.monotonic(), self.states.total(), self.states[OK]
+        seconds = max(self._reported[0] - begin_s, 1e-3)
+        latency_s, self._latency_s = self._latency_s, math.nan
         estimate = self.estimate
         state, reason = self.state(stale_after_s)
         if estimate is None:
             return Status(self.name, Level.STALE, state, {'reason': reason})
-        seconds = max(time.monotonic() - tally.begin_s, 1e-3)
         values: dict[str, object] = {
             'state': state,
             'reason': reason,
-            'rate_hz': tally.poses / seconds,
-            'frame_rate_hz': tally.frames / seconds,
-            'latency_s': tally.latency_s,
+            'rate_hz': (self._reported[2] - poses) / seconds,
+            'frame_rate_hz': (self._reported[1] - frames) / seconds,
+            'latency_s': latency_s,
             'sigma_position_m': estimate.sigma_position_m,
             'residual_t': estimate.residual_t,
             'chi2_per_freedom': estimate.chi2,

@@ -7,7 +7,6 @@ the node subscribes to topics as they appear.
 import importlib
 import json
 import os
-import re
 import statistics
 import struct
 import sys
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosidl_parser.definition import AbstractNestedType, NamespacedType
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import AnserError, BagError
@@ -29,10 +29,6 @@ from anser_ros.wire.bag_writer import BagRecord, BagWriter, qos_profile, write_m
 
 # What rosbag2 and mcap put between the definitions of a message and of its parts.
 SEPARATOR = '=' * 80
-# The integers of ROS's interface language.
-NUMBERS = {f'{kind}{bits}' for kind in ('int', 'uint') for bits in (8, 16, 32, 64)}
-PRIMITIVES = NUMBERS | {'bool', 'byte', 'char', 'float32', 'float64', 'string', 'wstring'}
-FIELD = re.compile(r'^([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w+')
 
 
 def message_class(type_name: str) -> type:
@@ -56,12 +52,10 @@ def definition(type_name: str) -> str:
     parts: list[str] = []
     names = [type_name]
     for current in names:  # which grows meanwhile
-        text = _file(current, 'msg').read_text(encoding='utf-8')
         package, _, name = _split(current)
         title = f'{SEPARATOR}\nMSG: {package}/{name}\n' if parts else ''
-        parts.append(title + text)
-        inner = dict.fromkeys(_contained(text, package))
-        names += [one for one in inner if one not in names]
+        parts.append(title + _file(current, 'msg').read_text(encoding='utf-8'))
+        names += [one for one in _contained(message_class(current)) if one not in names]
     return '\n'.join(parts)
 
 
@@ -92,16 +86,12 @@ def _file(type_name: str, ending: str) -> Path:
     raise BagError(f'no definition of {type_name} is installed')
 
 
-def _contained(text: str, package: str) -> list[str]:
-    """Return the full names of the types of a definition's fields."""
-    found = []
-    for line in text.splitlines():
-        match = FIELD.match(line.split('#', 1)[0].strip())
-        if match is None or match[1] in PRIMITIVES:
-            continue
-        tokens = match[1].split('/')
-        found.append(f'{tokens[0] if len(tokens) > 1 else package}/msg/{tokens[-1]}')
-    return found
+def _contained(message: Any) -> list[str]:
+    """Return the full names of the types of a message's fields, each once."""
+    kinds = message.SLOT_TYPES
+    parts = [k.value_type if isinstance(k, AbstractNestedType) else k for k in kinds]
+    names = ['/'.join(p.namespaced_name()) for p in parts if isinstance(p, NamespacedType)]
+    return list(dict.fromkeys(names))
 
 
 # Intervals from which a topic's own period is learnt.
@@ -190,6 +180,7 @@ DISCOVERY_PERIOD_S = 0.25
 METADATA_PERIOD_S = 2.0
 # Deep enough for a pause of seconds on a slow disk.
 DEPTH = 2000
+ROS_DISTRO = os.environ.get('ROS_DISTRO', 'jazzy')
 COMMON_TOPICS = ('/diagnostics', '/tf', '/tf_static')
 STAMPED = (
     'sensor_msgs/msg/PointCloud2',
@@ -200,8 +191,6 @@ STAMPED = (
 
 @dataclass(frozen=True)
 class RecorderParameters:
-    """Holds the parameters of the recorder."""
-
     directory: str = parameter('recordings', 'folder that gets one folder per bag')
     name: str = parameter(
         '', "name of the bag's folder, with _1, _2 appended if it exists; empty: date and time"
@@ -243,7 +232,6 @@ class Recorder(AnserNode):
             self.start()
 
     def status(self) -> Status:
-        """Return whether it records, how much, and what went wrong."""
         if self._bag is None:
             if self._error:
                 return Status('', Level.ERROR, f'recording stopped: {self._error}')
@@ -280,7 +268,7 @@ class Recorder(AnserNode):
         self._topic_subscriptions.clear()
         try:
             bag.close()
-            write_metadata(bag.path, bag.record, _ros_distro())
+            write_metadata(bag.path, bag.record, ROS_DISTRO)
         except OSError as error:
             self._error = self._error or _reason(error)
         logs, self._logs = self._logs, {}
@@ -289,7 +277,6 @@ class Recorder(AnserNode):
         return self._last_report
 
     def close(self) -> None:
-        """End the bag in order when the node ends."""
         self.stop_recording()
 
     # Callbacks ----------------------------------------------------------------------------
@@ -324,7 +311,7 @@ class Recorder(AnserNode):
         """Write what the running bag holds so far, for whoever finds it after a crash."""
         self._described_s = time.monotonic()
         try:
-            write_metadata(bag.path, bag.record, _ros_distro(), is_closed=False)
+            write_metadata(bag.path, bag.record, ROS_DISTRO, is_closed=False)
         except OSError as error:  # the next flush will stop the recording
             self.warn('metadata_errors', _reason(error))
 
@@ -416,10 +403,6 @@ def _stamp_ns(data: bytes) -> int | None:
     order = '<' if data[1] & 1 else '>'
     sec, nanosec = struct.unpack_from(f'{order}iI', data, 4)
     return int(sec) * SECOND_NS + int(nanosec)
-
-
-def _ros_distro() -> str:
-    return os.environ.get('ROS_DISTRO', 'jazzy')
 
 
 def _reason(error: OSError) -> str:

@@ -43,17 +43,16 @@ REFRESH_EVERY = 50
 
 class Consumers:
     """Finds the nodes that subscribe to topics; the executor of the ``node`` that asks them must
-    be spinning in another thread.
+    be spinning in another thread. All waits end when ``ending`` is set.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Node, ending: threading.Event) -> None:
+        self._node, self._ending = node, ending
         self._clients: dict[str, Any] = {}
         self._listeners: dict[tuple[str, ...], set[str]] = {}
         self._silent: set[str] = set()
         self._answered: set[str] = set()
         self._calls = 0
-        self._given_up = threading.Event()
 
     def wait(self, *topics: str, attempts: int = ATTEMPTS) -> None:
         """Wait until all listeners of the topics, by their full names, have handled what was
@@ -72,10 +71,6 @@ class Consumers:
                 self._answered.add(name)
             else:
                 self._listeners[topics].discard(name)
-
-    def give_up(self) -> None:
-        """End every wait that is going on."""
-        self._given_up.set()
 
     def _find(self, topic: str) -> set[str]:
         """Return the listeners that can be asked."""
@@ -108,7 +103,7 @@ class Consumers:
                 if answered.wait(ANSWER_POLL_S):
                     return True
                 # One that the graph does not know now is looked for again with the others.
-                if self._given_up.is_set() or not self._clients[name].service_is_ready():
+                if self._ending.is_set() or not self._clients[name].service_is_ready():
                     return False
             answered = self._ask(name)
         self._silent.add(name)
@@ -161,7 +156,6 @@ class Replay(AnserNode):
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """Add the bag and how to play it."""
         parser.add_argument('bag', help='the .mcap file, or the folder that holds it')
         parser.add_argument(
             '--rate', type=float, default=1.0, help='speed; 0: as fast as the subscribers take it'
@@ -194,7 +188,6 @@ class Replay(AnserNode):
         super().__init__(**options)
         self._bag, self._rate, self._loop, self._all_topics = bag, rate, loop, all_topics
         self._wait_s = wait
-        self._types: dict[str, type] = {}
         self._outlets: dict[str, Any] = {}
         self._latched: dict[str, RawMessage] = {}
         self._total = self._done = self._passes = 0
@@ -203,21 +196,18 @@ class Replay(AnserNode):
         self._ending = threading.Event()
         self._scan()
         self._ticks = self.create_publisher(Clock, self.parameters.clock, qos.STREAM)
-        self._consumers = Consumers(self)
+        self._consumers = Consumers(self, self._ending)
         self._thread = threading.Thread(target=self._play_guarded, name='replay', daemon=True)
         self._thread.start()
 
     def status(self) -> Status:
-        """Return how far it is, and what of the bag is lost."""
         values = {'published': self._done, 'messages': self._total, 'passes': self._passes}
         if self._lost:
             return Status('', Level.WARN, f'replaying a damaged bag: {self._lost}', values)
         return Status('', Level.OK, 'replaying', values)
 
     def close(self) -> None:
-        """Stop the thread that plays."""
         self._ending.set()
-        self._consumers.give_up()
         self._thread.join(LONGEST_ACK_S)
 
     # Before playing -----------------------------------------------------------------------
@@ -256,7 +246,6 @@ class Replay(AnserNode):
             return
         name = name_played(message.topic, home, self.parameters.optical)
         profile = qos.LATCHED if _is_latched(message) else qos.STREAM
-        self._types[message.topic] = kind
         self._outlets[message.topic] = self.create_publisher(kind, name, profile)
         if profile is qos.LATCHED and _message_of(message, kind) is not None:
             self._latched[message.topic] = message
@@ -270,7 +259,7 @@ class Replay(AnserNode):
             self._outlets[topic].publish(message.data)
             self._done += 1
             if topic.endswith('/setup'):
-                setup = getattr(_message_of(message, self._types[topic]), 'data', '')
+                setup = getattr(_message_of(message, self._outlets[topic].msg_type), 'data', '')
         fluxes = [o for t, o in self._outlets.items() if t.endswith(FLUX_ENDINGS)]
         readiness = Readiness(self, fluxes or list(self._outlets.values()), setup)
         self._poses = readiness.poses
@@ -354,11 +343,11 @@ class Replay(AnserNode):
         for message in iter_messages(self._bag, Salvage()):
             if self._ending.is_set():
                 return
-            kind = self._types.get(message.topic)
-            if kind is None:
+            outlet = self._outlets.get(message.topic)
+            if outlet is None:
                 continue
-            if _message_of(message, kind) is None:
-                self.warn('messages_left_out', f'{message.topic}: no {kind.__name__}')
+            if _message_of(message, outlet.msg_type) is None:
+                self.warn('messages_left_out', f'{message.topic}: no {outlet.msg_type.__name__}')
                 continue
             yield message
 

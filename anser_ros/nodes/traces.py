@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +15,8 @@ from anser_ros.stamps import LIVE_WITHIN_S
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
+OVERLAP = 5
+"""Poses of the last row that the next one's error is of, too."""
 LONGEST_OPTICAL_GAP_S = 0.1
 """Gap between optical poses, s, over which none is interpolated to compare with."""
 
@@ -74,15 +76,26 @@ class OpticalTrace:
         for values in (self.stamp_s, self.position, self.quaternion):
             del values[:-but]
 
-    def track(self, since: int = 0) -> PoseTrack | None:
-        """Return the poses from number `since` on, None when there are less than two."""
-        if len(self.stamp_s) - since < 2:
+    def track(self, newest: int = 0) -> PoseTrack | None:
+        """Return so many of the newest poses (0: all), None when there are less than two."""
+        if len(self.stamp_s) < 2:
             return None
-        return PoseTrack(
-            np.array(self.stamp_s[since:]),
-            np.array(self.position[since:]),
-            np.array(self.quaternion[since:]),
-        )
+        kept = self.stamp_s, self.position, self.quaternion
+        return PoseTrack(*(np.array(values[-newest:]) for values in kept))
+
+
+@dataclass(frozen=True)
+class Row:
+    """Holds the newest of one target, for a table: its place, and medians over the interval of
+    sigma, error and latency; NaN without a pose in it.
+    """
+
+    name: str
+    position_m: tuple[float, ...]
+    sigma_m: float
+    error_m: float
+    rate_hz: float
+    latency_s: float
 
 
 @dataclass
@@ -95,6 +108,16 @@ class PoseTrace:
     axis: list[tuple[float, ...]] = field(default_factory=list)
     sigma_m: list[float] = field(default_factory=list)
     latency_s: list[float] = field(default_factory=list)
+    forgotten: int = 0
+    _shown: int = 0
+
+    def forget(self) -> None:
+        """Keep only the poses that the next row needs."""
+        gone = max(len(self.stamp_s) - OVERLAP, 0)
+        for values in (self.stamp_s, self.position, self.axis, self.sigma_m, self.latency_s):
+            del values[:gone]
+        self.forgotten += gone
+        self._shown -= gone
 
     def distances(self, optical: PoseTrack, since: int = 0) -> tuple[Array, Array]:
         """Return distances (m) to the truth of the poses from number `since` on, NaN where the
@@ -113,43 +136,14 @@ class PoseTrace:
         away, axes = self.distances(optical)
         return away, axis_angles(np.array(self.axis).reshape(-1, 3), axes)
 
-
-@dataclass(frozen=True)
-class Row:
-    """Holds the newest of one target, for a table: its place, and medians over the interval of
-    sigma, error and latency; NaN without a pose in it.
-    """
-
-    name: str
-    position_m: tuple[float, ...]
-    sigma_m: float
-    error_m: float
-    rate_hz: float
-    latency_s: float
-
-
-class Traces:
-    """Keeps all targets of one chain of nodes."""
-
-    def __init__(self, targets: list[Target]) -> None:
-        self.of = {target.name: PoseTrace(target) for target in targets}
-        self._seen = dict.fromkeys(self.of, 0)
-
-    def rows(self, optical: Mapping[str, OpticalTrace], elapsed_s: float) -> list[Row]:
-        """Return a row for each target about what came since the last call."""
-        recent = {
-            body: trace.track(max(0, len(trace.stamp_s) - 200)) for body, trace in optical.items()
-        }
-        rows = []
-        for name, trace in self.of.items():
-            since, self._seen[name] = self._seen[name], len(trace.stamp_s)
-            count = len(trace.stamp_s) - since
-            track = recent.get(trace.target.body)
-            error = float('nan')
-            if count and track is not None:
-                # the last poses may be newer than the last optical one
-                error = middle(trace.distances(track, max(0, since - 5))[0])
-            position = trace.position[-1] if count else (float('nan'),) * 3
-            sigma, latency = middle(trace.sigma_m[since:]), middle(trace.latency_s[since:])
-            rows.append(Row(name, position, sigma, error, count / elapsed_s, latency))
-        return rows
+    def row(self, optical: PoseTrack | None, elapsed_s: float) -> Row:
+        """Return a row about what came since the last call."""
+        since, self._shown = self._shown, len(self.stamp_s)
+        count = self._shown - since
+        error = float('nan')
+        if count and optical is not None:
+            # the last poses may be newer than the last optical one
+            error = middle(self.distances(optical, max(0, since - OVERLAP))[0])
+        position = self.position[-1] if count else (float('nan'),) * 3
+        sigma, latency = middle(self.sigma_m[since:]), middle(self.latency_s[since:])
+        return Row(self.target.name, position, sigma, error, count / elapsed_s, latency)

@@ -327,7 +327,7 @@ class TrackerNode(AnserNode):
             if self._frames.waiting:
                 self._wait.reset()
 
-    def _on_doubted(self, message: PointCloud2 | HandedFlux, _info: dict[str, int]) -> None:
+    def _on_doubted(self, message: PointCloud2 | HandedFlux) -> None:
         """Say of a frame that may be another sender's why it has no poses."""
         frame = self._read(message)
         if frame is not None:

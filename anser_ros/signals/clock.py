@@ -12,11 +12,9 @@ FOLLOWED_SHARE = 1e-4
 """Largest relative rate difference at which a device's clock is followed. Two quartz clocks differ
 by less; a larger value would follow slow changes of the host's load."""
 _STRETCH_NS = 500_000_000
-"""Length (0.5 s) of a stretch of which only the earliest arrival is kept. Shorter stretches keep
-more late arrivals, longer ones give the line fewer points."""
+"""Length (0.5 s) of a stretch of which only the earliest arrival is kept."""
 _MEMORY = 120
-"""Stretches whose earliest arrivals are kept, together a minute. A longer memory makes the rate
-more certain and follows its changes with temperature more slowly."""
+"""Stretches whose earliest arrivals are kept, together a minute: rates change with temperature."""
 _FEWEST = 6
 """Stretches from which on the rate is estimated: with fewer, delays look like a rate."""
 _TYPICAL_SHARE = 3e-5
@@ -99,26 +97,22 @@ def _hull_slope(points: Sequence[tuple[float, float]]) -> float:
 
 LARGEST_LATENESS_S = 4e-3
 """Lateness, s, up to which an arrival confirms the line; one that is so much too early refutes it.
-It bounds what a stamp may be wrong by when the device lost time that it did not count: 5 ms less
-what the line itself is uncertain by. Smaller, a busy host confirms nothing for long."""
+It is the 5 ms that a stamp may be wrong by, less what the line itself is uncertain by."""
 _SETTLE_NS = 200_000_000
 """Time (0.2 s) that a new line must stand where the device never answers. Bytes that had piled up
 are worked off faster than new ones come, and push the line down meanwhile."""
 _SETTLE_UNPROVEN_NS = 3_000_000_000
-"""The same (3 s) where answers bound it only loosely, as from a device that is slow to answer, or
-where one that did answer has not yet: if everything is late, so is its answer. All of the time
-arrivals must be in time, so that a line that a busy host makes late does not count."""
+"""The same (3 s) where answers bound it only loosely, or are still awaited: if everything is late,
+so is its answer. All of the time arrivals must be in time."""
 _REFUTED_NS = 1_000_000.0
-"""By how much (1 ms) an answer must show a line to be too early to refute it: what the line itself
-is uncertain by. More lets a device lose so much time unseen."""
+"""By how much (1 ms) an answer must show a line to be too early to refute it."""
 _SETTLED_NS = 1_000_000.0
 """Fall of a new line (1 ms) that begins the time again; less is how arrivals scatter."""
 _ANSWER_S = 0.15
 """Longest time, s, that an answer of the device may take to bound nothing: it has 100 ms for it,
 and the line the rest. If it takes longer, the line itself is late."""
 _ANSWER_HOLDS_NS = 60e9
-"""Device time (60 s) after which an answer says nothing any more: two clocks may have drifted
-apart by 6 ms, more than a stamp may be wrong by."""
+"""Device time (60 s) after which two clocks may have drifted apart by more than an answer says."""
 _FALSE_ANSWERS = 3
 """Answers that arrivals have contradicted, after which none is asked for any more: the device
 answers before it has sent the samples that it has."""
@@ -126,16 +120,13 @@ _DOUBT_NS = 30_000_000
 """Time (30 ms) without a confirmation, while blocks arrive, from which on the device is asked. A
 stall of the host ends with a burst that confirms the line at once."""
 _GIVE_UP_NS = 10_000_000_000
-"""Time (10 s) of unchanged lateness after which a device that does not answer is believed to have
-lost time. A line that is late for longer is taken for such a device."""
+"""Time (10 s) of unchanged lateness after which a silent device is believed to have lost time."""
 _BUCKET_NS = 50_000_000
 """Time (50 ms) of arrivals of which the earliest one tells how well the line is confirmed."""
 _BUCKETS = 10
-"""Such times that are looked back on. Times in which nothing arrives do not count: a host that
-stalls is no evidence against the line."""
+"""Such times that are looked back on, without those in which nothing arrives."""
 _FLOOR_S = 1e-4
-"""Least uncertainty of a stamp, s: what reading a byte and taking the time cost even when nothing
-else happens."""
+"""Least uncertainty of a stamp, s: what reading a byte and taking the time cost."""
 
 
 class ClockState(Enum):
@@ -158,9 +149,9 @@ class SampleClock:
       or the device lost time. No stamp is good then, until an arrival is in time again, or an
       answer of the device (`bound`) shows which of the two it is.
 
-    ``jumps`` counts how often the line was started again because it was refuted; ``confirmed`` is
-    the number of the newest sample that an arrival in time, or an answer, has confirmed (-inf
-    before).
+    ``jumps`` counts how often the line was started again because it was refuted; ``is_settled`` is
+    whether it is relied on, however late the newest arrivals are; ``confirmed`` is the number of
+    the newest sample that an arrival in time, or an answer, has confirmed (-inf before).
     """
 
     def __init__(self, sample_rate_hz: float) -> None:
@@ -179,7 +170,7 @@ class SampleClock:
     def _begin_anew(self) -> None:
         self._line: Envelope | None = None
         self.confirmed = -math.inf
-        self._settled = False
+        self.is_settled = False
         self._stands: tuple[int, float] = (0, 0.0)
         self._earliest: deque[tuple[int, float]] = deque(maxlen=_BUCKETS)
         self._late_from_ns: int | None = None
@@ -196,7 +187,8 @@ class SampleClock:
         offset = arrival_ns - time_ns
         late = 0.0 if self._line is None else offset - self._line.offset_at(time_ns)
         if self._line is not None and (
-            time_ns < self._line.newest_ns or (self._settled and late < -1e9 * LARGEST_LATENESS_S)
+            time_ns < self._line.newest_ns
+            or (self.is_settled and late < -1e9 * LARGEST_LATENESS_S)
         ):
             self.jumps += 1
             self._begin_anew()
@@ -208,13 +200,13 @@ class SampleClock:
         self._newest_sample = sample
         self._contradict(time_ns, offset)
         self._note_lateness(late, arrival_ns)
-        if late > 1e9 * LARGEST_LATENESS_S and self._settled:
+        if late > 1e9 * LARGEST_LATENESS_S and self.is_settled:
             self._doubt(arrival_ns)
             return
         self._late_from_ns = None
         self._line.take(time_ns, offset)
         self.confirmed = sample
-        if not self._settled:
+        if not self.is_settled:
             self._settle(time_ns, arrival_ns)
 
     def bound(self, sample: float, sent_ns: int) -> None:
@@ -240,12 +232,12 @@ class SampleClock:
         if took_ns > 1e9 * _ANSWER_S:
             self._unexplained_from_ns = self._newest_ns
         is_refuted = lower > self._line.offset_at(time_ns) + _REFUTED_NS
-        if is_refuted and (self.is_doubted or not self._settled):
-            self.jumps += self._settled
+        if is_refuted and (self.is_doubted or not self.is_settled):
+            self.jumps += self.is_settled
             self._begin_anew()
         elif is_refuted:
             return
-        elif not self._settled:
+        elif not self.is_settled:
             self._settle(time_ns, self._newest_ns)
         elif self._quickest_ns < 1e9 * LARGEST_LATENESS_S:
             self.confirmed = self._newest_sample
@@ -266,30 +258,24 @@ class SampleClock:
             self._lower = None
             self._false_answers += 1
 
-    def _slack_ns(self, time_ns: float) -> float | None:
-        """How far the line lies above the least that it can be, ns; None without an answer."""
-        lower = self._lower_offset(time_ns)
-        return (
-            None if lower is None or self._line is None else self._line.offset_at(time_ns) - lower
-        )
-
     def _settle(self, time_ns: float, arrival_ns: int) -> None:
         """See whether a new line can be relied on."""
         assert self._line is not None
-        slack = self._slack_ns(time_ns)
-        offset = self._line.offset_at(time_ns)
+        offset, lower = self._line.offset_at(time_ns), self._lower_offset(time_ns)
+        # How far the line lies above the least that it can be, ns; None without an answer.
+        slack = None if lower is None else offset - lower
         since, stood = self._stands
         if offset < stood - _SETTLED_NS:
             self._stands = since, stood = arrival_ns, offset
         if slack is None:
             awaited = self._answers and self._false_answers < _FALSE_ANSWERS
-            self._settled = arrival_ns - since > (_SETTLE_UNPROVEN_NS if awaited else _SETTLE_NS)
+            self.is_settled = arrival_ns - since > (_SETTLE_UNPROVEN_NS if awaited else _SETTLE_NS)
         elif slack < 1e9 * LARGEST_LATENESS_S:
-            self._settled = True
+            self.is_settled = True
         elif slack > 1e9 * _ANSWER_S or max(late for _, late in self._earliest) > _SETTLED_NS:
             self._stands = arrival_ns, offset
         else:
-            self._settled = arrival_ns - since > _SETTLE_UNPROVEN_NS
+            self.is_settled = arrival_ns - since > _SETTLE_UNPROVEN_NS
 
     def _doubt(self, arrival_ns: int) -> None:
         """Note an arrival that is late."""
@@ -312,7 +298,7 @@ class SampleClock:
         """Return whether an answer of the device would help: the line is new, or late for long."""
         if self._line is None or self._false_answers >= _FALSE_ANSWERS:
             return False
-        return not self._settled or self.is_doubted
+        return not self.is_settled or self.is_doubted
 
     @property
     def is_doubted(self) -> bool:
@@ -323,7 +309,7 @@ class SampleClock:
     @property
     def state(self) -> ClockState:
         """Return what is known of the stamps now."""
-        if not self._settled:
+        if not self.is_settled:
             return ClockState.SETTLING
         return ClockState.LATE if self._late_from_ns is not None else ClockState.GOOD
 
@@ -337,18 +323,13 @@ class SampleClock:
         """Return the standard deviation of a confirmed stamp, s; infinite while the line is not
         settled.
         """
-        if not self._settled:
+        if not self.is_settled:
             return math.inf
         return math.hypot(_FLOOR_S, min(self.lateness_s, LARGEST_LATENESS_S))
 
     def is_good(self, sample: float) -> bool:
         """Return whether the host time of a sample is known to 5 ms."""
-        return self._settled and self.confirmed >= sample
-
-    @property
-    def is_settled(self) -> bool:
-        """Return whether the line is relied on, apart from how late the newest arrivals are."""
-        return self._settled
+        return self.is_settled and self.confirmed >= sample
 
     def host_ns(self, sample: float) -> int:
         """Return the host time (ns) of a sample's number; 0 before the first arrival."""

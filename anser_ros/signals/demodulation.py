@@ -26,11 +26,9 @@ LONGEST_WINDOW_S = 0.05
 """Longest window, s. A tool at 0.2 m/s moves 1 cm meanwhile, and its phasors no longer change
 linearly."""
 MAINS_HARMONICS = 5
-"""Harmonics of the mains that are fitted in addition to the tones: rectifiers make odd ones,
-weaker the higher. Fewer leave hum in the noise; more cost window length where tones are near."""
+"""Harmonics of the mains that are fitted in addition to the tones; higher ones are weaker."""
 _RANK_TOLERANCE = 1e-6
-"""Singular values below this fraction of the largest are left out. What the window determines lies
-far above it, and rounding far below."""
+"""Singular values below this fraction of the largest are left out, as rounding."""
 _LARGEST_LOSS = 1e-3
 """Largest part of a wanted coefficient that may lie in the singular vectors that are left out."""
 _WORST_VARIANCE_RATIO = 30.0
@@ -88,33 +86,28 @@ class Demodulator:
         if not SHORTEST_WINDOW_S - half_sample <= length_s <= LONGEST_WINDOW_S + half_sample:
             raise ParameterError(f'a window of {1e3 * length_s:.3g} ms is not 5 to 50 ms long')
         self.frequencies_hz = tones
-        self.window_samples = window_samples
         self.window_s = length_s
-        self._times_s = _times_s(sample_rate_hz, window_samples)
-        self._bias: NDArray[np.float64] | None = None
+        from_middle = np.arange(window_samples) - (window_samples - 1) / 2
+        self._times_s = np.asarray(from_middle / sample_rate_hz, float)
         harmonics = _kept_harmonics(mains_hz, tones, sample_rate_hz, length_s)
-
-        def prepare(motion: bool, worst: float) -> None:
-            self._design = _design_matrix(sample_rate_hz, window_samples, tones, harmonics, motion)
-            self._solution = _solve(self._design, 2 * tones.size, worst)
+        tries = [(bool(follow_motion), _WORST_VARIANCE_RATIO)]
+        if follow_motion is None:
+            tries.insert(0, (True, _AFFORDABLE_VARIANCE_RATIO))
+        for motion, worst in tries:
             self.follows_motion = motion
-            self._bias = (
-                None if motion else self._motion_bias(self._solution, self._design, self._times_s)
-            )
-
-        try:
-            if follow_motion is None:
-                try:
-                    prepare(True, _AFFORDABLE_VARIANCE_RATIO)
-                except FitError:
-                    prepare(False, _WORST_VARIANCE_RATIO)
-            else:
-                prepare(follow_motion, _WORST_VARIANCE_RATIO)
-        except FitError as error:
+            self._design = _design_matrix(self._times_s, length_s, tones, harmonics, motion)
+            try:
+                self._solution = _solve(self._design, 2 * tones.size, worst)
+                break
+            except FitError as error:
+                failure = error
+        else:
+            spacing_hz = float(np.diff(np.sort(tones)).min(initial=np.inf))
             raise ParameterError(
                 f'a window of {1e3 * length_s:.3g} ms cannot separate tones '
-                f'{_smallest_spacing(tones):.4g} Hz apart'
-            ) from error
+                f'{spacing_hz:.4g} Hz apart'
+            ) from failure
+        self._bias = self._motion_bias(self._solution, self._design, self._times_s)
 
     def demodulate(
         self, samples: NDArray[np.generic], present: NDArray[np.bool_] | None = None
@@ -129,8 +122,7 @@ class Demodulator:
         if present is not None and not present.all():
             solution = _solve(self._design[present], 2 * self.frequencies_hz.size)
             values = values[present]
-            if bias is not None:
-                bias = self._motion_bias(solution, self._design[present], self._times_s[present])
+            bias = self._motion_bias(solution, self._design[present], self._times_s[present])
         projected = solution.basis.T @ values
         coefficients = solution.to_coefficients @ projected
         energy = np.einsum('nc,nc->c', values, values) - np.einsum(
@@ -150,17 +142,13 @@ class Demodulator:
 
     def _motion_bias(
         self, solution: _Solution, design: NDArray[np.float64], times_s: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.float64] | None:
         """Return the phasors that a fit without motion finds in tones times t, (2K, 2K), s."""
+        if self.follows_motion:
+            return None
         count = 2 * self.frequencies_hz.size
         projected = solution.basis.T @ (times_s[:, None] * design[:, :count])
         return np.asarray((solution.to_coefficients @ projected)[:count])
-
-
-def _smallest_spacing(tones: NDArray[np.float64]) -> float:
-    if tones.size < 2:
-        return float('inf')
-    return float(np.diff(np.sort(tones)).min())
 
 
 def _kept_harmonics(
@@ -174,29 +162,22 @@ def _kept_harmonics(
     return kept
 
 
-def _times_s(sample_rate_hz: float, window_samples: int) -> NDArray[np.float64]:
-    """Return the times of a window's samples from its middle, s."""
-    times = (np.arange(window_samples) - (window_samples - 1) / 2) / sample_rate_hz
-    return np.asarray(times, float)
-
-
 def _design_matrix(
-    sample_rate_hz: float,
-    window_samples: int,
+    times_s: NDArray[np.float64],
+    length_s: float,
     tones: NDArray[np.float64],
     harmonics: NDArray[np.float64],
     follow_motion: bool,
 ) -> NDArray[np.float64]:
     """Return the columns: cos and -sin of the tones, the same times t, offset, slope, mains."""
-    time = _times_s(sample_rate_hz, window_samples)
-    unit = time / (window_samples / sample_rate_hz / 2)
-    angle = 2 * np.pi * time[:, None] * tones
+    unit = times_s / (length_s / 2)
+    angle = 2 * np.pi * times_s[:, None] * tones
     waves = np.hstack([np.cos(angle), -np.sin(angle)])
     columns = [waves]
     if follow_motion:
         columns.append(unit[:, None] * waves)
     columns += [np.ones_like(unit)[:, None], unit[:, None]]
-    mains = 2 * np.pi * time[:, None] * harmonics
+    mains = 2 * np.pi * times_s[:, None] * harmonics
     columns += [np.cos(mains), np.sin(mains)]
     return np.hstack(columns)
 

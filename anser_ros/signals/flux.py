@@ -27,8 +27,7 @@ from anser_ros.signals.demodulation import ToneFit
 
 LEAST_CURRENT = 0.05
 """Fraction of the nominal current below which an emitter counts as not driven; its fluxes would be
-divided by a current of noise. Smaller, and an idle emitter has fluxes of noise; larger, and a weak
-one is taken for dead."""
+divided by a current of noise."""
 
 
 @dataclass(frozen=True)
@@ -110,8 +109,7 @@ class FluxConverter:
 
 
 REACH_S = 0.03
-"""Time over which the straight line is fitted, s. A tool's velocity hardly changes meanwhile; a
-shorter time adds noise to the slopes, a longer one makes them late."""
+"""Time over which the straight line is fitted, s: a tool's velocity hardly changes meanwhile."""
 LONGEST_WINDOW_GAP_S = 0.05
 """Longest time from one window to the next, s; after a longer gap the windows before it say
 nothing about the present motion."""

@@ -27,15 +27,13 @@ FACTOR = np.uint32(0x9E3779B2)
 """Factor of the recursion h <- h * FACTOR + sample modulo 2^32: twice an odd number, the golden
 ratio's 32 bits, which spreads neighbouring codes over the whole range."""
 ANCHOR_SHARE = 64
-"""One fingerprint in so many, by its own value, is remembered and looked up: where it lies hangs
-on the samples alone, so a run that comes again has its anchors at the same samples. Fewer would
-find a repetition later; more cost time, and what they find is found a millisecond earlier."""
+"""One fingerprint in so many, by its own value, is remembered and looked up: where it lies depends
+on the samples alone, so a run that comes again has its anchors at the same samples."""
 _ANCHOR_BELOW = np.uint32(2**32 // ANCHOR_SHARE)
 """Fingerprints below this are anchors."""
 SLOTS = 2048
-"""Remembered anchors of a column, a power of 2: at 40 kS/s they are those of 3 s. A newer one
-takes the place of an older one with which it shares a slot, so a long ring is found by its second
-anchor or so. More of them leave the processor's cache, and the search takes twice the time."""
+"""Remembered anchors of a column, a power of 2: at 40 kS/s they are those of 3 s. With more of
+them, which leave the processor's cache, the search takes twice the time."""
 _SLOT_SHIFT = np.uint32(15)
 """Shift of an anchor, which is below 2^26, that leaves the number of its slot."""
 _ROW_BITS = np.uint32(20)
@@ -142,24 +140,19 @@ def search(  # type: ignore[no-untyped-def]
 
 EVIDENCE_BITS = 80.0
 """Bits of surprise that a run must hold to count as repeated. A unit of 42 columns at 40 kS/s with
-two seconds of history compares 2^37 pairs of runs a second and 2^65 in ten years, so that one
-false alarm in ten years has a probability of 2^-15 even if all tones returned at every lag. Fewer
-bits give false alarms, more need longer runs: a column of 3 bits per sample needs 27 samples for
-80."""
+two seconds of history compares 2^65 pairs of runs in ten years, so that one false alarm in them
+has a probability of 2^-15."""
 LONGEST_RUN_S = 0.025
-"""Longest run, s, that a column may need. One that needs more has less than 80 bits of noise in it
-(0.08 bits per sample at 40 kS/s, 0.06 codes rms) and is noiseless; a longer one would let whole
-windows of repeated samples pass before they are found."""
+"""Longest run, s, that a column may need. One that needs more (0.08 bits per sample at 40 kS/s,
+0.06 codes rms) is noiseless: whole windows would pass before a repetition is found."""
 HISTORY_S = 2.5
-"""How far back a repetition is found, s. Buffers that a fault of a driver or a cable can repeat
-are far shorter; a longer history costs 3.4 MB a second at 42 columns."""
+"""How far back a repetition is found, s: farther than the buffers of drivers reach."""
 MOST_BYTES = 64_000_000
 """Most memory of the history, bytes; that of a unit with very many channels is shorter."""
 _LONGEST_STEP = 2048
 """Most samples, and a power of 2, that wait to be searched; less than any history has."""
 _JUDGED_SAMPLES = 2 * _LONGEST_STEP
-"""Samples after which it is worked out again how long runs must be: every 0.1 s at 40 kS/s, far
-less than `MEMORY_S`. More often only costs time."""
+"""Samples after which it is worked out again how long runs must be: every 0.1 s at 40 kS/s."""
 SHORTEST_LAG_S = 1e-3
 """Shortest lag, s, at which fresh samples are compared: over a shorter one a tone at 1 kHz or less
 is no other than it was."""
@@ -169,11 +162,9 @@ long enough for what follows on what."""
 SAMPLED_SHARE = 16
 """One such stretch in so many is compared. All of them would cost as much as the search."""
 MEMORY_S = 1.0
-"""Time constant, s, with which coincidences are forgotten. A longer one keeps a tool's movement,
-which makes coincidences rarer, in mind when it rests; a shorter one counts few."""
+"""Time constant, s, with which coincidences are forgotten: they are rarer while a tool moves."""
 _PRIOR = 32.0
-"""Samples that the prior of the coincidences counts for, half of which coincide (one bit each). It
-holds the first 0.1 s, until there are samples at the worst lag; more would slow the start down."""
+"""Samples that the prior of the coincidences counts for, half of which coincide (one bit each)."""
 _PRIOR_RUNS = 4.0
 """Coincidences that the prior of what follows one counts for: that noise is so correlated that
 every further sample is worth half of its own surprise."""
@@ -185,7 +176,8 @@ class RepetitionWatch:
     """Keeps the last samples of a stream, and finds in them what comes again.
 
     ``tones_hz`` (K,) are the tones of the signals, Hz: fresh samples are most alike where all of
-    them return together. ``position`` counts samples since the last reset, holes included. Raises
+    them return together. ``position`` counts samples since the last reset, holes included;
+    ``needed`` (C,) is how long a run must be to count as repeated, samples. Raises
     `ParameterError` when there is no column, or the rate is not positive.
     """
 
@@ -197,7 +189,7 @@ class RepetitionWatch:
                 f'repetitions need columns and a rate, not {columns} at {sample_rate_hz:g} S/s'
             )
         rows = min(int(HISTORY_S * sample_rate_hz), MOST_BYTES // (2 * columns), MOST_ROWS)
-        self._rate_hz = sample_rate_hz
+        self.columns, self._rate_hz = columns, sample_rate_hz
         self._history = np.zeros((max(rows, 2 * _LONGEST_STEP), columns), np.int16)
         self._slots = np.zeros((columns, SLOTS), np.uint32)
         self._worst_lag = _worst_lag(len(self._history), sample_rate_hz, tones_hz)
@@ -206,7 +198,7 @@ class RepetitionWatch:
 
     def reset(self) -> None:
         """Forget all samples and what they were found to be."""
-        columns = self._history.shape[1]
+        columns = self.columns
         self.position = self._searched = self._contiguous_from = 0
         self._slots[:] = 0
         self._fingerprint = np.zeros(columns, np.uint32)
@@ -217,25 +209,15 @@ class RepetitionWatch:
         self._judge()
 
     @property
-    def columns(self) -> int:
-        """Return how many columns a sample has."""
-        return self._history.shape[1]
-
-    @property
     def noiseless(self) -> NDArray[np.bool_]:
         """Return the columns with too little noise in their samples to distinguish new from old,
         (C,)."""
-        return self._needed > self._longest
-
-    @property
-    def needed(self) -> NDArray[np.int64]:
-        """Return how long a run of each column must be to count as repeated, samples, (C,)."""
-        return self._needed
+        return self.needed > self._longest
 
     @property
     def repeats(self) -> bool:
         """Return whether no column said anything new lately, and one repeats what it said."""
-        repeating = self._run >= self._needed
+        repeating = self._run >= self.needed
         return bool(np.all(repeating | self.noiseless) and np.any(repeating))
 
     def take(self, codes: NDArray[np.int16]) -> None:
@@ -290,7 +272,7 @@ class RepetitionWatch:
             contiguous = at - self._contiguous_from
             search(
                 self._history, first, count, at, contiguous, self._fingerprint, self._probes,
-                self._probed_at, self._slots, self._needed, self._lag, self._run, self._until,
+                self._probed_at, self._slots, self.needed, self._lag, self._run, self._until,
                 self._age,
             )  # fmt: skip
             if contiguous > self._worst_lag:
@@ -305,7 +287,7 @@ class RepetitionWatch:
         Samples at an end of the converter's range tell nothing of the noise, and neither do
         columns that repeat themselves.
         """
-        history, is_new = self._history, self._run < self._needed
+        history, is_new = self._history, self._run < self.needed
         stretch = SAMPLED_ROWS * SAMPLED_SHARE
         for start in range(at - at % stretch, at + count, stretch):
             begin, end = max(start, at), min(start + SAMPLED_ROWS, at + count)
@@ -326,7 +308,7 @@ class RepetitionWatch:
         followed = continued + _PRIOR_RUNS * np.sqrt(same)
         surprise = -np.log2(np.maximum(same, followed / (coincided + _PRIOR_RUNS)))
         samples = np.ceil(EVIDENCE_BITS / np.maximum(surprise, 1e-6))
-        self._needed = np.maximum(samples, FINGERPRINT_SAMPLES).astype(np.int64)
+        self.needed = np.maximum(samples, FINGERPRINT_SAMPLES).astype(np.int64)
         self._tally *= math.exp(-_JUDGED_SAMPLES / (MEMORY_S * self._rate_hz))
 
 

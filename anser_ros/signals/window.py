@@ -16,24 +16,19 @@ from anser_ros.errors import ParameterError
 from anser_ros.signals.repetition import RAILS, RepetitionWatch
 
 _SLACK_SAMPLES = 2.0
-"""Difference, samples, that rounding of ticks may make. Smaller, coarse ticks are accused; larger,
-small jumps are not seen."""
+"""Difference, samples, that rounding of ticks may make."""
 _SLACK_SHARE = 5e-4
-"""Relative difference up to which ticks and samples run at one pace. What a device says of its
-rates is rounded less than that, and two quartz clocks differ by a fifth of it."""
+"""Relative difference up to which ticks and samples run at one pace; quartzes differ less."""
 _REFERENCE_S = 1.0
-"""Time, s, over which the two are compared: a wrong pace of 1 % shows after 5 ms, and one of 0.1 %
-after a tenth of this."""
+"""Time, s, over which the two are compared."""
 _TRUST_S = 0.2
 """Time, s, that ticks must agree before they are believed again about lost blocks."""
 _AGAIN_S = 0.1
 """Disagreements closer together than this, s, are a wrong pace, others are jumps."""
 _HOLE_TOLERANCE = 0.01
-"""Relative difference up to which a hole's length by ticks and by sequence number agree. It is far
-above the rate error of any clock and below one block in a hundred."""
+"""Relative difference up to which a hole's length by ticks and by sequence number agree."""
 _LONGEST_HOLE_S = 10.0
-"""Longest hole, s, that the sequence number alone may tell of while ticks are not believed. After
-a longer one little is lost by starting again."""
+"""Longest hole, s, that the sequence number alone may tell of while ticks are not believed."""
 _WRAP = 2**32
 """Ticks after which a 32-bit counter begins again."""
 
@@ -63,7 +58,7 @@ class TickCheck:
     def take(self, sample: int, ticks: int) -> None:
         """Take the ticks of a block whose first sample has a number."""
         if self._reference is None:
-            self._begin(sample, ticks)
+            self.begin(sample, ticks)
             return
         since, from_ticks = self._reference
         elapsed = sample - since
@@ -73,16 +68,12 @@ class TickCheck:
             advance = self._advance(from_ticks, ticks, elapsed)
         if abs(advance - elapsed) > slack:
             self._disagree(sample, ticks, advance, elapsed)
-            self._begin(sample, ticks)
+            self.begin(sample, ticks)
         elif elapsed > _REFERENCE_S * self._rate_hz:
-            self._begin(sample, ticks)
+            self.begin(sample, ticks)
         if not self.trusted and sample - self._agrees_from > _TRUST_S * self._rate_hz:
             self.trusted, self.words = True, ''
         self._last_ticks = ticks
-
-    def take_after_hole(self, sample: int, ticks: int) -> None:
-        """Take the ticks of the first block after a hole, which was judged already."""
-        self._begin(sample, ticks)
 
     def confirms(self, samples: int, ticks: int) -> bool:
         """Return whether a block `samples` after the last one may have these ticks."""
@@ -91,7 +82,8 @@ class TickCheck:
         advance = self._advance(self._last_ticks, ticks, samples)
         return abs(advance - samples) <= 1 + _HOLE_TOLERANCE * samples
 
-    def _begin(self, sample: int, ticks: int) -> None:
+    def begin(self, sample: int, ticks: int) -> None:
+        """Compare from a block on: the first, or one after a hole, which was judged already."""
         self._reference, self._last_ticks = (sample, ticks), ticks
 
     def _advance(self, before: int, ticks: int, samples: int) -> float:
@@ -165,7 +157,9 @@ class WindowCutter:
     A hop, the way from one window to the next, leaves samples out if it is longer than the window.
 
     ``end_sample`` is the number of the sample behind the newest block, since the device began to
-    count. Raises `ParameterError` when a length is less than one sample.
+    count, ``expected`` the number of the block that follows on it (None: any); ``samples_wanted``
+    is how many the next window still lacks. Raises `ParameterError` when a length is less than one
+    sample.
     """
 
     def __init__(
@@ -188,20 +182,11 @@ class WindowCutter:
     def reset(self) -> None:
         """Forget the samples; the next block begins a new grid of windows."""
         self._filled = 0
-        self._until_next = self._window
-        self._expected: int | None = None
+        self.samples_wanted = self._window
+        self.expected: int | None = None
         self.end_sample = self._begin_sample = 0
         self._watch.reset()
         self._ticks.reset()
-
-    @property
-    def samples_wanted(self) -> int:
-        """Return how many samples the next window still lacks."""
-        return self._until_next
-
-    def expects(self, sequence: int) -> bool:
-        """Return whether a block of this number follows on the newest one."""
-        return sequence == self._expected
 
     def push(
         self, sequence: int, timestamp_ticks: int | Sequence[int], codes: NDArray[np.int16]
@@ -223,15 +208,15 @@ class WindowCutter:
         if missing < 0:
             self.counters.duplicate_blocks += 1
             return []
-        if self._expected is None:
+        if self.expected is None:
             self.end_sample = self._begin_sample = sequence * block
         first = self.end_sample + missing
-        self._expected = (sequence + len(ticks)) % _SEQUENCES
+        self.expected = (sequence + len(ticks)) % _SEQUENCES
         windows: list[Window] = []
         if missing:
             self.counters.missing_samples += missing
             self._watch.skip(missing)
-            self._ticks.take_after_hole(first, ticks[0])
+            self._ticks.begin(first, ticks[0])
             skipped = self._skip_whole_windows(missing)
             windows += self._advance(None, missing - skipped, first - missing + skipped)
         else:
@@ -248,9 +233,9 @@ class WindowCutter:
         started a new stream, and its first blocks were lost. A repeated block has the same samples
         as before, or fills a hole too late.
         """
-        if self._expected is None or sequence == self._expected:
+        if self.expected is None or sequence == self.expected:
             return 0
-        ahead, block = (sequence - self._expected) % _SEQUENCES, len(codes)
+        ahead, block = (sequence - self.expected) % _SEQUENCES, len(codes)
         if ahead >= _SEQUENCES // 2:
             place = self._watch.position - (_SEQUENCES - ahead) * block
             if self._watch.matches_history(place, codes) is not False:
@@ -274,12 +259,12 @@ class WindowCutter:
         windows: list[Window] = []
         done = 0
         while done < count:
-            step = min(self._until_next, count - done)
+            step = min(self.samples_wanted, count - done)
             self._append(None if codes is None else codes[done : done + step], step)
             done += step
-            self._until_next -= step
-            if self._until_next == 0:
-                self._until_next = self._hop
+            self.samples_wanted -= step
+            if self.samples_wanted == 0:
+                self.samples_wanted = self._hop
                 windows += self._cut(first + done)
         return windows
 

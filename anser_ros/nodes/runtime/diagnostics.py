@@ -38,13 +38,6 @@ class Status:
     values: Mapping[str, object] = field(default_factory=dict)
 
 
-def text_of(value: object) -> str:
-    """Return a figure as an operator reads it."""
-    if isinstance(value, float):
-        return f'{value:.6g}' if math.isfinite(value) else str(value)
-    return str(value)
-
-
 def diagnostic_array(node: str, statuses: Iterable[Status], stamp: Time) -> DiagnosticArray:
     """Return the message of a node's statuses; each is named ``node`` or ``node: part``."""
     message = DiagnosticArray()
@@ -55,7 +48,10 @@ def diagnostic_array(node: str, statuses: Iterable[Status], stamp: Time) -> Diag
         one.name = f'{node}: {status.name}' if status.name else node
         one.message = status.message
         one.hardware_id = HARDWARE_ID
-        one.values = [KeyValue(key=key, value=text_of(v)) for key, v in status.values.items()]
+        one.values = [
+            KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
+            for key, value in status.values.items()
+        ]
         message.status.append(one)
     return message
 

@@ -4,10 +4,8 @@ A message that is handed over is also published, for the recorder and all other 
 that receives a topic in this way has no subscription to it: it would process everything twice.
 """
 
-import math
 import threading
-import time
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +13,6 @@ from typing import Any
 from anser_ros.wire.points import FluxPoints
 
 Taker = Callable[[Any], object]
-LONGEST_PAUSE_S = 0.2
-"""Time without a pause, s, after which no frames flow, and nothing is put off: more than any stall
-of a host, less than the time between two diagnostics of a node."""
 
 
 @dataclass(frozen=True)
@@ -78,15 +73,9 @@ class NewestWorker:
 
 
 class Handover:
-    """Keeps the topics that nodes of this process offer each other, by their full names.
-
-    The node that hands over frames reports when there is a pause before the next: diagnostics are
-    put off until then, so that no pose waits for them.
-    """
+    """Keeps the topics that nodes of this process offer each other, by their full names."""
 
     def __init__(self) -> None:
-        self._put_off: deque[Callable[[], bool]] = deque()
-        self._paused_s = -math.inf
         self._takings: defaultdict[str, list[DirectSubscription]] = defaultdict(list)
         self._offered: dict[str, bool] = {}
         self._last: dict[str, Any] = {}
@@ -112,24 +101,6 @@ class Handover:
     def drop(self, taking: DirectSubscription) -> None:
         """End what `take` began."""
         self._takings[taking.topic_name].remove(taking)
-
-    def defer(self, work: Callable[[], bool]) -> bool:
-        """Do some work in the next pause, or in a later one where it returns False; return False
-        if no node makes pauses at present.
-        """
-        if time.monotonic() - self._paused_s > LONGEST_PAUSE_S:
-            return False
-        if work not in self._put_off:
-            self._put_off.append(work)
-        return True
-
-    def pause(self) -> None:
-        """Do one thing that was put off: there is time until the next frame."""
-        self._paused_s = time.monotonic()
-        if self._put_off:
-            work = self._put_off.popleft()
-            if not work():
-                self._put_off.append(work)
 
     def give(self, topic: str, what: Any) -> None:
         """Give something to all who take a topic."""

@@ -22,11 +22,6 @@ MOST_FIELDS = 4096
 """Most fields of a cloud, which is one of 2000 emitters: each field is an object to be made."""
 
 
-def is_bounded(message_type: type) -> bool:
-    """Return whether messages of a type are taken as bytes first."""
-    return message_type in MOST_BYTES
-
-
 def opened(data: bytes, message_type: type) -> Any:
     """Return the message that serialised bytes hold.
 
@@ -43,9 +38,3 @@ def opened(data: bytes, message_type: type) -> Any:
                 f'the most is {MOST_POINTS} with {MOST_FIELDS}'
             )
     return deserialize_message(data, message_type)
-
-
-def seconds_of(message: Any) -> float:
-    """Return the header stamp of a message, s."""
-    stamp = message.header.stamp
-    return float(stamp.sec + 1e-9 * stamp.nanosec)

@@ -1,25 +1,10 @@
 """Gives every node its base: parameters, diagnostics, guarded callbacks, start and end.
 
-A node is a class with a name and a parameter table::
-
-    class Tracker(AnserNode):
-        NAME = 'tracker'
-        EXAMPLE = '--ros-args -p model_file:=model.yaml'
-        PARAMETERS = TrackerParameters
-
-        def __init__(self, **options):
-            super().__init__(**options)
-            self.create_subscription(PointCloud2, 'tool/flux', self._on_flux, qos.STREAM)
-
-    if __name__ == '__main__':
-        sys.exit(main(Tracker))
-
 Callbacks given to ``create_subscription``, ``create_timer`` and ``create_service`` are guarded:
 an error is logged, counted and shown in ``/diagnostics``, and the node lives on.
 """
 
 import argparse
-import contextlib
 import functools
 import threading
 import time
@@ -86,10 +71,11 @@ class AnserNode(Node):
         **options: Any,
     ) -> None:
         # The base class already creates services, so what guards them must be there first.
-        self._handover, self._beside = handover, tuple(beside)
+        self.hands_over = handover is not None  # what it publishes, to nodes of this process
+        self._handover, self._beside = handover or Handover(), tuple(beside)
         # Where frames are handed over, they come in another thread than the executor's.
         self._aside: NewestWorker | None = None
-        self._turn: Any = contextlib.nullcontext() if handover is None else threading.RLock()
+        self._turn = threading.RLock()
         self.counters: Counter[str] = Counter()
         self.exit_code: int | None = None
         self._throttle = Throttle(WARNING_PERIOD_S)
@@ -103,9 +89,7 @@ class AnserNode(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.EVENTS)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._report = self._guard(self._in_turn(self.publish_diagnostics, LONGEST_TURN_S))
-        timer = self._guard(self._diagnostics_due)
-        super().create_timer(DIAGNOSTICS_PERIOD_S, timer, clock=self.steady_clock)
+        self.create_timer(DIAGNOSTICS_PERIOD_S, self.publish_diagnostics, clock=self.steady_clock)
         if self.HAS_KERNELS:
             # Numba is half of the start of a node that has none.
             from anser_ros.kernel_cache import wait_for_kernels
@@ -141,23 +125,11 @@ class AnserNode(Node):
 
     def offer(self, publisher: Any, *, lasts: bool = False) -> None:
         """Hand over what is published, too, to the nodes of this process that want it."""
-        if self._handover is not None:
-            self._handover.offer(publisher.topic_name, lasts=lasts)
+        self._handover.offer(publisher.topic_name, lasts=lasts)
 
     def hand_over(self, publisher: Any, what: Any) -> None:
         """Give something that is published to the nodes of this process."""
-        if self._handover is not None:
-            self._handover.give(publisher.topic_name, what)
-
-    def pause(self) -> None:
-        """Let the nodes of this process do what they put off: there is time until the next."""
-        if self._handover is not None:
-            self._handover.pause()
-
-    @property
-    def hands_over(self) -> bool:
-        """Return whether other nodes of this process get what this one publishes directly."""
-        return self._handover is not None
+        self._handover.give(publisher.topic_name, what)
 
     def count(self, name: str, by: int = 1) -> None:
         """Count an event for ``/diagnostics``."""
@@ -177,20 +149,6 @@ class AnserNode(Node):
     def publish_diagnostics(self) -> None:
         """Publish all statuses now."""
         self._send_statuses(self._status_with_counters(), *self.part_statuses())
-
-    def _diagnostics_due(self) -> None:
-        """Publish them in the next pause between two frames, where there are such."""
-        if self._handover is None or not self._handover.defer(self._report_if_free):
-            self._report()
-
-    def _report_if_free(self) -> bool:
-        if not self._turn.acquire(blocking=False):
-            return False
-        try:
-            self._report()
-        finally:
-            self._turn.release()
-        return True
 
     def publish_end(self) -> None:
         """Publish that the node has ended, so that its last state is not taken for a live one."""
@@ -228,13 +186,13 @@ class AnserNode(Node):
         callback.
         """
         name = self.resolve_topic_name(topic)
-        if self._handover is not None and self._handover.offers(name):
+        if self._handover.offers(name):
             taker = self._guard(self._in_turn(handed or callback))
             if self.WORKS_ASIDE:
                 self._aside = self._aside or NewestWorker(lambda: self.count('frames_skipped'))
                 taker = functools.partial(self._aside.put, name, taker)
             return self._handover.take(name, taker)
-        bounded = incoming.is_bounded(msg_type) and not options.get('raw', False)
+        bounded = msg_type in incoming.MOST_BYTES and not options.get('raw', False)
 
         @functools.wraps(callback)
         def unpacked(*args: Any) -> Any:
@@ -263,7 +221,7 @@ class AnserNode(Node):
 
     def destroy_subscription(self, subscription: Any) -> bool:
         """Destroy a subscription as rclpy does, or take no longer what is handed over."""
-        if isinstance(subscription, DirectSubscription) and self._handover is not None:
+        if isinstance(subscription, DirectSubscription):
             self._handover.drop(subscription)
             return True
         return super().destroy_subscription(subscription)
@@ -293,7 +251,7 @@ class AnserNode(Node):
             finally:
                 self._turn.release()
 
-        return in_turn if self._handover is not None else callback
+        return in_turn
 
     def _guard(self, callback: Callback, is_service: bool = False) -> Callback:
         @functools.wraps(callback)

@@ -4,6 +4,7 @@ only place that knows a parameter's name, type, default, range and meaning. The 
 several nodes have, and what parameter files say.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import itertools
@@ -35,18 +36,9 @@ class Rule:
     live: bool = False  # whether it may change while the node runs
 
 
-def parameter(
-    default: Any,
-    description: str,
-    *,
-    minimum: float | None = None,
-    maximum: float | None = None,
-    choices: tuple[str, ...] = (),
-    live: bool = False,
-) -> Any:
-    """Return the dataclass field of one parameter (see :class:`Rule`)."""
-    rule = Rule(description, minimum, maximum, choices, live)
-    return dataclasses.field(default=default, metadata={'rule': rule})
+def parameter(default: Any, description: str, **rule: Any) -> Any:
+    """Return the dataclass field of one parameter, with the values of its :class:`Rule`."""
+    return dataclasses.field(default=default, metadata={'rule': Rule(description, **rule)})
 
 
 def rules(table: type) -> dict[str, Rule]:
@@ -54,15 +46,10 @@ def rules(table: type) -> dict[str, Rule]:
     return {field.name: field.metadata['rule'] for field in dataclasses.fields(table)}
 
 
-FOREIGN = ('use_sim_time', 'start_type_description_service')
-"""Parameters that rclpy itself declares or reads ..."""
-FOREIGN_PREFIXES = ('qos_overrides.',)
-"""... and what the names of others begin with."""
-
-
 def is_foreign(name: str) -> bool:
     """Return whether a parameter is rclpy's own."""
-    return name in FOREIGN or name.startswith(FOREIGN_PREFIXES)
+    own = 'use_sim_time', 'start_type_description_service'
+    return name in own or name.startswith('qos_overrides.')
 
 
 def is_known(table: type, name: str) -> bool:
@@ -127,7 +114,7 @@ def describe(table: type) -> str:
     lines = []
     for field in dataclasses.fields(table):
         rule = field.metadata['rule']
-        limits = [str(choice) for choice in rule.choices]
+        limits = list(rule.choices)
         if rule.minimum is not None or rule.maximum is not None:
             low = '-inf' if rule.minimum is None else f'{rule.minimum:g}'
             high = 'inf' if rule.maximum is None else f'{rule.maximum:g}'
@@ -174,24 +161,19 @@ def tracked_parameter() -> Any:
     )
 
 
-OPTION = '--params-file'
 LEAF = 'ros__parameters'
 WILDCARDS = ('*', '**')
 
 
-def _documents(arguments: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """Yield the path and content of each parameter file among a process's arguments.
+def _sections_given(arguments: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the path of each parameter file among a process's arguments, and its sections.
 
     Files that cannot be read or are not YAML are left out: rclpy refuses them.
     """
-    for option, value in itertools.pairwise(arguments):
-        if option != OPTION:
-            continue
-        try:
-            document = read_yaml(read_text(value))
-        except (ParameterError, yaml.YAMLError):
-            continue
-        yield value, document
+    for option, path in itertools.pairwise(arguments):
+        if option == '--params-file':
+            with contextlib.suppress(ParameterError, yaml.YAMLError):
+                yield path, dict(_sections(read_yaml(read_text(path))))
 
 
 def complaints(arguments: Sequence[str], node: str) -> list[str]:
@@ -200,23 +182,21 @@ def complaints(arguments: Sequence[str], node: str) -> list[str]:
     rclpy ignores such a file silently, and the node runs with its defaults.
     """
     found = []
-    for value, document in _documents(arguments):
-        keys = [key for key, _ in _sections(document)]
-        names = [key.rsplit('/', 1)[-1] for key in keys]
-        if any(name in names for name in (node, *WILDCARDS)):
-            continue
-        close = difflib.get_close_matches(node, names, n=1)
-        hint = f'it has: {", ".join(keys) or "no section at all"}'
-        hint = f"is '{keys[names.index(close[0])]}' meant?" if close else hint
-        found.append(f'{value} has nothing for {node}; {hint}')
+    for path, sections in _sections_given(arguments):
+        keys = {_node_of(key): key for key in sections}
+        if not keys.keys() & {node, *WILDCARDS}:
+            close = difflib.get_close_matches(node, keys, n=1)
+            hint = f'it has: {", ".join(sections) or "no section at all"}'
+            hint = f"is '{keys[close[0]]}' meant?" if close else hint
+            found.append(f'{path} has nothing for {node}; {hint}')
     return found
 
 
 def names_for(arguments: Sequence[str], node: str) -> Iterator[str]:
     """Yield the names of the values that parameter files have in sections of just this node."""
-    for _, document in _documents(arguments):
-        for key, values in _sections(document):
-            if key.rsplit('/', 1)[-1] == node and isinstance(values, dict):
+    for _, sections in _sections_given(arguments):
+        for key, values in sections.items():
+            if _node_of(key) == node and isinstance(values, dict):
                 yield from map(str, values)
 
 
@@ -228,19 +208,23 @@ def checked(name: str, nodes: Collection[str]) -> str:
     """
     path = str(config_path(name))
     try:
-        document = read_yaml(read_config(name))
+        sections = dict(_sections(read_yaml(read_config(name))))
     except (ValueError, yaml.YAMLError) as error:
         raise ParameterError(f'{path}: not YAML: {" ".join(str(error).split())}') from error
-    keys = [key for key, _ in _sections(document)]
-    if not keys:
+    if not sections:
         raise ParameterError(f'{path}: no section with {LEAF}')
-    for key in keys:
-        last = key.rsplit('/', 1)[-1]
-        if last not in (*nodes, *WILDCARDS):
-            close = difflib.get_close_matches(last, nodes, n=1)
+    for key in sections:
+        node = _node_of(key)
+        if node not in (*nodes, *WILDCARDS):
+            close = difflib.get_close_matches(node, nodes, n=1)
             hint = f', is {close[0]} meant?' if close else f'; there are: {", ".join(nodes)}'
             raise ParameterError(f'{path}: no node {key}{hint}')
     return path
+
+
+def _node_of(key: str) -> str:
+    """Return the name of a section's node, without its namespace."""
+    return key.rsplit('/', 1)[-1]
 
 
 def _sections(document: Any, path: str = '') -> Iterator[tuple[str, Any]]:

@@ -9,7 +9,7 @@ import socket
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from types import FrameType
 from typing import Any
 
@@ -52,19 +52,12 @@ def keep_in_one_piece() -> None:
 
 # How long a signal may go unnoticed by an idle node.
 SPIN_SLICE_S = 0.1
-# Where Fast DDS looks for profiles; the user's own ones hold.
-PROFILE_VARIABLES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
-PROFILES = 'fastdds.xml'
-# Without it, rmw_fastrtps sets how the memory of messages is kept itself; the ROS QoS hold anyway.
-READ_PROFILES = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
 ENDING = (signal.SIGINT, signal.SIGTERM)
 NOTICE_S = 1.0
 """How long, s, a busy process may take to notice that it is to end, before it is ended."""
 TURN_S = 1e-3
 """Time, s, after which a thread lets another one have its turn where samples are received, and so
 the error in the time at which bytes arrive; Python's own is 5 ms."""
-RENAMING = ('__node:=', '__name:=')
-"""Rules that rename all nodes of a process, which several can't be."""
 
 
 def main(
@@ -83,7 +76,8 @@ def main(
     name = name or classes[0].NAME
     try:
         own = _parse(name, classes, _without_ros(arguments))
-        if len(classes) > 1 and any(text.startswith(RENAMING) for text in arguments):
+        renaming = '__node:=', '__name:='  # of all nodes of a process, which several can't be
+        if len(classes) > 1 and any(text.startswith(renaming) for text in arguments):
             raise ParameterError(f'one node is renamed by -r {classes[-1].NAME}:__node:=NAME')
         signals = _Signals()
         _choose_profile()
@@ -104,9 +98,12 @@ def main(
 
 def _choose_profile() -> None:
     """Let nodes find each other at once, and the middleware give back the memory of messages."""
-    if not any(os.environ.get(variable) for variable in PROFILE_VARIABLES):
-        os.environ[PROFILE_VARIABLES[0]] = str(config_path(PROFILES))
-        os.environ.setdefault(READ_PROFILES, '1')
+    # Where Fast DDS looks for profiles; the user's own ones hold.
+    variables = 'FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'
+    if not any(os.environ.get(variable) for variable in variables):
+        os.environ[variables[0]] = str(config_path('fastdds.xml'))
+        # Without it, rmw_fastrtps sets how memory is kept itself; the ROS QoS hold anyway.
+        os.environ.setdefault('RMW_FASTRTPS_USE_QOS_FROM_XML', '1')
 
 
 def _without_ros(arguments: Sequence[str]) -> list[str]:
@@ -188,8 +185,7 @@ class _Signals:
         self.is_node_made = False
         self.caught: list[int] = []
         self._noticed = threading.Event()
-        # What devices have to be informed where the process is given up.
-        self.abandon_calls: list[Callable[[], object]] = []
+        self.nodes: list[AnserNode] = []
         for number in ENDING:
             signal.signal(number, self._catch)
         # Python's handlers wait for the main thread; this channel does not.
@@ -214,9 +210,9 @@ class _Signals:
             pass
         if self._noticed.wait(NOTICE_S):
             return
-        for on_abandon in self.abandon_calls:
+        for node in self.nodes:
             try:
-                on_abandon()
+                node.on_abandon()
             except Exception:  # noqa: BLE001 - the process ends, whatever a device says
                 traceback.print_exc()
         if not self._noticed.is_set():
@@ -244,18 +240,15 @@ def _run(
     meant: dict[str, list[str]],
     signals: _Signals,
 ) -> int:
-    nodes: list[AnserNode] = []
-    code = 0
+    nodes, code = signals.nodes, 0
     keep_in_one_piece()
     executor = make_executor()
-    shared: dict[str, Any] = (
-        {'handover': Handover(), 'beside': classes} if len(classes) > 1 else {}
-    )
+    shared: dict[str, Any] = {'handover': Handover(), 'beside': classes}
     try:
         for node_class in classes:
-            only: dict[str, Any] = {'cli_args': meant[node_class.NAME]} if shared else {}
-            nodes.append(node_class(**own, **shared, **only))
-            signals.abandon_calls.append(nodes[-1].on_abandon)
+            if len(classes) > 1:
+                own |= {**shared, 'cli_args': meant[node_class.NAME]}
+            nodes.append(node_class(**own))
         _complain(nodes, arguments)
         for node in nodes:
             executor.add_node(node)

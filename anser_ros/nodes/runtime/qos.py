@@ -3,26 +3,24 @@
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 
-def reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
-    """Return the profile of a topic of which so many messages are kept."""
+def _reliable(depth: int, *, is_latched: bool = False) -> QoSProfile:
+    """Return a profile by which so many messages are kept, for a late joiner too if latched."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE,
-        durability=durability,
+        durability=(DurabilityPolicy.TRANSIENT_LOCAL if is_latched else DurabilityPolicy.VOLATILE),
     )
 
 
-LATE = DurabilityPolicy.TRANSIENT_LOCAL
-"""Of what a late joiner must still get."""
 # The setup document and whatever else holds until it is said again.
-LATCHED = reliable(1, LATE)
+LATCHED = _reliable(1, is_latched=True)
 # Field models: while the model is refitted every frame has its own, and what a busy reader has not
 # taken yet must not give way to the next, so there is room for a second's.
-MODELS = reliable(50, LATE)
+MODELS = _reliable(50, is_latched=True)
 # Their uncertainty is a larger message; there is room for a third of a second.
-MODEL_ERRORS = reliable(16, LATE)
+MODEL_ERRORS = _reliable(16, is_latched=True)
 # Fluxes and poses: deep enough to bridge half a second at 200 Hz without a loss.
-STREAM = reliable(100)
+STREAM = _reliable(100)
 # /diagnostics and /tf, as everybody else has them.
-EVENTS = reliable(100)
+EVENTS = _reliable(100)

@@ -105,11 +105,10 @@ NUMBER = 'publication_sequence_number'
 class OneSource:
     """Subscribes to a topic; what comes while it has several senders is not passed on.
 
-    The callback takes the message alone, or its information too where ``informed``; ``doubted``
-    takes messages that are not believed. ``lasting`` returns what a message says if that holds
-    until its sender says otherwise, else None; if that ``is_constant``, who says otherwise is
-    another sender. The ``subscription`` to a latched topic is made again once it has a single
-    sender again.
+    ``doubted`` takes messages that are not believed. ``lasting`` returns what a message says if
+    that holds until its sender says otherwise, else None; if that ``is_constant``, who says
+    otherwise is another sender. The ``subscription`` to a latched topic is made again once it has
+    a single sender again.
     """
 
     def __init__(
@@ -117,17 +116,15 @@ class OneSource:
         node: AnserNode,
         message_type: type,
         topic: str,
-        callback: Callable[..., None],
+        callback: Callable[[Any], None],
         profile: QoSProfile,
-        doubted: Callable[..., None] | None = None,
+        doubted: Callable[[Any], None] | None = None,
         lasting: Callable[[Any], Hashable] | None = None,
         is_constant: bool = False,
-        informed: bool = False,
     ) -> None:
         self._node, self._topic = node, topic
         self._name = node.resolve_topic_name(topic)
         self._callback, self._doubted, self._lasting = callback, doubted, lasting
-        self._informed = informed
         self._arguments = message_type, profile
         self._sources = Senders(topic, is_constant)
         self._publishers, self._looked_s = 0, 0.0
@@ -138,7 +135,7 @@ class OneSource:
     def complaint(self) -> str:
         """Return why the topic can't be believed now; empty while it has one sender."""
         now_s = time.monotonic()
-        complaint = self._sources.look(self._count(now_s), now_s)
+        complaint = self._sources.look(self.publishers(), now_s)
         latched = self._arguments[1].durability == DurabilityPolicy.TRANSIENT_LOCAL
         if self._refused_s is not None and self._publishers > 1:
             self._refused_s = now_s
@@ -152,7 +149,10 @@ class OneSource:
 
     def publishers(self) -> int:
         """Return how many publishers the graph knows, idle ones included."""
-        return self._count(time.monotonic())
+        now_s = time.monotonic()
+        if now_s - self._looked_s > LOOK_S:
+            self._publishers, self._looked_s = self._node.count_publishers(self._name), now_s
+        return self._publishers
 
     def sender(self) -> str:
         """Return what identifies the only publisher in the graph; empty where there is another
@@ -166,7 +166,7 @@ class OneSource:
         now_s, number = time.monotonic(), info.get(NUMBER)
         if number is not None and not self._sources.continues(number):
             self._looked_s = 0.0  # the graph as it is at this moment is needed
-        is_good = self._sources.take(number, self._count(now_s), now_s, lasting)
+        is_good = self._sources.take(number, self.publishers(), now_s, lasting)
         if not is_good:
             # A successor that goes on publishing is refused again and again: the first counts.
             if self._refused_s is None or self._publishers > 1:
@@ -184,15 +184,13 @@ class OneSource:
 
     def _take(self, message: Any, info: Mapping[str, Any]) -> None:
         lasting = None if self._lasting is None else self._lasting(message)
-        callback = self._callback if self.accepts(info, lasting) else self._doubted
-        if callback is not None:
-            callback(message, *([info] if self._informed else []))
+        if self.accepts(info, lasting):
+            self._deliver(message, info)
+        elif self._doubted is not None:
+            self._doubted(message)
 
-    def _count(self, now_s: float) -> int:
-        """How many publishers the graph knows."""
-        if now_s - self._looked_s > LOOK_S:
-            self._publishers, self._looked_s = self._node.count_publishers(self._name), now_s
-        return self._publishers
+    def _deliver(self, message: Any, _info: Mapping[str, Any]) -> None:
+        self._callback(message)
 
 
 def setup_source(node: AnserNode, callback: Callable[[Any], None]) -> OneSource:
@@ -220,21 +218,19 @@ class NewestSource(OneSource):
         node: AnserNode,
         topic: str,
         callback: Callable[[Any], None],
-        doubted: Callable[..., None] | None = None,
+        doubted: Callable[[Any], None] | None = None,
         works_later: bool = False,
     ) -> None:
-        self._work, self._works_later, self.backlog = callback, works_later, Backlog()
-        super().__init__(
-            node, PointCloud2, topic, self._on_frame, qos.STREAM, doubted, informed=True
-        )
+        self._works_later, self.backlog = works_later, Backlog()
+        super().__init__(node, PointCloud2, topic, callback, qos.STREAM, doubted)
 
-    def _on_frame(self, message: PointCloud2 | HandedFlux, info: Mapping[str, Any]) -> None:
+    def _deliver(self, message: PointCloud2 | HandedFlux, info: Mapping[str, Any]) -> None:
         # What is handed over has no queue.
         is_handed = isinstance(message, HandedFlux)
         newest = message if is_handed else self._newest(message, info)
         begin_s = time.perf_counter()
         if newest is not None:
-            self._work(newest)
+            self._callback(newest)
         if not self._works_later:
             self.backlog.worked(time.perf_counter() - begin_s)
 

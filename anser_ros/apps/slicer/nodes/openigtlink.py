@@ -25,11 +25,11 @@ from anser_ros.apps.slicer import igtl
 from anser_ros.apps.slicer.extension import OPENIGTLINK
 from anser_ros.errors import AnserError, ParameterError, PortError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.incoming import seconds_of
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import STALE_AFTER_S, parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.pose_states import OK, STALE
+from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.recorded import pose_numbers
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 from anser_ros.wire.setup_values import tip_name
@@ -355,7 +355,7 @@ class OpenIGTLink(AnserNode):
             self.warn('poses_refused', f'{name}: an invalid pose')
             return
         now_s = self._last_pose_s[name] = time.monotonic()
-        stamp_s = seconds_of(message)
+        stamp_s = stamp_of(message) * NANO
         self._ahead_s = stamp_s - now_s
         self._set_state(name, OK)
         if self._n_clients:
