@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosidl_parser.definition import AbstractNestedType, NamespacedType
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import AnserError, BagError
@@ -88,9 +87,8 @@ def _file(type_name: str, ending: str) -> Path:
 
 def _contained(message: Any) -> list[str]:
     """Return the full names of the types of a message's fields, each once."""
-    kinds = message.SLOT_TYPES
-    parts = [k.value_type if isinstance(k, AbstractNestedType) else k for k in kinds]
-    names = ['/'.join(p.namespaced_name()) for p in parts if isinstance(p, NamespacedType)]
+    parts = [getattr(kind, 'value_type', kind) for kind in message.SLOT_TYPES]  # of sequences
+    names = ['/'.join(p.namespaced_name()) for p in parts if hasattr(p, 'namespaced_name')]
     return list(dict.fromkeys(names))
 
 

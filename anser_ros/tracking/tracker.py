@@ -393,9 +393,13 @@ def warm_up() -> None:
             uncertainty,
         )  # fmt: skip
         rng = np.random.default_rng(0)
-        flux = model.flux(sensors.position + [0.01, 0.02, 0.15], sensors.axis, sensors.length)
+        places = sensors.position + [0.01, 0.02, 0.15]
+        flux = model.flux(places, sensors.axis, sensors.length)
         tracker = Tracker(model, sensors, settings)
         for stamp_ns in (1, 2, 3):
             # New noise each time, for a reading that repeats is no reading.
             noise = settings.flux_noise_t * rng.standard_normal((2, *flux.shape))
             tracker.update(stamp_ns, sensors.channel, flux + noise[0] + 1j * noise[1])
+        if uncertainty is not None:  # what a coil needs that is far from where it was expected
+            context = build_context(model, settings)
+            context.errors_at(places, sensors.axis, sensors.length)
