@@ -81,7 +81,8 @@ def in_order(work: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list[R
         help_out()
     finally:
         for helper in helpers:
-            helper.result()
+            if not helper.cancel():  # one that has not begun is not waited for
+                helper.result()
     return [found[index] for index in range(len(whole))]
 
 

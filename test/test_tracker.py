@@ -154,6 +154,22 @@ def test_a_dead_emitter_is_named_and_the_others_go_on(rng, silence):
     assert 'coil0, coil2, coil5; 5 emitters are left, 6 needed' in found['tool_a'].reason
 
 
+def test_the_error_of_the_model_is_that_of_the_living_emitters(rng):
+    """A tool at rest goes on from what it knew; emitter 2 alone is uncertain."""
+    modes = np.zeros((1, *MODEL.moments.shape), complex)
+    modes[0, :, 2] = 0.01 * MODEL.moments[:, 2]
+    model, settings = replace(MODEL, modes=modes), replace(EXACT, adaptive=False)
+    ((_, *pose),) = path(1)
+    flux, sigmas = [fluxes(model, TOOL, *pose, rng) for _ in range(4)], []
+    for course in ((2, 2, 2, 5), (5, 5, 5, 5)):
+        tracker = Tracker(model, TOOL, settings)
+        for i, dead in enumerate(course):
+            silent = np.arange(8) == dead
+            found = one_frame(tracker, np.where(silent, 0.0, flux[i]), (i + 1) * STEP_NS)
+        sigmas.append([e.sigma_position_m for e in found.values()])
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=0.01)
+
+
 def test_a_cold_start_and_a_model_swap_with_a_dead_emitter(rng):
     tracker = Tracker(MODEL, TOOL)
     for i in range(5):

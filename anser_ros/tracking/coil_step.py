@@ -134,7 +134,8 @@ def take_errors(s, position, axis, length, memory, model):  # type: ignore[no-un
         model.modes, model.sigma, memory.errors[s : s + 1], memory.whitening[s : s + 1], near,
     )  # fmt: skip
     at[:3], at[3:] = position, axis
-    memory.reach_m[s], memory.among[s] = ERROR_REACH * near[0, 0], near[0, 1]
+    memory.reach_m[s] = ERROR_REACH * near[0, 0] if is_finite else -1.0
+    memory.among[s] = near[0, 1]
     return is_finite
 
 
@@ -264,5 +265,6 @@ def rules_of(settings: TrackerSettings, width: int) -> Rules:
         float(settings.gate), settings.has_gate, settings.adaptive, float(freedom), usual,
         USUAL_GATE**2 if settings.has_gate else usual, float(settings.warm_age_s),
         float(settings.min_signal), float(settings.roll_variance), float(settings.max_sigma_m),
-        box.low, box.high,
+        (float(box.low[0]), float(box.low[1]), float(box.low[2])),
+        (float(box.high[0]), float(box.high[1]), float(box.high[2])),
     )  # fmt: skip

@@ -34,7 +34,7 @@ from anser_ros.tracking.coil_step import (
 from anser_ros.tracking.estimate import FRESH_NOISE, NoiseScale, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import CoilSolution, coil_covariance, solve_coil, whitening_of
-from anser_ros.tracking.solve_context import NOT_FINITE, SolveContext
+from anser_ros.tracking.solve_context import NOT_FINITE, ErrorModes, SolveContext
 from anser_ros.tracking.solve_verdict import SOUND, Freedom, SolveFrame, millimetres
 
 FIRST_RETRY_S, LAST_RETRY_S = 0.05, 0.25
@@ -70,7 +70,7 @@ class CoilTracks:
 
     def __init__(self, count: int) -> None:
         self.scans = [Scans() for _ in range(count)]
-        self._made_for: tuple[object, Array] | None = None
+        self._made_for: tuple[ErrorModes | None, Array] | None = None
         noise = np.tile(FRESH_NOISE, (count, 1))
         self.noise = [NoiseScale(row) for row in noise]
         some, none = np.zeros((count, 6)), np.empty((count, 0, 0))
@@ -89,12 +89,10 @@ class CoilTracks:
     def prepare(self, context: SolveContext) -> CoilMemory:
         """Drop what is remembered of the errors of another model; return the memory."""
         modes, sigma = context.modes, context.sigma
-        key = None if modes is None else modes.given
         if self._made_for is not None:
             known, own = self._made_for
-            if known is key and (own is sigma or np.array_equal(own, sigma)):
+            if known is modes and (own is sigma or np.array_equal(own, sigma)):
                 return self.memory
-        self._made_for = key, sigma
         memory, count, width = self.memory, len(self.scans), sigma.size
         rank = 0 if modes is None else modes.moments.shape[1] // width
         rows = 1 if modes is None else width
@@ -107,7 +105,7 @@ class CoilTracks:
         if modes is None:
             memory.whitening[:] = whitening_of(sigma)
         memory.reach_m[:], memory.among[:] = -1.0, 0.0
-        self.memory = memory
+        self.memory, self._made_for = memory, (modes, sigma)
         return memory
 
     def follow(

@@ -251,7 +251,7 @@ class BodyCoils:
         """Return what the changes of gains make of fluxes (S, 2K): (S, G, 2K), T."""
         if self.changes is None:
             return np.zeros((len(flux), 0, flux.shape[1]))
-        return np.asarray(self.changes.T[:, :, None] * flux[:, None, :])
+        return np.ascontiguousarray(self.changes.T[:, :, None] * flux[:, None, :])
 
 
 @dataclass(frozen=True)
