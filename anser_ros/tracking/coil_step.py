@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.stamps import NANO
 from anser_ros.tracking.descent import descend
-from anser_ros.tracking.estimate import USUAL_GATE, TrackerSettings, add_frame, scale_of_frame
-from anser_ros.tracking.solve import MAX_EVALUATIONS, CoilSolution, chi2_limit, coil_covariance
+from anser_ros.tracking.estimate import TrackerSettings, add_frame, scale_of_frame, sigma_factor
+from anser_ros.tracking.solve import MAX_EVALUATIONS, CoilSolution, coil_covariance
 from anser_ros.tracking.solve_context import fill_model_errors
-from anser_ros.tracking.solve_verdict import SOUND, SYSTEMATIC, fault_of
+from anser_ros.tracking.solve_verdict import SOUND, SYSTEMATIC, fault_of, usual_and_most
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -207,7 +207,7 @@ def _judge_coil(s, memory, model, rules, out):  # type: ignore[no-untyped-def]
     is_inside = True
     for i in range(3):
         is_inside &= rules.low[i] <= position[i] <= rules.high[i]
-    most_m = rules.max_sigma_m * (1.0 if rules.has_gate else math.sqrt(max(1.0, scale)))
+    most_m = rules.max_sigma_m * sigma_factor(rules.has_gate, scale)
     in_metal = memory.among[s] > 1.0 and rules.has_gate
     return fault_of(ratio, rules.gate, is_inside, True, sigma_m, most_m, in_metal)
 
@@ -260,10 +260,10 @@ def freedom_of(width: int) -> int:
 def rules_of(settings: TrackerSettings, width: int) -> Rules:
     """Return the rules for coils of so many flux components."""
     freedom, box = freedom_of(width), settings.box
-    usual = chi2_limit(freedom, SELDOM) / freedom
+    usual, most = usual_and_most(settings, freedom, SELDOM)
     return Rules(
         float(settings.gate), settings.has_gate, settings.adaptive, float(freedom), usual,
-        USUAL_GATE**2 if settings.has_gate else usual, float(settings.warm_age_s),
+        most, float(settings.warm_age_s),
         float(settings.min_signal), float(settings.roll_variance), float(settings.max_sigma_m),
         (float(box.low[0]), float(box.low[1]), float(box.low[2])),
         (float(box.high[0]), float(box.high[1]), float(box.high[2])),

@@ -66,7 +66,7 @@ class Scans:
 
 
 class CoilTracks:
-    """Follows coils through time, ``lengths`` (S,) m."""
+    """Remembers coils, a row each, and solves them near where they are expected."""
 
     def __init__(self, count: int) -> None:
         self.scans = [Scans() for _ in range(count)]

@@ -41,6 +41,12 @@ no misfit. Of noise alone, a coil with eight emitters has 0 +- 0.02. Smaller, an
 poses; larger, and a coil that is a little wrong all the time counts as one with more noise."""
 
 
+@inlined
+def sigma_factor(has_gate, scale):  # type: ignore[no-untyped-def]
+    """Return the factor on the largest sigma, see `TrackerSettings.max_sigma_factor`."""
+    return 1.0 if has_gate else math.sqrt(max(1.0, scale))
+
+
 @dataclass(frozen=True)
 class TrackerSettings:
     """States what the tracker may assume."""
@@ -106,7 +112,7 @@ class TrackerSettings:
 
     def max_sigma_factor(self, scale: float) -> float:
         """Return the factor on ``max_sigma_m``: larger without a gate, by the misfit."""
-        return 1.0 if self.has_gate else math.sqrt(max(1.0, scale))
+        return float(sigma_factor.py_func(self.has_gate, scale))
 
 
 @dataclass(frozen=True)

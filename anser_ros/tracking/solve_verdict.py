@@ -59,6 +59,14 @@ def fault_of(ratio, gate, is_inside, converged, sigma_m, most_m, in_metal):  # t
     return IN_METAL if in_metal else SOUND
 
 
+def usual_and_most(settings: TrackerSettings, freedom: int, seldom: float) -> tuple[float, float]:
+    """Return residual powers per freedom: that which noise exceeds with a probability of
+    ``seldom``, and that beyond which a misfit is systematic.
+    """
+    usual = chi2_limit(freedom, seldom) / freedom
+    return usual, USUAL_GATE**2 if settings.has_gate else usual
+
+
 def variance_scale(
     noise: NoiseScale,
     chi2: float,
@@ -75,11 +83,10 @@ def variance_scale(
     """
     if not settings.adaptive:
         return 1.0
-    usual, ratio = chi2_limit(freedom, seldom) / freedom, chi2 / freedom
+    (usual, most), ratio = usual_and_most(settings, freedom, seldom), chi2 / freedom
     scale = noise.of_frame(
         ratio, usual, freedom / unknowns, context.model_share, context.modes is not None
     )
-    most = USUAL_GATE**2 if settings.has_gate else usual
     return scale if ratio <= most else SYSTEMATIC * scale
 
 
