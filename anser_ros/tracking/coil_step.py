@@ -72,6 +72,7 @@ class Rules(NamedTuple):
     min_signal: float
     roll_variance: float
     max_sigma_m: float
+    most_steps: int  # of a descent
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
@@ -133,19 +134,19 @@ def take_errors(s, position, axis, length, memory, model):  # type: ignore[no-un
         position.reshape(1, 3), axis.reshape(1, 3), length, model.uncertain, model.spacing,
         model.modes, model.sigma, memory.errors[s : s + 1], memory.whitening[s : s + 1], near,
     )  # fmt: skip
-    at[:3], at[3:] = position, axis
+    for i in range(3):
+        at[i], at[3 + i] = position[i], axis[i]
     memory.reach_m[s] = ERROR_REACH * near[0, 0] if is_finite else -1.0
     memory.among[s] = near[0, 1]
     return is_finite
 
 
 @kernel
-def remember(s, stamp_ns, position, axis, residual, ratio, freedom, length, memory, model):  # type: ignore[no-untyped-def]
+def remember(s, stamp_ns, position, axis, residual, ratio, freedom, memory):  # type: ignore[no-untyped-def]
     """Take in a good solution of coil ``s``: ``residual`` (2K,), T, its power a freedom.
 
-    Returns False where the model's covariance is not finite.
+    The model's error there has been taken in before, by `take_errors`.
     """
-    is_finite = take_errors(s, position, axis, length, memory, model)
     weights, last = memory.whitening[s], memory.whitened[s]
     lasting, has_last = 0.0, not math.isnan(last[0])
     for k in range(residual.shape[0] - 1, -1, -1):  # the factor is lower triangular
@@ -165,7 +166,6 @@ def remember(s, stamp_ns, position, axis, residual, ratio, freedom, length, memo
     for i in range(3):
         before[i], before[3 + i] = good[i], good[3 + i]
         good[i], good[3 + i] = position[i], axis[i]
-    return is_finite
 
 
 @inlined
@@ -236,7 +236,7 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
             return False
         descend(
             out.position[row], out.axis[row], lengths[row], values[row], memory.whitening[row],
-            model.columns, model.moments, model.low, model.high, MAX_EVALUATIONS,
+            model.columns, model.moments, model.low, model.high, rules.most_steps,
             out.normal[row], out.residual[row], out.found[row],
         )  # fmt: skip
         ratio = out.found[s, 0] / rules.freedom
@@ -244,11 +244,10 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
         if not is_confirmed or _distance(position, memory.good[s]) > SUSPICIOUS_JUMP_M:
             continue
         out.fault[s] = _judge_coil(s, memory, model, rules, out)
-        if out.fault[s] == SOUND and not remember(
-            s, stamp_ns, position, axis, out.residual[s], ratio, rules.freedom, lengths[row],
-            memory, model,
-        ):  # fmt: skip
-            return False
+        if out.fault[s] == SOUND:
+            if not take_errors(s, position, axis, lengths[row], memory, model):
+                return False
+            remember(s, stamp_ns, position, axis, out.residual[s], ratio, rules.freedom, memory)
     return True
 
 
@@ -265,6 +264,7 @@ def rules_of(settings: TrackerSettings, width: int) -> Rules:
         float(settings.gate), settings.has_gate, settings.adaptive, float(freedom), usual,
         most, float(settings.warm_age_s),
         float(settings.min_signal), float(settings.roll_variance), float(settings.max_sigma_m),
+        MAX_EVALUATIONS,
         (float(box.low[0]), float(box.low[1]), float(box.low[2])),
         (float(box.high[0]), float(box.high[1]), float(box.high[2])),
     )  # fmt: skip

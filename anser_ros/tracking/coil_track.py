@@ -237,28 +237,32 @@ def _cold(frame: CoilFrame, scans: Scans) -> list[CoilSolution]:
 
 def _descend(frame: CoilFrame, position: Array, axis: Array) -> CoilSolution:
     context, length, row = frame.context, frame.length, frame.row
-    memory = frame.tracks.memory
-    if not take_errors(row, position, axis, np.array([length]), memory, context.arrays):
-        raise TrackingError(NOT_FINITE)
+    _take_errors(frame, position, axis)
     return solve_coil(
-        context.field, frame.flux, memory.whitening[row], position, axis, context.low,
-        context.high, length,
+        context.field, frame.flux, frame.tracks.memory.whitening[row], position, axis,
+        context.low, context.high, length,
     )  # fmt: skip
+
+
+def _take_errors(frame: CoilFrame, position: Array, axis: Array) -> None:
+    """Remember the model's error for the coil at a pose."""
+    length, memory = np.array([frame.length]), frame.tracks.memory
+    if not take_errors(frame.row, position, axis, length, memory, frame.context.arrays):
+        raise TrackingError(NOT_FINITE)
 
 
 def _scanned(
     frame: CoilFrame, scans: Scans, solution: CoilSolution, *rivals: CoilSolution
 ) -> CoilResult:
     """Judge the best solution of a scan and remember it as good or suspect."""
-    judged, row, tracks = _judge(frame, solution, rivals), frame.row, frame.tracks
+    judged = _judge(frame, solution, rivals)
     if judged.state == states.OK:
         scans.forget()
-        if not remember(
-            row, frame.stamp_ns, solution.position, solution.axis, solution.residual,
-            judged.chi2, float(frame.freedom), np.array([frame.length]), tracks.memory,
-            frame.context.arrays,
-        ):  # fmt: skip
-            raise TrackingError(NOT_FINITE)
+        _take_errors(frame, solution.position, solution.axis)
+        remember(
+            frame.row, frame.stamp_ns, solution.position, solution.axis, solution.residual,
+            judged.chi2, float(frame.freedom), frame.tracks.memory,
+        )  # fmt: skip
     else:
         wait_s = min(FIRST_RETRY_S * 2.0 ** min(scans.failures, 10), LAST_RETRY_S)
         scans.suspect, scans.failures = solution, scans.failures + 1
