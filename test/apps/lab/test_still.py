@@ -159,7 +159,7 @@ class TestFit:
     @pytest.mark.long
     def test_what_was_put_in_is_found(self):
         measured, _, _ = recorded(11)
-        fit = StillFitter(measured, CENTRES[:2], KINDS, STATED).fit()
+        fit = StillFitter(measured, CENTRES[:2], STATED).fit(KINDS)
         assert set(fit.evidence) == set(KINDS)
         assert 0.5 * NOISE_T < fit.widths.noise_t < 2.5 * NOISE_T
         assert fit.widths.sensors[0] == pytest.approx(0.02, rel=0.25)
@@ -173,15 +173,15 @@ class TestFit:
         measured, _, _ = recorded(
             12, gain=0.0, tilt=0.0, bend=0.0, iron=False, off=np.zeros((4, 6))
         )
-        fitter = StillFitter(measured, CENTRES[:2], KINDS, STATED)
-        fit = fitter.fit()
+        fitter = StillFitter(measured, CENTRES[:2], STATED)
+        fit = fitter.fit(KINDS)
         assert fit.evidence == {} and not fit.unknowns.sensors.any()
         assert fit.beside == 0 and fitter.evidence_of_poses(fit) < 0.0
 
     def test_zeros_are_refused(self):
         measured, _, _ = recorded(13)
         with pytest.raises(FitError, match='all fluxes are zero'):
-            StillFitter(replace(measured, flux=0.0 * measured.flux), CENTRES, KINDS, STATED)
+            StillFitter(replace(measured, flux=0.0 * measured.flux), CENTRES, STATED)
 
 
 @pytest.mark.long
@@ -228,7 +228,7 @@ def test_a_body_that_stands_elsewhere_than_stated_is_reported():
 def test_what_no_fold_finds_is_not_corrected():
     """The evidence of all frames alone gave this sound plate tilts of 0.4 mrad."""
     measured, _, _ = recorded(13, gain=0.0, tilt=0.0, bend=0.0, off=np.zeros((4, 6)), emitters=3)
-    fit = StillFitter(measured, CENTRES, ('axes',), STATED).fit()
+    fit = StillFitter(measured, CENTRES, STATED).fit(['axes'])
     assert 'axes' in fit.evidence
     scan = calibrated(measured, ('axes', 'poses')).scan
     assert not (*scan.corrections, *scan.reported_effects)
