@@ -218,7 +218,7 @@ def test_a_body_that_stands_elsewhere_than_stated_is_reported():
     assert 0.3 < np.sqrt(np.mean(ratio**2)) < 1.5 and np.abs(ratio).max() < 4.0
     # The others' field explains the readings at the pose that was found, though not as stated.
     assert rms(found.held_out.error) < 0.4 * told.evidence[AS_STATED]
-    three = calibrated(recorded(21, **sound)[0].frames(np.arange(3)), ('poses',))
+    three = calibrated(measured.frames(np.arange(3)), ('poses',))
     assert three.scan.reported_effects == ()  # so few poses don't tell it
     (line,) = to_document(three)['unobservable']
     assert line.startswith('poses:') and '4' in line
