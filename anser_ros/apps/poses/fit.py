@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtri
-from scipy.special import gammaincinv
+from scipy.special import gammaincinv, ndtri
 
 from anser_ros.apps.poses.effect import PoseTerm, Role
 from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState, stamp_step

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tracking_world import three_axis
 
 from anser_ros.apps.lab.calibration_engines import is_still
 from anser_ros.apps.lab.still import AS_STATED, PLACEMENT, calibrate_still
@@ -23,7 +24,6 @@ from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import dipole_field
 from anser_ros.physics.rotations import tilted
-from anser_ros.physics.sensor import SensorTable
 from anser_ros.settings import Accuracy
 
 pytestmark = pytest.mark.timeout(1800)  # half a minute of a quiet machine
@@ -43,11 +43,7 @@ def plate(per_side=5):
     """A square of three-axis sensors, 4 cm apart."""
     steps = 0.04 * (np.arange(per_side) - (per_side - 1) / 2)
     grid = np.array([[x, y, 0.0] for x in steps for y in steps])
-    count = 3 * len(grid)
-    return SensorTable(
-        np.arange(count), tuple(f's{k}' for k in range(count)), ('plate',) * count,
-        np.repeat(grid, 3, axis=0), np.tile(np.eye(3), (len(grid), 1)), np.zeros(count),
-    )  # fmt: skip
+    return three_axis('plate', grid)
 
 
 def field(points, emitter, iron):
