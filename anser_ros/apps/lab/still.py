@@ -130,10 +130,7 @@ def calibrate_still(
 
 @functools.lru_cache(maxsize=1)
 def _fitters(readings: bytes) -> tuple[StillFitter, ...]:
-    """The fitter of all frames, then one without each frame, of pickled readings.
-
-    They are kept, as a diagnosis calibrates the same frames again without one kind after another.
-    """
+    """Fitters of all frames, then without each, kept while a diagnosis leaves out other kinds."""
     posed, centres, accuracy = pickle.loads(readings)
     frames = np.arange(len(posed.time))
     some = [posed, *(posed.frames(frames != frame) for frame in frames)]
