@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from tracking_world import three_axis
 
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.readings import DipoleSites
@@ -119,10 +120,7 @@ def tool_of(count):
 
 def tool(length=0.0):
     """Two triaxial clusters 40 mm apart."""
-    axes = np.tile(np.eye(3), (2, 1))
-    place = np.repeat([[0.0, 0.0, -0.02], [0.0, 0.0, 0.02]], 3, axis=0)
-    names = tuple(f'tool/{i // 3}/{"xyz"[i % 3]}' for i in range(6))
-    return SensorTable(np.arange(6), names, ('tool',) * 6, place, axes, np.full(6, length))
+    return three_axis('tool', [[0.0, 0.0, -0.02], [0.0, 0.0, 0.02]], length_m=length)
 
 
 def scene(rng, side=9, jitter=1.0, sensors=None, noise=NOISE_T, height=0.14, centres=CENTRES):

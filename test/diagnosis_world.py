@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from injection_subject import JITTER_M, JITTER_RAD, NOISE_T, Subject
 from scipy.spatial.transform import Rotation
+from tracking_world import three_axis
 
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
@@ -30,10 +31,7 @@ def board(emitters: int = 4) -> FieldModel:
 
 def tool_sensors() -> SensorTable:
     """Two triaxial clusters, 30 mm apart."""
-    place = np.repeat([[0.0, 0.0, -0.015], [0.0, 0.0, 0.015]], 3, axis=0)
-    names = tuple(f'tool/{c}/{a}' for c in (0, 1) for a in 'xyz')
-    axes = np.tile(np.eye(3), (2, 1))
-    return SensorTable(np.arange(6), names, ('tool',) * 6, place, axes, np.zeros(6))
+    return three_axis('tool', [[0.0, 0.0, -0.015], [0.0, 0.0, 0.015]])
 
 
 def reference_sensors(count: int = 12) -> SensorTable:

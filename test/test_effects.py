@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from diagnosis_world import world
 from effects_scene import candidates, in_force, undrawn
+from tracking_world import three_axis
 
 from anser_ros.effects.channels import compressed
 from anser_ros.effects.correction import Correction, reference_view, tool_view
 from anser_ros.effects.effect import Family, Remedy, Term, all_effects, effect_named
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.physics.sensor import SensorTable
 
 
 @pytest.fixture(scope='module')
@@ -30,11 +30,7 @@ def corrected(problem, *records):
 def test_effects_declare_what_the_search_needs(problem):
     """Whoever adds an effect of a family must give what that family is refined with."""
     apparatus = problem.apparatus
-    places = np.repeat(0.05 * np.random.default_rng(1).normal(size=(13, 3)), 3, axis=0)
-    array = SensorTable(
-        1000 + np.arange(39), tuple(map(str, range(39))), ('array',) * 39, places,
-        np.tile(np.eye(3), (13, 1)), np.zeros(39),
-    )  # fmt: skip
+    array = three_axis('array', 0.05 * np.random.default_rng(1).normal(size=(13, 3)), 1000)
     apparatus = replace(undrawn(apparatus), tools=(*apparatus.tools, array))
     for name, effect in all_effects().items():
         terms = [*effect.candidates(apparatus)]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, Errors, moved_scan, scene
+from tracking_world import three_axis
 
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
 from anser_ros.calibration.population import Likelihood, Population, solve
@@ -117,13 +118,7 @@ def test_a_channel_far_outside_its_population_stands_alone(dirty):
 
 def test_gains_that_the_axes_of_a_chip_share_are_found_to_be_shared():
     rng = np.random.default_rng(4)
-    sensors = scene(rng, side=2).measurements.sensors
-    names = tuple(f'{k}/{axis}' for k in range(12) for axis in 'xyz')
-    places = np.repeat(0.02 * rng.normal(size=(12, 3)), 3, axis=0)
-    chips = replace(
-        sensors, channel=np.arange(36), name=names, body=('patch',) * 36, position=places,
-        axis=np.tile(np.eye(3), (12, 1)), length=np.zeros(36),
-    )  # fmt: skip
+    chips = three_axis('patch', 0.02 * rng.normal(size=(12, 3)))
     told = replace(scene(rng, side=2).measurements, body='patch', sensors=chips)
     population = Population(SensorParameters([told], ('gains',)))
     information = np.zeros((72, 72))

@@ -13,7 +13,6 @@ from anser_ros import pose_states as states
 from anser_ros.field.nominal import nominal_model
 from anser_ros.metal.body import sphere_polarisability
 from anser_ros.physics.board import build_board
-from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
@@ -291,11 +290,7 @@ def test_bodies_without_two_directions_get_no_pose(rng):
 
 def test_two_bodies_are_tracked_side_by_side(rng):
     other = triaxial_tool('tool_b', first=20)
-    both = SensorTable(
-        np.concatenate([TOOL.channel, other.channel]), TOOL.name + other.name,
-        TOOL.body + other.body, np.concatenate([TOOL.position, other.position]),
-        np.concatenate([TOOL.axis, other.axis]), np.zeros(18),
-    )  # fmt: skip
+    both = TOOL.joined(other)
     first, second = random_pose(rng), random_pose(rng)
     flux = np.concatenate([fluxes(MODEL, TOOL, *first, rng), fluxes(MODEL, other, *second, rng)])
     found = {e.name: e for e in Tracker(MODEL, both).update(1, both.channel, flux)}

@@ -46,14 +46,20 @@ def certain_model() -> FieldModel:
     )  # fmt: skip
 
 
+def three_axis(body: str, places, first: int = 0, length_m: float = 0.0) -> SensorTable:
+    """Sensors at places (n, 3) in a body, each of three coils along its x, y and z."""
+    names = tuple(f'{body}/{i}/{axis}' for i in range(len(places)) for axis in 'xyz')
+    count = len(names)
+    return SensorTable(
+        channel=np.arange(first, first + count), name=names, body=(body,) * count,
+        position=np.repeat(np.asarray(places), 3, axis=0),
+        axis=np.tile(np.eye(3), (len(places), 1)), length=np.full(count, length_m),
+    )  # fmt: skip
+
+
 def triaxial_tool(body: str = 'tool_a', first: int = 0, length_m: float = 0.0) -> SensorTable:
     """Three clusters of three coils each, 30 mm apart."""
-    names = [f'{body}/{i}/{axis}' for i in range(3) for axis in 'xyz']
-    return SensorTable(
-        channel=np.arange(first, first + 9), name=tuple(names), body=(body,) * 9,
-        position=np.repeat(np.array(CLUSTER), 3, axis=0), axis=np.tile(np.eye(3), (3, 1)),
-        length=np.full(9, length_m),
-    )  # fmt: skip
+    return three_axis(body, CLUSTER, first, length_m)
 
 
 def random_pose(rng: np.random.Generator, low: float = 0.1, high: float = 0.22):

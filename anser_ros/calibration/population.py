@@ -84,10 +84,14 @@ def width_by_evidence(square: Array, ratio: Array, least: float) -> tuple[float,
 
 def solve(likelihood: Likelihood, width: Array, root: Array | None = None) -> Posterior:
     """Return the parameters for given prior widths, or a root (Q, Q) of the prior covariance."""
-    root = np.diag(width) if root is None else root
-    inner = np.eye(width.size) + root.T @ likelihood.information @ root
+    known, unit = likelihood.information, np.eye(width.size)
     # In units of the widths, a parameter that is held fixed does no harm.
-    covariance = root @ np.linalg.solve(inner, root.T)
+    if root is None:
+        inner = unit + width[:, None] * known * width
+        covariance = width[:, None] * np.linalg.solve(inner, np.diag(width))
+    else:
+        inner = unit + root.T @ known @ root
+        covariance = root @ np.linalg.solve(inner, root.T)
     covariance = (covariance + covariance.T) / 2.0
     values = covariance @ likelihood.natural
     log_size = float(np.linalg.slogdet(inner)[1])

@@ -11,14 +11,12 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
 from anser_ros import extensions
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
-from anser_ros.cli.output import remove_empty_folders
 from anser_ros.errors import AnserError, OneLineParser
 from anser_ros.parallel import ONE_THREAD, cores, shared_among
 
@@ -48,6 +46,8 @@ def _dispatch(arguments: list[str]) -> int:
         print(_usage())
         return EXIT_OK if arguments else EXIT_BAD_INPUT
     if arguments[0] == '--version':
+        from importlib.metadata import PackageNotFoundError, version
+
         try:
             print(f'anser_ros {version("anser_ros")}')
         except PackageNotFoundError:
@@ -88,6 +88,7 @@ def exec_node(name: str, arguments: Sequence[str]) -> NoReturn:
 
 def run_verb(name: str, arguments: Sequence[str]) -> int:
     """Run one offline command in this process and return the exit code."""
+    from anser_ros.cli.output import remove_empty_folders  # imports what no node needs
 
     def work() -> int:
         path, words = OFFLINE[name]

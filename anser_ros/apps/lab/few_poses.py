@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f_oneway
 
 from anser_ros.apps.lab.calibration_engines import is_estimated_jointly
 from anser_ros.apps.lab.still import AS_STATED, BEND, PLACEMENT, STILL_ONLY
@@ -147,6 +146,8 @@ def residual_power(calibration: Calibration) -> NDArray[np.float64]:
 
 def _differs(power: NDArray[np.float64], axis: int) -> bool:
     """Whether the logarithm of the power differs along an axis beyond chance."""
+    from scipy.stats import f_oneway  # loads slowly, and other diagnoses do without
+
     rows = np.log(np.maximum(np.moveaxis(power, axis, 0), 1e-300)).reshape(power.shape[axis], -1)
     groups = [row[np.isfinite(row)] for row in rows]
     groups = [group for group in groups if group.size > 1]

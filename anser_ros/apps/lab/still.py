@@ -8,6 +8,8 @@ sensors, noise and what is chosen come from those alone. Where errors of the sta
 looked for and found, each half of the sensors is predicted at the pose that the other half finds.
 """
 
+import functools
+import pickle
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -81,18 +83,17 @@ def calibrate_still(
     looked_for = tuple(kind for kind in STILL_KINDS if kind in kinds)
     chosen = tuple(kind for kind in looked_for if kind != 'poses')  # those are in every fit
 
-    frames, folds = np.arange(len(posed.time)), []
-    for frame in frames:
+    whole, *others = _fitters(pickle.dumps((posed, generator.centres, accuracy)))
+    folds = []
+    for frame, fitter in enumerate(others):
         if progress is not None:
-            progress('each pose from the others', frame / (len(frames) + 1.0))
-        others = posed.frames(frames != frame)
-        folds.append(StillFitter(others, generator.centres, chosen, accuracy).fit())
+            progress('each pose from the others', frame / (len(others) + 1.0))
+        folds.append(fitter.fit(chosen))
     # What most folds do not find has no part in what is predicted, so nothing speaks for it.
     kept = [
         kind for kind in chosen if 2 * sum(kind in fold.evidence for fold in folds) > len(folds)
     ]
-    whole = StillFitter(posed, generator.centres, kept, accuracy)
-    fit = whole.fit()
+    fit = whole.fit(kept)
     held_out = _held_out(posed, folds, accuracy, _as_stated)
     misplaced = []
     if 'poses' in looked_for and len(posed.time) >= FEWEST_PLACED:
@@ -125,6 +126,15 @@ def calibrate_still(
         undetermined=_not_determined(kinds, len(posed.time)),
     )
     return with_provenance(calibration, [name])
+
+
+@functools.lru_cache(maxsize=1)
+def _fitters(readings: bytes) -> tuple[StillFitter, ...]:
+    """Fitters of all frames, then without each, kept while a diagnosis leaves out other kinds."""
+    posed, centres, accuracy = pickle.loads(readings)
+    frames = np.arange(len(posed.time))
+    some = [posed, *(posed.frames(frames != frame) for frame in frames)]
+    return tuple(StillFitter(part, centres, accuracy) for part in some)
 
 
 def _not_determined(kinds: Sequence[str], poses: int) -> tuple[str, ...]:

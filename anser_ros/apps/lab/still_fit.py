@@ -9,7 +9,8 @@ noise, the kinds of errors and the free dipoles in addition to the emitters are 
 approximation of the log evidence.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -258,18 +259,14 @@ class StillFit:
 
 
 class StillFitter:
-    """Fits the frames of one body.
+    """Fits the frames of one body; keeps what it found for fits that look for other kinds.
 
-    ``centres`` (K, 3): rough places of the emitters, m, frame fg. ``kinds``: what to look for
-    besides errors of the poses: ``gains``, ``axes``, ``bend``.
+    ``centres`` (K, 3): rough places of the emitters, m, frame fg.
     """
 
-    def __init__(
-        self, measurements: Measurements, centres: Array, kinds: Sequence[str], accuracy: Accuracy
-    ) -> None:
+    def __init__(self, measurements: Measurements, centres: Array, accuracy: Accuracy) -> None:
         self.measurements, self.accuracy = measurements, accuracy
         self.model = StillModel(measurements, StillModel.has_quadrature(measurements))
-        self.kinds = tuple(k for k in kinds if k != 'bend' or self.model.bend is not None)
         self.points = measurements.placed()[0][measurements.usable]
         self.tree = cKDTree(self.points)
         self.extent = float(np.ptp(self.points, axis=0).max())
@@ -277,6 +274,8 @@ class StillFitter:
         if not self.flux_rms > 0.0:
             raise FitError(f'{measurements.body}: all fluxes are zero')
         self.around, self.around_width = self._around(centres)
+        self.alone = functools.cache(self._alone)
+        self.with_beside = functools.cache(self._with_beside)
 
     def _around(self, centres: Array) -> tuple[DipoleSites, Array]:
         """Return dipoles about each emitter, and how large their moments may be.
@@ -294,21 +293,32 @@ class StillFitter:
         width = self.flux_rms * away**3 / DIPOLE_CONSTANT
         return DipoleSites.of_any_direction(places.reshape(-1, 3)), np.repeat(width, 3 * len(step))
 
-    def fit(self) -> StillFit:
-        """Return the fit with the noise, the kinds and the dipoles that the readings ask for."""
-        widths = self._start(self.accuracy.flux_noise_t, ())
-        best = self._best_noise(self._solve(self.around, 0, widths))
+    def fit(self, kinds: Sequence[str]) -> StillFit:
+        """Return the fit with the noise, the kinds and the dipoles that the readings ask for.
+
+        ``kinds``: what to look for besides errors of the poses: ``gains``, ``axes``, ``bend``.
+        """
+        kinds = [kind for kind in kinds if kind != 'bend' or self.model.bend is not None]
+        start = self.accuracy.flux_noise_t, frozenset[str]()
         evidence = dict[str, float]()
-        while left := [kind for kind in self.kinds if kind not in evidence]:
-            tried = {}
-            for kind in left:
-                widths = self._start(best.widths.noise_t, (*evidence, kind))
-                tried[kind] = self._best_noise(self._solve(self.around, 0, widths))
-            kind = max(left, key=lambda name: tried[name].log_evidence)
-            gain = tried[kind].log_evidence - best.log_evidence
+        while left := [kind for kind in kinds if kind not in evidence]:
+            best = self.alone(*start)
+            starts = {k: (best.widths.noise_t, frozenset((*evidence, k))) for k in left}
+            tried = {kind: self.alone(*starts[kind]).log_evidence for kind in left}
+            kind = max(left, key=lambda name: tried[name])
+            gain = tried[kind] - best.log_evidence
             if gain < LEAST_EVIDENCE:
                 break
-            best, evidence[kind] = tried[kind], float(gain)
+            start, evidence[kind] = starts[kind], float(gain)
+        return replace(self.with_beside(*start), evidence=evidence)
+
+    def _alone(self, noise_t: float, kinds: frozenset[str]) -> StillFit:
+        """The fit with the emitters' dipoles alone, of the best noise about this one."""
+        return self._best_noise(self._solve(self.around, 0, self._start(noise_t, kinds)))
+
+    def _with_beside(self, noise_t: float, kinds: frozenset[str]) -> StillFit:
+        """The same with as many dipoles beside the emitters as pay."""
+        best = self.alone(noise_t, kinds)
         while best.beside < MOST_FREE_DIPOLES:
             found = self._place_beside(best)
             if found is None:
@@ -320,7 +330,7 @@ class StillFitter:
             if more.log_evidence < best.log_evidence + DIPOLE_PAYS:
                 break
             best = more
-        return replace(self._best_noise(best), evidence=evidence)
+        return self._best_noise(best)
 
     def evidence_of_poses(self, fit: StillFit) -> float:
         """Return the log evidence that the errors of the stated poses add to a fit."""
@@ -329,7 +339,7 @@ class StillFitter:
         held = self._solve(fit.sites, fit.beside, replace(fit.widths, frames=frames))
         return fit.log_evidence - self._best_noise(held).log_evidence
 
-    def _start(self, noise_t: float, kinds: Sequence[str]) -> StillWidths:
+    def _start(self, noise_t: float, kinds: Container[str]) -> StillWidths:
         jitter = self.accuracy.pose_jitter
         bend = jitter[0] if 'bend' in kinds else 0.0
         gain, tilt = (START[kind] if kind in kinds else 0.0 for kind in ('gains', 'axes'))

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtri
-from scipy.stats import chi2
+from scipy.special import gammaincinv, ndtri
 
 from anser_ros.apps.poses.effect import PoseTerm, Role
 from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState, stamp_step
@@ -96,7 +95,8 @@ class PoseFit(JointFit[PoseState]):
         course = np.outer(np.arange(1, SLOW + 1), np.arange(1, blocks + 1))
         tapers = np.sin(np.pi * course / (blocks + 1)) * np.sqrt(2 * blocks / (blocks + 1))
         slow = np.mean((tapers @ sums.right @ formal.T) ** 2, axis=0)
-        variance = np.where(slow > least * chi2.ppf(1 - CHANCE, SLOW) / SLOW, slow, least)
+        limit = 2 * gammaincinv(SLOW / 2, 1 - CHANCE)  # of chi-square; scipy.stats loads slowly
+        variance = np.where(slow > least * limit / SLOW, slow, least)
         scale = np.ones(clocks.size)
         scale[clocks] = np.sqrt(variance / np.diag(whole)[clocks])
         return np.asarray(whole * scale[:, None] * scale[None, :])

@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import DiagnosisError, PlausibilityError
@@ -336,6 +335,8 @@ def filtered(path: OpticalPath, tau: float, two_sided: bool = False) -> OpticalP
     keep = float(np.exp(-step / tau))
     # A straight line between samples goes through the filter exactly.
     late = (1 - keep) * tau / step
+    from scipy.signal import lfilter  # takes half a second, that every command would wait
+
     passed = values
     for way in (1, -1) if two_sided else (1,):
         turned = passed[::way]

@@ -61,7 +61,7 @@ def dipoles_of(model):
     return model.dipoles
 
 
-def recorded(world, rng, frames=200):
+def recorded(world, rng, frames):
     """Readings of an array that moves about a magnet, 80 to 160 mm away, and its optical poses."""
     table, time = array_of_sensors(rng), np.arange(frames) / 25.0
     place = np.stack(
@@ -116,7 +116,7 @@ def test_a_second_moment_is_what_a_cylinder_has_beyond_its_dipole(world, apparat
 @pytest.mark.long
 @pytest.mark.parametrize(
     ('world', 'key', 'gain', 'frames'),
-    [(LONG, 'length_m', 1.0, 300), (FLAT, 'diameter_m', 1.03, 200)],
+    [(LONG, 'length_m', 1.0, 150), (FLAT, 'diameter_m', 1.03, 120)],
 )
 def test_the_size_of_a_magnet_is_named_and_nothing_else(world, key, gain, frames):
     """But, of one of them, the gain of a sensor that is wrong too."""
@@ -146,7 +146,7 @@ def test_the_size_of_a_magnet_is_named_and_nothing_else(world, key, gain, frames
 
 @pytest.mark.long
 def test_a_magnet_without_a_size_is_not_given_one():
-    result = diagnosed(recorded(POINT, np.random.default_rng(5)))
+    result = diagnosed(recorded(POINT, np.random.default_rng(5), 120))
     assert not result.findings and result.unexplained == 0.0
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tracking_world import three_axis
 
 from anser_ros.apps.lab.source_track import Sources, seen_from
 from anser_ros.calibration import sensor_fit
@@ -26,7 +27,7 @@ from anser_ros.field.model import EffectRecord, FieldModel, symmetry_axis
 from anser_ros.fingerprint import Identity
 from anser_ros.physics.board import loop_field
 from anser_ros.physics.pose_track import PoseTrack
-from anser_ros.physics.sensor import SensorTable, clusters_of
+from anser_ros.physics.sensor import clusters_of
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OK
 from anser_ros.sessions.starting_model import with_new_survey
@@ -62,10 +63,7 @@ def array_of_sensors(rng):
     places = 0.03 * rng.uniform(-1.0, 1.0, size=(7, 3)) * [1.0, 1.0, 0.3]
     turns = Rotation.random(7, random_state=1).as_matrix()
     axes = turns.transpose(0, 2, 1).reshape(-1, 3)
-    names = tuple(f'array/{k}/{a}' for k in range(7) for a in 'xyz')
-    return SensorTable(
-        np.arange(21), names, ('array',) * 21, np.repeat(places, 3, axis=0), axes, np.zeros(21)
-    )
+    return replace(three_axis('array', places), axis=axes)
 
 
 def recorded(table, rng, frames=40, gains=None):
@@ -319,12 +317,7 @@ class TestGainsInADiagnosis:
         flux = 1e-6 * (rng.normal(size=(frames, 39, 2)) + 1j * rng.normal(size=(frames, 39, 2)))
         matrix = EFFECT.channel_matrix(term, np.arange(39))
         linear = np.einsum('st,ftk->fsk', matrix, flux)
-        places = np.repeat(0.05 * rng.normal(size=(13, 3)), 3, axis=0)
-        names = tuple(map(str, range(39)))
-        table = SensorTable(
-            np.arange(39), names, ('array',) * 39, places, np.tile(np.eye(3), (13, 1)),
-            np.zeros(39),
-        )  # fmt: skip
+        table = three_axis('array', 0.05 * rng.normal(size=(13, 3)))
         nothing = np.zeros((frames, 39, 3, 2))
         return table, View(
             np.arange(frames), table, nothing[:, 0, :, 0], np.tile(np.eye(3), (frames, 1, 1)),
