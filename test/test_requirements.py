@@ -23,7 +23,8 @@ OPTIONAL = {'tf2_msgs', 'launch', 'launch_ros'}
 SETUPTOOLS = 'setuptools'
 """Is needed by colcon's build of a Python package, by no import."""
 ROSDEP = {
-    'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'pyyaml': 'python3-yaml',
+    'numpy': 'python3-numpy', 'pandas': 'python3-pandas', 'scipy': 'python3-scipy',
+    'pyyaml': 'python3-yaml',
     'pyserial': 'python3-serial', 'matplotlib': 'python3-matplotlib', 'h5py': 'python3-h5py',
     'numba': 'python3-numba', 'rich': 'python3-rich',
 }  # fmt: skip

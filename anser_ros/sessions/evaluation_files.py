@@ -22,7 +22,8 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.pose_states import OK
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, metrics
-from anser_ros.wire.text_files import read_rows, read_text
+from anser_ros.wire.tables import read_table
+from anser_ros.wire.text_files import read_text
 
 Array = NDArray[np.float64]
 
@@ -209,10 +210,11 @@ def _read(
     path = folder / name
     if not path.is_file():
         raise ParameterError(f'{folder}: no {name}; is it a folder of anser evaluate?')
-    names, rows = read_rows(path)
+    table = read_table(path, as_text=True)
     try:
-        if tuple(names) != columns:
+        if table.names != columns:
             raise ValueError(f'columns must be {", ".join(columns)}')
+        rows = table.rows(columns)
         return {(int(row['stamp_ns']), row[columns[1]]): float(value(row)) for row in rows}
     except (ValueError, TypeError) as error:
         raise ParameterError(f'{path}: {error}') from error

@@ -1,5 +1,7 @@
 """Holds a recorded session as arrays, names topics of poses, and judges quaternions."""
 
+import re
+import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -37,6 +39,12 @@ BODY = 'body'
 """What a body is called without a name."""
 SCHEMA = 'anser_poses/1'
 """Schema of the setup document of a session of poses."""
+
+
+def legal_name(text: str) -> str:
+    """Return a name as near to a text as a topic can have: ``EM run-1`` is EM_run_1."""
+    plain = unicodedata.normalize('NFKD', text).encode('ascii', 'ignore').decode()
+    return topic_of(re.sub('[^a-zA-Z0-9_/]+', '_', plain).strip('_/') or BODY)
 
 
 def tracked_topic(sensor: str) -> str:

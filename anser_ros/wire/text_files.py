@@ -1,23 +1,18 @@
-"""Reads files from anybody: text, tables, points, YAML within bounds, model files.
+"""Reads files from anybody: text, YAML within bounds, model files.
 
 A file that cannot be read, or is no text of its kind, is one clear line.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 
-from anser_ros.errors import AnserError, BagError, ModelFileError, ParameterError, SetupError
+from anser_ros.errors import AnserError, ModelFileError, ParameterError, SetupError
 
 
 def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterError) -> str:
@@ -28,50 +23,6 @@ def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterEr
         raise kind(f'{os.fspath(path)}: {error.strerror}') from error
     except UnicodeDecodeError as error:
         raise kind(f'{os.fspath(path)}: not a text in UTF-8') from error
-
-
-def read_rows(path: str | os.PathLike[str]) -> tuple[list[str], list[dict[str, str]]]:
-    """Return the head of a CSV file, and its rows by these names; raises `ParameterError`."""
-    reader = csv.DictReader(io.StringIO(read_text(path), newline=''))
-    try:
-        rows = list(reader)
-    except csv.Error as error:
-        raise ParameterError(f'{os.fspath(path)}: no table: {error}') from error
-    return list(reader.fieldnames or []), rows
-
-
-def numbers_of(
-    path: str | os.PathLike[str],
-    rows: Sequence[dict[str, str]],
-    names: Sequence[str],
-    *,
-    with_gaps: bool = False,
-) -> NDArray[np.float64]:
-    """Return columns (rows, names) as finite numbers, gaps as NaN if allowed; `ParameterError`."""
-    try:
-        values = np.array(
-            [[float((row[n] or 'nan') if with_gaps else row[n]) for n in names] for row in rows]
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise ParameterError(
-            f'{os.fspath(path)}: needs the columns {", ".join(names)} with numbers: {error}'
-        ) from error
-    if not (with_gaps or np.isfinite(values).all()):
-        raise ParameterError(f'{os.fspath(path)}: the columns {", ".join(names)} must be finite')
-    return values
-
-
-def read_fiducials(path: Path) -> NDArray[np.float64]:
-    """Return the positions (P, 3), m, of a list of fiducials; raises `BagError`."""
-    lines = read_text(path).splitlines()
-    rows = [line.split(',') for line in lines if line.strip() and not line.startswith('#')]
-    try:
-        places = np.array([[float(value) for value in row[1:4]] for row in rows])
-    except ValueError as error:
-        raise BagError(f'{path}: no table of fiducials: {error}') from error
-    if not places.size or places.shape[1] != 3:
-        raise BagError(f'{path}: no table of fiducials')
-    return np.asarray(1e-3 * places)
 
 
 # libyaml's are several times as fast, where it is there.

@@ -20,7 +20,8 @@ from anser_ros.apps.poses.start import (
 )
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.plausibility import LENGTH_M, check_positions
+from anser_ros.sessions.plausibility import check_positions
+from anser_ros.wire.table_names import LENGTH_M
 
 Array = NDArray[np.float64]
 

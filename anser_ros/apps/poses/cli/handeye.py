@@ -108,7 +108,7 @@ def _session(args: argparse.Namespace) -> PoseSession:
         raise ParameterError('--tracked, --model and --optical need a bag')
     return import_poses(
         args.tracked, args.reference, stamps=args.stamps, unit=args.unit,
-        quaternion=args.quaternion,
+        quaternion=args.quaternion, shift_s=(args.shift, args.shift_reference),
     )  # fmt: skip
 
 

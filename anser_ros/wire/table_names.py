@@ -1,0 +1,157 @@
+"""Says what the name of a column means: a place, a rotation, a time, of whom and in which unit."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from anser_ros.errors import ParameterError
+
+LENGTH_M = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'inch': 0.0254}
+"""Metres in a unit of length."""
+TIME_NS = {'s': 1e9, 'ms': 1e6, 'us': 1e3, 'ns': 1.0}
+"""Nanoseconds in a unit of time."""
+_WORDS = {
+    'm': 'm meter meters metre metres', 'cm': 'cm centimeter centimeters centimetres',
+    'mm': 'mm millimeter millimeters millimetre millimetres', 'inch': 'in inch inches',
+    's': 's sec secs second seconds', 'ms': 'ms msec millisec milliseconds',
+    'us': 'us usec microseconds', 'ns': 'ns nsec nanosec nanoseconds nsecs nanosecs',
+    'deg': 'deg degree degrees', 'rad': 'rad radian radians',
+}  # fmt: skip
+UNITS = {word: unit for unit, words in _WORDS.items() for word in words.split()}
+"""Units by the words for them."""
+PLACE = {
+    '', 't', 'p', 'pos', 'position', 'trans', 'translation', 'loc', 'location', 'coord',
+    'coordinate',
+}  # fmt: skip
+TURN = {'q', 'quat', 'quaternion', 'rot', 'rotation', 'ori', 'orient', 'orientation', 'o', 'r'}
+TIME = {'time', 'timestamp', 'timestamps', 'stamp', 'clock'}
+OTHER = {
+    'v', 'vel', 'velocity', 'acc', 'accel', 'acceleration', 'gyro', 'mag', 'force', 'sigma',
+    'std', 'cov', 'err', 'error', 'bias', 'true',
+}  # fmt: skip
+"""Words of columns with axes that are neither places nor rotations."""
+ANGLES = {'roll', 'pitch', 'yaw', 'azimuth', 'elevation', 'euler', 'heading'}
+_AXIS = re.compile(f'({"|".join(sorted(PLACE | TURN, key=len, reverse=True))})([xyzw])')
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """Holds what a name says: kind (``place``, ``turn``, ``time``, ``angle`` or none), axis, unit,
+    and the other words, which are of a body or sensor."""
+
+    kind: str = ''
+    axis: str = ''
+    unit: str = ''
+    group: tuple[str, ...] = ()
+
+
+def is_unit(cell: str) -> bool:
+    """Return whether a cell is the word for a unit, or says that there is none."""
+    word = re.sub(r'[\W_]', '', cell).casefold()
+    return not word or word in UNITS or word in ('none', 'quat', 'quaternion')
+
+
+def words_of(name: str) -> list[str]:
+    """Return the words of a name: ``Tool1 posX (mm)`` has tool, 1, pos, x, mm."""
+    parted = re.sub('([a-z])([A-Z])', r'\1 \2', name)
+    return re.findall('[^\\W\\d_]+|\\d+', parted.casefold())
+
+
+def meaning_of(name: str, unit: str = '') -> Meaning:
+    """Return what a name means, with the unit that a row of units states."""
+    words = words_of(name)
+    unit = UNITS.get(unit, '')
+    if len(words) > 1 and words[-1] in UNITS:
+        unit = UNITS[words.pop()]
+    if not words:
+        return Meaning()
+    is_span = len(words) == 1 and UNITS.get(words[0]) in TIME_NS
+    if is_span or words == ['t'] or TIME.intersection((words[0], words[-1])):
+        return Meaning('time', unit=unit or UNITS.get(words[0], ''), group=tuple(words))
+    if ANGLES.intersection(words) or unit in ('deg', 'rad'):
+        return Meaning('angle', unit=unit)
+    kind, axis, place = _axis(words)
+    others = [*words[:place], *words[place + 1 :]]
+    if not axis or OTHER.intersection(others):
+        return Meaning()
+    kinds = [word for word in others if word in TURN or word in PLACE]
+    kind = kind or (kinds[0] if kinds else '')
+    is_turn = kind in TURN or axis == 'w'
+    group = tuple(word for word in others if word not in kinds)
+    return Meaning('turn' if is_turn else 'place', axis, unit, group)
+
+
+def _axis(words: list[str]) -> tuple[str, str, int]:
+    """Kind and axis that a word says, and which word; the last that says one."""
+    for place in reversed(range(len(words))):
+        if match := _AXIS.fullmatch(words[place]):
+            return match[1], match[2], place
+    for place in reversed(range(len(words))):
+        word = words[place]
+        if word in ('qr', 'qs'):
+            return 'q', 'w', place
+        if word in ('0', '1', '2', '3', 'r') and place and words[place - 1] in TURN:
+            return '', 'w' if word == 'r' else word, place
+    return '', '', 0
+
+
+@dataclass(frozen=True)
+class PoseColumns:
+    """Holds which columns are the pose of one body: x y z, and the quaternion x y z w."""
+
+    place: tuple[int, ...]
+    turn: tuple[int, ...]
+    unit: str  # of length, a key of `LENGTH_M`; empty if no name states it
+
+
+def pose_columns(
+    names: Sequence[str], units: Sequence[str]
+) -> tuple[dict[str, PoseColumns], list[tuple[int, str]]]:
+    """Return the poses in a table by the body's words, and its times: column and unit.
+
+    Raises `ParameterError`, which says what is not clear, when no pose or no time is named.
+    """
+    found = [meaning_of(name, unit) for name, unit in zip(names, units, strict=True)]
+    axes: dict[str, dict[tuple[str, ...], dict[str, int]]] = {'place': {}, 'turn': {}}
+    for column, one in enumerate(found):
+        if one.kind in axes:
+            known = axes[one.kind].setdefault(one.group, {})
+            axis = 'w' if one.axis == '0' else one.axis  # NDI's Q0 Qx Qy Qz
+            if axis in known:
+                raise ParameterError(f'{names[known[axis]]} and {names[column]} mean the same')
+            known[axis] = column
+    places = {group: one for group, one in axes['place'].items() if set('xyz') <= set(one)}
+    turns = {group: one for group, one in axes['turn'].items() if set('xyzw') <= set(one)}
+    both = {group: (places[group], turns[group]) for group in places if group in turns}
+    if not both and len(places) == len(turns) == 1:
+        both = {(): (next(iter(places.values())), next(iter(turns.values())))}
+    if not both:
+        angles = [n for n, one in zip(names, found, strict=True) if one.kind in ('angle', 'turn')]
+        raise ParameterError(
+            'no position x, y, z' if not places else
+            f'{", ".join(angles)} are no quaternion x, y, z, w' if angles else 'no quaternion'
+        )  # fmt: skip
+    bodies = {}
+    common = set.intersection(*map(set, both)) if len(both) > 1 else set()
+    for group, (place, turn) in both.items():
+        unit = {found[place[axis]].unit for axis in 'xyz'}
+        if len(unit) > 1 or not unit <= {*LENGTH_M, ''}:
+            raise ParameterError(f'the columns x, y, z are in {", ".join(sorted(unit))}')
+        label = '_'.join(word for word in group if word not in common)
+        bodies[label] = PoseColumns(
+            tuple(place[axis] for axis in 'xyz'), tuple(turn[axis] for axis in 'xyzw'), unit.pop()
+        )
+    return bodies, _times(names, found)
+
+
+def _times(names: Sequence[str], found: Sequence[Meaning]) -> list[tuple[int, str]]:
+    """The column of times and its unit; two where seconds and their rest in ns stand apart."""
+    times = [(column, one) for column, one in enumerate(found) if one.kind == 'time']
+    stamps = [(column, one) for column, one in times if 'stamp' in one.group] or times
+    parts = {one.unit: column for column, one in stamps}
+    if len(stamps) == 2 and set(parts) == {'s', 'ns'} and stamps[0][1].group == stamps[1][1].group:
+        return [(parts['s'], 's'), (parts['ns'], 'ns')]
+    if len(stamps) != 1:
+        words = ', '.join(names[column] for column, _ in stamps)
+        raise ParameterError(f'several times: {words}' if stamps else 'no time')
+    return [(stamps[0][0], stamps[0][1].unit)]

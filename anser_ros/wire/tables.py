@@ -1,0 +1,289 @@
+"""Reads tables of anybody: finds their dialect and their header, and refuses what is not clear.
+
+A table is a text with a header of names, or with numbers alone. Separators, decimal commas,
+quotes, encodings, titles, rows of units and headers of several lines are found in the text itself;
+pandas splits and converts the cells, and is imported only where a table is read.
+"""
+
+import codecs
+import csv
+import io
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import ParameterError
+from anser_ros.wire.table_names import LENGTH_M, is_unit, meaning_of
+
+Array = NDArray[np.float64]
+
+SEPARATORS = ('\t', ';', ',', None)
+"""Between cells, in the order in which they are preferred; None: any blanks."""
+COMMENTS = ('#', '%')
+TITLE_LINES = 60
+"""Lines in which the first row of numbers is looked for."""
+GAPS = ('-', '--', '---')
+"""Words for no value, beside those that pandas knows."""
+_NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?', re.IGNORECASE)
+_COMMA = re.compile(r'^([-+]?\d*),(\d+)')
+_MARKS = {
+    codecs.BOM_UTF8: 'utf-8-sig', codecs.BOM_UTF16_LE: 'utf-16', codecs.BOM_UTF16_BE: 'utf-16',
+}  # fmt: skip
+
+
+def decode_text(path: str | os.PathLike[str]) -> str:
+    """Return the text of a file in UTF-8 or UTF-16, else Windows' letters; `ParameterError`."""
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise ParameterError(f'{os.fspath(path)}: {error.strerror}') from error
+    encoding = next((name for mark, name in _MARKS.items() if data.startswith(mark)), 'utf-8')
+    if encoding == 'utf-8' and data[1:64:2].strip(b'\0') == b'' and len(data) > 2:
+        encoding = 'utf-16-le'
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError:
+        text = data.decode('cp1252', 'replace')
+    if '\0' in text:
+        raise ParameterError(f'{os.fspath(path)}: not a text')
+    return text
+
+
+@dataclass(frozen=True)
+class Table:
+    """Holds the cells (n, k) of a table as texts, empty for a gap, under the names of its header.
+
+    Without a header the names are the numbers of the columns from 1 on. ``lines`` are the rows'
+    lines in the file; ``titles`` the cells of the lines above the header.
+    """
+
+    path: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    has_names: bool
+    lines: list[int]
+    titles: list[list[str]]
+    cells: NDArray[Any]
+
+    def words(self, name: str) -> list[str]:
+        """Return a column as texts, by its name in any case; raises `ParameterError`."""
+        found = [i for i, known in enumerate(self.names) if known.casefold() == name.casefold()]
+        found = [i for i in found if self.names[i] == name] or found
+        if not found:
+            raise ParameterError(f'{self.path}: no {name!r}; there are: {", ".join(self.names)}')
+        return list(self.cells[:, found[0]])
+
+    def array(self, name: str) -> NDArray[Any]:
+        """Return a column (n,): whole numbers as such, others with NaN for an empty cell.
+
+        Raises `ParameterError` for a word, with its line.
+        """
+        words = self.words(name)
+        if all(re.fullmatch(r'[-+]?\d{1,18}|1\d{18}', word) for word in words):
+            return np.array([int(word) for word in words], dtype=np.int64)
+        values = np.full(len(words), np.nan)
+        for row, word in enumerate(words):
+            try:
+                values[row] = float(word or 'nan')
+            except ValueError as error:
+                raise ParameterError(
+                    f'{self.path}: line {self.lines[row]}: {name} is {word!r}, which is no '
+                    'number; leave the cell empty where there is none'
+                ) from error
+        return values
+
+    def numbers(self, names: Sequence[str], *, with_gaps: bool = False) -> Array:
+        """Return columns (n, k) as numbers, with gaps as NaN if allowed; `ParameterError`."""
+        values = np.stack([self.array(name).astype(np.float64) for name in names], axis=1)
+        bad = np.argwhere(~np.isfinite(values))
+        if bad.size and not with_gaps:
+            row, column = bad[0]
+            raise ParameterError(
+                f'{self.path}: line {self.lines[row]}: {names[column]} must be finite'
+            )
+        return values
+
+    def positions(self, prefix: str = '', *, with_gaps: bool = False) -> Array:
+        """Return the columns x, y, z of a prefix as positions (n, 3), m; raises `ParameterError`.
+
+        Their names, or a row of units, state the unit: ``x_mm``, ``true_x_m``.
+        """
+        begin = f'{prefix}_' if prefix else ''
+        found = {
+            i: meaning_of(name[len(begin) :], self.units[i])
+            for i, name in enumerate(self.names) if name.casefold().startswith(begin)
+        }  # fmt: skip
+        chosen = {m.axis: i for i, m in found.items() if (m.kind, m.group) == ('place', ())}
+        units = {found[i].unit for i in chosen.values()}
+        if sorted(chosen) != ['x', 'y', 'z'] or len(units) > 1 or not units <= set(LENGTH_M):
+            wanted = (', '.join(f'{begin}{a}_{u}' for a in 'xyz') for u in ('m', 'mm'))
+            raise ParameterError(
+                f'{self.path}: needs the columns {", or ".join(wanted)}; there are: '
+                f'{", ".join(self.names)}'
+            )
+        names = [self.names[chosen[axis]] for axis in 'xyz']
+        return LENGTH_M[units.pop()] * self.numbers(names, with_gaps=with_gaps)
+
+    def rows(self, names: Sequence[str]) -> list[dict[str, str]]:
+        """Return the rows as texts by some names; raises `ParameterError`."""
+        columns = [self.words(name) for name in names]
+        return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
+    """Read a table, its cells as they are written if ``as_text``.
+
+    Raises `ParameterError` for a file that cannot be read, has no row of numbers, several columns
+    of a name, or a row of another length than its header, with its line.
+    """
+    name = os.fspath(path)
+    lines = [(n, line.strip()) for n, line in enumerate(decode_text(path).splitlines(), start=1)]
+    lines = [(n, line) for n, line in lines if line.strip('\t ,;')]
+    return _parsed(name, lines, as_text)
+
+
+def _parsed(name: str, lines: list[tuple[int, str]], as_text: bool) -> Table:
+    comments = [line.strip('#% ') for _, line in lines if line.startswith(COMMENTS)]
+    lines = [one for one in lines if not one[1].startswith(COMMENTS)]
+    if not lines:
+        raise ParameterError(f'{name}: no rows')
+    separator, first = _find_rows([line for _, line in lines], is_text=as_text)
+    if first == len(lines) and not as_text:
+        raise ParameterError(f'{name}: no row of numbers; it begins with {lines[0][1][:60]!r}')
+    cells = [(n, line, _cells(line, separator)) for n, line in lines]
+    above, rows = cells[:first], cells[first:]
+    width = len(rows[0][2]) if rows else len(above[-1][2])
+    head, units = _header([one[2] for one in above], width)
+    if not above:
+        named = (_cells(line, separator) for line in reversed(comments))
+        head = next((found for found in named if len(found) == width), [])
+    elif not head:
+        n, line, _ = above[-1]
+        raise ParameterError(
+            f'{name}: line {n}, {line[:60]!r}, does not name the {width} columns; write # before '
+            'a line that is a title'
+        )
+    names = head or [str(i + 1) for i in range(width)]
+    twice = [known for known, many in Counter(filter(None, names)).items() if many > 1]
+    if twice:
+        raise ParameterError(f'{name}: several columns are called {", ".join(twice)}')
+    rows = [row for row in rows if row[2] != head]  # a program that was started again
+    for n, _, found in rows:  # the last may have been cut
+        if any(found[len(names) :]) or (len(found) < len(names) and n != rows[-1][0]):
+            many = f'{len(found)} cells, the header {len(names)}'
+            raise ParameterError(f'{name}: line {n} has {many}')
+    return Table(
+        name, tuple(names), tuple([*units, *([''] * len(names))][: len(names)]), bool(head),
+        [n for n, _, _ in rows], [one[2] for one in above],
+        _texts([line for _, line, _ in rows], separator, len(names)),
+    )  # fmt: skip
+
+
+def _texts(rows: list[str], separator: str | None, width: int) -> NDArray[Any]:
+    import pandas  # late: it takes half a second, and few commands read a table
+
+    if not rows:
+        return np.empty((0, width), dtype=object)
+    # A row may end with separators; a decimal comma is no number to Python.
+    frame = pandas.read_csv(
+        io.StringIO('\n'.join(rows)), sep=separator or r'\s+', header=None, dtype=str,
+        names=range(max(width, rows[0].count(separator or ' ') + 1)), skipinitialspace=True,
+        index_col=False, na_values=GAPS,
+    ).fillna('')  # fmt: skip
+    cells = frame.to_numpy(dtype=object)[:, :width]
+    if separator == ',':
+        return np.asarray(cells)
+    return np.array([[_COMMA.sub(r'\1.\2', cell) for cell in row] for row in cells], dtype=object)
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return line.split()
+    if '"' in line:
+        line_cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        return [cell.strip() for cell in line_cells]
+    return [cell.strip() for cell in line.split(separator)]
+
+
+def _count(line: str, separator: str | None) -> int:
+    """How many cells of a line are numbers."""
+    cells = _cells(line, separator)
+    if separator != ',':
+        cells = [_COMMA.sub(r'\1.\2', cell) for cell in cells]
+    return sum(_NUMBER.fullmatch(cell) is not None for cell in cells)
+
+
+def _find_rows(lines: list[str], *, is_text: bool) -> tuple[str | None, int]:
+    """The separator with which most cells are numbers, and the first line with as many.
+
+    Of a text, such as names and directions, the first line is the header.
+    """
+    if is_text:
+        return max(SEPARATORS[:-1], key=lambda s: len(_cells(lines[0], s))), 1
+    sample = lines[len(lines) // 2 :][:20]
+    separator = max(SEPARATORS, key=lambda s: sum(_count(line, s) for line in sample))
+    usual = float(np.median([_count(line, separator) for line in sample]))
+    counts = [_count(line, separator) for line in lines[:TITLE_LINES]]
+    first = next((i for i, n in enumerate(counts) if n >= max(0.6 * usual, 1.0)), len(lines))
+    width = len(_cells(lines[first], separator)) if first < len(lines) else 0
+    # Rows with gaps may come before the first whole one.
+    while first and counts[first - 1] and len(_cells(lines[first - 1], separator)) == width:
+        first -= 1
+    return separator, first
+
+
+def _header(above: list[list[str]], width: int) -> tuple[list[str], list[str]]:
+    """Names and units of the columns, from the lines above the rows; empty where none has them."""
+    units: list[str] = []
+    if len(above) > 1 and all(map(is_unit, above[-1])):
+        *above, last = above
+        units = [re.sub(r'[\W_]', '', cell).casefold() for cell in last]
+    head = above[-1] if above else []
+    if len(head) < max(width - 1, 2):  # rows may end with a separator, the last may be cut
+        return [], []
+    named = [name for name in head if name]
+    if len(set(named)) < len(named):  # bodies and kinds stand above the axes
+        same = [
+            row[: len(head)] for row in above[:-1]
+            if len(row) >= len(head) and not any(map(_NUMBER.fullmatch, row))
+        ]  # fmt: skip
+        head = [' '.join(filter(None, column)) for column in zip(*same, head, strict=True)]
+    return head, units
+
+
+MARKUPS = ('.fcsv', '.mrk.json')
+"""Endings of 3D Slicer's lists of points."""
+SIGNS = {'LPS': (-1.0, -1.0, 1.0), '1': (-1.0, -1.0, 1.0)}
+"""What turns a list's axes into right, anterior, superior, in which it is by default."""
+
+
+def read_points(path: Path) -> Array:
+    """Return the points (n, 3), m, of a table of x, y, z or of a list of 3D Slicer.
+
+    A list of 3D Slicer is returned in the axes right, anterior, superior, whichever it has; gaps
+    of a table are NaN. Raises `ParameterError`.
+    """
+    if not path.name.endswith(MARKUPS):
+        return read_table(path).positions(with_gaps=True)
+    text = decode_text(path)
+    if path.suffix == '.json':
+        try:
+            (markups,) = json.loads(text)['markups']
+            system, unit = markups.get('coordinateSystem', 'LPS'), markups['coordinateUnits']
+            places = np.array([point['position'] for point in markups['controlPoints']])
+            scaled = LENGTH_M[unit] * places.reshape(-1, 3)
+        except (ValueError, KeyError, TypeError) as error:
+            raise ParameterError(f'{path}: no list of points of 3D Slicer: {error}') from error
+    else:
+        stated = re.search(r'CoordinateSystem\s*=\s*(\w+)', text)
+        system, table = stated[1] if stated else 'RAS', read_table(path)
+        scaled = 1e-3 * table.numbers('xyz' if table.has_names else '234')
+    return np.asarray(scaled * SIGNS.get(str(system), (1.0, 1.0, 1.0)))
