@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import time
+from importlib.util import find_spec
 
 import pytest
 import yaml
@@ -246,4 +247,5 @@ class TestDefinitions:
             return sections
 
         for type_name, text in DEFINITIONS.items():
-            assert essence(text) == essence(definition(type_name))
+            if find_spec(type_name.split('/')[0]):  # not every installation has tf2_msgs
+                assert essence(text) == essence(definition(type_name))

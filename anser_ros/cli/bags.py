@@ -17,7 +17,6 @@ from anser_ros.simulation.world import (
     manufactured,
     steel_disc,
 )
-from anser_ros.wire.bag import bag_file
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import read_config
 
@@ -85,7 +84,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
             errors=errors, rng=rng,
         )  # fmt: skip
         size = file.stat().st_size
-        written.append({'file': str(bag_file(file)), 'frames': count, 'bytes': size})
+        written.append({'file': str(file), 'frames': count, 'bytes': size})
     shown = tuple(
         f'{one["file"]}: {one["frames"]} frames, {one["bytes"] / 1e6:.2f} MB, simulated'
         for one in written

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire import cdr
-from anser_ros.wire.bag import Salvage, published_poses, read_fluxes, read_foreign
-from anser_ros.wire.bag_writer import SETUP_TYPE, SessionWriter
+from anser_ros.wire.bag import SETUP_TYPE, Salvage, iter_messages, published_poses, read_fluxes
+from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
 
@@ -63,7 +62,7 @@ def import_bag(
     types: dict[str, str] = {}
     seen: set[str] = set()
     with SessionWriter(out) as writer:
-        for message in read_foreign(path, salvage):
+        for message in iter_messages(path, salvage):
             if setup_text is not None and not seen:
                 writer.write_setup(setup_text, message.log_time_ns)
             seen.add(message.topic)
@@ -74,7 +73,7 @@ def import_bag(
             if types.setdefault(topic, type_name) != type_name:
                 clash = f'{topic} would have {types[topic]} and {type_name}'
                 raise BagError(f'{os.fspath(path)}: {clash}')
-            if type_name not in cdr.DEFINITIONS and not message.definition:
+            if not message.definition:
                 left_out[f'{message.topic} ({type_name})'] += 1
                 continue
             channel = writer.channel(topic, type_name, message.definition)
@@ -118,7 +117,8 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBa
             _write_fluxes(out / name, fluxes, form)
             written[name] = int(fluxes.stamp_ns.size)
     if not written:
-        raise BagError(f'{os.fspath(path)}: nothing to export as {form}')
+        words = f'nothing to export as {form}; there are: {salvage.topic_words()}'
+        raise BagError(f'{os.fspath(path)}: {words}')
     return ExportedBag(written, salvage.lost)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from anser_ros.stamps import stamp_of
 from anser_ros.wire.setup import Setup, topic_of
 
 LENGTH_TOLERANCE = 1e-2
@@ -29,6 +30,29 @@ def pose_numbers(pose: Any) -> tuple[float, ...]:
     """Return x y z and the quaternion x y z w of a ``geometry_msgs/Pose``, whoever decoded it."""
     p, q = pose.position, pose.orientation
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
+POSE_TYPES = (
+    POSE_TYPE, 'geometry_msgs/msg/PoseWithCovarianceStamped', 'geometry_msgs/msg/TransformStamped',
+    'nav_msgs/msg/Odometry', 'tf2_msgs/msg/TFMessage',
+)  # fmt: skip
+"""Types of messages that hold poses."""
+
+
+def poses_in(topic: str, message: Any) -> list[tuple[str, int, tuple[float, ...]]]:
+    """Return topic, stamp, ns, and x y z, quaternion x y z w of each pose in a message.
+
+    Of transforms of `/tf` each child counts as a topic below it: ``/tf/pen``.
+    """
+    if hasattr(message, 'transforms'):
+        parts = ((f'{topic}/{one.child_frame_id}', one) for one in message.transforms)
+        return [pose for name, one in parts for pose in poses_in(name, one)]
+    if hasattr(message, 'transform'):
+        p, q = message.transform.translation, message.transform.rotation
+        return [(topic, stamp_of(message), (p.x, p.y, p.z, q.x, q.y, q.z, q.w))]
+    pose = message.pose if hasattr(message.pose, 'position') else message.pose.pose
+    return [(topic, stamp_of(message), pose_numbers(pose))]
 
 
 TRACKED, OPTICAL = '/tracked/', '/optical/'

@@ -471,7 +471,10 @@ def read_pose_session(
     length.
     """
     name, salvage = os.fspath(path), Salvage()
+    named = [*(tracked or {}).values(), *filter(None, [optical])]
     streams = published_poses(path, salvage=salvage)
+    if not set(named) <= set(streams):  # poses of another type, of which there may be more
+        streams |= {t: s for t, s in published_poses(path, named).items() if s.stamp_ns.size}
     chosen = tracked or {
         topic[len(TRACKED) : -len(ENDING)]: topic
         for topic in sorted(streams)

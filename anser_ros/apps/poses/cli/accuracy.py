@@ -146,7 +146,9 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     written = write_files(args.out, {'accuracy.json': document, 'report.html': report})
     if verdict is not None and args.history is not None:
         written = (*written, keep(found, args.history, verdict.figures))
-    return Result(document, (), _shown(found, document), written)
+    lost = [one.session for one in recordings if one.session.lost]
+    notes = tuple(f'{session.path}: {session.lost}' for session in lost)
+    return Result(document, notes, _shown(found, document), written)
 
 
 def _shown(found: Assessment, document: dict[str, Any]) -> tuple[Any, ...]:
