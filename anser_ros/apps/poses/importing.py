@@ -18,6 +18,7 @@ from anser_ros.apps.poses.sequence import (
     PoseSequence,
     PoseSession,
     sequence_of,
+    stamp_words,
 )
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.sessions.table_import import SCHEMA
@@ -344,7 +345,8 @@ def import_poses(
         if old not in (names or {}) and old != new
     ]
     renamed = [(called[piece[0]], *piece[1:]) for piece in pieces]
-    return replace(_session(str(tracked[0]), renamed), lost='; '.join(lost))
+    session = _session(str(tracked[0]), renamed)
+    return replace(session, lost='; '.join(filter(None, (*lost, session.lost))))
 
 
 def _called(found: Sequence[str], names: Mapping[str, str]) -> dict[str, str]:
@@ -454,7 +456,13 @@ def _session(path: str, pieces: Sequence[Piece]) -> PoseSession:
         raise ParameterError(f'{path}: no complete pose with a time')
     # A bag's stamp of zero means none.
     start_ns = max(round(start * 1e9), 1_000_000_000)
-    return PoseSession(path, start_ns, sequences, reference)
+    return _judged(PoseSession(path, start_ns, sequences, reference))
+
+
+def _judged(session: PoseSession) -> PoseSession:
+    """The session with what its stamps show."""
+    words = filter(None, (session.lost, stamp_words(session)))
+    return replace(session, lost='; '.join(words))
 
 
 def read_pose_session(
@@ -499,7 +507,7 @@ def read_pose_session(
 
     sensors = {label: sequence(label, topic) for label, topic in chosen.items()}
     found = sequence(REFERENCE, reference) if reference else None
-    return PoseSession(name, start, sensors, found, salvage.lost)
+    return _judged(PoseSession(name, start, sensors, found, salvage.lost))
 
 
 def _only_optical(path: str, topics: list[str]) -> str | None:
