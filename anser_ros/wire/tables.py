@@ -30,10 +30,11 @@ SEPARATORS = ('\t', ';', ',', None)
 COMMENTS = ('#', '%')
 TITLE_LINES = 60
 """Lines in which the first row of numbers is looked for."""
-GAPS = ('-', '--', '---')
-"""Words for no value, beside those that pandas knows."""
+GAPS = ('', '-', '--', 'na', 'n/a', '#n/a', 'nan', 'null', 'none')
+"""Words for no number."""
 _NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?', re.IGNORECASE)
-_COMMA = re.compile(r'^([-+]?\d*),(\d+)')
+_WHOLE = re.compile(r'[-+]?\d{1,18}|1\d{18}')
+_COMMA = re.compile(r'(?<=\d),(?=\d+(e[-+]?\d+)?$)', re.IGNORECASE)  # of a decimal number
 _MARKS = {
     codecs.BOM_UTF8: 'utf-8-sig', codecs.BOM_UTF16_LE: 'utf-16', codecs.BOM_UTF16_BE: 'utf-16',
 }  # fmt: skip
@@ -79,20 +80,20 @@ class Table:
         found = [i for i in found if self.names[i] == name] or found
         if not found:
             raise ParameterError(f'{self.path}: no {name!r}; there are: {", ".join(self.names)}')
-        return list(self.cells[:, found[0]])
+        return [cell.strip() for cell in self.cells[:, found[0]]]
 
     def array(self, name: str) -> NDArray[Any]:
-        """Return a column (n,): whole numbers as such, others with NaN for an empty cell.
+        """Return a column (n,): whole numbers as such, others with NaN for a gap.
 
         Raises `ParameterError` for a word, with its line.
         """
         words = self.words(name)
-        if all(re.fullmatch(r'[-+]?\d{1,18}|1\d{18}', word) for word in words):
+        if all(map(_WHOLE.fullmatch, words)):
             return np.array([int(word) for word in words], dtype=np.int64)
         values = np.full(len(words), np.nan)
         for row, word in enumerate(words):
             try:
-                values[row] = float(word or 'nan')
+                values[row] = np.nan if word.casefold() in GAPS else float(_COMMA.sub('.', word))
             except ValueError as error:
                 raise ParameterError(
                     f'{self.path}: line {self.lines[row]}: {name} is {word!r}, which is no '
@@ -145,63 +146,56 @@ def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
     of a name, or a row of another length than its header, with its line.
     """
     name = os.fspath(path)
-    lines = [(n, line.strip()) for n, line in enumerate(decode_text(path).splitlines(), start=1)]
-    lines = [(n, line) for n, line in lines if line.strip('\t ,;')]
-    return _parsed(name, lines, as_text)
-
-
-def _parsed(name: str, lines: list[tuple[int, str]], as_text: bool) -> Table:
-    comments = [line.strip('#% ') for _, line in lines if line.startswith(COMMENTS)]
-    lines = [one for one in lines if not one[1].startswith(COMMENTS)]
+    every = [(n, line.strip(' ')) for n, line in enumerate(decode_text(path).splitlines(), 1)]
+    lines = [one for one in every if one[1].strip('\t ,;') and not one[1].startswith(COMMENTS)]
     if not lines:
         raise ParameterError(f'{name}: no rows')
-    separator, first = _find_rows([line for _, line in lines], is_text=as_text)
+    texts = [line for _, line in lines]
+    separator, first = _find_rows(texts, is_text=as_text)
     if first == len(lines) and not as_text:
-        raise ParameterError(f'{name}: no row of numbers; it begins with {lines[0][1][:60]!r}')
-    cells = [(n, line, _cells(line, separator)) for n, line in lines]
-    above, rows = cells[:first], cells[first:]
-    width = len(rows[0][2]) if rows else len(above[-1][2])
-    head, units = _header([one[2] for one in above], width)
-    if not above:
-        named = (_cells(line, separator) for line in reversed(comments))
-        head = next((found for found in named if len(found) == width), [])
+        raise ParameterError(f'{name}: no row of numbers; it begins with {texts[0][:60]!r}')
+    sizes = [len(_cells(line, separator)) for line in texts]
+    above = [_cells(line, separator) for line in texts[:first]]
+    width = sizes[first] if first < len(sizes) else sizes[-1]
+    head, units = _header(above, width)
+    if not above:  # names may stand behind the mark of a comment
+        notes = (line.strip('#% ') for _, line in reversed(every) if line.startswith(COMMENTS))
+        head = next((f for note in notes if len(f := _cells(note, separator)) == width), [])
     elif not head:
-        n, line, _ = above[-1]
         raise ParameterError(
-            f'{name}: line {n}, {line[:60]!r}, does not name the {width} columns; write # before '
-            'a line that is a title'
+            f'{name}: line {lines[first - 1][0]}, {texts[first - 1][:60]!r}, does not name the '
+            f'{width} columns; write # before a line that is a title'
         )
     names = head or [str(i + 1) for i in range(width)]
     twice = [known for known, many in Counter(filter(None, names)).items() if many > 1]
     if twice:
         raise ParameterError(f'{name}: several columns are called {", ".join(twice)}')
-    rows = [row for row in rows if row[2] != head]  # a program that was started again
-    for n, _, found in rows:  # the last may have been cut
-        if any(found[len(names) :]) or (len(found) < len(names) and n != rows[-1][0]):
-            many = f'{len(found)} cells, the header {len(names)}'
-            raise ParameterError(f'{name}: line {n} has {many}')
+    cells = _split(name, texts[first:], separator, max([len(names), *sizes]))
+    for (n, _), size, row in zip(lines[first:], sizes[first:], cells, strict=True):
+        if any(row[len(names) :]) or (size < len(names) and n != lines[-1][0]):  # it may be cut
+            raise ParameterError(f'{name}: line {n} has {size} cells, the header {len(names)}')
+    cells = cells[:, : len(names)]
+    new = [row for row, found in enumerate(cells.tolist()) if found != head]  # not started again
     return Table(
         name, tuple(names), tuple([*units, *([''] * len(names))][: len(names)]), bool(head),
-        [n for n, _, _ in rows], [one[2] for one in above],
-        _texts([line for _, line, _ in rows], separator, len(names)),
+        [lines[first + row][0] for row in new], above, cells[new],
     )  # fmt: skip
 
 
-def _texts(rows: list[str], separator: str | None, width: int) -> NDArray[Any]:
+def _split(name: str, rows: list[str], separator: str | None, width: int) -> NDArray[Any]:
+    """Cells (n, width) of rows as texts, empty where a row is shorter."""
     import pandas  # late: it takes half a second, and few commands read a table
 
     if not rows:
         return np.empty((0, width), dtype=object)
-    # A row may end with separators; a decimal comma is no number to Python.
-    frame = pandas.read_csv(
-        io.StringIO('\n'.join(rows)), sep=separator or r'\s+', header=None, dtype=str,
-        names=range(max(width, rows[0].count(separator or ' ') + 1)), skipinitialspace=True,
-        index_col=False, na_values=GAPS,
-    ).fillna('')  # fmt: skip
-    cells = frame.to_numpy(dtype=object)[:, :width]
-    if separator == ',':
-        return np.asarray(cells)
-    return np.array([[_COMMA.sub(r'\1.\2', cell) for cell in row] for row in cells], dtype=object)
+    try:
+        frame = pandas.read_csv(
+            io.StringIO('\n'.join(rows)), sep=separator or r'\s+', header=None, dtype=str,
+            names=range(width), index_col=False, skipinitialspace=True, keep_default_na=False,
+        )  # fmt: skip
+    except ValueError as error:  # as its errors of syntax are
+        raise ParameterError(f'{name}: no table: {error}') from error
+    return np.asarray(frame.fillna('').to_numpy(dtype=object))
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
@@ -215,9 +209,7 @@ def _cells(line: str, separator: str | None) -> list[str]:
 
 def _count(line: str, separator: str | None) -> int:
     """How many cells of a line are numbers."""
-    cells = _cells(line, separator)
-    if separator != ',':
-        cells = [_COMMA.sub(r'\1.\2', cell) for cell in cells]
+    cells = (_COMMA.sub('.', cell) for cell in _cells(line, separator))
     return sum(_NUMBER.fullmatch(cell) is not None for cell in cells)
 
 
