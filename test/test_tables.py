@@ -248,3 +248,53 @@ def test_lists_of_points_in_their_coordinate_system(tmp_path, name, text):
     with pytest.raises(ParameterError, match='no list of points of 3D Slicer'):
         (tmp_path / 'a.mrk.json').write_text('{}')
         read_points(tmp_path / 'a.mrk.json')
+
+
+def test_numbers_with_a_comma_between_commas_are_no_numbers(tmp_path):
+    """It may stand for a thousand as well."""
+    (tmp_path / 'a.csv').write_text('x_m,y_m,z_m\n"1,234",2,3\n"1,235",2,3\n')
+    with pytest.raises(ParameterError, match="line 2: x_m is '1,234'"):
+        read_table(tmp_path / 'a.csv').positions()
+
+
+def test_gaps_in_the_first_column_of_tabs(tmp_path):
+    (tmp_path / 'a.tsv').write_text('x_m\ty_m\tz_m\n\t2\t3\n1\t2\t3\n')
+    places = read_table(tmp_path / 'a.tsv').positions(with_gaps=True)
+    np.testing.assert_array_equal(places, [[np.nan, 2, 3], [1, 2, 3]])
+
+
+@pytest.mark.parametrize('sign', [' = ', ':='])
+def test_sequences_of_plus(tmp_path, sign):
+    lines = ['ObjectType = Image']
+    for k in range(9):
+        matrix = f'0 -1 0 {k} 1 0 0 20 0 0 1 -30 0 0 0 1'
+        state = 'INVALID' if k == 4 else 'OK'
+        for key, value in (('ProbeToTrackerTransform', matrix), ('Timestamp', 5.0 + 0.1 * k),
+                           ('ProbeToTrackerTransformStatus', state),
+                           ('ImageToProbeTransform', matrix)):  # fmt: skip
+            lines.append(f'Seq_Frame{k:04d}_{key}{sign}{value}')
+    path = tmp_path / 'a.mha'
+    path.write_bytes('\n'.join(lines).encode() + b'\nElementDataFile = LOCAL\n\0\1\2\xff')
+    (poses,) = import_poses([path]).sensors.values()
+    assert poses.name == 'probe' and poses.size == 8 and poses.missing == pytest.approx([0.4])
+    np.testing.assert_allclose(poses.position[-1], [0.008, 0.02, -0.03])
+    np.testing.assert_allclose(poses.quaternion[0], [0, 0, 0.5**0.5, 0.5**0.5])
+    path.write_text('ObjectType = Image\n')
+    with pytest.raises(ParameterError, match='a sequence of PLUS without'):
+        import_poses([path])
+
+
+VICON = """Segments
+100
+,,pen:pen,,,,,
+Frame,Sub Frame,RX,RY,RZ,TX,TY,TZ
+,,deg,deg,deg,mm,mm,mm
+1,0,0.1,0.2,0.3,10.5,20,30
+2,0,0.1,0.2,0.3,10.6,20,30
+"""
+
+
+def test_other_programs_are_refused_with_their_columns(tmp_path):
+    (tmp_path / 'vicon.csv').write_text(VICON)
+    with pytest.raises(ParameterError, match='RX, RY, RZ are no quaternion'):
+        import_poses([tmp_path / 'vicon.csv'])

@@ -198,7 +198,9 @@ def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[Ra
                         words = (channel.message_encoding or 'unknown').upper()
                         other[f'messages of {channel.topic} are {words}, not CDR'] += 1
                         continue
-                    known = schemas.setdefault((kind, schema.data), _known(schema, len(schemas)))
+                    if (kind, schema.data) not in schemas:
+                        schemas[kind, schema.data] = _known(schema, len(schemas))
+                    known = schemas[kind, schema.data]
                     yield RawMessage(channel.topic, kind, time, _unpack(data), channel, known)
         except BagError as error:
             if len(files) == 1:
@@ -397,7 +399,8 @@ def _kind(path: Path) -> str:
 def _file(path: Path, stack: ExitStack, salvage: Salvage) -> Iterator[_Found]:
     """The messages of a file, which is unpacked if need be."""
     if _kind(path) not in ('.db3', '.mcap'):
-        raise BagError(f'{path}: neither .db3 nor .mcap')
+        remedy = '; rosbags-convert turns bags of ROS 1 into those' * (path.suffix == '.bag')
+        raise BagError(f'{path}: neither .db3 nor .mcap{remedy}')
     logs = [log for end in LOGS if (log := Path(f'{path}{end}')).is_file()]
     plain, size = path, 0 if _kind(path) == '.mcap' else _stated_size(path)
     if path.suffix == ZSTD or (size and (logs or size > path.stat().st_size)):

@@ -34,7 +34,7 @@ GAPS = ('', '-', '--', 'na', 'n/a', '#n/a', 'nan', 'null', 'none')
 """Words for no number."""
 _NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?', re.IGNORECASE)
 _WHOLE = re.compile(r'[-+]?\d{1,18}|1\d{18}')
-_COMMA = re.compile(r'(?<=\d),(?=\d+(e[-+]?\d+)?$)', re.IGNORECASE)  # of a decimal number
+_COMMA = re.compile(r'(?<=\d),(?=\d+(?:e[-+]?\d+)?$)', re.IGNORECASE)  # of a decimal
 _MARKS = {
     codecs.BOM_UTF8: 'utf-8-sig', codecs.BOM_UTF16_LE: 'utf-16', codecs.BOM_UTF16_BE: 'utf-16',
 }  # fmt: skip
@@ -54,7 +54,7 @@ def decode_text(path: str | os.PathLike[str]) -> str:
     except UnicodeDecodeError:
         text = data.decode('cp1252', 'replace')
     if '\0' in text:
-        raise ParameterError(f'{os.fspath(path)}: not a text')
+        raise ParameterError(f'{os.fspath(path)}: not a text in UTF-8')
     return text
 
 
@@ -73,6 +73,7 @@ class Table:
     lines: list[int]
     titles: list[list[str]]
     cells: NDArray[Any]
+    has_comma: bool = False  # in place of the point of a number
 
     def words(self, name: str) -> list[str]:
         """Return a column as texts, by its name in any case; raises `ParameterError`."""
@@ -80,7 +81,8 @@ class Table:
         found = [i for i in found if self.names[i] == name] or found
         if not found:
             raise ParameterError(f'{self.path}: no {name!r}; there are: {", ".join(self.names)}')
-        return [cell.strip() for cell in self.cells[:, found[0]]]
+        texts = (cell.strip() for cell in self.cells[:, found[0]])
+        return [_COMMA.sub('.', text) if self.has_comma else text for text in texts]
 
     def array(self, name: str) -> NDArray[Any]:
         """Return a column (n,): whole numbers as such, others with NaN for a gap.
@@ -93,7 +95,7 @@ class Table:
         values = np.full(len(words), np.nan)
         for row, word in enumerate(words):
             try:
-                values[row] = np.nan if word.casefold() in GAPS else float(_COMMA.sub('.', word))
+                values[row] = np.nan if word.casefold() in GAPS else float(word)
             except ValueError as error:
                 raise ParameterError(
                     f'{self.path}: line {self.lines[row]}: {name} is {word!r}, which is no '
@@ -178,7 +180,7 @@ def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
     new = [row for row, found in enumerate(cells.tolist()) if found != head]  # not started again
     return Table(
         name, tuple(names), tuple([*units, *([''] * len(names))][: len(names)]), bool(head),
-        [lines[first + row][0] for row in new], above, cells[new],
+        [lines[first + row][0] for row in new], above, cells[new], separator != ',',
     )  # fmt: skip
 
 
@@ -209,7 +211,9 @@ def _cells(line: str, separator: str | None) -> list[str]:
 
 def _count(line: str, separator: str | None) -> int:
     """How many cells of a line are numbers."""
-    cells = (_COMMA.sub('.', cell) for cell in _cells(line, separator))
+    cells = _cells(line, separator)
+    if separator != ',':
+        cells = [_COMMA.sub('.', cell) for cell in cells]
     return sum(_NUMBER.fullmatch(cell) is not None for cell in cells)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.sequence import (
     FARTHEST,
@@ -21,6 +22,7 @@ from anser_ros.apps.poses.sequence import (
     stamp_words,
 )
 from anser_ros.errors import BagError, ParameterError
+from anser_ros.physics.rotations import nearest_rotation
 from anser_ros.sessions.table_import import SCHEMA
 from anser_ros.stamps import NANO, RECENT_NS, SECOND_NS, stamp_fault
 from anser_ros.wire.bag import Salvage, published_poses
@@ -69,6 +71,8 @@ UNITS_OF_TIME = ((9e17, 2.2e18, 'ns'), (9e14, 2.2e15, 'us'), (9e11, 2.2e12, 'ms'
 TITLE_LINES = 20  # lines that a program may write before its poses
 PORT_COLUMNS = 13
 """Columns of a port in a ToolTracker file: name, frame, face, state, pose, error, markers."""
+PLUS = ('.mha', '.mhd', '.nrrd')
+_PLUS_FIELD = re.compile(r'^Seq_Frame(\d+)_(\w+?)\s*:?=\s*(.*?)\s*$', re.MULTILINE)
 _KEY = re.compile(r'(\w+):\s*((?:[^\s:]+(?:\s+|$)(?!:))*?)(?=\s*\w+:|\s*$)')
 
 
@@ -100,6 +104,8 @@ def read_form(path: Path) -> Found:
     Lines before the first that has the form, such as a title, are left out. Raises
     `ParameterError` when no form fits, or the file has no row.
     """
+    if path.suffix.lower() in PLUS:
+        return _plus(path), 0
     lines = [line for line in decode_text(path).splitlines() if line.strip()]
     lines = [line for line in lines if not line.lstrip().startswith('#')]
     if not lines:
@@ -173,6 +179,28 @@ def _keyed(lines: Sequence[str], path: Path) -> Found:
     if not rows:
         raise ParameterError(f'{path}: no line with a position and an orientation')
     return rows, sum(len(one.rows) for one in rows.values())
+
+
+def _plus(path: Path) -> dict[str, RawRows]:
+    """A sequence of PLUS: matrices of tools in the tracker's frame, mm, before any pictures."""
+    frames: dict[str, dict[str, str]] = {}
+    for number, key, value in _PLUS_FIELD.findall(path.read_bytes().decode('latin-1')):
+        frames.setdefault(number, {})[key] = value
+    rows: dict[str, RawRows] = {}
+    for fields in frames.values():
+        for key, value in fields.items():
+            if not key.endswith('ToTrackerTransform'):
+                continue
+            matrix = np.array([_number(cell) for cell in value.split()])
+            pose = np.full(7, np.nan)
+            if matrix.size == 16 and fields.get(f'{key}Status', 'OK') == 'OK':
+                turn = nearest_rotation(matrix.reshape(4, 4)[:3, :3])
+                pose = np.concatenate([matrix[3:12:4], Rotation.from_matrix(turn).as_quat()])
+            one = rows.setdefault(key.removesuffix('ToTrackerTransform').lower(), RawRows())
+            one.rows.append((_number(fields.get('Timestamp', '')), np.nan, *pose.tolist()))
+    if not rows:
+        raise ParameterError(f'{path}: a sequence of PLUS without ...ToTrackerTransform')
+    return rows
 
 
 def _table(path: Path) -> dict[str, RawRows]:

@@ -24,7 +24,7 @@ from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 Array = NDArray[np.float64]
 
-BAGS = ('.mcap', '.db3', '.bag')  # endings; a folder is a bag too
+BAGS = ('.mcap', '.db3', '.zstd', '.bag')  # endings; a folder is a bag too
 TOOL = 'tool'
 """What the body of a file of poses is called that names none."""
 
