@@ -41,7 +41,6 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     if is_document and (args.remap or args.setup is not None):
         raise ParameterError('--remap and --setup are for bags; a document names its own setup')
     lost, left_out = '', {}
-    notes: list[str] = []
     tell(f'reading {args.source}')
     if is_document:
         counts, notes = import_tables(args.source, args.out)
@@ -49,7 +48,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         setup = None if args.setup is None else read_text(args.setup)
         bag = import_bag(args.source, args.out, parse_remaps(args.remap), setup)
         counts, lost, left_out = bag.messages, bag.lost, bag.left_out
-    notes += [f'{count} messages of {topic} left out' for topic, count in left_out.items()]
+        notes = [f'{count} messages of {topic} left out' for topic, count in left_out.items()]
     return Result(
         {'schema': SCHEMA, 'messages': counts, 'left_out': left_out, 'lost': lost},
         (*loss_notes(str(args.source), lost), *notes),

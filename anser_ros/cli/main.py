@@ -140,7 +140,8 @@ def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
     except BrokenPipeError:
         raise
     except Exception as error:  # noqa: BLE001 - the outermost place: whatever is left is a defect
-        if isinstance(error, ModuleNotFoundError) and str(error.name).split('.')[0] in LATE:
+        name = str(getattr(error, 'name', '')).split('.')[0]
+        if isinstance(error, ModuleNotFoundError) and name in (*PYPI, 'pandas'):
             return EXIT_BAD_INPUT, None, missing_words(str(error.name))
         # A file that is not there or can't be written is the caller's input, not a defect.
         if isinstance(error, OSError) and error.filename is not None:
@@ -171,8 +172,6 @@ PYPI = {
     'nicegui': 'nicegui',
 }
 """Modules without a key of rosdep, and what they are called on PyPI."""
-LATE = (*PYPI, 'pandas')
-"""Modules that are imported only where they are needed."""
 OPTIONAL = ('dask', 'distributed', 'nicegui')
 """Of these, what only `anser batch` and the live view in a browser need."""
 ROS = 'rclpy'

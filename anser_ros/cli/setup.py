@@ -137,8 +137,8 @@ def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
     found = [name.casefold() for name in table.names]
     extra = [name for name in found if name == 'length_mm']
     if set(found) - set(extra) != set(columns):
-        found = [name for name in table.names if name not in extra]
-        raise ParameterError(f'{path}: columns must be {",".join(columns)}, got {",".join(found)}')
+        got = ','.join(table.names)
+        raise ParameterError(f'{path}: columns must be {",".join(columns)}, got {got}')
     rows = [','.join(row.values()) for row in table.rows((*columns, *extra))]
     if not rows:
         raise ParameterError(f'{path}: no rows')

@@ -33,7 +33,7 @@ from anser_ros.wire.recorded import (
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
 from anser_ros.wire.table_names import LENGTH_M, TIME_NS
-from anser_ros.wire.tables import read_table
+from anser_ros.wire.tables import Table, read_table
 from anser_ros.wire.text_files import read_text, read_yaml
 
 Array = NDArray[Any]
@@ -48,14 +48,17 @@ ENDINGS = (*TEXTS, '.npy', '.npz', '.mat')
 class NumberTable:
     """Holds the arrays of one file by name; the first index of each counts rows.
 
-    A CSV file has one for each column, a ``.npy`` file one called ``data``.
+    A text has one for each column, a ``.npy`` file one called ``data``.
     """
 
     path: Path
     arrays: Mapping[str, NDArray[Any]]
+    table: Table | None = None  # of a text, whose columns are read as they are asked for
 
     def array(self, name: str) -> NDArray[Any]:
         """Return the whole array of a name; `ParameterError` where there is none."""
+        if self.table is not None:
+            return self.table.array(name)
         if name not in self.arrays:
             known = ', '.join(list(self.arrays)[:20])
             raise ParameterError(f'{self.path}: no {name!r}; there are: {known}')
@@ -99,9 +102,7 @@ def read_arrays(path: Path) -> NumberTable:
         raise ParameterError(f'{path}: {"is a folder" if path.is_dir() else "no such file"}')
     try:
         if path.suffix.lower() in TEXTS:
-            table = read_table(path)
-            arrays = {name: table.array(name) for name in table.names if name}
-            return NumberTable(path, arrays)
+            return NumberTable(path, {}, read_table(path))
         if path.suffix == '.npy':
             return NumberTable(path, {'data': np.load(path, allow_pickle=False)})
         if path.suffix == '.npz':
@@ -143,9 +144,7 @@ ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
 
 
 def import_tables(document: Path, out: Path) -> tuple[dict[str, int], list[str]]:
-    """Write the session that a document, beside its files, describes.
-
-    Returns messages by topic, and what was left out, in words.
+    """Write the session that a document describes; return messages by topic, and what lacks.
 
     Raises `ParameterError`, `SetupError`, `BagError` with the file's name.
     """
@@ -234,9 +233,8 @@ class _Import:
             stamps = [start_ns + round(v * unit_ns) for v in values.tolist()]
         if not stamps:
             raise ParameterError(f'{table.path}: no rows')
-        if min(stamps) <= 0:
-            raise ParameterError(f'{table.path}: a stamp is not after 1970; is start_ns missing?')
-        if fault := stamp_fault(min(stamps), max(stamps)):
+        if fault := stamp_fault(min(stamps), max(stamps)) or '1970' * (min(stamps) <= 0):
+            fault = fault if min(stamps) > 0 else 'a stamp is not after 1970; is start_ns missing?'
             raise ParameterError(f'{table.path}: {fault}')
         if len(set(stamps)) < len(stamps):
             raise ParameterError(f'{table.path}: the same stamp twice; is the unit of time right?')
@@ -298,7 +296,7 @@ class _Import:
             _real(table.columns(entry.get(k), n, f'{what}: {k}', entry['stamp']), table, k)
             for k, n in (('position', 3), ('quaternion', 4))
         )
-        position, quaternion = scale * position, quaternion[:, ORDERS[order]]
+        quaternion = quaternion[:, ORDERS[order]]
         good = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1)
         unit = np.isfinite(unit_quaternions(quaternion)).all(axis=1)
         none = good & (quaternion == 0.0).all(axis=1)
@@ -307,14 +305,13 @@ class _Import:
         good &= unit
         quaternion[good] = unit_quaternions(quaternion[good])
         if lacking := len(stamps) - int(good.sum()):
-            plural = 'pose' if lacking == 1 else 'poses'
-            self.notes.append(
-                f'{table.path}: {lacking} {plural} without numbers or a rotation left out'
-            )
+            words = f'{lacking} pose{"s" * (lacking > 1)} without numbers or rotation left out'
+            self.notes.append(f'{table.path}: {words}')
         for row in np.flatnonzero(good).tolist():
             put = partial(
                 SessionWriter.write_pose, topic=topic, stamp_ns=stamps[row],
-                position=position[row].tolist(), quaternion_xyzw=quaternion[row].tolist(),
+                position=(scale * position[row]).tolist(),
+                quaternion_xyzw=quaternion[row].tolist(),
             )  # fmt: skip
             self._entries.append((stamps[row], put))
         self._messages[topic] += int(good.sum())
