@@ -83,6 +83,7 @@ HEADERS = {
         (0, 1, 2, 3, 7, 4, 5, 6),
     'TimeStamp;X_Tool0;Y_Tool0;Z_Tool0;QX_Tool0;QY_Tool0;QZ_Tool0;QR_Tool0': range(8),
     't,posX,posY,posZ,rotX,rotY,rotZ,rotW': range(8),
+    't,pos_mm_x,pos_mm_y,pos_mm_z,q_x,q_y,q_z,q_w': range(8),
     'Elapsed Time (s),Position X,Position Y,Position Z,Rotation W,Rotation X,Rotation Y,'
     'Rotation Z':
         (0, 1, 2, 3, 7, 4, 5, 6),
@@ -131,6 +132,10 @@ REFUSED = {
     'a name twice': (text_of(',', ['t', 'x', 'y', 'x', *NAMES[4:]]), 'columns are called x'),
     'whole numbers without a unit of time': (
         rows_of('time,x,y,z,qx,qy,qz,qw', *((33 * k, *ROWS[k][1:]) for k in range(9))),
+        'no unit of time',
+    ),
+    'milliseconds without a unit of time': (
+        rows_of('time,x,y,z,qx,qy,qz,qw', *((33.33 * k, *ROWS[k][1:]) for k in range(9))),
         'no unit of time',
     ),
     'lengths that cannot be metres': (

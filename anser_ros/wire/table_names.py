@@ -60,11 +60,14 @@ def words_of(name: str) -> list[str]:
 def meaning_of(name: str, unit: str = '') -> Meaning:
     """Return what a name means, with the unit that a row of units states."""
     words = words_of(name)
-    unit = UNITS.get(unit, '')
-    if len(words) > 1 and words[-1] in UNITS:
-        unit = UNITS[words.pop()]
     if not words:
         return Meaning()
+    unit = UNITS.get(unit, '')
+    stated = [word for word in words[:-1] if word in UNITS and len(word) > 1 and word != 'in']
+    stated += [word for word in words[-1:] if word in UNITS]
+    if len(words) > 1 and stated:
+        unit = UNITS[stated[-1]]
+        words.remove(stated[-1])
     is_span = len(words) == 1 and UNITS.get(words[0]) in TIME_NS
     if is_span or words == ['t'] or TIME.intersection((words[0], words[-1])):
         return Meaning('time', unit=unit or UNITS.get(words[0], ''), group=tuple(words))

@@ -66,6 +66,8 @@ MOST_FALLS = 0.1
 """Share of times before the one above them from which a column is no time."""
 FARTHEST_M = 3.0
 """Median distance, m, from which on positions without a stated unit are not in metres."""
+LONGEST_INTERVAL_S = 2.0
+"""Interval of a tracker's poses, s, from which on times without a stated unit are no seconds."""
 UNITS_OF_TIME = ((9e17, 2.2e18, 'ns'), (9e14, 2.2e15, 'us'), (9e11, 2.2e12, 'ms'))
 """What numbers must be whose name states no unit, by their range, if they count since 1970."""
 TITLE_LINES = 20  # lines that a program may write before its poses
@@ -254,10 +256,15 @@ def _seconds(table: Table, column: int, unit: str) -> Array:
 
 
 def _unit_of(time: Array) -> str:
-    """The unit that times can have: whole numbers from zero on may have any, which is empty."""
-    middle = float(np.nanmedian(time)) if np.isfinite(time).any() else 0.0
+    """The unit that times can have; empty if they do not count since 1970, and no tracker gives
+    them in seconds: they are whole numbers, or far apart."""
+    known = time[np.isfinite(time)]
+    if not known.size:
+        return 's'
+    middle, apart = np.median(known), np.median(np.diff(known, append=known[-1:]))
     unit = next((u for low, high, u in UNITS_OF_TIME if low < middle < high), 's')
-    return '' if unit == 's' and not np.any(time % 1) and middle < RECENT_NS * NANO else unit
+    is_odd = apart > LONGEST_INTERVAL_S or not np.any(known % 1)
+    return '' if unit == 's' and is_odd and middle < RECENT_NS * NANO else unit
 
 
 def _check_times(path: Path, time: Array) -> None:
