@@ -115,6 +115,13 @@ def test_what_rosdep_does_not_know_is_asked_for_where_it_is_needed(monkeypatch, 
     said = capsys.readouterr().err
     assert said == 'anser evaluate: mcap is not installed: pip install mcap\n'
 
+    def read(name):
+        raise ModuleNotFoundError('No module named pandas', name='pandas')
+
+    monkeypatch.setattr(cli.importlib, 'import_module', read)
+    assert cli.main(['pivot', 'poses.csv']) == 2
+    assert 'pandas is not installed: pip install pandas' in capsys.readouterr().err
+
 
 # Imports modules as where some packages are not.
 WITHOUT = """
