@@ -540,6 +540,9 @@ def published_poses(
     for raw in iter_messages(path, salvage):
         if raw.type_name not in recorded.POSE_TYPES:
             continue
+        is_unasked = raw.topic not in rows and raw.type_name != recorded.POSE_TYPES[-1]
+        if topics is not None and is_unasked:
+            continue
         if raw.type_name == recorded.POSE_TYPE:
             plain.add(raw.topic)
         elif plain and topics is None:
