@@ -10,11 +10,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
+from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes.acquisition_status import (
     Interval,
@@ -27,11 +28,10 @@ from anser_ros.nodes.acquisition_status import (
 )
 from anser_ros.nodes.acquisition_stream import FluxFrame, FluxStream, MeasuredAccuracy, WallClock
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.runtime.process import TURN_S, main
-from anser_ros.nodes.streams.clouds import FluxCloud
+from anser_ros.nodes.streams.clouds import FluxCloud, readings_of
 from anser_ros.nodes.streams.one_source import Backlog, too_slow
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.frames import (
@@ -57,6 +57,9 @@ from anser_ros.wire.port import (
 from anser_ros.wire.protocols import PROTOCOLS, StreamControl
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.text_files import read_config
+
+if TYPE_CHECKING:
+    from anser_ros.chain.chain import Chain
 
 
 @dataclass(frozen=True)
@@ -107,8 +110,16 @@ WAIT_S = 0.1
 """Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
 
 
+def _sent(points: FluxPoints) -> FrameReadings | None:
+    """Return fluxes as readers of their message have them; None where there are no sensors."""
+    return readings_of(as_sent(points)) if len(points.channel) else None
+
+
 class Acquisition(AnserNode):
-    """Publishes ``setup``, ``tool/flux`` and ``reference/flux``."""
+    """Publishes ``setup``, ``tool/flux`` and ``reference/flux``.
+
+    ``chain`` is what it takes frames through itself, where other nodes of its process do that.
+    """
 
     NAME = 'acquisition'
     EXAMPLE = '--ros-args -p device:=/dev/ttyACM0 -p setup_file:=config/demo_setup.yaml'
@@ -124,8 +135,6 @@ class Acquisition(AnserNode):
         self._reference_publisher = self.create_publisher(
             PointCloud2, 'reference/flux', qos.STREAM
         )
-        self.offer(self._tool_publisher)
-        self.offer(self._reference_publisher)
         self._cloud = FluxCloud(self._setup.frame_id)
         may_set = table.set_frequencies and PROTOCOLS[table.protocol].sets_tones
         self._control = StreamControl(self._setup.frequencies_hz, set_frequencies=may_set)
@@ -144,6 +153,7 @@ class Acquisition(AnserNode):
         self._wall_clock = WallClock()
         self._asked_ns = 0
         self._start_sent_ns: int | None = None
+        self.chain: Chain[Any] | None = None
         self._faults = RecentFaults()
         self._publish_setup(self._setup)
         self._port: ControlUnitPort | None = None
@@ -291,24 +301,14 @@ class Acquisition(AnserNode):
             self._publish_setup(self._accuracy.stated_in(self._setup, stream.rate_hz))
         # The system's clock may be set while we run; the offset is taken again for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
-        self._hand_over_flux(self._tool_publisher, frame.tool, stamp_ns)
+        if self.chain is not None:
+            self.chain.step(ChainFrame(stamp_ns, _sent(frame.tool), _sent(frame.reference)))
         publishers = self._tool_publisher, self._reference_publisher
         for publisher, points in zip(publishers, (frame.tool, frame.reference), strict=True):
             if len(points.channel) and publisher.get_subscription_count():
                 publisher.publish(self._cloud.packed(points, stamp_ns))
-        # The model is refitted once poses and messages are on their way, if no frame waits.
-        age_s = (time.monotonic_ns() - arrival_ns) / 1e9
-        if self.hands_over and self._backlog.gives_way(age_s):
-            self.count('refits_left_out')
-        else:
-            self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)
         self._frame = frame
         self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
-
-    def _hand_over_flux(self, publisher: Any, points: FluxPoints, stamp_ns: int) -> None:
-        if self.hands_over and len(points.channel):
-            sent = HandedFlux(stamp_ns, self._setup.frame_id, as_sent(points))
-            self.hand_over(publisher, sent)
 
     # Executor thread ----------------------------------------------------------------------
 

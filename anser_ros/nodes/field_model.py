@@ -13,6 +13,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from anser_ros import pose_states as states
+from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
@@ -38,7 +39,7 @@ from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.streams.clouds import read_frame
+from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
 from anser_ros.nodes.streams.one_source import LOOK_S, NewestSource, sender_words, setup_source
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.frame import MOST_RATE_HZ, Pace, ReadingWindow, check_enough
@@ -110,13 +111,15 @@ class FieldModelParameters:
 
 
 class FieldModelNode(AnserNode):
-    """Publishes ``field_model``, and answers ``field_model/reset`` and its like."""
+    """Publishes ``field_model``, and answers ``field_model/reset`` and its like.
+
+    Where another node of the process has frames, it calls ``step`` and ``witnessed``.
+    """
 
     NAME = 'field_model'
     EXAMPLE = '--ros-args -p model_file:=config/demo_model.yaml -p baseline_file:=bags/scan.mcap'
     PARAMETERS = FieldModelParameters
     HAS_KERNELS = True
-    WORKS_ASIDE = True  # its first answer takes seconds
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -147,6 +150,7 @@ class FieldModelNode(AnserNode):
         kept = KeptBaseline(folder, name, self._fluxes.sender)
         witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)
         self._refit = ActiveRefit(witnesses, self._pace, self.count, kept, ahead)
+        self.step, self.witnessed = self.given(self._take_frame), self.given(witnesses.note)
         self._sources = [setups, self._fluxes, *witnesses.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
@@ -201,38 +205,54 @@ class FieldModelNode(AnserNode):
                 self.get_logger().warning(no_baseline(self.get_namespace()))
 
     def _on_flux(self, message: PointCloud2) -> None:
+        if self._setup is None:
+            self.count('fluxes_before_setup')
+            return
+        try:
+            stamp_ns, points = read_frame(message, self._frame_id, self.count)
+            self._take_readings(stamp_ns, readings_of(points))
+        except AnserError as error:
+            self._refuse('fluxes_refused', error)
+
+    def _take_frame(self, frame: ChainFrame) -> GivenModel | None:
+        """Take a frame of another node of the process, and return the model that now holds."""
+        try:
+            if frame.reference is not None and self._fluxes.accepts({}):
+                self._take_readings(frame.stamp_ns, frame.reference)
+        except AnserError as error:
+            self._refuse('fluxes_refused', error)
+        return self._output.newest
+
+    def _take_readings(self, stamp_ns: int, readings: FrameReadings) -> None:
+        """Judge a frame, check the model's place by it, and let the model follow it."""
         setup, window, frames = self._setup, self._window, self._frames
         if setup is None or window is None or frames is None:
             self.count('fluxes_before_setup')
             return
-        try:
-            stamp_ns, points = read_frame(message, setup.frame_id, self.count)
-            frame = frames.admit(
-                stamp_ns, points.channel, points.flux, points.flags, setup.emitter_names
-            )
-            if frame is None:
-                return
-            for kind, many in frame.kinds.items():
-                self.count(f'readings_{kind}', many)
-            window.add(frame)
-            self._received_s = time.monotonic()
-            start = self._refit.start if self._refit.is_awaited else None
-            if start is not None and not is_live(stamp_ns, time.time_ns()):
-                start.wait()  # a recording that is played is worked off whole
-            self._take_refit()
-            if self._place.look(frame, window) and not self._follows and self._model is not None:
-                self._serve(self._model, stamp_ns)
-            has_none = self._refit.current is None and not self._refit.is_making
-            if has_none and self.parameters.baseline_at_start and window.full:
-                try:
-                    self._follow(clean_mean(window, self._base, self._references, setup))
-                except FitError as error:
-                    self._refuse_baseline(error)
-                    window.clear()
-            if self._refit.current is not None and self._follows:
-                self._update(frame)
-        except AnserError as error:
-            self._refuse('fluxes_refused', error)
+        frame = frames.admit(
+            stamp_ns, readings.channels, readings.flux, readings.flags, setup.emitter_names
+        )
+        if frame is None:
+            return
+        for kind, many in frame.kinds.items():
+            self.count(f'readings_{kind}', many)
+        window.add(frame)
+        self._received_s = time.monotonic()
+        start = self._refit.start if self._refit.is_awaited else None
+        if start is not None and not is_live(stamp_ns, time.time_ns()):
+            start.wait()  # a recording that is played is worked off whole
+        self._take_refit()
+        if self._place.look(frame, window) and not self._follows and self._model is not None:
+            self._serve(self._model, stamp_ns)
+        has_none = self._refit.current is None and not self._refit.is_making
+        if has_none and self.parameters.baseline_at_start and window.full:
+            try:
+                self._follow(clean_mean(window, self._base, self._references, setup))
+            except FitError as error:
+                self._refuse_baseline(error)
+                window.clear()
+        if self._refit.current is not None and self._follows:
+            self._update(frame)
 
     def _update(self, frame: Frame) -> None:
         """Let the model follow the references, not more often than wanted.

@@ -144,14 +144,21 @@ class LiveRefit:
         self, stamp_ns: int, channels: NDArray[np.generic], flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
     ) -> RefitResult:  # fmt: skip
-        """Take in one frame of reference fluxes and return the result of the refit.
+        """Judge one frame of reference fluxes, and return the result of the refit to it."""
+        return self.follow(self.judged(stamp_ns, channels, flux, flags))
+
+    def judged(
+        self, stamp_ns: int, channels: NDArray[np.generic], flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None = None,
+    ) -> Frame:  # fmt: skip
+        """Return one frame of reference fluxes in the order of the references, with its faults.
 
         ``channels`` (S,) may come in any order, and unknown ones are passed over; ``flux`` (S, K)
         is in T; a reading with ``flags`` (S,) is not used. Raises `FitError` when shapes don't fit
         or a channel appears twice.
         """
         width = len(self.model.emitters)
-        return self.follow(self._intake.judge(stamp_ns, channels, flux, flags, width))
+        return self._intake.judge(stamp_ns, channels, flux, flags, width)
 
     def follow(self, frame: Frame) -> RefitResult:
         """Take in one frame that has been judged, in the order of the references."""

@@ -12,11 +12,11 @@ import numpy as np
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 
+from anser_ros.chain.frame import FrameReadings
 from anser_ros.effects.correction import needs_correction
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Count
-from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.pose_states import state_of
 from anser_ros.stamps import SECOND_NS, pack_stamp, set_stamp, stamp_of
 from anser_ros.wire.points import (
@@ -116,20 +116,16 @@ def layout_of(message: PointCloud2) -> tuple[list[PointFieldTuple], int, int, An
     return fields, message.point_step, int(message.width), message.data
 
 
-def read_frame(
-    message: PointCloud2 | HandedFlux, frame_id: str, count: Count
-) -> tuple[int, FluxPoints]:
+def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, FluxPoints]:
     """Read a flux message that must be in a frame; its peculiarities are counted.
 
     The counters are ``fluxes_big_endian``, ``fluxes_other_frame_id``, ``fluxes_without_stamp``.
     Raises `LayoutError` when it is in another frame, has no stamp, or is no flux cloud.
     """
-    given_id = message.frame_id if isinstance(message, HandedFlux) else message.header.frame_id
+    given_id = message.header.frame_id
     if given_id != frame_id:
         count('fluxes_other_frame_id', 1)
         raise LayoutError(f'fluxes in the frame {given_id!r}, the setup is in {frame_id!r}')
-    if isinstance(message, HandedFlux):
-        return message.stamp_ns, message.points
     if message.is_bigendian:
         count('fluxes_big_endian', 1)
     stamp_ns, nanosec = stamp_of(message), message.header.stamp.nanosec
@@ -140,6 +136,11 @@ def read_frame(
     if stamp_ns <= 0:
         raise LayoutError('the flux message has no stamp')
     return stamp_ns, decode_flux(*layout_of(message), bool(message.is_bigendian))
+
+
+def readings_of(points: FluxPoints) -> FrameReadings:
+    """Return what the chain takes of a frame's points."""
+    return FrameReadings(points.channel, points.flux, points.flags)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from std_msgs.msg import String
 
 from anser_ros.integrity.streams import Senders
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.incoming import opened
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.streams.clouds import without_measured
@@ -47,9 +46,6 @@ MEMORY = 25
 """Messages that typical figures are taken of, so that a few slow ones say nothing."""
 FEWEST_MESSAGES = 10
 """Messages that must have been worked on before a backlog is judged: the first ones are slow."""
-MOST_LEFT_OUT = 2
-"""Frames in a row that may be left out: more, and the model is older than metal in a hand
-allows."""
 
 
 class Backlog:
@@ -60,7 +56,6 @@ class Backlog:
         self._spacing_s: deque[float] = deque(known, maxlen=MEMORY)
         self._work_s: deque[float] = deque(maxlen=MEMORY)
         self._last = (0, 0)
-        self._left_out = 0
 
     def arrived(self, received_ns: int, stamp_ns: int) -> None:
         """Note when the middleware received the message that is worked on next, and its stamp.
@@ -84,13 +79,6 @@ class Backlog:
             return False
         share = work_s / max(spacing_s, 1e-9)
         return share >= 1.0 or age_s * share / (1.0 - share) > CATCH_UP_S
-
-    def gives_way(self, age_s: float) -> bool:
-        """Return whether to leave out, of a frame so old, work that can wait for newer ones."""
-        behind = bool(self._spacing_s) and age_s > median(self._spacing_s)
-        is_left_out = behind and self._left_out < MOST_LEFT_OUT
-        self._left_out = self._left_out + 1 if is_left_out else 0
-        return is_left_out
 
 
 LOOK_S = 0.1
@@ -162,7 +150,9 @@ class OneSource:
         return bytes(known[0].endpoint_gid).hex() if len(known) == 1 else ''
 
     def accepts(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:
-        """Take a message's information; return whether the message may be used."""
+        """Take a message's information, empty where a node of this process gave it as an object;
+        return whether the message may be used.
+        """
         now_s, number = time.monotonic(), info.get(NUMBER)
         if number is not None and not self._sources.continues(number):
             self._looked_s = 0.0  # the graph as it is at this moment is needed
@@ -176,11 +166,7 @@ class OneSource:
 
     def _subscribed(self) -> Any:
         message_type, profile = self._arguments
-        # Of what is handed over within the process nothing more is known: its sender is ours.
-        handed = partial(self._take, info={})
-        return self._node.create_subscription(
-            message_type, self._topic, self._take, profile, handed=handed
-        )
+        return self._node.create_subscription(message_type, self._topic, self._take, profile)
 
     def _take(self, message: Any, info: Mapping[str, Any]) -> None:
         lasting = None if self._lasting is None else self._lasting(message)
@@ -224,10 +210,8 @@ class NewestSource(OneSource):
         self._works_later, self.backlog = works_later, Backlog()
         super().__init__(node, PointCloud2, topic, callback, qos.STREAM, doubted)
 
-    def _deliver(self, message: PointCloud2 | HandedFlux, info: Mapping[str, Any]) -> None:
-        # What is handed over has no queue.
-        is_handed = isinstance(message, HandedFlux)
-        newest = message if is_handed else self._newest(message, info)
+    def _deliver(self, message: PointCloud2, info: Mapping[str, Any]) -> None:
+        newest = self._newest(message, info)
         begin_s = time.perf_counter()
         if newest is not None:
             self._callback(newest)
