@@ -84,8 +84,8 @@ def test_what_is_not_said_yet_is_unknown_but_a_shift_from_the_file():
     assert not intake.has_error
     given = ModelIntake().take(messages([0])[1][0])
     setup = setup_of(triaxial_tool())
-    assert given.field_model(setup, None).shift_sigma_m == 0.0
-    assert given.field_model(setup, replace(MODEL, shift_sigma_m=1e-3)).shift_sigma_m == 1e-3
+    for own, size in ((None, 0.0), (replace(MODEL, shift_sigma_m=1e-3), 1e-3)):
+        assert ModelReader(setup, own, '').answer(given).model.shift_sigma_m == size
 
 
 def test_published_models_become_answers_that_share_what_is_the_same():

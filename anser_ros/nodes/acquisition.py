@@ -302,9 +302,16 @@ class Acquisition(AnserNode):
         # The system's clock may be set while we run; the offset is taken again for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
         if self.chain is not None:
-            self.chain.step(ChainFrame(stamp_ns, _sent(frame.tool), _sent(frame.reference)))
-        publishers = self._tool_publisher, self._reference_publisher
-        for publisher, points in zip(publishers, (frame.tool, frame.reference), strict=True):
+            # While the next window waits, only every third frame refits the model.
+            late = self._backlog.gives_way((time.monotonic_ns() - arrival_ns) / 1e9)
+            self.count('refits_left_out', late)
+            reference = None if late else _sent(frame.reference)
+            self.chain.step(ChainFrame(stamp_ns, _sent(frame.tool), reference))
+        # References first: their model is what a tracker in another process waits for.
+        for publisher, points in (
+            (self._reference_publisher, frame.reference),
+            (self._tool_publisher, frame.tool),
+        ):
             if len(points.channel) and publisher.get_subscription_count():
                 publisher.publish(self._cloud.packed(points, stamp_ns))
         self._frame = frame

@@ -43,7 +43,7 @@ from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
 from anser_ros.nodes.streams.one_source import LOOK_S, NewestSource, sender_words, setup_source
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.frame import MOST_RATE_HZ, Pace, ReadingWindow, check_enough
-from anser_ros.sessions.baseline import clean_flux, clean_mean
+from anser_ros.sessions.baseline import board_place_of, clean_flux, clean_mean
 from anser_ros.sessions.kept_tables import ReadAhead, kept_folder
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import (
@@ -139,7 +139,6 @@ class FieldModelNode(AnserNode):
         self._trouble = Trouble()
         self._frames: Intake | None = None
         self._stamp_ns, self._received_s = 0, 0.0
-        self._pace = Pace(table.refit_rate_hz)
         self._output = ModelOutput(self)
         self._metal = MetalView(self)
         setups = setup_source(self, self._on_setup)
@@ -149,7 +148,7 @@ class FieldModelNode(AnserNode):
         ahead = ReadAhead(folder, self._file_model if table.refit else None)
         kept = KeptBaseline(folder, name, self._fluxes.sender)
         witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)
-        self._refit = ActiveRefit(witnesses, self._pace, self.count, kept, ahead)
+        self._refit = ActiveRefit(witnesses, Pace(table.refit_rate_hz), self.count, kept, ahead)
         self.step, self.witnessed = self.given(self._take_frame), self.given(witnesses.note)
         self._sources = [setups, self._fluxes, *witnesses.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
@@ -182,14 +181,12 @@ class FieldModelNode(AnserNode):
             return
         self._setup_text, self._setup, table = message.data, setup, self.parameters
         self._trouble.forget()
-        self._refit.forget_baseline()
         self._references = sensor_table(setup.reference_sensors)
         self._frames = Intake(self._references.channel, self.count)
         self._window = ReadingWindow(self._references, len(base.emitters), table.baseline_s)
         self._output.name_origin(base)
         self._unfit, self._base = False, base
-        self._place = PlaceWatch.of(base, self._references, setup, self._fluxes.publishers)
-        self._refit.prepare(setup, base, self._references, table.refit)
+        self._prepare(setup, base, self._references)
         if base is not self._model:
             self._serve(base, self.get_clock().now().nanoseconds)
         self._announce_changes()
@@ -260,14 +257,13 @@ class FieldModelNode(AnserNode):
         Every frame is answered with its active model, even if that is unchanged: so the
         tracker knows the model for each frame, and gives the same poses as offline.
         """
-        result, model = self._refit.follow(frame), self._model
-        if result is None:
-            self.count('frames_between_refits')
-        elif result.is_answer:
-            model = result.model
+        result = self._refit.follow(frame)
+        model = self._refit.answered or self._model
         if model is not None:
             self._serve(model, frame.stamp_ns, self._refit.withheld)
-        if result is not None:
+        if result is None:
+            self.count('frames_between_refits')
+        else:
             self._metal.show(result, self._frame_id, frame.stamp_ns)
 
     @property
@@ -363,13 +359,19 @@ class FieldModelNode(AnserNode):
         if base is None:
             return
         if setup is not None and references is not None:
-            self._place = PlaceWatch.of(base, references, setup, self._fluxes.publishers)
-            self._refit.prepare(setup, base, references, self.parameters.refit)
-            self._refit.begin_again()
+            self._prepare(setup, base, references, again=True)
         self._unfit, self._received_s = False, time.monotonic()
         self._trouble.forget()
         self._output.name_origin(base)
         self._serve_start(base)
+
+    def _prepare(
+        self, setup: Setup, base: FieldModel, references: SensorTable, again: bool = False
+    ) -> None:
+        """Prepare for references, ``again`` for those that there is a baseline of."""
+        place = board_place_of(base, references, setup)
+        self._place = PlaceWatch(place, self._fluxes.publishers)
+        self._refit.prepare(setup, base, references, self.parameters.refit, again)
 
     def _serve_start(self, base: FieldModel) -> None:
         """Serve a model that is no answer of the references: trackers wait for the next one."""
@@ -426,7 +428,7 @@ class FieldModelNode(AnserNode):
         """Go on with the new model, at the new rate, or no longer."""
         if old.model_file != new.model_file:
             self._exchange(model_of(new.model_file))
-        self._pace.rate_hz = new.refit_rate_hz
+        self._refit.pace.rate_hz = new.refit_rate_hz
         self._announce_changes()
 
     def status(self) -> Status:
@@ -472,8 +474,7 @@ class FieldModelNode(AnserNode):
 
     def stop_working(self) -> bool:
         """End what is worked on aside, a refit that is being made among it."""
-        has_ended = self._refit.end(LONGEST_END_S)
-        return super().stop_working() and has_ended
+        return self._refit.end(LONGEST_END_S)
 
 
 if __name__ == '__main__':

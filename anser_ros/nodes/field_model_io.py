@@ -34,12 +34,10 @@ from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.streams.clouds import GivenModel, ModelWriter, read_frame, readings_of
 from anser_ros.nodes.streams.one_source import OneSource
 from anser_ros.physics.rotations import rotation_of_quaternion
-from anser_ros.physics.sensor import SensorTable
 from anser_ros.pose_states import code_of
 from anser_ros.refit.frame import ReadingWindow
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.model import Metal, RefitResult
-from anser_ros.sessions.baseline import board_place_of
 from anser_ros.sessions.kept_tables import DAMAGED, read_arrays, used_s, write_arrays
 from anser_ros.sessions.session import sensor_table, tracking_noise
 from anser_ros.stamps import set_stamp, stamp_of
@@ -262,13 +260,6 @@ class PlaceWatch:
         self._has_frame = self._has_looked = False
         self._begin_s = time.monotonic()
         self.misplaced = ''
-
-    @classmethod
-    def of(
-        cls, base: FieldModel, references: SensorTable, setup: Setup, announced: Callable[[], int]
-    ) -> 'PlaceWatch':
-        """Return what watches a model."""
-        return cls(board_place_of(base, references, setup), announced)
 
     @property
     def is_open(self) -> bool:

@@ -177,9 +177,11 @@ class ActiveRefit(ModelHalf):
         self.update_s = 0.0
 
     def prepare(
-        self, setup: Setup, base: FieldModel, references: SensorTable, at_once: bool
+        self, setup: Setup, base: FieldModel, references: SensorTable, at_once: bool, again: bool
     ) -> None:
-        """Be without a refit, and begin at once with what needs no baseline for the next one."""
+        """Be without a refit, and begin at once with what needs no baseline for the next one, or
+        to make it ``again`` to the last baseline, which is dropped else.
+        """
         self.end()
         self.follow_by(None)
         self.start = None
@@ -193,10 +195,9 @@ class ActiveRefit(ModelHalf):
                 self.start.prepare()
         else:
             self._ahead.drop()
-
-    def forget_baseline(self) -> None:
-        """Drop the baseline: the readings are to be others."""
-        self._baseline = None
+        baseline, self._baseline = self._baseline, None
+        if again and baseline is not None:
+            self.begin(baseline)
 
     def begin(self, baseline: NDArray[np.complex128]) -> None:
         """Begin to make a refit to what differs from a baseline, shape (S, K), T.
@@ -209,11 +210,6 @@ class ActiveRefit(ModelHalf):
         self._kept.drop()
         self._baseline = baseline
         self.start.begin(baseline)
-
-    def begin_again(self) -> None:
-        """Begin to make one to the last baseline, if there is one."""
-        if self._baseline is not None:
-            self.begin(self._baseline)
 
     def resume(self, is_wanted: bool) -> None:
         """Begin with the baseline of a process before this one, where there is one.

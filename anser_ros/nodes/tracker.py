@@ -212,7 +212,11 @@ class TrackerNode(AnserNode):
             self, PointCloud2, 'field_model', take, qos.MODELS, lasting=self._lasting
         )
         self._fluxes = NewestSource(
-            self, 'tool/flux', self._on_flux, self._on_doubted, works_later=True
+            self,
+            'tool/flux',
+            self._on_flux,
+            partial(self._on_flux, is_doubted=True),
+            works_later=True,
         )
         self._sources = [setups, self._models, self._fluxes]
         self._wait = self.create_timer(WAIT_PERIOD_S, self._on_wait, clock=self.steady_clock)
@@ -315,20 +319,18 @@ class TrackerNode(AnserNode):
         except AnserError as error:
             self._refuse('models_refused', error)
 
-    def _on_flux(self, message: PointCloud2) -> None:
-        """Track a frame when its model is there, or after so long."""
+    def _on_flux(self, message: PointCloud2, is_doubted: bool = False) -> None:
+        """Track a frame when its model is there, or after so long; say at once of one that may be
+        another sender's why it has no poses.
+        """
         frame = self._read(message)
-        if frame is not None:
+        if frame is not None and is_doubted:
+            self._track(frame)
+        elif frame is not None:
             wait_s = self.parameters.model_wait_s
             self._frames.add_frame(frame[0], frame, time.monotonic(), wait_s)
             if self._frames.waiting:
                 self._wait.reset()
-
-    def _on_doubted(self, message: PointCloud2) -> None:
-        """Say of a frame that may be another sender's why it has no poses."""
-        frame = self._read(message)
-        if frame is not None:
-            self._track(frame)
 
     def _lasting(self, message: PointCloud2) -> bytes | None:
         """Return what a model says until there is another; None while each frame has its own."""

@@ -3,6 +3,7 @@
 """
 
 from collections import deque
+from typing import Any
 
 from sensor_msgs.msg import PointCloud2
 
@@ -94,7 +95,7 @@ class ModelReader:
         self, setup: Setup, file_model: FieldModel | None, name: str, uncalibrated: bool = False
     ) -> None:
         self._setup, self._file_model, self._uncalibrated = setup, file_model, uncalibrated
-        self._read: tuple[GivenModel, FieldModel] | None = None
+        self._read: tuple[DipolePoints, ModelError | None, FieldModel] | None = None
         self.own = Answer(0, file_model, name=name)
 
     def answer(self, given: GivenModel) -> Answer:
@@ -102,8 +103,7 @@ class ModelReader:
 
         Raises `LayoutError` when it has other emitters than the setup.
         """
-        if self._read is None or not given.is_same_as(self._read[0]):
-            self._read = given, given.field_model(self._setup, self._file_model)
+        field = self._field_of(given)
         state, differs, withheld = given.withheld, self._difference(given), None
         if differs:
             withheld = Withheld(OTHER_MODEL, differs)
@@ -111,7 +111,29 @@ class ModelReader:
             reason = NO_READINGS if state == REFERENCES_LOST else 'reported by field_model'
             withheld = Withheld(state, reason)
         name = str(given.stamp_ns)
-        return Answer(given.stamp_ns, self._read[1], given.follows, withheld, name)
+        return Answer(given.stamp_ns, field, given.follows, withheld, name)
+
+    def _field_of(self, given: GivenModel) -> FieldModel:
+        """The model for the setup, the same one where only the stamp is new."""
+        points, error, own = given.points, given.error, self._file_model
+        if self._read is not None and self._read[0] is points and self._read[1] is error:
+            return self._read[2]
+        names, count = self._setup.emitter_names, points.moments.shape[1]
+        if count != len(names):
+            raise LayoutError(f'the field model has {count} emitters, the setup {len(names)}')
+        kept: dict[str, Any] = {}
+        if own is not None:
+            of_own = 'flux_error_t', 'shift_sigma_m', 'effects'
+            kept = {name: getattr(own, name) for name in of_own}
+        if error is not None:
+            modes = error.modes if len(error.modes) else None
+            kept |= {'flux_error_t': error.flux_error_t, 'modes': modes}
+        field = FieldModel(
+            points.positions, points.directions, points.moments, names,
+            self._setup.frequencies_hz, **kept,
+        )  # fmt: skip
+        self._read = points, error, field
+        return field
 
     def _difference(self, given: GivenModel) -> str:
         """In what the published model is not the one whose effects are undone; empty where it is.

@@ -15,7 +15,6 @@ from anser_ros.frames.intake import Frame
 from anser_ros.refit.frame import Pace, check_enough
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.model import RefitResult
-from anser_ros.sessions.baseline import Baseline
 from anser_ros.sessions.nominal_board import stated_volume
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.session import Session, tracking_noise
@@ -98,7 +97,12 @@ class ModelFollower(ModelHalf):
             raise BagError(f'{baseline.path}: {error}') from error
         super().__init__(Pace())
         self.summary = RefitSummary()
-        self.follow_by(_refit_of(prepared, baseline))
+        if len(session.reference.sensors):
+            drawing, volume = prepared.nominal.field, stated_volume(session.setup)
+            self.current = LiveRefit(
+                prepared.model, session.reference.sensors, baseline.flux, session.setup.refit,
+                drawing, volume=volume,
+            )  # fmt: skip
         if witnesses:
             if self.current is None:
                 raise BagError(
@@ -113,19 +117,3 @@ class ModelFollower(ModelHalf):
         result = super().refitted(refit, frame)
         self.summary.add(result)
         return result
-
-
-def _refit_of(prepared: PreparedSession, baseline: Baseline) -> LiveRefit | None:
-    """The refit to a session's references; None where there are none."""
-    session = prepared.session
-    assert session.reference is not None
-    if not len(session.reference.sensors):
-        return None
-    return LiveRefit(
-        prepared.model,
-        session.reference.sensors,
-        baseline.flux,
-        session.setup.refit,
-        prepared.nominal.field,
-        volume=stated_volume(session.setup),
-    )

@@ -71,7 +71,6 @@ class AnserNode(Node):
         self.exit_code: int | None = None
         self._throttle = Throttle(WARNING_PERIOD_S)
         self._fault: str | None = None
-        self._is_ending = False
         self._faults_reported = 0
         self.started_s = time.monotonic()
         options.setdefault('namespace', NAMESPACE)
@@ -201,7 +200,6 @@ class AnserNode(Node):
 
     def stop_working(self) -> bool:
         """End what is worked on aside; False where that still goes on after a while."""
-        self._is_ending = True
         return True
 
     def destroy_node(self) -> None:
@@ -236,7 +234,7 @@ class AnserNode(Node):
                 reason = ' '.join(str(error).split())
                 self.warn(f'refused_{type(error).__name__}', reason)
             except Exception as error:  # noqa: BLE001 - the node must outlive any callback
-                if self.context.ok() and not self._is_ending:
+                if self.context.ok():
                     reason = f'{type(error).__name__}: {error}'
                     self._report_fault(reason)
             response: Any = args[1] if is_service else None

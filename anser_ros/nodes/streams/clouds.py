@@ -31,7 +31,6 @@ from anser_ros.wire.points import (
     encode_flux,
     encode_model_error,
 )
-from anser_ros.wire.setup import Setup
 
 FLUX_NOISE, STAMP_SIGMA, FLUX_RATE = 'flux_noise_t', 'stamp_sigma_s', 'flux_rate_hz'
 """Keys of the setup document that acquisition measures: by what the components of fluxes scatter,
@@ -161,32 +160,6 @@ class GivenModel:
         """Return the state for which the server wants no pose to be given; empty where none is."""
         code = 0 if self.error is None else self.error.withheld
         return state_of(code)
-
-    def is_same_as(self, other: 'GivenModel | None') -> bool:
-        """Return whether only the stamp differs."""
-        return other is not None and self.points is other.points and self.error is other.error
-
-    def field_model(self, setup: Setup, file_model: FieldModel | None) -> FieldModel:
-        """Return the model for a setup, with the effects of the model file.
-
-        Raises `LayoutError` when it has other emitters than the setup.
-        """
-        points, count = self.points, len(setup.emitter_names)
-        if points.moments.shape[1] != count:
-            raise LayoutError(
-                f'the field model has {points.moments.shape[1]} emitters, the setup {count}'
-            )
-        own: dict[str, Any] = {}
-        if file_model is not None:
-            names = 'flux_error_t', 'shift_sigma_m', 'effects'
-            own = {name: getattr(file_model, name) for name in names}
-        if self.error is not None:
-            modes = self.error.modes if len(self.error.modes) else None
-            own |= {'flux_error_t': self.error.flux_error_t, 'modes': modes}
-        return FieldModel(
-            points.positions, points.directions, points.moments, setup.emitter_names,
-            setup.frequencies_hz, **own,
-        )  # fmt: skip
 
 
 class ModelWriter:

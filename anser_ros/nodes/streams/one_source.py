@@ -47,6 +47,10 @@ MEMORY = 25
 FEWEST_MESSAGES = 10
 """Messages that must have been worked on before a backlog is judged: the first ones are slow."""
 
+MOST_LEFT_OUT = 2
+"""Frames in a row that may be left out: more, and the model is older than metal in a hand
+allows."""
+
 
 class Backlog:
     """Estimates the typical spacing of messages, and the time that each takes."""
@@ -56,6 +60,7 @@ class Backlog:
         self._spacing_s: deque[float] = deque(known, maxlen=MEMORY)
         self._work_s: deque[float] = deque(maxlen=MEMORY)
         self._last = (0, 0)
+        self._left_out = 0
 
     def arrived(self, received_ns: int, stamp_ns: int) -> None:
         """Note when the middleware received the message that is worked on next, and its stamp.
@@ -79,6 +84,13 @@ class Backlog:
             return False
         share = work_s / max(spacing_s, 1e-9)
         return share >= 1.0 or age_s * share / (1.0 - share) > CATCH_UP_S
+
+    def gives_way(self, age_s: float) -> bool:
+        """Return whether to leave out, of a frame so old, work that can wait for newer ones."""
+        behind = bool(self._spacing_s) and age_s > median(self._spacing_s)
+        is_left_out = behind and self._left_out < MOST_LEFT_OUT
+        self._left_out = self._left_out + 1 if is_left_out else 0
+        return is_left_out
 
 
 LOOK_S = 0.1
