@@ -11,7 +11,6 @@ from anser_ros.chain.chain import Chain
 from anser_ros.chain.frame import Answer, ChainFrame, FrameReadings
 from anser_ros.chain.model_half import ModelHalf
 from anser_ros.chain.tracking_half import TrackingHalf
-from anser_ros.frames.intake import Intake
 from anser_ros.pose_states import Withheld
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
@@ -77,10 +76,7 @@ class Refit:
 
     def __init__(self, states):
         self.states, self.followed = iter(states), []
-        self._intake = Intake(READINGS.channels)
-
-    def judged(self, stamp_ns, channels, flux, flags):
-        return self._intake.judge(stamp_ns, channels, flux, flags)
+        self.references = SimpleNamespace(channel=READINGS.channels)
 
     def follow(self, frame):
         state = next(self.states)

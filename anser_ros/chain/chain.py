@@ -1,38 +1,33 @@
 """Writes down the order in which a frame passes both halves, wherever they run."""
 
 from collections.abc import Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Protocol
 
 from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.tracking.estimate import PoseEstimate
 
-A = TypeVar('A')
-"""What a half that refits says to one that tracks."""
-Said = TypeVar('Said', covariant=True)
-Heard = TypeVar('Heard', contravariant=True)
 
+class Refits(Protocol):
+    """Gives models, as `ModelHalf` does by references; what it says is for the other half."""
 
-class Refits(Protocol[Said]):
-    """Gives models, as `ModelHalf` does by references."""
-
-    def step(self, frame: ChainFrame) -> Said | None:
+    def step(self, frame: ChainFrame) -> Any:
         """Return what is to be used for the frame; None where that has not changed."""
 
     def witnessed(self, frame: ChainFrame, found: Sequence[PoseEstimate]) -> None:
         """Take in what a frame's tools read, and the poses that were found."""
 
 
-class Tracks(Protocol[Heard]):
+class Tracks(Protocol):
     """Gives poses, as `TrackingHalf` does."""
 
-    def use(self, answer: Heard, ahead: bool = False) -> None:
+    def use(self, answer: Any, ahead: bool = False) -> None:
         """Track by another answer; one ahead of frames is for the frame after its own."""
 
     def step(self, stamp_ns: int, tools: FrameReadings) -> list[PoseEstimate]:
         """Return the estimates of a frame."""
 
 
-class Chain(Generic[A]):
+class Chain:
     """Takes frames through both halves, without a clock of its own.
 
     Each frame is read, judged, refitted, tracked and judged in this order, so that it is tracked
@@ -40,9 +35,9 @@ class Chain(Generic[A]):
     before, aged by a frame. What tools contradict is for the next frame.
     """
 
-    def __init__(self, refits: Refits[A] | None, tracks: Tracks[A], lags: bool = False) -> None:
+    def __init__(self, refits: Refits | None, tracks: Tracks, lags: bool = False) -> None:
         self._refits, self._tracks, self._lags = refits, tracks, lags
-        self._used: A | None = None
+        self._used: Any = None
 
     def step(self, frame: ChainFrame) -> list[PoseEstimate]:
         """Return the estimates of a frame, with their states; none where it has no tools."""

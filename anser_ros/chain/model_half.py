@@ -9,7 +9,7 @@ from anser_ros.chain.frame import Answer, ChainFrame, FrameReadings
 from anser_ros.effects.correction import Correction
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.faults import GOOD, reading_codes
-from anser_ros.frames.intake import Frame
+from anser_ros.frames.intake import Frame, Intake
 from anser_ros.pose_states import OK, Withheld
 from anser_ros.refit.frame import Pace
 from anser_ros.refit.live_refit import LiveRefit
@@ -29,16 +29,19 @@ class ModelHalf:
     ``witnesses`` is the correction of tools whose contradictions show metal, too; None for none.
     """
 
+    current: LiveRefit | None
+    result: RefitResult | None
+    answered: FieldModel | None
+
     def __init__(self, pace: Pace) -> None:
         self.pace = pace
-        self.current: LiveRefit | None = None
-        self.result: RefitResult | None = None
-        self.answered: FieldModel | None = None
         self.witnesses: Correction | None = None
+        self.follow_by(None)
 
     def follow_by(self, refit: LiveRefit | None) -> None:
         """Follow by another refit from now on, or by none."""
         self.current, self.result, self.answered = refit, None, None
+        self._intake = None if refit is None else Intake(refit.references.channel)
 
     def reset(self) -> None:
         """Let the refit forget all frames, and what it gave."""
@@ -48,11 +51,10 @@ class ModelHalf:
 
     def step(self, frame: ChainFrame) -> Answer | None:
         """Answer a frame's references; None where there are none, or no refit to them."""
-        readings, refit = frame.reference, self.current
-        if readings is None or refit is None:
+        readings, intake = frame.reference, self._intake
+        if readings is None or intake is None:
             return None
-        judged = refit.judged(frame.stamp_ns, readings.channels, readings.flux, readings.flags)
-        self.follow(judged)
+        self.follow(intake.judge(frame.stamp_ns, readings.channels, readings.flux, readings.flags))
         return self.answer(frame.stamp_ns)
 
     def witnessed(self, frame: ChainFrame, found: Sequence[PoseEstimate]) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
-from anser_ros.chain.frame import ChainFrame, FrameReadings
+from anser_ros.chain.frame import ChainFrame
 from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes.acquisition_status import (
     Interval,
@@ -45,7 +45,7 @@ from anser_ros.wire.frames import (
     SampleBlock,
     Start,
 )
-from anser_ros.wire.points import FluxPoints, as_sent
+from anser_ros.wire.points import as_sent
 from anser_ros.wire.port import (
     DEFAULT_BAUD,
     SILENCE_S,
@@ -110,11 +110,6 @@ WAIT_S = 0.1
 """Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
 
 
-def _sent(points: FluxPoints) -> FrameReadings | None:
-    """Return fluxes as readers of their message have them; None where there are no sensors."""
-    return readings_of(as_sent(points)) if len(points.channel) else None
-
-
 class Acquisition(AnserNode):
     """Publishes ``setup``, ``tool/flux`` and ``reference/flux``.
 
@@ -153,7 +148,7 @@ class Acquisition(AnserNode):
         self._wall_clock = WallClock()
         self._asked_ns = 0
         self._start_sent_ns: int | None = None
-        self.chain: Chain[Any] | None = None
+        self.chain: Chain | None = None
         self._faults = RecentFaults()
         self._publish_setup(self._setup)
         self._port: ControlUnitPort | None = None
@@ -305,8 +300,11 @@ class Acquisition(AnserNode):
             # While the next window waits, only every third frame refits the model.
             late = self._backlog.gives_way((time.monotonic_ns() - arrival_ns) / 1e9)
             self.count('refits_left_out', late)
-            reference = None if late else _sent(frame.reference)
-            self.chain.step(ChainFrame(stamp_ns, _sent(frame.tool), reference))
+            tools, reference = (
+                readings_of(as_sent(points)) if len(points.channel) else None
+                for points in (frame.tool, frame.reference)
+            )
+            self.chain.step(ChainFrame(stamp_ns, tools, None if late else reference))
         # References first: their model is what a tracker in another process waits for.
         for publisher, points in (
             (self._reference_publisher, frame.reference),

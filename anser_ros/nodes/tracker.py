@@ -195,7 +195,7 @@ class TrackerNode(AnserNode):
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
         self._given: GivenModel | None = None
-        self._frames = AnsweredFrames(self._activate, self._track)
+        self._frames = AnsweredFrames(self._use_model, self._track)
         self.use, self.step = self.given(self._take_given), self.given(self._take_frame)
         self._trouble = Trouble()
         self._solve_s = self._diagnosed_s = 0.0
@@ -284,7 +284,7 @@ class TrackerNode(AnserNode):
         """Track with a model that another node of the process made."""
         if self._models.accepts({}):
             self._intake.newest = given
-            self._activate(given, ahead)
+            self._use_model(given, ahead)
 
     def _take_frame(self, stamp_ns: int, tools: FrameReadings) -> list[PoseEstimate]:
         """Track a frame of another node of the process, and return what is found."""
@@ -294,20 +294,16 @@ class TrackerNode(AnserNode):
         self._fluxes.accepts({})
         return self._track((stamp_ns, tools))
 
-    def _activate(self, given: GivenModel, ahead: bool = False) -> None:
-        """Track with another model from now on."""
-        self._given = given
-        self._use_model(ahead)
-
     def _begin(self, setup: Setup, tracker: Tracker) -> None:
         """Track the tools of a setup with the tracker's own model, until another one is used."""
         name, allowed = self.parameters.model_file, self.parameters.allow_uncalibrated
         self._reader = ModelReader(setup, self._file_model, name, allowed)
         self._half = TrackingHalf(tracker, setup.refit.references_age_s, self._reader.own)
 
-    def _use_model(self, ahead: bool = False) -> None:
-        """Use the newest model, or the tracker's own, once the setup is known too."""
-        half, reader, given = self._half, self._reader, self._given
+    def _use_model(self, given: GivenModel | None = None, ahead: bool = False) -> None:
+        """Use a model, else the last one or the tracker's own, once the setup is known too."""
+        half, reader = self._half, self._reader
+        self._given = given = given or self._given
         if half is None or reader is None:
             return
         before = half.answer.model if given is not None else None

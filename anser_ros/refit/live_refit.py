@@ -144,21 +144,14 @@ class LiveRefit:
         self, stamp_ns: int, channels: NDArray[np.generic], flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
     ) -> RefitResult:  # fmt: skip
-        """Judge one frame of reference fluxes, and return the result of the refit to it."""
-        return self.follow(self.judged(stamp_ns, channels, flux, flags))
-
-    def judged(
-        self, stamp_ns: int, channels: NDArray[np.generic], flux: NDArray[np.generic],
-        flags: NDArray[np.generic] | None = None,
-    ) -> Frame:  # fmt: skip
-        """Return one frame of reference fluxes in the order of the references, with its faults.
+        """Take in one frame of reference fluxes and return the result of the refit.
 
         ``channels`` (S,) may come in any order, and unknown ones are passed over; ``flux`` (S, K)
         is in T; a reading with ``flags`` (S,) is not used. Raises `FitError` when shapes don't fit
         or a channel appears twice.
         """
         width = len(self.model.emitters)
-        return self._intake.judge(stamp_ns, channels, flux, flags, width)
+        return self.follow(self._intake.judge(stamp_ns, channels, flux, flags, width))
 
     def follow(self, frame: Frame) -> RefitResult:
         """Take in one frame that has been judged, in the order of the references."""

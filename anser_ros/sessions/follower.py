@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 
 from anser_ros.chain.chain import Refits
-from anser_ros.chain.frame import Answer
 from anser_ros.chain.model_half import ModelHalf
 from anser_ros.errors import BagError, FitError, ParameterError
 from anser_ros.frames.intake import Frame
@@ -68,7 +67,7 @@ class RefitSummary:
         self.left_out.update(result.left_out)
 
 
-class FrameModels(Refits[Answer], Protocol):
+class FrameModels(Refits, Protocol):
     """Gives each frame of a session the model that it is tracked with."""
 
     summary: RefitSummary
@@ -99,10 +98,10 @@ class ModelFollower(ModelHalf):
         self.summary = RefitSummary()
         if len(session.reference.sensors):
             drawing, volume = prepared.nominal.field, stated_volume(session.setup)
-            self.current = LiveRefit(
+            self.follow_by(LiveRefit(
                 prepared.model, session.reference.sensors, baseline.flux, session.setup.refit,
                 drawing, volume=volume,
-            )  # fmt: skip
+            ))  # fmt: skip
         if witnesses:
             if self.current is None:
                 raise BagError(
