@@ -4,6 +4,7 @@ import signal
 import socket
 import threading
 import time
+from collections import Counter
 from dataclasses import make_dataclass
 from types import SimpleNamespace
 
@@ -21,10 +22,12 @@ from tracking_world import setup_of, triaxial_tool
 
 from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import ParameterError
+from anser_ros.nodes.acquisition import Acquisition
 from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.live import CHAIN, join
 from anser_ros.nodes.runtime import process, qos
 from anser_ros.nodes.runtime.parameters import is_known, names_for
+from anser_ros.nodes.streams.one_source import Backlog
 from anser_ros.nodes.tracker import TrackerNode
 from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux
@@ -133,6 +136,27 @@ def test_frames_pass_the_nodes_of_one_process_as_objects(joined, ros):
     found = acquisition.chain.step(frame_of(joined, first_ns + 60_000_000))
     assert {one.state for one in found} == {'two_sources'}
     stranger.destroy_node()
+
+
+def test_a_late_frame_passes_without_its_references_at_most_twice():
+    """So that a slow machine loses no window."""
+    passed, counted = [], Counter()
+    unheard = SimpleNamespace(get_subscription_count=lambda: 0)
+    node = SimpleNamespace(
+        _accuracy=SimpleNamespace(must_republish=lambda *_: False),
+        _wall_clock=SimpleNamespace(offset_ns=lambda: 5), _backlog=Backlog(0.02),
+        _reference_publisher=unheard, _tool_publisher=unheard,
+        _interval=SimpleNamespace(add=lambda *_: None), chain=SimpleNamespace(step=passed.append),
+        count=lambda name, by: counted.update({name: by}),
+    )  # fmt: skip
+    points = FluxPoints(np.arange(1), np.zeros(1, int), np.ones((1, 8), complex), *2 * [None])
+    frame = SimpleNamespace(tool=points, reference=points, host_ns=1)
+    stream = SimpleNamespace(clock=SimpleNamespace(sigma_s=0.0))
+    for age_s in (0.0, 0.1, 0.1, 0.1, 0.0):
+        Acquisition._publish_frame(node, stream, frame, time.monotonic_ns() - round(age_s * 1e9))
+    assert [one.reference is None for one in passed] == [False, True, True, False, False]
+    assert all(one.tools is not None and one.stamp_ns == 6 for one in passed)
+    assert counted == {'refits_left_out': 2}
 
 
 def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from refit_world import NOISE_T, anser_world, metal_block, metal_flux
 from tracked_tool import CHANNELS, MODEL
 from tracking_world import flux_points, triaxial_tool
 
+from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError
 from anser_ros.nodes.field_model_io import ToolWitnesses
@@ -244,6 +246,20 @@ def test_readings_and_poses_of_one_frame_come_together_in_any_order(witnesses):
         assert reading.position[0] == x and np.array_equal(reading.rotation, np.eye(3))
         assert (reading.flux == np.float32(level)).all()
         assert len(reading.table) == len(TOOL) - 1, 'the one without a reading is left out'
+
+
+def test_frames_of_the_same_process_come_with_the_poses_that_were_found(witnesses):
+    refit, values = Refit(), np.full((len(CHANNELS), 8), 1e-9, dtype=np.complex128)
+    tools = FrameReadings(np.array(CHANNELS), values, np.zeros(len(CHANNELS), int))
+    turn, good = np.eye(3), {'state': 'ok', 'position': np.ones(3)}
+    found = [
+        SimpleNamespace(name=name, rotation=rotation, **good)
+        for name, rotation in (('tool_a', turn), ('tool_a/0/x', None))
+    ]
+    witnesses.note(ChainFrame(100, tools, None), found)
+    witnesses.pass_on(refit, 100)
+    ((reading,),) = refit.given
+    assert reading.rotation is turn and len(reading.table) == len(TOOL)
 
 
 def test_what_has_no_partner_is_forgotten_and_an_earlier_recording_is_taken(witnesses):

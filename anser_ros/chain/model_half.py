@@ -55,7 +55,10 @@ class ModelHalf:
         if readings is None or intake is None:
             return None
         self.follow(intake.judge(frame.stamp_ns, readings.channels, readings.flux, readings.flags))
-        return self.answer(frame.stamp_ns)
+        result, withheld = self.result, None
+        if result is not None and result.withheld:
+            withheld = Withheld(result.withheld, result.reason)
+        return Answer(frame.stamp_ns, self.answered, True, withheld)
 
     def witnessed(self, frame: ChainFrame, found: Sequence[PoseEstimate]) -> None:
         """Let a frame's tools show metal, at the poses that were found for their bodies."""
@@ -75,13 +78,6 @@ class ModelHalf:
     def refitted(self, refit: LiveRefit, frame: Frame) -> RefitResult:
         """Return what the refit makes of a frame that is due; for who counts or times it."""
         return refit.follow(frame)
-
-    def answer(self, stamp_ns: int) -> Answer:
-        """Return what holds for a frame of this stamp that was followed, or was not due."""
-        result, withheld = self.result, None
-        if result is not None and result.withheld:
-            withheld = Withheld(result.withheld, result.reason)
-        return Answer(stamp_ns, self.answered, True, withheld)
 
 
 def tool_readings(

@@ -306,10 +306,8 @@ class Acquisition(AnserNode):
             )
             self.chain.step(ChainFrame(stamp_ns, tools, None if late else reference))
         # References first: their model is what a tracker in another process waits for.
-        for publisher, points in (
-            (self._reference_publisher, frame.reference),
-            (self._tool_publisher, frame.tool),
-        ):
+        publishers = self._reference_publisher, self._tool_publisher
+        for publisher, points in zip(publishers, (frame.reference, frame.tool), strict=True):
             if len(points.channel) and publisher.get_subscription_count():
                 publisher.publish(self._cloud.packed(points, stamp_ns))
         self._frame = frame

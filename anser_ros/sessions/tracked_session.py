@@ -72,8 +72,8 @@ def track(
     tracker = Tracker(prepared.model, prepared.sensors, settings, observers)
     estimates: dict[str, list[PoseEstimate]] = {}
     further: dict[str, dict[str, list[PoseEstimate]]] = {one.KIND: {} for one in observers}
-    tools = TrackingHalf(tracker, prepared.session.setup.refit.references_age_s)
-    chain = Chain(follower, tools)
+    age_s = prepared.session.setup.refit.references_age_s
+    chain = Chain(follower, TrackingHalf(tracker, age_s))
     frames = list(frames_of(prepared.session))
     start = time.perf_counter()
     for count, frame in enumerate(frames, start=1):
