@@ -152,8 +152,11 @@ def test_a_late_frame_passes_without_its_references_at_most_twice():
     points = FluxPoints(np.arange(1), np.zeros(1, int), np.ones((1, 8), complex), *2 * [None])
     frame = SimpleNamespace(tool=points, reference=points, host_ns=1)
     stream = SimpleNamespace(clock=SimpleNamespace(sigma_s=0.0))
-    for age_s in (0.0, 0.1, 0.1, 0.1, 0.0):
+    refitted = [
         Acquisition._publish_frame(node, stream, frame, time.monotonic_ns() - round(age_s * 1e9))
+        for age_s in (0.0, 0.1, 0.1, 0.1, 0.0)
+    ]
+    assert refitted == [True, False, False, True, True]
     assert [one.reference is None for one in passed] == [False, True, True, False, False]
     assert all(one.tools is not None and one.stamp_ns == 6 for one in passed)
     assert counted == {'refits_left_out': 2}

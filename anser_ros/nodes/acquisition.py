@@ -245,9 +245,10 @@ class Acquisition(AnserNode):
             done, arrival_ns = run.stop, arrivals_ns[run.stop - 1]
             skips = self._backlog.is_hopeless((begin_ns - arrival_ns) / 1e9)
             for frame in stream.push(blocks[run], arrivals_ns[run], skips=skips):
-                self._publish_frame(stream, frame, arrival_ns)
+                could_wait = self._publish_frame(stream, frame, arrival_ns)
                 now_ns = time.monotonic_ns()
-                self._backlog.worked((now_ns - begin_ns) / 1e9)
+                if not could_wait:  # whether a backlog is hopeless depends on all other work
+                    self._backlog.worked((now_ns - begin_ns) / 1e9)
                 begin_ns = now_ns
 
     def _take_answer(self, command: int, tag: int) -> None:
@@ -291,20 +292,24 @@ class Acquisition(AnserNode):
             self._published_setup = text
             self._setup_publisher.publish(String(data=text))
 
-    def _publish_frame(self, stream: FluxStream, frame: FluxFrame, arrival_ns: int) -> None:
+    def _publish_frame(self, stream: FluxStream, frame: FluxFrame, arrival_ns: int) -> bool:
+        """Publish a frame, and take it through the chain; return whether its model was refitted,
+        which is left out, but for every third frame, when the next window is near or waits.
+        """
+        reference = None
         if self._accuracy.must_republish(frame, stream.clock.sigma_s, time.monotonic()):
             self._publish_setup(self._accuracy.stated_in(self._setup, stream.rate_hz))
         # The system's clock may be set while we run; the offset is taken again for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
         if self.chain is not None:
-            # While the next window waits, only every third frame refits the model.
             late = self._backlog.gives_way((time.monotonic_ns() - arrival_ns) / 1e9)
             self.count('refits_left_out', late)
             tools, reference = (
                 readings_of(as_sent(points)) if len(points.channel) else None
                 for points in (frame.tool, frame.reference)
             )
-            self.chain.step(ChainFrame(stamp_ns, tools, None if late else reference))
+            reference = None if late else reference
+            self.chain.step(ChainFrame(stamp_ns, tools, reference))
         # References first: their model is what a tracker in another process waits for.
         publishers = self._reference_publisher, self._tool_publisher
         for publisher, points in zip(publishers, (frame.reference, frame.tool), strict=True):
@@ -312,6 +317,7 @@ class Acquisition(AnserNode):
                 publisher.publish(self._cloud.packed(points, stamp_ns))
         self._frame = frame
         self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
+        return reference is not None
 
     # Executor thread ----------------------------------------------------------------------
 

@@ -110,6 +110,11 @@ class FieldModelParameters:
     seed: int = stated('seed')
 
 
+LONGEST_WAIT_S = 0.004
+"""Time, s, that a frame's poses may be late by what this node does besides, as it writes to disk;
+a frame whose model would come later has none, and the one before ages."""
+
+
 class FieldModelNode(AnserNode):
     """Publishes ``field_model``, and answers ``field_model/reset`` and its like.
 
@@ -149,7 +154,8 @@ class FieldModelNode(AnserNode):
         kept = KeptBaseline(folder, name, self._fluxes.sender)
         witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)
         self._refit = ActiveRefit(witnesses, Pace(table.refit_rate_hz), self.count, kept, ahead)
-        self.step, self.witnessed = self.given(self._take_frame), self.given(witnesses.note)
+        self.step = self.given(self._take_frame, LONGEST_WAIT_S)
+        self.witnessed = self.given(witnesses.note, LONGEST_WAIT_S)
         self._sources = [setups, self._fluxes, *witnesses.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)

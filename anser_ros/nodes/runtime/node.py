@@ -113,9 +113,11 @@ class AnserNode(Node):
 
     # What a node uses ---------------------------------------------------------------------
 
-    def given(self, callback: Callback) -> Callback:
-        """Return a callback as another thread of the process may call it: guarded, in turn."""
-        return self._guard(self._in_turn(callback))
+    def given(self, callback: Callback, longest_s: float = -1.0) -> Callback:
+        """Return a callback as another thread of the process may call it: guarded, in turn, and
+        left out where that would take longer.
+        """
+        return self._guard(self._in_turn(callback, longest_s))
 
     def count(self, name: str, by: int = 1) -> None:
         """Count an event for ``/diagnostics``."""

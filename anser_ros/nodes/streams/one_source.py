@@ -86,8 +86,10 @@ class Backlog:
         return share >= 1.0 or age_s * share / (1.0 - share) > CATCH_UP_S
 
     def gives_way(self, age_s: float) -> bool:
-        """Return whether to leave out, of a frame so old, work that can wait for newer ones."""
-        behind = bool(self._spacing_s) and age_s > median(self._spacing_s)
+        """Return whether to leave out, of a frame so old, work that can wait for newer ones: once
+        half of the time until the next one is over.
+        """
+        behind = bool(self._spacing_s) and age_s > 0.5 * median(self._spacing_s)
         is_left_out = behind and self._left_out < MOST_LEFT_OUT
         self._left_out = self._left_out + 1 if is_left_out else 0
         return is_left_out
