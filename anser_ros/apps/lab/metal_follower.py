@@ -23,18 +23,19 @@ from anser_ros.apps.lab.metal_track import (
     predicted,
     updated,
 )
+from anser_ros.chain.frame import Answer, ChainFrame
+from anser_ros.chain.model_half import poses_of, tool_readings
 from anser_ros.errors import BagError, ModelFileError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.model_age import FrameModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.pose_states import MODEL_DOUBTFUL, OK, Withheld
+from anser_ros.pose_states import MODEL_DOUBTFUL, Withheld
 from anser_ros.refit.clouds import Excitation, excitation_for
 from anser_ros.refit.witness import ToolReading, coil_spread, linearised
-from anser_ros.sessions.follower import FrameModels, RefitSummary, tool_readings
+from anser_ros.sessions.follower import FrameModels, RefitSummary
 from anser_ros.sessions.nominal_board import stated_volume
 from anser_ros.sessions.prepared import PreparedSession, settings_for
-from anser_ros.sessions.session import FrameReadings, SessionFrame, tracking_noise
+from anser_ros.sessions.session import tracking_noise
 from anser_ros.settings import ToolSettings
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import NO_GATE, PoseEstimate, TrackerSettings
@@ -308,26 +309,24 @@ class KnownMetalModels(FrameModels):
         self._stamp_ns = 0
         self.summary = RefitSummary()
 
-    def at(self, frame: SessionFrame) -> FrameModel:
+    def step(self, frame: ChainFrame) -> Answer:
         """Return what a frame is tracked with."""
         self._stamp_ns = frame.stamp_ns
         model, withheld = self._follower.at(frame.stamp_ns)
         self.summary.states[FOLLOWED if self._follower.is_followed else SEARCHED] += 1
         if model is not self._rough.model:
             self._rough = self._rough.with_model(model)
-        return FrameModel(model, withheld)
+        return Answer(frame.stamp_ns, model, withheld=withheld)
 
-    def witnessed(self, tools: FrameReadings, found: Sequence[PoseEstimate]) -> None:
+    def witnessed(self, frame: ChainFrame, found: Sequence[PoseEstimate]) -> None:
         """Take in what a frame's tools read, at poses near theirs."""
+        if (tools := frame.tools) is None:
+            return
         rough = self._rough.update(self._stamp_ns, tools.channels, tools.flux, tools.flags)
-        poses = {
-            one.name: (one.position, one.rotation)
-            for one in (*rough, *(one for one in found if one.state == OK))
-            if one.state == OK and one.rotation is not None
-        }
+        poses = poses_of((*rough, *found))
         at = [one.position for one in rough if np.isfinite(one.position).all()]
         self._follower.take(
             self._stamp_ns,
-            tool_readings(self._correction, tools.channels, tools.flux, tools.flags, poses),
+            tool_readings(self._correction, tools, poses),
             np.array(at) if at else None,
         )
