@@ -24,6 +24,7 @@ from anser_ros.errors import TrackingError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE, value_codes
 from anser_ros.frames.intake import Frame, Freshness, Intake
+from anser_ros.integrity.pose_checks import SurveyErrors, distances
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import Withheld
@@ -32,7 +33,13 @@ from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, trac
 from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTracks, track_coil
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
-from anser_ros.tracking.rigid import BodyCoils
+from anser_ros.tracking.rigid import (
+    BodyCoils,
+    common_factor,
+    solve_body,
+    start_from_grid,
+    step_to_coils,
+)
 from anser_ros.tracking.solve_context import (
     FEWEST_EMITTERS,
     ReducedScene,
@@ -403,3 +410,24 @@ def warm_up() -> None:
         if uncertainty is not None:  # what a coil needs that is far from where it was expected
             context = build_context(model, settings)
             context.errors_at(places, sensors.axis, sensors.length)
+
+
+def warm_up_bodies(model: FieldModel) -> None:
+    """Solve a small made-up body alone, which `warm_up` comes to last."""
+    context = build_context(model, TrackerSettings())
+    coils = BodyCoils(np.zeros((3, 3)), np.eye(3), np.zeros(3))
+    flux = model.flux(coils.offsets + [0.0, 0.0, 0.15], coils.axes, coils.lengths).view(np.float64)
+    weights = np.tile(1.0 / context.sigma, (3, 1))
+    common = common_factor(np.zeros((3, 0, context.sigma.size)), weights)
+    normals, took_part = np.tile(np.eye(6), (3, 1, 1)), np.ones(3, dtype=bool)
+    for start in start_from_grid(context.grid, context.field, coils, flux):
+        found = solve_body(
+            context.field, coils, flux, weights, common, *start, context.low, context.high
+        )
+        body = found.position, found.rotation
+        own = coils.offsets + found.position, coils.axes @ found.rotation.T
+        step_to_coils(*body, coils.offsets, coils.axes, *own, normals, context.low, context.high)
+        distances(
+            (*body, np.eye(6)), coils.offsets, coils.axes, (*own, normals), took_part,
+            SurveyErrors(1e-4, 1e-3, 1e-3),
+        )  # fmt: skip
