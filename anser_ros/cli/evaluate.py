@@ -211,7 +211,6 @@ ALONE = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', *SESSION_KI
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = (
         'example: anser evaluate bags/metal.mcap --model config/demo_model.yaml'
         ' --refit --baseline bags/scan.mcap --out refit/'

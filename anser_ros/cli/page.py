@@ -78,8 +78,6 @@ BEFORE, AFTER = '#c44e52', '#4c72b0'
 
 
 class Html(str):
-    """Text that is HTML already."""
-
     __slots__ = ()
 
 

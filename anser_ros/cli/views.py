@@ -26,7 +26,6 @@ NAMESPACE = re.compile(r'^[A-Za-z_]\w*(/[A-Za-z_]\w*)*$')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = 'example: anser views config/demo_setup.yaml --namespace left --out views/'
     parser.add_argument('setup', help='setup document: a path, or a file of config/')
     add_out(parser)
@@ -40,7 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def work(args: argparse.Namespace, tell: Tell) -> Result:
-    """Write both views."""
     space = args.namespace.strip('/')
     if not NAMESPACE.match(space):
         raise ParameterError(f'{args.namespace!r} is not a namespace')
@@ -60,19 +58,15 @@ class Topics(NamedTuple):
     prefix: str
 
     def frame(self, setup: Setup) -> str:
-        """Return the name of the board's frame."""
         return f'{self.prefix}{setup.frame_id}'
 
     def own(self, name: str) -> str:
-        """Return the name of a topic of the nodes."""
         return f'/{self.namespace}/{name}'
 
     def pose(self, name: str, ending: str = 'pose') -> str:
-        """Return the name of the topic of a coil's or body's pose."""
         return self.own(f'{topic_of(name)}/{ending}')
 
     def optical(self, body: str) -> str:
-        """Return the name of the topic of a body's optical pose."""
         return f'{self.optical_namespace}/{topic_of(body)}/pose'
 
 
@@ -91,7 +85,6 @@ def _cells(setup: Setup) -> int:
 
 
 def rviz_view(setup: Setup, topics: Topics) -> dict[str, Any]:
-    """Return the whole configuration of RViz as plain data."""
     view: dict[str, Any] = yaml.safe_load(read_config(RVIZ))
     manager = view['Visualization Manager']
     manager['Displays'] = list(_displays(manager['Displays'], setup, topics))
@@ -135,7 +128,6 @@ def _display(known: dict[str, Any], name: str, topic: str, shown: bool = True) -
 
 
 def foxglove_view(setup: Setup, topics: Topics) -> dict[str, Any]:
-    """Return the whole layout of Foxglove as plain data."""
     view: dict[str, Any] = json.loads(read_config(FOXGLOVE))
     panels = view['configById']
     scene = panels['3D!tool']

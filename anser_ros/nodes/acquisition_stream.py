@@ -121,7 +121,6 @@ class FluxStream:
         self._reference = SensorRows.of(self.sensors[self._split :], fixed_only=True)
 
     def counts(self) -> dict[str, int]:
-        """Return the counters of the stream by name."""
         return {
             **vars(self.counters),
             'windows_withheld': self.withheld,

@@ -120,10 +120,6 @@ class TopicLog:
         found = [f'{self.lost} lost', gaps, f'{self.jumps_back} jumps back in time']
         return ', '.join(words for words in found if not words.startswith('0 '))
 
-    def publishers(self, count: int) -> None:
-        """Note how many publish the topic now."""
-        self.n_publishers = max(self.n_publishers, count)
-
     def add(self, sequence: int | None, stamp_ns: int | None) -> None:
         """Note one message by its publisher's number and its stamp, where it has them."""
         if sequence is not None and self.n_publishers == 1:
@@ -314,13 +310,13 @@ class Recorder(AnserNode):
             self.warn('metadata_errors', _reason(error))
 
     def _discover(self) -> None:
-        """Subscribe to what has appeared since the last time."""
         if self._bag is None:
             return
         added = False
         for topic, type_names in self.get_topic_names_and_types():
             if topic in self._topic_subscriptions:
-                self._logs[topic].publishers(self.count_publishers(topic))
+                log = self._logs[topic]
+                log.n_publishers = max(log.n_publishers, self.count_publishers(topic))
             elif self._wanted(topic) and len(type_names) == 1:
                 added = self._add(topic, type_names[0]) or added
         if added:
@@ -395,7 +391,6 @@ def _matching(offered: list[QoSProfile]) -> QoSProfile:
 
 
 def _stamp_ns(data: bytes) -> int | None:
-    """Return the stamp of a serialised message that begins with a header."""
     if len(data) < 12:
         return None
     order = '<' if data[1] & 1 else '>'

@@ -96,7 +96,6 @@ class TrackerSettings:
 
     @property
     def box(self) -> TrackedVolume:
-        """Return the volume where tools may be."""
         return self.volume or DEFAULT_VOLUME
 
     def margin(self, ratio: float) -> float:
@@ -200,7 +199,6 @@ class NoiseScale:
 
     @property
     def value(self) -> float:
-        """Return residual power over its expectation."""
         return float(self._state[1] / self._state[0])
 
     def add(self, ratio: float, whitened: Array | None = None, freedom: int = 1) -> None:
@@ -247,11 +245,7 @@ class Tip:
         the arm ``a`` in fg, ``d_tip = d_body - [a]x d_turn + R d_arm``, and turns are the body's.
         """
         if body.rotation is None:
-            nothing = np.full(3, np.nan)
-            return replace(
-                body, name=self.name, position=nothing, axis=nothing,
-                covariance=np.full((6, 6), np.nan), sigma_position_m=math.nan,
-            )  # fmt: skip
+            return no_pose(self.name, body.stamp_ns, body.state, body.model_id, body.reason)
         arm = body.rotation @ self.position
         x, y, z = arm
         carry = np.eye(6)

@@ -59,7 +59,6 @@ class ModelRecord:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all frames that were judged so far."""
         self._frames: deque[tuple[int, int, int, float]] = deque()
         self._refused = self._total = self._sound_since_ns = self._last_ns = 0
         self.is_doubtful = False
@@ -121,7 +120,6 @@ class Judgement:
         self.record = ModelRecord()
 
     def forget(self) -> None:
-        """Forget all frames that were judged so far."""
         self._continuity.clear()
         self._last.clear()
         self.record.forget()

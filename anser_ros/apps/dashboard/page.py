@@ -117,7 +117,6 @@ class Screen:
 
     @property
     def is_seen(self) -> bool:
-        """Return whether the browser is connected."""
         return bool(self._client.has_socket_connection)
 
     def show_frame(self, rows: list[Any]) -> None:
@@ -268,7 +267,6 @@ class Pages:
         self._tick = guarded(self._move)
 
     def register(self) -> None:
-        """Serve the page at ``/``."""
 
         @ui.page('/', title='anser_ros live view')
         def _page() -> None:
@@ -281,7 +279,6 @@ class Pages:
 
     @property
     def count(self) -> int:
-        """Return how many pages are open."""
         return len(self._screens)
 
     async def _drive(self) -> None:

@@ -56,7 +56,6 @@ class ChainClient:
         }
 
     def is_there(self, service: str) -> bool:
-        """Return whether somebody offers a service."""
         return bool(self._triggers[service].service_is_ready())
 
     async def trigger(self, service: str) -> str:
@@ -178,7 +177,6 @@ class Dashboard(AnserNode):
         self._source.setup_text = message.data
 
     def status(self) -> Status:
-        """Return how many pages look on."""
         job = self._loop.job
         values = {
             'pages': self._server.guard.pages,
@@ -188,7 +186,6 @@ class Dashboard(AnserNode):
         return Status('', Level.OK, f'{self._pages.count} pages open', values)
 
     def close(self) -> None:
-        """End the page, and a command that runs."""
         self._loop.cancel()
         self._server.end()
         self._streams.destroy_node()

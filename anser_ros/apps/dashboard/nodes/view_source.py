@@ -100,7 +100,6 @@ class Polled:
         return found
 
     def close(self) -> None:
-        """End the subscription and forget what came by it."""
         self._node.destroy_subscription(self._subscription)
 
 
@@ -156,7 +155,6 @@ class ViewSource:
         self._processor = Processor()
 
     def mark(self, words: str) -> None:
-        """Mark this moment in the curves."""
         self._marks.append((time.time(), words))
 
     def figures(self, since_s: float) -> dict[str, float | None]:
@@ -166,7 +164,6 @@ class ViewSource:
     # What comes in ------------------------------------------------------------------------
 
     def look(self) -> None:
-        """Take in what has come since the last time."""
         self._take_setup(self.setup_text)
         for message in self._diagnostics.messages(self._refused):
             self._take_statuses(message)
@@ -254,7 +251,6 @@ class ViewSource:
         }
 
     def frame(self) -> list[Any]:
-        """Return the places of all targets that the view shows."""
         return [] if self.view is None else self.view.frame()
 
     def table(self) -> list[list[Any]]:
@@ -273,11 +269,9 @@ class ViewSource:
         ]
 
     def metal(self) -> list[list[float]]:
-        """Return balls where metal seems to be."""
         return self._balls
 
     def point(self) -> list[Any]:
-        """Return the newest point of the curves."""
         view = self.view
         return [] if view is None or not view.points else _point(view.points[-1])
 
@@ -286,7 +280,6 @@ class ViewSource:
         return [list(mark) for mark in self._marks]
 
     def status(self) -> dict[str, Any]:
-        """Return what the page's header and lists say."""
         view, space = self.view, self.namespace
         own, busy = self._processor.shares()
         status: dict[str, Any] = {

@@ -109,7 +109,6 @@ class _Client:
             self._filled.notify()
 
     def is_due(self, now_s: float) -> bool:
-        """Return whether a TDATA message is due."""
         return self._tracking_s is not None and now_s >= self._due_s
 
     def put_tracking(self, data: bytes, now_s: float) -> None:
@@ -185,7 +184,6 @@ class IgtlServer:
 
     @property
     def n_clients(self) -> int:
-        """Return the number of connected clients."""
         self._forget_the_gone()
         return len(self._connections)
 
@@ -212,7 +210,6 @@ class IgtlServer:
                 client.put_tracking(data, now_s)
 
     def close(self) -> None:
-        """End the connections of all clients."""
         self._ending.set()
         self._thread.join()
         self._listener.close()
@@ -309,11 +306,9 @@ class OpenIGTLink(AnserNode):
 
     @property
     def port(self) -> int:
-        """Return the TCP port in use."""
         return self._server.port
 
     def status(self) -> Status:
-        """Return how many clients there are, and what they have missed."""
         values = {
             'address': f'{self.parameters.host}:{self._server.port}',
             'clients': self._server.n_clients,
@@ -327,7 +322,6 @@ class OpenIGTLink(AnserNode):
         return Status('', Level.OK, 'serving', values)
 
     def close(self) -> None:
-        """End the connections of all clients."""
         self._server.close()
 
     def _on_setup(self, message: String) -> None:
