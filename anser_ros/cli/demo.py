@@ -51,7 +51,7 @@ VISITS_APART_S = 3.0
 
 def load(path: Path) -> Results:
     with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+        return dict(stored)
 
 
 def summarise(results: Results) -> dict[str, dict[str, Any]]:

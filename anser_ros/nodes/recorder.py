@@ -5,7 +5,6 @@ the node subscribes to topics as they appear.
 """
 
 import importlib
-import json
 import os
 import statistics
 import struct
@@ -53,19 +52,9 @@ def definition(type_name: str) -> str:
     for current in names:  # which grows meanwhile
         package, _, name = _split(current)
         title = f'{SEPARATOR}\nMSG: {package}/{name}\n' if parts else ''
-        parts.append(title + _file(current, 'msg').read_text(encoding='utf-8'))
+        parts.append(title + _file(current).read_text(encoding='utf-8'))
         names += [one for one in _contained(message_class(current)) if one not in names]
     return '\n'.join(parts)
-
-
-def type_hash(type_name: str) -> str:
-    """Return the type's hash, or nothing where the installation does not have it."""
-    try:
-        document: dict[str, Any] = json.loads(_file(type_name, 'json').read_text('utf-8'))
-        hashes = {entry['type_name']: entry['hash_string'] for entry in document['type_hashes']}
-    except (BagError, ValueError, KeyError, TypeError):
-        return ''
-    return str(hashes.get(type_name, ''))
 
 
 def _split(type_name: str) -> tuple[str, str, str]:
@@ -75,11 +64,11 @@ def _split(type_name: str) -> tuple[str, str, str]:
     return tokens[0], tokens[1], tokens[2]
 
 
-def _file(type_name: str, ending: str) -> Path:
+def _file(type_name: str) -> Path:
     package, kind, name = _split(type_name)
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     for prefix in [*filter(None, prefixes), sys.prefix]:
-        path = Path(prefix, 'share', package, kind, f'{name}.{ending}')
+        path = Path(prefix, 'share', package, kind, f'{name}.msg')
         if path.is_file():
             return path
     raise BagError(f'no definition of {type_name} is installed')
@@ -334,7 +323,8 @@ class Recorder(AnserNode):
 
     def _add(self, topic: str, type_name: str) -> bool:
         """Subscribe to one topic; return whether it is recorded from now on."""
-        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        publishers = self.get_publishers_info_by_topic(topic)
+        offered = [info.qos_profile for info in publishers]
         if not offered or self._bag is None:
             return False  # only somebody who listens
         try:
@@ -352,7 +342,9 @@ class Recorder(AnserNode):
             )
             for profile in offered
         ]
-        channel = self._bag.add_topic(topic, type_name, text, profiles, type_hash(type_name))
+        type_hash = str(publishers[0].topic_type_hash)
+        known_hash = type_hash if type_hash.startswith('RIHS') else ''
+        channel = self._bag.add_topic(topic, type_name, text, profiles, known_hash)
         log = self._logs[topic] = TopicLog(len(offered))
         is_stamped = type_name in STAMPED
 

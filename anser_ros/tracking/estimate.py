@@ -27,18 +27,14 @@ MEMORY_FRAMES = 100.0
 """Good frames over which the noise is averaged, 2 s at 50 Hz: it is then known to a tenth with one
 coil of eight emitters. Fewer follow the noise of single frames; more are late when it changes."""
 PRIOR_FRAMES = 8.0
-"""Frames for which the stated noise counts at the start. Fewer let the first frame decide; more
-keep a wrong statement for longer."""
+"""Frames for which the stated noise counts at the start, so that the first one does not decide."""
 HIDDEN = 20.0 / 11.0
-"""Power of a distortion that goes into the pose over the power that stays in the residual. A
-smooth distortion looks more like a pose than like anything else: of a coil with eight emitters the
-five dimensions of the pose get four times what each of the eleven others gets. Smaller, and
-distorted poses say that they are certain; larger, and slight misfits widen poses that are
-right."""
+"""Power of a distortion that goes into the pose over the power that stays in the residual: of a
+coil with eight emitters the five dimensions of the pose get four times what each of the eleven
+others gets, as a smooth distortion looks more like a pose than like anything else."""
 SLIGHT = 0.1
 """Residual power that lasts from frame to frame, in units of the expected power, up to which it is
-no misfit. Of noise alone, a coil with eight emitters has 0 +- 0.02. Smaller, and chance widens
-poses; larger, and a coil that is a little wrong all the time counts as one with more noise."""
+no misfit: of noise alone, a coil with eight emitters has 0 +- 0.02."""
 
 
 @inlined

@@ -45,8 +45,7 @@ a model that is a little wrong."""
 FEWEST_JUDGED_READINGS = 6
 """Readings that a share is made of at least: a single bad coil is not the whole chain."""
 GOOD_SHARE = 0.2
-"""Share (0 to 1) of refused readings up to which a frame speaks for the model: one bad coil of
-five."""
+"""Share of refused readings up to which a frame speaks for the model: one bad coil of five."""
 RECOVERY_S = 0.5
 """For so long, s, all frames must speak for a doubtful model before it gives poses again: where it
 happens to fit, it is not yet right."""

@@ -28,8 +28,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MAX_EVALUATIONS = 40
-"""Evaluations of the residuals after which a descent is given up as not converged. Good starts
-need a few; the bound keeps the time of a frame limited when the fluxes fit no pose."""
+"""Evaluations after which a descent is given up: good starts need a few, and a frame is short."""
 
 
 @dataclass(frozen=True)

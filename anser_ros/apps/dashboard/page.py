@@ -133,7 +133,7 @@ class Screen:
                 self._version = source.version
                 self._instrument.run_method('setup', world)
         elif self._is_ready:
-            self._instrument.run_method('table', source.table(), source.metal())
+            self._instrument.run_method('table', source.table(), source.metal)
             self._instrument.run_method('point', source.point())
             self._once('marks', source.marks(),
                        lambda marks: self._instrument.run_method('marks', marks))  # fmt: skip

@@ -38,10 +38,6 @@ FULL = (1013, 'too many pages')
 """The same where as many pages are open as may be."""
 
 
-def is_local(host: str) -> bool:
-    return host in LOOPBACK
-
-
 class Guard:
     """Stands before another ASGI application, and refuses who may not come in.
 
@@ -64,7 +60,11 @@ class Guard:
         if refused:
             await _refuse(scope, receive, send, *refused)
         elif scope['type'] == 'websocket':
-            await self._connect(scope, receive, send)
+            self.pages += 1
+            try:
+                await self._inner(scope, receive, send)
+            finally:
+                self.pages -= 1
         elif given and self._token:
             # The browser keeps the token, and takes it out of the address line.
             answer = RedirectResponse(scope['path'], 303)
@@ -75,7 +75,7 @@ class Guard:
 
     def _refusal(self, request: HTTPConnection, given: str) -> tuple[int, str] | None:
         host, origin = request.headers.get('host', ''), request.headers.get('origin', '')
-        if not self._token and not is_local(urlsplit(f'//{host}').hostname or ''):
+        if not self._token and urlsplit(f'//{host}').hostname not in LOOPBACK:
             return 403, 'The live view answers to localhost only.'
         if origin and urlsplit(origin).netloc != host:
             return 403, 'The request comes from another page.'
@@ -89,13 +89,6 @@ class Guard:
         if is_new and self.pages >= MOST_PAGES:
             return 503, f'{MOST_PAGES} pages are open, which is the most; close one of them.'
         return None
-
-    async def _connect(self, scope: Scope, receive: Receive, send: Send) -> None:
-        self.pages += 1
-        try:
-            await self._inner(scope, receive, send)
-        finally:
-            self.pages -= 1
 
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, code: int, words: str) -> None:
@@ -130,7 +123,7 @@ def token_for(host: str, token_file: str) -> str:
     Raises `ParameterError` when the file holds none, or a short one.
     """
     if not token_file:
-        return '' if is_local(host) else secrets.token_urlsafe(LEAST_TOKEN)
+        return '' if host in LOOPBACK else secrets.token_urlsafe(LEAST_TOKEN)
     try:
         token = Path(token_file).expanduser().read_text(encoding='utf-8').strip()
     except (OSError, UnicodeDecodeError) as error:

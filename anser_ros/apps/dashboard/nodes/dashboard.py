@@ -119,8 +119,6 @@ async def _ask(client: Any, request: Any, longest_s: float) -> Any:
 
 @dataclass(frozen=True)
 class DashboardParameters:
-    """Holds the parameters of the live view."""
-
     host: str = parameter(
         '127.0.0.1',
         "address that the page is served on; any other than this machine's own needs a token",

@@ -48,8 +48,6 @@ SILENCE_S = 2.0
 
 @dataclass(frozen=True)
 class WatcherParameters:
-    """Holds the parameters of the watcher."""
-
     model_file: str = parameter(
         NOMINAL,
         "the tracker's model: a file, or nominal for that of the setup's own geometry",
@@ -93,7 +91,7 @@ class WatcherParameters:
 class Streams(Protocol):
     """States what a watcher looks at: streams into a window, and who looks at the window.
 
-    `FluxStreams` are those of this package's own fluxes; others come by `streams_of`.
+    `FluxStreams` are those of this package's own fluxes; others are an application's.
     """
 
     WHAT: str  # what comes, in a word
@@ -215,12 +213,6 @@ class FluxStreams:
         }
 
 
-def streams_of(node: 'Watcher', table: WatcherParameters) -> Streams:
-    """Return what the parameters ask for: streams of an application, or fluxes."""
-    asked = extensions.loaded('STREAMS', lambda name: getattr(table, name))
-    return next((make(node, table) for make in asked), None) or FluxStreams(node, table)
-
-
 class Watcher(AnserNode):
     """Subscribes to fluxes and optical poses, or to the tracked poses that are named and a
     reference's, and publishes ``/diagnostics`` alone.
@@ -243,7 +235,11 @@ class Watcher(AnserNode):
         self._busy = False
         # What looks, and by whose watch; None at the end.
         self._tasks: queue.SimpleQueue[tuple[Any, Callable[[], Any]] | None] = queue.SimpleQueue()
-        self._streams = streams_of(self, self.parameters)
+        table = self.parameters
+        asked = extensions.loaded('STREAMS', lambda name: getattr(table, name))
+        self._streams: Streams = next((make(self, table) for make in asked), None) or FluxStreams(
+            self, table
+        )
         self.create_timer(POLL_S, self._begin_look, clock=self.steady_clock)
         work = self._guard(self._take_look)
         self._thread = threading.Thread(target=self._work, args=(work,), daemon=True)
