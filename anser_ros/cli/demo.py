@@ -45,8 +45,6 @@ SMOOTH = 25
 """Number of poses of the running median by which the reported sigma is drawn."""
 METAL_NEAR_M = 0.3
 """Distance of the disc from the board, m, up to which the picture marks the metal as near."""
-VISITS_APART_S = 3.0
-"""Time, s, after which metal that is near again counts as a further visit."""
 
 
 def load(path: Path) -> Results:
@@ -151,20 +149,15 @@ def _draw_error(axes: Any, results: Results, shown: int) -> None:
         at, level = broken(stamp - begin, median_filter(sigma, SMOOTH, mode='nearest'))
         words = 'half to twice the sigma, live'
         axes.fill_between(at, level / 2, 2 * level, color='k', alpha=0.15, lw=0, label=words)
-    _shade_metal(axes, results['metal'], begin)
+    seen_s, near = results['metal'][:, 0] - begin, results['metal'][:, 1] < METAL_NEAR_M
+    if near.any():
+        axes.fill_between(
+            seen_s, 0, 1, where=near, transform=axes.get_xaxis_transform(), color='tab:red',
+            alpha=0.12, lw=0, label='metal near',
+        )  # fmt: skip
     axes.set(xlabel='time, s', ylabel='position error, mm', yscale='log')
     axes.set_xlim(0.0, max(end - begin, 1.0))
     axes.grid(alpha=0.3, which='both')
-
-
-def _shade_metal(axes: Any, metal: NDArray[np.float64], begin: float) -> None:
-    near = metal[metal[:, 1] < METAL_NEAR_M, 0] - begin
-    if not near.size:
-        return
-    visits = np.split(near, np.flatnonzero(np.diff(near) > VISITS_APART_S) + 1)
-    for rank, visit in enumerate(visits):
-        label = 'metal near' if rank == 0 else None
-        axes.axvspan(visit[0], visit[-1], color='tab:red', alpha=0.12, label=label)
 
 
 def _joined(results: Results, kind: str, rank: int) -> NDArray[np.float64]:

@@ -169,7 +169,6 @@ class Tracker:
 
     @property
     def counters(self) -> Counter[str]:
-        """Return how often what was seen, by name."""
         return self._past.counters
 
     @property

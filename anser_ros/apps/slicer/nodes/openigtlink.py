@@ -141,15 +141,6 @@ class _Client:
         return not data
 
 
-def _set_options(connection: socket.socket) -> None:
-    """Send at once, and find out when the other end is no longer there."""
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in KEEP_ALIVE.items():
-        if hasattr(socket, name):
-            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-
-
 class IgtlServer:
     """Listens on one address and sends to all who connect.
 
@@ -224,7 +215,11 @@ class IgtlServer:
                 self.refused += 1
                 connection.close()
                 continue
-            _set_options(connection)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # send at once
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            for name, value in KEEP_ALIVE.items():
+                if hasattr(socket, name):
+                    connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
             with self._lock:
                 self._connections.append(_Client(connection, self._answer))
 
