@@ -33,6 +33,8 @@ REPLY_TIMEOUT_S = 2.0
 """Time, s, that a listener has for an answer before it is asked again."""
 # A listener may be compiling its kernels.
 ATTEMPTS = 30
+# Fewest for one that has not answered yet: answers can miss a client that is new to the server.
+FIRST_ATTEMPTS = 5
 ANSWER_POLL_S = 0.1
 """How often a wait looks whether it was given up, s: a Ctrl-C takes so long."""
 # How often the graph is asked for new listeners, in messages.
@@ -49,11 +51,13 @@ class Consumers:
         self._clients: dict[str, Any] = {}
         self._listeners: dict[tuple[str, ...], set[str]] = {}
         self._silent: set[str] = set()
+        self._answered: set[str] = set()
         self._calls = 0
 
     def wait(self, *topics: str, attempts: int = ATTEMPTS) -> None:
         """Wait until all listeners of the topics, by their full names, have handled what was
-        published; after so many ``attempts`` to ask one it is gone on without it for good.
+        published; after so many ``attempts`` to ask one it is gone on without it, after
+        `FIRST_ATTEMPTS` at least where it has never answered.
         """
         if self._calls % REFRESH_EVERY == 0:
             self._listeners.clear()
@@ -62,7 +66,10 @@ class Consumers:
             self._listeners[topics] = set().union(*map(self._find, topics))
         waiting = {name: self._ask(name) for name in self._listeners[topics]}
         for name, answered in waiting.items():
-            if not self._answers(name, answered, attempts):
+            patience = attempts if name in self._answered else max(attempts, FIRST_ATTEMPTS)
+            if self._answers(name, answered, patience):
+                self._answered.add(name)
+            else:
                 self._listeners[topics].discard(name)
 
     def _find(self, topic: str) -> set[str]:
@@ -120,8 +127,9 @@ REPORT_AFTER_S = 3.0
 CLOCK_PERIOD_NS = 10_000_000
 # How long listeners have to acknowledge the first and the last messages, s.
 LONGEST_ACK_S = 5.0
-# How often a silent listener of poses is asked: answers can miss a client that is new to it.
-ATTEMPTS_OF_LISTENERS = 5
+# How often a silent listener of poses is asked again: fewer times than one of fluxes, for it is
+# asked after every frame.
+ATTEMPTS_OF_LISTENERS = 2
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,6 @@ from anser_ros.tracking.solve_context import (
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-__all__ = ['PoseEstimate', 'Tracker', 'TrackerSettings']
-
 
 def _add(counters: Counter[str], name: str, by: int) -> None:
     counters[name] += by

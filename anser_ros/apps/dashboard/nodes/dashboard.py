@@ -11,10 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -82,13 +81,11 @@ class ChainClient:
         Raises `ChainError` when one refuses; those before it have theirs already.
         """
         for name, path in files.items():
-            value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=path)
-            wanted = ParameterMessage(name=MODEL_FILE, value=value)
+            wanted = Parameter(MODEL_FILE, value=path).to_parameter_msg()
             request = SetParameters.Request(parameters=[wanted])
-            answer = await _ask(self._setters[name], request, LOADING_S)
-            if not answer.results or not answer.results[0].successful:
-                reason = answer.results[0].reason if answer.results else 'refused'
-                raise ChainError(f'{name}: {reason}')
+            (result,) = (await _ask(self._setters[name], request, LOADING_S)).results
+            if not result.successful:
+                raise ChainError(f'{name}: {result.reason}')
 
     async def baseline_file(self) -> str:
         """Return the recording without metal that ``field_model`` was started with."""
