@@ -29,8 +29,7 @@ from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, Setup
 
 PATIENCE_NS = 300_000_000
-"""Host time (0.3 s) that a frame waits for an arrival that confirms its stamp: stalls of the host
-are shorter."""
+"""Host time (0.3 s) that a frame waits for its stamp to be confirmed: the host stalls for less."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,11 @@ class FluxStream:
         if not self.sensors:
             raise SetupError('the control unit has none of the channels of the setup')
         self.tones_hz = np.array(hello.frequencies_hz)
-        self.nominal_a = _nominal_currents(setup, hello)
+        # Currents that the setup's field is given for; the control unit's where it says nothing.
+        self.nominal_a = np.array(hello.currents_a, dtype=np.float64)
+        current = setup.emitter.geometry.get('current_a')
+        if isinstance(current, (int, float)) and current > 0:
+            self.nominal_a[:] = current
         rate = hello.sample_rate_hz
         window = round(window_s * rate)
         hop = max(1, round(rate / rate_hz))
@@ -121,7 +124,6 @@ class FluxStream:
         self._reference = SensorRows.of(self.sensors[self._split :], fixed_only=True)
 
     def counts(self) -> dict[str, int]:
-        """Return the counters of the stream by name."""
         return {
             **vars(self.counters),
             'windows_withheld': self.withheld,
@@ -275,14 +277,6 @@ def _points(
     return FluxPoints(rows.channel, flags, flux, rows.position, rows.axis)
 
 
-def _nominal_currents(setup: Setup, hello: Hello) -> NDArray[np.float64]:
-    """Currents that the setup's field is given for; the control unit's where it says nothing."""
-    current = setup.emitter.geometry.get('current_a')
-    if isinstance(current, (int, float)) and current > 0:
-        return np.full(len(hello.currents_a), float(current))
-    return np.array(hello.currents_a)
-
-
 EARLIEST_S = 10.0
 """Least time, s, between setup documents that only state another uncertainty of the stamps."""
 _FACTOR = 2.0
@@ -333,8 +327,7 @@ _TRIES = 5
 _CLOSE_NS = 20_000
 """Time (20 us) from one reading to the next that is close enough to try no more."""
 _STEP_NS = 5_000_000
-"""Change of the difference (5 ms) that is a setting: a clock that is slewed moves 0.5 ms a
-second."""
+"""Change of the difference (5 ms) that is a setting: a slewed clock moves 0.5 ms a second."""
 
 
 class WallClock:

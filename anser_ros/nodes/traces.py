@@ -137,7 +137,6 @@ class PoseTrace:
         return away, axis_angles(np.array(self.axis).reshape(-1, 3), axes)
 
     def row(self, optical: PoseTrack | None, elapsed_s: float) -> Row:
-        """Return a row about what came since the last call."""
         since, self._shown = self._shown, len(self.stamp_s)
         count = self._shown - since
         error = float('nan')

@@ -45,8 +45,7 @@ a model that is a little wrong."""
 FEWEST_JUDGED_READINGS = 6
 """Readings that a share is made of at least: a single bad coil is not the whole chain."""
 GOOD_SHARE = 0.2
-"""Share (0 to 1) of refused readings up to which a frame speaks for the model: one bad coil of
-five."""
+"""Share of refused readings up to which a frame speaks for the model: one bad coil of five."""
 RECOVERY_S = 0.5
 """For so long, s, all frames must speak for a doubtful model before it gives poses again: where it
 happens to fit, it is not yet right."""
@@ -59,7 +58,6 @@ class ModelRecord:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all frames that were judged so far."""
         self._frames: deque[tuple[int, int, int, float]] = deque()
         self._refused = self._total = self._sound_since_ns = self._last_ns = 0
         self.is_doubtful = False
@@ -121,7 +119,6 @@ class Judgement:
         self.record = ModelRecord()
 
     def forget(self) -> None:
-        """Forget all frames that were judged so far."""
         self._continuity.clear()
         self._last.clear()
         self.record.forget()

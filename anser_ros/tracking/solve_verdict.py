@@ -149,10 +149,6 @@ class Solution(Protocol):
     """States where the solve of any tracked thing ended."""
 
     @property
-    def position(self) -> Array:
-        """Return the position, m, frame fg."""
-
-    @property
     def chi2(self) -> float:
         """Return the sum of squared whitened residuals."""
 

@@ -52,8 +52,6 @@ from anser_ros.tracking.solve_context import (
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-__all__ = ['PoseEstimate', 'Tracker', 'TrackerSettings']
-
 
 def _add(counters: Counter[str], name: str, by: int) -> None:
     counters[name] += by
@@ -86,7 +84,6 @@ class Past:
         self.first_ns = 0
 
     def forget(self) -> None:
-        """Forget all warm starts, and what was seen of the sensors and bodies."""
         self.judgement.forget()
         self.coils.forget()
         for body in self.bodies.values():
@@ -177,12 +174,10 @@ class Tracker:
 
     @property
     def counters(self) -> Counter[str]:
-        """Return how often what was seen, by name."""
         return self._past.counters
 
     @property
     def model(self) -> FieldModel | None:
-        """Return the active field model, or None."""
         return self._scene.model
 
     @property
@@ -265,7 +260,6 @@ class Tracker:
         return [] if frame is None else self._track(frame, withheld)
 
     def _track(self, frame: Frame, withheld: Withheld | None) -> list[PoseEstimate]:
-        """Estimate the poses of a frame that has been judged."""
         past, context = self._past, self._scene.context
         if frame.goes_back:
             self.reset()
@@ -287,7 +281,6 @@ class Tracker:
         return self._solved(frame.stamp_ns, np.ascontiguousarray(flux), codes, context)
 
     def _few_emitters(self, living: NDArray[np.bool_]) -> str:
-        """Why a frame with so few emitters has no poses."""
         emitters = () if self.model is None else self.model.emitters
         silent = [name for name, lives in zip(emitters, living, strict=True) if not lives]
         return (
@@ -339,7 +332,6 @@ class Tracker:
     def _solved_coils(
         self, stamp_ns: int, values: Array, codes: NDArray[np.int64], context: SolveContext
     ) -> list[CoilResult]:
-        """Solve each sensor by itself, from flux components (S, 2K)."""
         table, past, settings, results = self._scene.table, self._past, self.settings, []
         tracks, lengths = past.coils, table.length.tolist()
         followed = tracks.follow(stamp_ns, values, codes == GOOD, table.length, context, settings)
@@ -359,7 +351,6 @@ class Tracker:
     def _without_poses(
         self, frame: Frame, state: str, model_id: str, reason: str
     ) -> list[PoseEstimate]:
-        """Return an estimate without a pose for every sensor and body."""
         names = (*self._scene.table.name, *self._scene.bodies)
         return [no_pose(name, frame.stamp_ns, state, model_id, reason) for name in names]
 

@@ -36,8 +36,7 @@ def too_slow(skipped: int, worked: int) -> str:
 
 
 LATE_WINDOWS = 3.0
-"""Age of a message, in the spacing of messages, from which it may be late: more than the jitter of
-a loaded machine."""
+"""Age, in spacings of messages, from which one may be late, more than a busy machine's jitter."""
 SHORTEST_LATE_S = 0.05
 """Age, s, below which no message is late, however fast messages come: the executor has delays."""
 CATCH_UP_S = 1.0
@@ -48,8 +47,7 @@ FEWEST_MESSAGES = 10
 """Messages that must have been worked on before a backlog is judged: the first ones are slow."""
 
 MOST_LEFT_OUT = 2
-"""Frames in a row that may be left out: more, and the model is older than metal in a hand
-allows."""
+"""Frames in a row that may be left out: no model may be older than metal in a hand allows."""
 
 
 class Backlog:
