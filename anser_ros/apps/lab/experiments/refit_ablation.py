@@ -8,7 +8,7 @@ poses count as such.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,7 @@ class FreeDipoles:
         excitation, region = excitation_for(model, drawing)
         clouds = [cloud for cloud in default_clouds(region) if not cloud.overhead]
         self.model, self.baseline, self._noise = model, baseline, accuracy.flux_noise_t
-        self._layer = bottom_layer(model, region, excitation, clouds[0].positions)
+        self._layer = bottom_layer(region, excitation)
         self._spectra, self._bases, self._transfers = [], [], []
         for cloud in clouds:
             root = np.repeat(np.sqrt(cloud.volumes), 3)
@@ -89,13 +89,7 @@ class FreeDipoles:
                 best, kept = evidence, transfer @ (shrink * projected)
         k, layer = flux.shape[1], self._layer
         moments = (self._noise * (kept[:, :k] + 1j * kept[:, k:])).astype(np.complex128)
-        rows = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
-        base = self.model.moments.copy()
-        base[rows] += moments[: rows.size]
-        model = replace(self.model, moments=base)
-        return model.with_dipoles(
-            layer.positions[rows.size :], layer.directions[rows.size :], moments[rows.size :]
-        )
+        return self.model.with_dipoles(layer.positions, layer.directions, moments)
 
 
 REACH_M = 0.15
