@@ -34,6 +34,10 @@ OTHERS_CORRELATION, BETTER = 0.95, 0.1
 """Correlation (0 to 1) with another's prediction, and share of the power that its own leaves which
 the other's may leave, from which a plug is in its socket. A looser pair takes neighbours that read
 alike for exchanged ones; a stricter one misses an exchange if there are other effects."""
+AS_LITTLE = 2.0
+"""Power that an explanation of the wiring may leave over what the best one leaves, so that the one
+with fewer faults is named. Exact symmetries leave the same; what is not one leaves tens of times
+as much. Smaller lets noise choose between two names of the same fault."""
 DEAD = 0.02
 """Share of the expected reading below which a channel receives nothing: a fifth of the leak that
 `channel_crosstalk` expects, so that one that its neighbours leak into is not called dead.

@@ -47,6 +47,7 @@ class Site(TypedDict, total=False):
     coils: tuple[int, ...]  # of crosstalk: the one that leaks, and the one that it leaks into
     read_as: tuple[int, ...]  # for each of the channels or coils, the one whose place it has
     body: str
+    rotation_deg: tuple[float, ...]  # rotation vector of a body in its holder, its own frame
     mutual: Literal[True]  # the leak is the same both ways
     shape: str  # curve of a saturation
     sees: str  # what a saturating channel sees: one tone, or all together
