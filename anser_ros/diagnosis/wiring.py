@@ -6,7 +6,8 @@ of a prediction, so that no fit is needed: the right one leaves a small part of 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ from anser_ros.effects.seen import (
     SWAPPED_COILS,
 )
 from anser_ros.field.measurements import Measurements
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import along_each_axis
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -128,14 +131,116 @@ def _rewired(problem: Problem, number: int, known: Sequence[Term]) -> list[Term]
     return list(min(alike, key=lambda way: way[1])[2])
 
 
+MOST_EXCHANGED = 12
+"""Channels of a body up to which each pair is tried in each other's place: 66 pairs."""
+RIDGE = 1e-6
+"""Damping of the free dipoles of a scan, over their mean information: they are nearly alike."""
+MOST_LEFT = 0.02
+"""Share of a scan's power that free dipoles leave at most where its wiring is right: less than a
+hundredth for coils of some centimetres, a third where one sensor of three is reversed."""
+
+
+def scan_faults(measurements: Sequence[Measurements], places: Array) -> list[Term]:
+    """Return what is reversed or turned in a scan, whose field is still unknown.
+
+    ``measurements``: with poses; ``places`` (P, 3): about where the emitters are, m. Each emitter
+    is three free dipoles at every place. Signs of emitters are signs of their dipoles, and nothing
+    is named unless it leaves a small part of what is left without it.
+    """
+    none = _scan_signs(measurements, places)
+    if none[2] < MOST_LEFT:
+        return []
+    tried = [none]
+    for channels in {tuple(m.sensors.channel.tolist()): None for m in measurements}:
+        for term in (*_exchanges(channels), *_quarter_turns(np.array(channels))):
+            righted = [rightly_wired(m, [term]) for m in measurements]
+            terms, left, _ = _scan_signs(righted, places)
+            tried.append(([term, *terms], left, none[2]))
+    least = min(left for _, left, _ in tried)
+    if least > decisions.BETTER * none[2]:
+        return []
+    alike = [way for way in tried if way[1] <= decisions.AS_LITTLE * least]
+    return min(alike, key=lambda way: len(way[0]))[0]
+
+
+def rightly_wired(measurements: Measurements, faults: Sequence[Term]) -> Measurements:
+    """Return a tool's measurements without the faults that `scan_faults` found in them."""
+    flux, sensors = measurements.flux, measurements.sensors
+    for term in faults:
+        sensors = term.effect.table(term, sensors)
+        mixing = term.effect.channel_matrix(term, sensors.channel)
+        if mixing is not None:
+            flux = np.einsum('ts,fsk->ftk', np.linalg.inv(mixing), flux)
+    return replace(measurements, flux=flux, sensors=sensors) if faults else measurements
+
+
+def _exchanges(channels: Sequence[int]) -> list[Term]:
+    """Each two channels of a body of few in each other's place."""
+    pairs = combinations(channels, 2) if len(channels) <= MOST_EXCHANGED else ()
+    sites: list[Site] = [{'channels': (b, a), 'read_as': (a, b)} for a, b in pairs]
+    return [Term(SWAPPED_CHANNELS, site) for site in sites]
+
+
+def _scan_signs(
+    measurements: Sequence[Measurements], places: Array
+) -> tuple[list[Term], float, float]:
+    """The sensors that are reversed, and the shares of power left with and without their signs.
+
+    With signs q of the sensors the dipoles explain q M q, where M is a sum over the emitters.
+    """
+    positions, directions = along_each_axis(places)
+    count = 3 * len(places)
+    normal, power = np.zeros((count, count)), np.zeros(measurements[0].flux.shape[2])
+    right: dict[int, ComplexArray] = {}
+    for m in measurements:
+        points, axes = m.placed()
+        for row, channel in enumerate(m.sensors.channel.tolist()):
+            keep = m.usable[:, row]
+            lengths, flux = np.full(keep.sum(), m.sensors.length[row]), m.flux[keep, row]
+            basis = flux_basis(points[keep, row], axes[keep, row], lengths, positions, directions)
+            normal += basis.T @ basis
+            right[channel] = right.get(channel, 0.0) + basis.T @ flux
+            power += np.sum(np.abs(flux) ** 2, axis=0)
+    ridge = RIDGE * float(np.trace(normal)) / count
+    sums = np.array(list(right.values()))  # (S, 3 P, K)
+    solved = np.linalg.solve(normal + ridge * np.eye(count), sums)
+    share = 1.0 / np.maximum(power, 1e-300)
+    together = np.einsum('sck,tck,k->st', sums.conj(), solved, share).real / len(share)
+    starts = np.concatenate([np.ones((1, len(together))), np.linalg.eigh(together)[1].T, together])
+    signs = max((_climbed(q, together) for q in starts), key=lambda q: float(q @ together @ q))
+    signs = -signs if (signs < 0).sum() > (signs > 0).sum() else signs
+    left, plain = (1.0 - float(q @ together @ q) for q in (signs, np.ones(len(signs))))
+    reversed_ = tuple(c for c, sign in zip(right, signs, strict=True) if sign < 0)
+    if not reversed_ or left > decisions.BETTER * plain:
+        return [], plain, plain
+    return [Term(SENSOR_POLARITY, {'channels': reversed_})], left, plain
+
+
+def _climbed(start: Array, together: Array) -> Array:
+    """Signs q near a start's, of which no other one makes q M q larger."""
+    signs = np.where(start < 0, -1.0, 1.0)
+    while True:
+        gains = np.diag(together) - signs * (together @ signs)
+        if gains.max() <= 1e-12:
+            return signs
+        signs[int(np.argmax(gains))] *= -1.0
+
+
+def _quarter_turns(channels: NDArray[np.int64]) -> list[Term]:
+    """The quarter turns of a body with these channels, the least first."""
+    group = sorted(Rotation.create_group('O'), key=lambda one: round(float(one.magnitude()), 6))
+    found: list[Term] = []
+    for turn in group[1:]:
+        degrees = tuple(np.round(np.degrees(turn.as_rotvec()), 6).tolist())
+        site: Site = {'channels': tuple(channels.tolist()), 'rotation_deg': degrees}
+        found.append(Term(BODY_TURNED, site))
+    return found
+
+
 def _turns(plain: _Readings, read: Callable[[Sequence[Term]], _Readings]) -> Iterator[list[Term]]:
     """Quarter turns of a body that are likest, up to the signs of its readings; least first."""
-    group = Rotation.create_group('O')
-    channels = tuple(int(c) for c in plain.channels)
     tried = []
-    for turn in sorted(group, key=lambda one: round(float(one.magnitude()), 6))[1:]:
-        degrees = tuple(np.round(np.degrees(turn.as_rotvec()), 6).tolist())
-        term = Term(BODY_TURNED, {'channels': channels, 'rotation_deg': degrees})
+    for term in _quarter_turns(plain.channels):
         readings = read([term])
         weight = _power(readings.seen, (0,))
         alike = float(np.sum(weight * np.abs(readings.cells()) ** 2) / max(weight.sum(), 1e-300))
