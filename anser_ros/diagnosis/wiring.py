@@ -147,13 +147,14 @@ def scan_faults(measurements: Sequence[Measurements], places: Array) -> list[Ter
     is three free dipoles at every place. Signs of emitters are signs of their dipoles, and nothing
     is named unless it leaves a small part of what is left without it.
     """
-    none = _scan_signs(measurements, places)
+    read = [m for m in measurements if m.usable.any()]
+    none = _scan_signs(read, places) if read else ([], 0.0, 0.0)
     if none[2] < MOST_LEFT:
         return []
     tried = [none]
-    for channels in {tuple(m.sensors.channel.tolist()): None for m in measurements}:
+    for channels in {tuple(m.sensors.channel.tolist()): None for m in read}:
         for term in (*_exchanges(channels), *_quarter_turns(np.array(channels))):
-            righted = [rightly_wired(m, [term]) for m in measurements]
+            righted = [rightly_wired(m, [term]) for m in read]
             terms, left, _ = _scan_signs(righted, places)
             tried.append(([term, *terms], left, none[2]))
     least = min(left for _, left, _ in tried)
