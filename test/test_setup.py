@@ -144,7 +144,9 @@ def test_a_stated_volume_is_read_and_written():
 
 def test_a_volume_may_reach_around_the_emitters():
     box = (-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)
-    setup = parse_setup(f'{DEMO.read_text()}\nvolume: {{low_m: {[*box[0]]}, high_m: {[*box[1]]}}}\n')
+    setup = parse_setup(
+        f'{DEMO.read_text()}\nvolume: {{low_m: {[*box[0]]}, high_m: {[*box[1]]}}}\n'
+    )
     assert setup.volume == box
 
 
