@@ -356,7 +356,7 @@ def _helps(without: State, with_it: State, columns: Sequence[Array | None]) -> b
 
 def _crowd(fit: Fit, term: Term) -> int:
     """Effects of a fit with the same name, or about the same channel."""
-    alike = sum(t.effect is term.effect for t in fit.effects)
+    alike = 1 if term.effect.gregarious else sum(t.effect is term.effect for t in fit.effects)
     about = [sum(c in _singled(t) for t in fit.effects) for c in _singled(term)]
     return max([alike, *about])
 

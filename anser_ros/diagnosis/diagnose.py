@@ -30,10 +30,10 @@ from anser_ros.diagnosis.screening import (
     not_white,
     outlying_share,
     structure_tests,
-    wiring_faults,
     without_outliers,
 )
 from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
+from anser_ros.diagnosis.wiring import wiring_faults
 from anser_ros.effects.correction import Fields, changed_illumination
 from anser_ros.effects.effect import Family, Remedy, Term
 from anser_ros.effects.seen import EXCESS_NOISE, known_share, outliers_of

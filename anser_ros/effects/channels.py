@@ -96,6 +96,33 @@ class ToolGain(GainOfChannels):
         return [Term(self, {'channels': channels}, np.zeros(2)) for channels in tools]
 
 
+class CommonGain(Effect[Term]):
+    """Theta is (gain - 1) of all channels, those of the references too."""
+
+    name = 'common_gain'
+    summary = 'the gain of all channels has changed alike'
+    units = {'gain': '1'}
+    plausible = {'gain': (0.5, 2.0)}
+    remedy = Remedy.FLUX
+    typical = 0.1  # gains of a whole system stay within some percent
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        return [Term(self, {}, np.zeros(1))]
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        return np.asarray(view.linear[..., None] / (1 + term.theta[0]))
+
+    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+        return np.asarray((1 + term.theta[0]) * np.eye(channels.size, dtype=complex))
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        gain, sigma = 1 + float(term.theta[0]), float(sigmas(covariance)[0])
+        return EffectRecord(self.name, {'gain': gain}, {'gain': sigma})
+
+    def term(self, record: EffectRecord) -> Term:
+        return Term(self, {}, np.array([float(needed(record, 'gain')) - 1]))
+
+
 DELAY_UNIT = 1e-6
 """theta counts microseconds."""
 
@@ -396,6 +423,6 @@ class Saturation(Effect[SaturationTerm]):
 
 
 EFFECTS = (
-    SensorGain(), ToolGain(), PhaseDelay(), ChannelCrosstalk(), Pickup(), ReferenceChanged(),
-    Saturation(),
+    SensorGain(), ToolGain(), CommonGain(), PhaseDelay(), ChannelCrosstalk(), Pickup(),
+    ReferenceChanged(), Saturation(),
 )  # fmt: skip

@@ -47,6 +47,7 @@ class Site(TypedDict, total=False):
     coils: tuple[int, ...]  # of crosstalk: the one that leaks, and the one that it leaks into
     read_as: tuple[int, ...]  # for each of the channels or coils, the one whose place it has
     body: str
+    rotation_deg: tuple[float, ...]  # rotation vector of a body in its holder, its own frame
     mutual: Literal[True]  # the leak is the same both ways
     shape: str  # curve of a saturation
     sees: str  # what a saturating channel sees: one tone, or all together
@@ -54,6 +55,7 @@ class Site(TypedDict, total=False):
     place: tuple[float, ...]  # where resting metal is looked for, m, frame fg
     z: float  # height of a sheet, m, frame fg
     edge: float  # length of its edge, m
+    axis: tuple[float, ...]  # unit vector of the optical frame along which its lengths are off
 
 
 @dataclass(frozen=True)
@@ -252,6 +254,8 @@ class Effect(BaseEffect[TermT]):
     drifts: ClassVar[bool] = False
     # whether nothing but the reference sensors can follow it live
     followed: ClassVar[bool] = False
+    # whether several of it at once are as likely as one, and no stand-in for what they share
+    gregarious: ClassVar[bool] = False
     # relative error of what it changes at a reference, beyond the survey's, where the field's
     # gradient close to an emitter is known less well than the field
     gradient_error: ClassVar[float] = 0.0
@@ -262,6 +266,10 @@ class Effect(BaseEffect[TermT]):
     # --- search ------------------------------------------------------------------------------
     def candidates(self, apparatus: Apparatus) -> Sequence[TermT]:
         """Return the effect at every site where it may sit, with parameters of zero."""
+        return ()
+
+    def anew(self, apparatus: Apparatus) -> Sequence[TermT]:
+        """Return what it is where the same parts are set up anew: a rival of metal at rest."""
         return ()
 
     def columns(self, term: TermT, view: View) -> ComplexArray | None:

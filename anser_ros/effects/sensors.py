@@ -56,10 +56,11 @@ class SensorAxis(Effect[SensorAxisTerm]):
             SensorAxisTerm(self, {'channel': c}, np.zeros(2), surveyed=axes[c])
             for c in apparatus.tool_channels
         ]
-        for cluster in apparatus.clusters():
-            if len(apparatus.tool_channels) > len(cluster) and len(cluster) > 1:
-                terms.append(SensorAxisTerm(self, {'channels': cluster}, np.zeros(3)))
-        return terms
+        # The turn of all that a tool has is hardly told from another frame of its poses.
+        return [*terms, *(t for t in self.anew(apparatus) if len(t.channels) < len(axes))]
+
+    def anew(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
+        return [SensorAxisTerm(self, {'channels': c}, np.zeros(3)) for c in apparatus.clusters()]
 
     def columns(self, term: SensorAxisTerm, view: View) -> ComplexArray | None:
         """Return the derivative by the axis, along the tangents or across the cluster's turn."""

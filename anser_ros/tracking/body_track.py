@@ -245,6 +245,8 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     if not fits:
         reason = 'no coil of this body has a pose to start from'
         return BodyResult(frame.no_pose(states.RESIDUAL, reason))
+    fits += _on_other_sides(frame, fits[0])
+    fits.sort(key=lambda candidate: candidate.ratio)
     fit = fits[0]
     result = _judge(track, frame, fit, fits[1:])
     if result.state == states.OK:
@@ -254,6 +256,29 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
         if left_out != track.left_out:
             track.left_out, track.again_ns = left_out, frame.stamp_ns + round(LEFT_OUT_S / NANO)
     return BodyResult(result, fit)
+
+
+OTHER_SIDES = -np.ones(3), np.array([1.0, 1.0, -1.0])
+"""What takes a place to the other side of a source, and to that of a board (its plane is z)."""
+
+
+def _on_other_sides(frame: BodyFrame, fit: BodyFit) -> list[BodyFit]:
+    """Fits across the source and the board, where the volume reaches there.
+
+    A dipole has the same field at opposite places, and upright dipoles in a plane have on its
+    other side the field that half a turn about z makes of it: what is read cannot tell them apart.
+    """
+    solution, middle = fit.solution, frame.context.middle
+    lever = frame.coils.subset(fit.used).offsets.mean(axis=0)
+    place, found = solution.position + solution.rotation @ lever - middle, []
+    for signs in OTHER_SIDES:
+        across = middle + signs * place
+        if np.linalg.norm(across - middle - place) > SAME_PLACE_M and (
+            frame.settings.box.contains(across)
+        ):
+            rotation = -signs[:, None] * solution.rotation
+            found.append(_solve(frame, fit.used, (across - rotation @ lever, rotation)))
+    return found
 
 
 def _from_good(track: BodyTrack, frame: BodyFrame, used: NDArray[np.int64]) -> list[BodyFit]:

@@ -260,6 +260,10 @@ def _pick(points, linear, triangles, power, apart, chosen, cost, axes):  # type:
     return chosen.shape[0]
 
 
+CLOSEST_M = 5e-3
+"""Distance (m) from the field's dipoles within which no start pose is: nothing fits between."""
+
+
 def grid_points(volume: TrackedVolume, spacing_m: float) -> Array:
     """Return points of a grid that covers a volume, shape (G, 3), m.
 
@@ -295,6 +299,9 @@ def build_grid(
     Raises `TrackingError` when the spacing doesn't suit the volume, see `grid_points`.
     """
     points = grid_points(volume, spacing_m)
+    if volume.low[2] <= field.positions[:, 2].max():  # it reaches around the dipoles
+        apart = np.linalg.norm(points[:, None] - field.positions, axis=2).min(axis=1)
+        points = np.ascontiguousarray(points[apart > CLOSEST_M])
     moments = field.moments.view(np.complex128)
     fields = dipole_field(points, field.positions, field.directions, moments)
     white = np.ascontiguousarray(fields).view(np.float64) / sigma

@@ -252,6 +252,12 @@ class SolveContext:
         return self.starts.grid(self.field, self.sigma)
 
     @cached_property
+    def middle(self) -> Array:
+        """Return the middle of the field's dipoles, weighted by their strength, (3,), m."""
+        weight = np.abs(self.field.moments).sum(axis=1)
+        return np.asarray(weight @ self.field.positions / max(float(weight.sum()), 1e-300))
+
+    @cached_property
     def readings(self) -> int:
         """Return how many flux components the field makes: a constant one has no quadrature."""
         return int((self.field.moments != 0.0).any(axis=0).sum())

@@ -41,8 +41,6 @@ KEYS = (
     'volume', 'tips', *SECTIONS,
 )  # fmt: skip
 FIELD_GENERATOR = 'fg'
-LOWEST_VOLUME_M = 1e-3
-"""Least height of a tracked volume over the copper (z = 0), m: no model holds nearer."""
 
 
 @dataclass(frozen=True)
@@ -265,11 +263,6 @@ def _parse_volume(item: Any) -> tuple[Vector, Vector]:
     )
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise SetupError(f'setup: volume.low_m must be below volume.high_m, got {low} and {high}')
-    if low[2] < LOWEST_VOLUME_M:
-        raise SetupError(
-            f'setup: volume.low_m[2] must be at least {LOWEST_VOLUME_M:g} m over the board, '
-            f'got {low[2]:g}'
-        )
     return low, high
 
 
