@@ -114,7 +114,7 @@ def _one_vector(rows: Rows, centre: Array) -> tuple[Array, Array]:
     where, weighted = np.tile(centre, (3, 1)), flux * root[:, None]
     basis = flux_basis(points, normals, lengths, where, np.eye(3)) * root[:, None]
     moments = np.linalg.lstsq(basis, weighted, rcond=1e-12)[0]
-    return moments, weighted - basis @ moments
+    return np.asarray(moments), np.asarray(weighted - basis @ moments)
 
 
 UNIT_Z = np.array([0.0, 0.0, 1.0])

@@ -430,10 +430,10 @@ class SensorFitter:
         # made good by a shift of the field and of the tool, which no single frame contradicts.
         # The next step uses it: what the jitter of the poses limits would not scale with it.
         readings = sum(float(tool.weights.sum()) for tool in tools) * self.field.shape[1]
+        kinds = [rows for _, rows in self.population.groups]
+        information, natural = rest.likelihood(self.values, kinds)
         self.likelihood = Likelihood(
-            rest.information + self.parameters.rule(),
-            rest.gradient + rest.information @ self.values,
-            readings / self.inflation,
+            information + self.parameters.rule(), natural, readings / self.inflation
         )
         self.inflation = max(1.0, rest.inflation * self.inflation) if inspect else 1.0
         # Nothing is held here: while a clock is off, poses look too bad to tell it.

@@ -99,9 +99,12 @@ class BodyErrors:
         return replace(out, track=track, position=position, rotation=rotation, has_pose=seen)
 
 
-def has_turned(measurements: Measurements) -> bool:
-    """Return whether a body turned about two axes, without which a lever arm shifts the field."""
-    rotation = measurements.rotation[measurements.has_pose]
+def has_turned(measurements: Sequence[Measurements]) -> bool:
+    """Return whether a body turned about two axes, without which a lever arm shifts the field.
+
+    ``measurements``: of the body, in all sessions: several that turn about one axis each will do.
+    """
+    rotation = np.concatenate([m.rotation[m.has_pose] for m in measurements])
     if len(rotation) < 2:
         return False
     turns = Rotation.from_matrix(rotation[0].T @ rotation).as_rotvec()
@@ -129,7 +132,8 @@ class SensorParameters:
         estimated = (
             set(kinds) if all(m.is_followed for m in measurements) else {*kinds} - {*CLOCKS}
         )
-        if not all(has_turned(m) for m in measurements):
+        bodies = {m.body for m in measurements}
+        if not all(has_turned([m for m in measurements if m.body == body]) for body in bodies):
             estimated -= {SHARED_SHIFT}
         if not self.omega.any():
             estimated -= {'delays'}
