@@ -15,7 +15,14 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.layouts import Generator, Layout, fit_clusters, fit_coaxial, place
+from anser_ros.calibration.layouts import (
+    FREE_KINDS,
+    Generator,
+    Layout,
+    fit_clusters,
+    fit_coaxial,
+    place,
+)
 from anser_ros.calibration.least_squares import ComplexArray, GramFactor, as_complex, as_real
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
 from anser_ros.calibration.placement import CoilPlacer, PositionFitter
@@ -179,9 +186,9 @@ MOVING_DAMPING = 1e-4
 """Damping while dipoles are moved: it keeps two that come close from growing huge moments."""
 MOST_MOVING_ROWS = 6000
 """Readings by which dipoles are moved at most: some hundred positions need no more."""
-AS_GOOD = 1.15
-"""Factor by which the noise of dipoles where the emitters are may be larger than a layer's: that
-has four times as many, which take up errors of the sensors."""
+AS_GOOD = 1.5
+"""Factor by which the noise of fewer dipoles may be larger than that of more, as of a layer:
+these take up errors of the sensors, and of the poses of one region for another."""
 LEAST_HEIGHT_M = 0.01
 """Height of the lowest reading at least, m, for recordings in which a sensor touches the board."""
 LEAST_EXTENSION = 1.1
@@ -217,13 +224,14 @@ def rich_bases(measurements: Sequence[Measurements], generator: Generator) -> li
     """Return sets of dipoles of which one makes the field at poses that are yet to be corrected.
 
     A fine layer over the board; where no drawing says that there is one, also clusters about the
-    emitters, wherever they are and whatever their shape.
+    emitters, wherever they are and whatever their shape, shared by all and each its own.
     """
     bases = [place(rich_layout(measurements, generator), generator)]
     if generator.nominal is None:
         posed = [with_pose(m) for m in measurements]
         weights = [usable_weights(m) for m in posed]
-        bases.append(fit_clusters(posed, weights, generator.centres))
+        own = fit_clusters(posed, weights, generator.centres)
+        bases += [own.shared, own]
     return bases
 
 
@@ -283,8 +291,9 @@ class LayoutPlacer:
         shares = [w[::step] for w in weights]
         if layout.kind == 'drawing' and self.scaled is not None:
             return CoilPlacer(self.scaled.nominal).fit(thin, shares)
-        if layout.kind == 'cluster':
-            return fit_clusters(thin, shares, self.generator.centres), None
+        if layout.kind in FREE_KINDS:
+            found = fit_clusters(thin, shares, self.generator.centres)
+            return found if layout.kind == 'cluster' else found.shared, None
         dipoles, prior = self.placed(layout)
         if layout.kind == 'coaxial':
             found = fit_coaxial(thin, shares, dipoles, layout.count)

@@ -124,12 +124,16 @@ UNIT_Z = np.array([0.0, 0.0, 1.0])
 CLUSTER = np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 """Places of a cluster's dipoles, in its spacing: three components in the middle and at six places
 around it make every dipole and quadrupole, and all octupoles but one."""
+FREE_KINDS = ('cluster', 'shared_cluster')
+"""Kinds of layouts of clusters: of each emitter its own, or of all the same ones, as currents in
+one coil that another drives ask for."""
 SAME_PLACE = 0.5
 """Distance of two emitters' middles, in spacings, below which one cluster does for both."""
 
 
 def clusters(centres: Array, spacing_m: float) -> DipoleSites:
     """Return dipoles around emitters of any shape, with middles (K, 3), m, frame fg.
+
 
     Moments grow with the power of a source's size over the spacing: damping, which holds all of
     them alike, holds each multipole as much as a source of that size lets it be.
@@ -202,8 +206,9 @@ class Layout:
     """Describes a rule by which dipoles are placed and fitted."""
 
     # 'layer' of z-dipoles, 'layer_xyz' of dipoles with three free components, z-dipoles on the
-    # 'coils', 'coaxial' dipoles along an axis of its own for each coil, a 'cluster' of them about
-    # each, those of the coils of the 'drawing', or another rule, which has its own words
+    # 'coils', 'coaxial' dipoles along an axis of its own for each coil, a 'cluster' or
+    # 'shared_cluster' about each, those of the coils of the 'drawing', or another rule, which has
+    # its own words
     kind: str
     count: int  # dipoles along a side of the layer, of each coil, along each axis, or in all
     extension: float  # size of the layer as a multiple of the field generator's
@@ -219,8 +224,9 @@ class Layout:
             return self.words
         if self.kind == 'coaxial':
             return f'{self.count} on an axis of its own for every emitter, place and axis free'
-        if self.kind == 'cluster':
-            return f'{self.count} of any direction about every emitter, place free'
+        if self.kind in FREE_KINDS:
+            more = '' if self.kind == 'cluster' else ', shared by all emitters'
+            return f'{self.count} of any direction about every emitter, place free{more}'
         if self.kind == 'drawing':
             return f'{self.count} of the drawn coils, each coil placed where it fits, pulled to it'
         more = ', pulled to the drawn board' if self.prior == 'nominal' else ''
@@ -250,8 +256,9 @@ def place(layout: Layout, generator: Generator) -> DipoleSites:
         count = len(generator.centres)
         upright, spacing = np.tile(UNIT_Z, (count, 1)), np.full(count, FIRST_SPACING_M)
         return coaxial(generator.centres, upright, layout.count, spacing)
-    if layout.kind == 'cluster':
-        return clusters(generator.centres, SPREAD * generator.side_m)
+    if layout.kind in FREE_KINDS:
+        found = clusters(generator.centres, SPREAD * generator.side_m)
+        return found if layout.kind == 'cluster' else found.shared
     flat = grid(layout.count, generator.half_extent * layout.extension)
     middle = generator.middle
     positions = np.empty((flat.shape[0], 3))

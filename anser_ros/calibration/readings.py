@@ -103,6 +103,11 @@ class DipoleSites:
         """Return three dipoles, along x, y and z, at each of P places (P, 3), m."""
         return DipoleSites(*along_each_axis(places))
 
+    @property
+    def shared(self) -> 'DipoleSites':
+        """Return the same dipoles, of which every emitter may have moments."""
+        return DipoleSites(self.positions, self.directions)
+
     def joined(self, other: 'DipoleSites') -> 'DipoleSites':
         """Return these dipoles, then the others."""
         return DipoleSites(

@@ -24,7 +24,7 @@ from anser_ros.calibration.layout_fit import (
     rich_fit,
     rich_layout,
 )
-from anser_ros.calibration.layouts import Generator, Layout, place
+from anser_ros.calibration.layouts import FREE_KINDS, Generator, Layout, place
 from anser_ros.calibration.least_squares import ComplexArray, as_real
 from anser_ros.calibration.moments import (
     MomentFit,
@@ -235,8 +235,8 @@ MOVING = (
 """Layouts from which dipoles are moved; one does the work of several fixed ones."""
 COAXIAL = tuple(Layout('coaxial', n, 1.0, 0.0, moved=True) for n in (1, 3, 5))
 """Layouts for emitters of unknown geometry: see `coaxial`."""
-CLUSTER = Layout('cluster', 7, 1.0, 0.0, moved=True)
-"""The same, of any shape."""
+FREE = tuple(Layout(kind, 7, 1.0, 0.0, moved=True) for kind in FREE_KINDS)
+"""The same, of any shape: see `clusters`."""
 LOCAL_COUNT = 10
 """Dipoles along a side of the layer that every region of a local model has."""
 LOCAL_READINGS = 24
@@ -352,7 +352,12 @@ class _Search:
             found.append(min(map(self.score, moving), key=lambda c: c.score))
         if self.generator.nominal is None:
             # A few dipoles more cost a tracker nothing: the best of them, not the leanest.
-            found.append(min(map(self.score, (*COAXIAL, CLUSTER)), key=lambda c: c.score))
+            straight, free = (
+                min(map(self.score, some), key=lambda c: c.score) for some in (COAXIAL, FREE)
+            )
+            # What has an axis keeps it unless that is clearly wrong.
+            is_clear = free.score * (1.0 + LEAST_GAIN) < straight.score
+            found.append(free if is_clear else straight)
         else:
             coils = CoilPlacer(self.generator.nominal)
             if coils.possible and len(coils.sites) <= MOST_DIPOLES:
