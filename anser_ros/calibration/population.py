@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from anser_ros.calibration.sensor_parameters import (
     AS_PLACES,
@@ -29,7 +30,7 @@ Index = NDArray[np.int64]
 
 WIDTH_STEPS = 40
 """Fixed-point steps of the widths; they settle within some ten."""
-NARROWEST = {'gains': 1e-6, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9}
+NARROWEST = {'gains': 1e-6, 'delays': 1e-12, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9}
 """Least width of a population, in its own unit: no spread at all."""
 LEAST_EVIDENCE = 5.0
 """Gain of the log probability for which a kind of error is kept: odds of 150 to 1."""
@@ -288,6 +289,45 @@ def interpolation_share(measurements: Measurements) -> Array:
     before, after = track.time[right - 1], track.time[right]
     along = np.clip((measurements.time - before) / np.maximum(after - before, 1e-9), 0.0, 1.0)
     return np.asarray((1.0 - along) ** 2 + along**2)
+
+
+APART_S = 1.0
+"""Time, s, from which on two poses of the reference share no sample of it."""
+NEAREST = 8
+"""Poses beside each one among which the nearest of another time is looked for."""
+NEAR = 0.2
+"""Distance of these at most, as a fraction of the poses' extent: farther errors are other ones."""
+
+
+def alike_sigma_m(
+    parts: Sequence[Measurements], steps: Sequence[Array], kept: Sequence[NDArray[np.bool_]]
+) -> float:
+    """Return how far poses at the same place are off together, m along each axis, one sigma.
+
+    That is what field and sensors cannot explain, and the reference's own errors by place; the
+    jitter of poses has no part in it.
+    For each of the measurements, ``steps`` (F, 6) to where the fluxes put the poses.
+    """
+    place, time, step, of = (
+        np.concatenate(each)
+        for each in zip(
+            *(
+                (m.position[k], m.time[k], s[k, :3], np.full(int(k.sum()), i))
+                for i, (m, s, k) in enumerate(zip(parts, steps, kept, strict=True))
+            ),
+            strict=True,
+        )
+    )
+    if len(place) <= NEAREST:
+        return 0.0
+    distance, row = cKDTree(place).query(place, NEAREST + 1)
+    other = (np.abs(time[row] - time[:, None]) >= APART_S) | (of[row] != of[:, None])
+    other &= distance < NEAR * float(np.ptp(place, axis=0).max())
+    some, first = np.flatnonzero(other.any(axis=1)), other.argmax(axis=1)
+    if len(some) <= NEAREST:
+        return 0.0
+    product = (step[some] * step[row[some, first[some]]]).mean()
+    return float(np.sqrt(max(product, 0.0)))
 
 
 def estimate_noise(

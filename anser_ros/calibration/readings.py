@@ -84,14 +84,29 @@ class DipoleSites:
 
     positions: Array
     directions: Array
+    own: NDArray[np.bool_] | None = None  # (N, K): whose dipoles they are; None if everybody's
 
     def __len__(self) -> int:
         return int(self.positions.shape[0])
+
+    def groups(self, emitters: int) -> list[tuple[list[int], NDArray[np.int64]]]:
+        """Return emitters that have the same dipoles, with the indices of these."""
+        if self.own is None:
+            return [(list(range(emitters)), np.arange(len(self)))]
+        alike: dict[bytes, list[int]] = {}
+        for k in range(emitters):
+            alike.setdefault(self.own[:, k].tobytes(), []).append(k)
+        return [(some, np.flatnonzero(self.own[:, some[0]])) for some in alike.values()]
 
     @staticmethod
     def of_any_direction(places: Array) -> 'DipoleSites':
         """Return three dipoles, along x, y and z, at each of P places (P, 3), m."""
         return DipoleSites(*along_each_axis(places))
+
+    @property
+    def shared(self) -> 'DipoleSites':
+        """Return the same dipoles, of which every emitter may have moments."""
+        return DipoleSites(self.positions, self.directions)
 
     def joined(self, other: 'DipoleSites') -> 'DipoleSites':
         """Return these dipoles, then the others."""

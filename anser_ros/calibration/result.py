@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 SPREADS = {
     'gains': 'sensor_gain_spread',
+    'delays': 'sensor_delay_spread',
     'axes': 'sensor_axis_spread',
     'places': 'sensor_place_spread',
     'offsets': 'sensor_pickup_spread',
@@ -35,7 +36,7 @@ SPREADS = {
 FEWEST_REFLECTED = 1e-3
 """Share of frames with a wrong optical pose from which on they are reported."""
 UNITS = {
-    'gains': (100.0, '%'), 'axes': (1e3, 'mrad'), 'places': (1e3, 'mm'),
+    'gains': (100.0, '%'), 'delays': (1e6, 'us'), 'axes': (1e3, 'mrad'), 'places': (1e3, 'mm'),
     'lever_arm': (1e3, 'mm'), 'time_offset': (1e3, 'ms'), 'clock_rate': (1e6, 'ppm'),
     'offsets': (100.0, '% of the fluxes'),
 }  # fmt: skip
@@ -187,6 +188,10 @@ def _single(kind: str, channel: int, axis: Array, value: Array, sigma: Array) ->
         stated |= {'gain': abs(gain), 'phase_deg': float(np.degrees(np.angle(gain)))}
         phase_deg = float(np.degrees(sigma[1] / abs(gain)))
         sigmas = {'gain': float(sigma[0]), 'phase_deg': phase_deg}
+    elif kind == 'delays':
+        name = SPREADS[kind]
+        stated = {'channels': [channel], 'values': [value.tolist()]}
+        sigmas = {'values': [sigma.tolist()]}
     elif kind == 'offsets':
         name = 'pickup'
         stated['phasor_t'] = value.reshape(-1, 2).tolist()

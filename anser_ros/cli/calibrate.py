@@ -167,7 +167,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-SHOWN_UNITS = {'1': (100.0, '%'), 'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 'T': (1e9, 'nT')}
+SHOWN_UNITS = {
+    '1': (100.0, '%'),
+    'rad': (1e3, 'mrad'),
+    'm': (1e3, 'mm'),
+    'T': (1e9, 'nT'),
+    's': (1e6, 'us'),
+}
 """Factor and unit in which values of each SI unit are shown."""
 MOST_TICKS = 9
 """Channels that are named on the axis of a picture; of more, some at even steps."""

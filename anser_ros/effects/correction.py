@@ -1,8 +1,9 @@
 """Predicts what sensors read when effects hold, and undoes a model's effects on what is measured.
 
-The forward chain is ``flux = compress(C T (field) + offset)`` with C mixing channels and T mixing
-emitters; it is undone from the outside in, live in the tracker and node, and offline. Effects on
-the field are in the model's dipoles already, and effects that cannot be corrected are skipped.
+The forward chain is ``flux = compress(R C T (field) + offset)`` with C mixing channels, T mixing
+emitters and R factors of both; it is undone from the outside in, live in the tracker and node, and
+offline. Effects on the field are in the model's dipoles already, and effects that cannot be
+corrected are skipped.
 """
 
 from collections.abc import Sequence
@@ -179,6 +180,11 @@ def _measured(view: View, terms: Sequence[Term]) -> View:
         if mixing is not None:
             linear = np.einsum('st,ftk->fsk', mixing, linear)
             slopes = [np.einsum('st,ftik->fsik', mixing, slope) for slope in slopes]
+    for term in terms:
+        factor = term.effect.response(term, channels, view.omega)
+        if factor is not None:
+            linear = linear * factor
+            slopes = [slope * factor[:, None, :] for slope in slopes]
     flux = linear
     for term in terms:
         added = term.effect.offset(term, channels, view.omega.size)
@@ -302,6 +308,9 @@ class Correction:
         for term in terms:
             added = term.effect.offset(term, number, self.omega.size)
             values = values if added is None else values - added
+        for term in terms:
+            factor = term.effect.response(term, number, self.omega)
+            values = values if factor is None else values / factor
         for term in reversed(terms):
             mixing = term.effect.channel_matrix(term, number)
             if mixing is not None:

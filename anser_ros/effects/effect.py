@@ -395,6 +395,12 @@ class Effect(BaseEffect[TermT]):
         """Return the mixing of the channels, shape (S, S): row the channel that is read."""
         return None
 
+    def response(
+        self, term: TermT, channels: NDArray[np.int64], omega: Array
+    ) -> ComplexArray | None:
+        """Return the factor of each channel at each tone, (S, K), where they differ by both."""
+        return None
+
     def gain_changes(self, term: TermT, sensors: SensorTable) -> Array | None:
         """Return relative changes of gains since, one standard deviation each, shape (G, S)."""
         return None

@@ -424,6 +424,22 @@ class SensorGainSpread(SensorSpread):
         return out
 
 
+class SensorDelaySpread(SensorSpread):
+    """Values are delays (s) about the mean tone, whose phases are those of the gains."""
+
+    name = 'sensor_delay_spread'
+    summary = "every channel's phase depends on the tone in its own way"
+    units = {'spread': 's', 'channels': '1', 'values': 's'}
+    remedy = Remedy.FLUX
+    parts = ('delay',)
+    faultless = (0.0,)
+
+    def response(
+        self, term: SpreadTerm, channels: NDArray[np.int64], omega: Array
+    ) -> ComplexArray | None:
+        return np.asarray(np.exp(-1j * term.of(channels) * (omega - omega.mean())))
+
+
 class SensorAxisSpread(SensorSpread):
     """Values are the tilts (rad) of each axis along its two tangents (`physics.rotations`)."""
 
@@ -470,5 +486,6 @@ class SensorPickupSpread(SensorSpread):
 
 EFFECTS = (
     SensorAxis(), SensorPosition(), LeverArm(), SensorSize(),
-    SensorGainSpread(), SensorAxisSpread(), SensorPlaceSpread(), SensorPickupSpread(),
+    SensorGainSpread(), SensorDelaySpread(), SensorAxisSpread(), SensorPlaceSpread(),
+    SensorPickupSpread(),
 )  # fmt: skip
