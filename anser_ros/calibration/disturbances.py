@@ -9,16 +9,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_propagation
 from scipy.spatial import cKDTree
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.field.measurements import Measurements
 from anser_ros.settings import RefitSettings
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
 BIN_S = 0.5
 """Length of the stretches, s, in which changes are looked for: metal comes and goes in seconds."""
@@ -71,7 +70,7 @@ def glitches(steps: Array, usable: Mask, stated: Array) -> Mask:
     return np.asarray((np.abs(steps - middle) > GLITCH * np.maximum(spread, stated)).any(axis=1))
 
 
-def stretches(time: Array) -> NDArray[np.int64]:
+def stretches(time: Array) -> Integers:
     """Return the number of the stretch of time that each frame is in, shape (F,)."""
     if time.size < 2:
         return np.zeros(time.size, dtype=np.int64)
@@ -165,8 +164,6 @@ def outside(time: Array, spans: Sequence[Span]) -> Mask:
         out &= ~span.holds(time)
     return out
 
-
-ComplexArray = NDArray[np.complex128]
 
 FEWEST_SENSORS = RefitSettings.min_references
 """References that have to be read throughout: with fewer, metal may look like a strength."""

@@ -17,17 +17,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.calibration.least_squares import NormalFactor, as_complex, as_real, subtract_gram
 from anser_ros.calibration.moments import PoseTerms, PoseWhitener, pose_slopes
 from anser_ros.calibration.readings import DipoleSites, basis_rows, flux_slopes, frame_blocks
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
 from anser_ros.field.measurements import Measurements
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-Index = NDArray[np.int64]
+Index = Integers
 
 LEAST_MOST_MODES, MOST_MODES = 160, 240
 """Modes of the field at most, for a scan of minutes and for a short one. What 160 miss of a wide
@@ -129,7 +127,7 @@ def open_directions(
     return np.asarray(along.reshape(len(along), 6, *linear.slope.shape[1:3]))
 
 
-def tied_parts(along: Sequence[Array]) -> NDArray[np.bool_]:
+def tied_parts(along: Sequence[Array]) -> Booleans:
     """Return to which parts (2K,) open poses add more than `LEAST_OPEN`, in any of the bodies."""
     added = np.array([(a**2).sum(axis=(0, 1, 2)) / max(len(a) * a.shape[2], 1) for a in along])
     return np.asarray((added > LEAST_OPEN).any(axis=0))
@@ -142,9 +140,7 @@ class JointSystem:
     poses tie together.
     """
 
-    def __init__(
-        self, parameters: SensorParameters, modes: FieldModes, tied: NDArray[np.bool_]
-    ) -> None:
+    def __init__(self, parameters: SensorParameters, modes: FieldModes, tied: Booleans) -> None:
         self.parameters, self.modes, self.tied = parameters, modes, tied
         self.parts, self.count = tied.size, modes.size.size
         rest = len(parameters) + 1

@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.layouts import (
     FREE_KINDS,
     Generator,
@@ -23,7 +23,7 @@ from anser_ros.calibration.layouts import (
     fit_coaxial,
     place,
 )
-from anser_ros.calibration.least_squares import ComplexArray, GramFactor, as_complex, as_real
+from anser_ros.calibration.least_squares import GramFactor, as_complex, as_real
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
 from anser_ros.calibration.placement import CoilPlacer, PositionFitter
 from anser_ros.calibration.readings import (
@@ -39,8 +39,6 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 POINTS_ALONG = 11
 """Points along x and y (half along z) where dipoles are to make the nominal field: 2000 equations
@@ -133,7 +131,7 @@ def join_regions(
     fit: MomentFit,
     damping: float,
     layer: DipoleSites,
-) -> NDArray[np.complex128]:
+) -> ComplexArray:
     """Return the moments of a finer layer that make the blended field of the regions.
 
     ``fit``: the common fit: its poses and weights are kept, and the damping pulls the regions'

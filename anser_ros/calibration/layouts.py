@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from anser_ros.arrays import Array
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.readings import DipoleSites, weighted_readings
 from anser_ros.field.measurements import Measurements
@@ -23,7 +23,6 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import tilted
 
-Array = NDArray[np.float64]
 Rows = tuple[Array, Array, Array, Array, Array]
 """Points, axes, lengths, roots of weights and real fluxes of readings, (P, ...)."""
 

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.parallel import in_order, slices
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-Index = NDArray[np.int64]
+Index = Integers
 
 RIGHT_SCALE = 1e9
 """Factor of the right-hand sides in a Gram matrix: fluxes are then of a size with the columns."""

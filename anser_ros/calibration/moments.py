@@ -16,9 +16,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.least_squares import (
     GramFactor,
     Spectrum,
@@ -37,9 +37,6 @@ from anser_ros.calibration.readings import (
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 OUTLIER_SCALE = 3.0
 """Residuals larger than this many times the median residual lose weight. A smaller value takes

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.calibration.sensor_parameters import (
     AS_PLACES,
     POPULATIONS,
@@ -25,8 +25,7 @@ from anser_ros.calibration.sensor_parameters import (
 )
 from anser_ros.field.measurements import Measurements
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+Index = Integers
 
 WIDTH_STEPS = 40
 """Fixed-point steps of the widths; they settle within some ten."""
@@ -300,7 +299,7 @@ NEAR = 0.2
 
 
 def alike_sigma_m(
-    parts: Sequence[Measurements], steps: Sequence[Array], kept: Sequence[NDArray[np.bool_]]
+    parts: Sequence[Measurements], steps: Sequence[Array], kept: Sequence[Booleans]
 ) -> float:
     """Return how far poses at the same place are off together, m along each axis, one sigma.
 
@@ -334,7 +333,7 @@ def estimate_noise(
     steps: Sequence[Array],
     variances: Sequence[Array],
     shares: Sequence[Array],
-    kept: Sequence[NDArray[np.bool_]],
+    kept: Sequence[Booleans],
     present: OpticalNoise,
 ) -> OpticalNoise:
     """Estimate the jitter from the poses' most probable steps.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.disturbances import spans_of
 from anser_ros.calibration.held_out import HeldOut, rms
 from anser_ros.calibration.layouts import Layout
@@ -22,8 +22,6 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel, plain
 from anser_ros.physics.rotations import tilted
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 SPREADS = {
     'gains': 'sensor_gain_spread',
@@ -54,7 +52,7 @@ def undetermined_words(result: SensorFit) -> tuple[str, ...]:
     )
 
 
-def drift_records(strength: NDArray[np.complex128]) -> tuple[EffectRecord, ...]:
+def drift_records(strength: ComplexArray) -> tuple[EffectRecord, ...]:
     """Return the emitters that drifted in a scan, from their strengths (F, K), and how far."""
     size = np.abs(strength)
     records = []
@@ -405,6 +403,6 @@ def _optical(noise: OpticalNoise) -> dict[str, Any]:
     }
 
 
-def _outlier_fraction(weights: Sequence[NDArray[np.float64]]) -> float:
+def _outlier_fraction(weights: Sequence[Array]) -> float:
     every = np.concatenate([w.ravel() for w in weights])
     return float((every[every > 0.0] < OUTLIER_WEIGHT).mean())

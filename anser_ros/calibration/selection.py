@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.calibration.layout_fit import (
     LayoutPlacer,
     lowest_height,
@@ -25,7 +25,7 @@ from anser_ros.calibration.layout_fit import (
     rich_layout,
 )
 from anser_ros.calibration.layouts import FREE_KINDS, Generator, Layout, place
-from anser_ros.calibration.least_squares import ComplexArray, as_real
+from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import (
     MomentFit,
     MomentFitter,
@@ -40,8 +40,6 @@ from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.parallel import in_order
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 DAMPINGS = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 """Dampings: from far above a Gram matrix's rounding (1e-8) to where only the prior is left."""
@@ -70,7 +68,7 @@ class _BodyReadings:
     """
 
     def __init__(
-        self, corrected: Measurements, measured: Measurements, folds: NDArray[np.int64],
+        self, corrected: Measurements, measured: Measurements, folds: Integers,
         weights: Array, dipoles: DipoleSites, fit: MomentFit, precision: Array,
     ) -> None:  # fmt: skip
         self.corrected, self.folds, self.weights = corrected, folds, weights
@@ -89,7 +87,7 @@ class LayoutScorer:
     def __init__(
         self,
         measurements: Sequence[Measurements],
-        folds: Sequence[NDArray[np.int64]],
+        folds: Sequence[Integers],
         rich: DipoleSites,
         accuracy: Accuracy,
         placer: LayoutPlacer,
@@ -269,7 +267,7 @@ def thin_frames(measurements: Sequence[Measurements]) -> list[Measurements]:
 
 def choose_layout(
     measurements: Sequence[Measurements],
-    folds: Sequence[NDArray[np.int64]],
+    folds: Sequence[Integers],
     generator: Generator,
     accuracy: Accuracy,
     progress: Progress | None = None,

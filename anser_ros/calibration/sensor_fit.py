@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.calibration.disturbances import glitches, outside, spans_of, unsteady_tool
 from anser_ros.calibration.joint_system import (
     LEAST_MOST_MODES,
@@ -37,7 +37,7 @@ from anser_ros.calibration.joint_system import (
 )
 from anser_ros.calibration.layout_fit import RICH_DAMPING, ScaledNominal, rich_bases, richest
 from anser_ros.calibration.layouts import Generator
-from anser_ros.calibration.least_squares import ComplexArray, as_real
+from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import (
     SMALLEST_NOISE_T,
     MomentFitter,
@@ -75,8 +75,6 @@ from anser_ros.calibration.sensor_parameters import (
 )
 from anser_ros.field.measurements import Measurements
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 CERTAIN = 6.0
 """Standard deviations between two sessions from which on they contradict each other."""
@@ -138,7 +136,7 @@ def contradictions(
 
 def _pairs(
     parameters: SensorParameters, kind: str, i: int, j: int
-) -> list[tuple[str, NDArray[np.int64], NDArray[np.int64]]]:
+) -> list[tuple[str, Integers, Integers]]:
     """Each sensor's name (none for a body's own) with its rows for two of the measurements."""
     slices = [parameters.slices[kind, str(index)] for index in (i, j)]
     one, other = (np.arange(s.start, s.stop) for s in slices)
@@ -161,11 +159,11 @@ class SensorFit:
     noise_t: float  # noise of a phasor component, with what the field's model misses, T
     optical: OpticalNoise  # jitter of the optical poses
     # parameters of channels that stand outside their population
-    alone: dict[str, NDArray[np.int64]]
+    alone: dict[str, Integers]
     # kept, steady: frames of each of the measurements whose pose and field are good, and those in
     # which nothing moved
-    kept: tuple[NDArray[np.bool_], ...]
-    steady: tuple[NDArray[np.bool_], ...]
+    kept: tuple[Booleans, ...]
+    steady: tuple[Booleans, ...]
     reflected: float  # share of the frames whose pose is not where the fluxes put it
     # kinds that the scan does not determine, with the standard deviation that it leaves; these are
     # as the setup says, or as their prior makes them
@@ -221,8 +219,8 @@ class _Tool:
     """One body's frames with a pose, with their present weights."""
 
     measured: Measurements  # as recorded
-    known: NDArray[np.bool_]  # (F,): frames that nothing speaks against beforehand
-    steady: NDArray[np.bool_]  # (F,): those of them in which the tool saw nothing move either
+    known: Booleans  # (F,): frames that nothing speaks against beforehand
+    steady: Booleans  # (F,): those of them in which the tool saw nothing move either
     weights: Array  # (F, S): of the readings, in [0, 1]
 
 
@@ -239,7 +237,7 @@ class SensorFitter:
         generator: Generator,
         accuracy: Accuracy,
         progress: Progress | None = None,
-        steady: Sequence[NDArray[np.bool_]] | None = None,
+        steady: Sequence[Booleans] | None = None,
     ) -> None:
         self.measured = list(measurements)
         every = [np.ones(len(m.time), dtype=bool) for m in measurements]
@@ -406,7 +404,7 @@ class SensorFitter:
         """A tool's frames by the present estimate; those without a pose lose their weight."""
         errors = self.parameters.errors_of(tool.measured.body, self.values)
         out = errors.apply(tool.measured)
-        lost: NDArray[np.bool_] = np.asarray(~np.isfinite(out.position).all(axis=1))
+        lost: Booleans = np.asarray(~np.isfinite(out.position).all(axis=1))
         if lost.any():
             tool.weights[lost] = 0.0
             out = replace(
@@ -499,9 +497,7 @@ class SensorFitter:
         self.optical = estimate_noise(steps, variances, shares, kept, self.optical)
         self.alike_m = alike_sigma_m([at.part for at in linear], steps, kept)
 
-    def _wrong_poses(
-        self, at: Linear, weights: Array, judged: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.bool_], Array]:
+    def _wrong_poses(self, at: Linear, weights: Array, judged: Booleans) -> tuple[Booleans, Array]:
         """Frames whose poses are far from where the fluxes put them, and what no pose explains."""
         step, left = most_probable_step(at, weights, self.noise_t, FREE_POSE)
         scaled = step / np.sqrt(interpolation_share(at.part))[:, None]
@@ -513,9 +509,7 @@ class SensorFitter:
         white = PoseWhitener(at.slope, weights, self.noise_t, prior)
         return white.step(at.residual), np.diagonal(white.inverse, axis1=1, axis2=2)
 
-    def _all_frames(
-        self, steady: Sequence[NDArray[np.bool_]]
-    ) -> tuple[tuple[NDArray[np.bool_], ...], float]:
+    def _all_frames(self, steady: Sequence[Booleans]) -> tuple[tuple[Booleans, ...], float]:
         """Which of all frames are good, and the share of those whose pose is not."""
         out, bad, seen = [], 0, 0
         for whole, mask in zip(self.measured, steady, strict=True):

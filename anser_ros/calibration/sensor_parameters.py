@@ -12,16 +12,13 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.rotations import tangents, tilted
 from anser_ros.physics.sensor import SensorTable, clusters_of
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 KINDS = ('gains', 'delays', 'axes', 'places', 'lever_arm', 'time_offset', 'clock_rate')
 EXTRA_KINDS = ('offsets',)
@@ -170,12 +167,12 @@ class SensorParameters:
     def __len__(self) -> int:
         return self._size
 
-    def rows(self, kind: str) -> NDArray[np.int64]:
+    def rows(self, kind: str) -> Integers:
         """Return the indices of all parameters of a kind."""
         found = [np.arange(s.start, s.stop) for (own, _), s in self.slices.items() if own == kind]
         return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
 
-    def groups(self) -> list[tuple[str, NDArray[np.int64]]]:
+    def groups(self) -> list[tuple[str, Integers]]:
         """Return parameters that share a prior's width: a kind's, with gain and phase apart."""
         out = []
         for kind in self.kinds:
@@ -190,7 +187,7 @@ class SensorParameters:
             width[rows] = PRIOR[kind]
         return width
 
-    def gains_at_one_place(self) -> list[NDArray[np.int64]]:
+    def gains_at_one_place(self) -> list[Integers]:
         """Return indices of the gains (real parts) of the sensors at each place with several."""
         out = []
         for body, table in zip(self.bodies, self.tables, strict=True):

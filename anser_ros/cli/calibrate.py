@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 
+from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration, to_document
@@ -165,7 +165,6 @@ def _short(value: Any) -> str:
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 SHOWN_UNITS = {
     '1': (100.0, '%'),

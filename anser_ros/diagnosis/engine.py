@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.diagnosis.decisions import TIME_FOLDS
 from anser_ros.effects.base import BaseTerm
 from anser_ros.parallel import in_order, slices
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Ints = Integers
 Columns = Sequence[Array | None]
 
 BLOCKS_A_THREAD = 4
@@ -50,11 +50,11 @@ class BlockSums:
         """Return the number of columns."""
         return int(self.right.shape[1])
 
-    def part(self, rows: NDArray[np.int64]) -> 'BlockSums':
+    def part(self, rows: Integers) -> 'BlockSums':
         """Return the sums of some blocks, chosen by index."""
         return BlockSums(self.normal[rows], self.right[rows], self.squares[rows])
 
-    def columns(self, keep: NDArray[np.int64]) -> 'BlockSums':
+    def columns(self, keep: Integers) -> 'BlockSums':
         """Return the sums of some columns, chosen by index."""
         normal = self.normal[:, keep[:, None], keep[None, :]]
         return BlockSums(normal, self.right[:, keep], self.squares)

@@ -3,16 +3,15 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import chdtrc, chdtri
 
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, tool_parts
 from anser_ros.effects.effect import Family
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
 WINDOW = 11
 """Neighbouring frames whose median an outlier stands out from: up to five bad ones in a row."""
@@ -161,12 +160,12 @@ def noise_t(state: State) -> float:
     return float(np.sqrt(variance)) * state.problem.spread.flux_t
 
 
-def _quantiles(values: Array, bins: int) -> NDArray[np.int64]:
+def _quantiles(values: Array, bins: int) -> Integers:
     edges = np.quantile(values, np.linspace(0, 1, bins + 1)[1:-1])
     return np.searchsorted(edges, values, side='right')
 
 
-def _cells(part: Part, name: str) -> list[NDArray[np.int64]]:
+def _cells(part: Part, name: str) -> list[Integers]:
     """Cell of each frame by a variable; by the amplitude, those of each reading apart."""
     view = part.view
     if name == 'time':

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Integers
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.choice import (
     at_floor,
@@ -31,7 +31,6 @@ from anser_ros.diagnosis.screening import noise_scale
 from anser_ros.effects.effect import Family, Term, all_effects
 from anser_ros.parallel import in_order, sharing, slices
 
-Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 CANDIDATES_A_THREAD = 16
@@ -46,7 +45,7 @@ class SearchSettings:
     finalists: int = 7  # candidates fitted in full in a round, which a round's time goes into
     iterations: int = 8  # most steps of a fit; most settle in fewer
 
-    def fitter(self, problem: Problem, blocks: NDArray[np.int64]) -> Fitter:
+    def fitter(self, problem: Problem, blocks: Integers) -> Fitter:
         """Return what fits effects on some blocks of a problem with these settings."""
         return Fitter(problem, blocks, self.iterations)
 
@@ -77,7 +76,7 @@ class Search:
 
 def search_effects(
     problem: Problem,
-    blocks: NDArray[np.int64],
+    blocks: Integers,
     start: Sequence[Term] = (),
     settings: SearchSettings | None = None,
     progress: Progress | None = None,

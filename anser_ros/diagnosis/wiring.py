@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.effects.correction import Fields, tool_view
@@ -29,16 +29,14 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
 
 @dataclass(frozen=True)
 class _Readings:
     """Holds a tool's readings and what some terms predict, zero where they do not count."""
 
-    channels: NDArray[np.int64]  # (S,)
+    channels: Integers  # (S,)
     seen: ComplexArray  # (F, S, K), T
     wanted: ComplexArray  # (F, S, K), T
     driven: Mask  # (S,), sensors that receive anything
@@ -227,7 +225,7 @@ def _climbed(start: Array, together: Array) -> Array:
         signs[int(np.argmax(gains))] *= -1.0
 
 
-def _quarter_turns(channels: NDArray[np.int64]) -> list[Term]:
+def _quarter_turns(channels: Integers) -> list[Term]:
     """The quarter turns of a body with these channels, the least first."""
     group = sorted(Rotation.create_group('O'), key=lambda one: round(float(one.magnitude()), 6))
     found: list[Term] = []
@@ -261,7 +259,7 @@ def _likeness(pairs: Sequence[tuple[ComplexArray, ComplexArray]]) -> Array:
     return np.asarray(cross / np.sqrt(np.maximum(np.outer(own, power), 1e-300)))
 
 
-def _moved(alike: Array, is_driven: Mask) -> NDArray[np.int64]:
+def _moved(alike: Array, is_driven: Mask) -> Integers:
     """Rows that are plainly another's; none when they are no permutation."""
     rows = np.arange(len(alike))
     order, own = np.argmax(alike, axis=1), np.diag(alike)

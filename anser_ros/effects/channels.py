@@ -14,10 +14,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
-    Array,
-    ComplexArray,
     Effect,
     Remedy,
     Site,

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array, ComplexArray, Integers
 from anser_ros.effects.base import View
 from anser_ros.effects.effect import Effect, Remedy, Term, effect_named
 from anser_ros.errors import ModelFileError
@@ -21,9 +21,6 @@ from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 KEPT = 6
 """Sets of sensors whose slopes are kept, some megabytes each."""
@@ -286,7 +283,7 @@ class Correction:
         return true_track(track, self._with(Remedy.OPTICAL))
 
     def flux(
-        self, time: float, channels: NDArray[np.generic], flux: ComplexArray, *,
+        self, time: float, channels: AnyArray, flux: ComplexArray, *,
         recorded: bool = False,
     ) -> ComplexArray:  # fmt: skip
         """Return a frame's fluxes (S, K), T, as ideal sensors and emitters would have given them.
@@ -324,7 +321,7 @@ class Correction:
 
     @staticmethod
     def _decompressed(
-        terms: list[Term], channels: NDArray[np.int64], measured: ComplexArray
+        terms: list[Term], channels: Integers, measured: ComplexArray
     ) -> ComplexArray:
         """Fixed point of ``x = measured - (compress(x) - x)``; at most half of x is corrected."""
         x = measured

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import anser_ros.effects
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, BaseEffect, BaseTerm, View
 from anser_ros.effects.base import Remedy as Remedy
 from anser_ros.errors import ModelFileError
@@ -33,9 +34,6 @@ from anser_ros.metal.body import BODIES, COMPACT, ball_modes
 from anser_ros.metal.scattering import Shapes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 class Site(TypedDict, total=False):
@@ -276,7 +274,7 @@ class Effect(BaseEffect[TermT]):
         """Return the derivative of the view's flux by the parameters, (F, S, K, q), or None."""
         return None
 
-    def amounts(self, term: TermT) -> NDArray[np.int64]:
+    def amounts(self, term: TermT) -> Integers:
         """Return the indices of the parameters that are all zero when there is no effect."""
         return np.arange(term.theta.size)
 
@@ -391,13 +389,11 @@ class Effect(BaseEffect[TermT]):
         """Return the mixing of the emitters' tones, (F or 1, K, K): row the tone that is read."""
         return None
 
-    def channel_matrix(self, term: TermT, channels: NDArray[np.int64]) -> ComplexArray | None:
+    def channel_matrix(self, term: TermT, channels: Integers) -> ComplexArray | None:
         """Return the mixing of the channels, shape (S, S): row the channel that is read."""
         return None
 
-    def response(
-        self, term: TermT, channels: NDArray[np.int64], omega: Array
-    ) -> ComplexArray | None:
+    def response(self, term: TermT, channels: Integers, omega: Array) -> ComplexArray | None:
         """Return the factor of each channel at each tone, (S, K), where they differ by both."""
         return None
 
@@ -405,15 +401,11 @@ class Effect(BaseEffect[TermT]):
         """Return relative changes of gains since, one standard deviation each, shape (G, S)."""
         return None
 
-    def offset(
-        self, term: TermT, channels: NDArray[np.int64], emitters: int
-    ) -> ComplexArray | None:
+    def offset(self, term: TermT, channels: Integers, emitters: int) -> ComplexArray | None:
         """Return phasors that are added, shape (S, K), T."""
         return None
 
-    def compress(
-        self, term: TermT, channels: NDArray[np.int64], flux: ComplexArray
-    ) -> ComplexArray:
+    def compress(self, term: TermT, channels: Integers, flux: ComplexArray) -> ComplexArray:
         """Return what the channels make of fluxes of shape (F, S, K)."""
         return flux
 

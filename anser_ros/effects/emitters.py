@@ -8,19 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.channels import ComplexGain
-from anser_ros.effects.effect import (
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Site,
-    Term,
-    needed,
-    recorded_site,
-    sigmas,
-)
+from anser_ros.effects.effect import Effect, Remedy, Site, Term, needed, recorded_site, sigmas
 from anser_ros.field.model import (
     Dipoles,
     EffectRecord,

@@ -11,11 +11,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     FROZEN,
-    Array,
-    ComplexArray,
     Effect,
     Family,
     Remedy,

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     FROZEN,
     LARGEST,
-    Array,
     BodyTerm,
-    ComplexArray,
     Effect,
     Family,
     Remedy,

@@ -11,17 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.effect import (
-    Array,
-    ComplexArray,
-    Effect,
-    Family,
-    Remedy,
-    Site,
-    Term,
-    needed,
-    recorded_site,
-)
+from anser_ros.arrays import Array, ComplexArray
+from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term, needed, recorded_site
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 

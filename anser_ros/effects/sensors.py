@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
-    Array,
-    ComplexArray,
     Effect,
     Family,
     Remedy,

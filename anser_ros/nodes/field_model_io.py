@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseStamped
-from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.chain.model_half import ToolPose, poses_of, tool_readings
 from anser_ros.effects.correction import Correction
@@ -45,8 +45,6 @@ from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.wire.points import ModelError
 from anser_ros.wire.recorded import pose_numbers, unit_quaternions
 from anser_ros.wire.setup import Setup, topic_of
-
-Array = NDArray[np.float64]
 
 
 def pose_in(message: PoseStamped, frame_id: str, body: str) -> tuple[Array, Array]:
@@ -201,7 +199,7 @@ class KeptBaseline:
         """Return whether the references have one sender, and the setup is known."""
         return self._path() is not None
 
-    def read(self) -> NDArray[np.complex128] | None:
+    def read(self) -> ComplexArray | None:
         """Return the baseline that another process confirmed lately, shape (R, K), T, or None."""
         path = self._path()
         with contextlib.suppress(*DAMAGED):
@@ -209,7 +207,7 @@ class KeptBaseline:
                 return np.asarray(read_arrays(path)['flux'], dtype=np.complex128)
         return None
 
-    def confirm(self, flux: NDArray[np.complex128]) -> None:
+    def confirm(self, flux: ComplexArray) -> None:
         """Keep a baseline, shape (R, K), T, to which nothing is opposed at this moment.
 
         Raises `OSError` when the disk is full, or must not be written.

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anser_ros import extensions
+from anser_ros.arrays import Array, Booleans, ComplexArray
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
 from anser_ros.calibration.disturbances import (
     at_strength,
@@ -43,8 +43,7 @@ from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
 from anser_ros.wire.setup import Setup
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
 MOTION_MARGIN_S = 1.0
 """Time (s) before and after a motion that is looked at: it begins before it is seen."""
@@ -65,7 +64,7 @@ UNCERTAINTY_FRAMES = 60
 class RestingMetal:
     """Holds what metal at rest did to tools' fluxes, (F, S, K) each, T, its error and places."""
 
-    flux: tuple[NDArray[np.complex128], ...]
+    flux: tuple[ComplexArray, ...]
     sigma_t: float
     record: EffectRecord
 
@@ -321,7 +320,7 @@ def check_explained(calibration: Calibration, measurements: Sequence[Measurement
         )
 
 
-def _steady(session: Session, tool: Measurements) -> NDArray[np.bool_]:
+def _steady(session: Session, tool: Measurements) -> Booleans:
     """Which frames of a tool lie outside the times in which the session's references changed."""
     if session.reference is None:
         return np.ones(tool.time.size, dtype=bool)

@@ -10,9 +10,9 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import extensions
+from anser_ros.arrays import Array
 from anser_ros.diagnosis.diagnose import SCHEMA, Diagnosis, diagnose
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem, test_blocks
 from anser_ros.errors import DiagnosisError
@@ -24,8 +24,6 @@ from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import date_drifts, made_for
 from anser_ros.sessions.tracked_session import track
 from anser_ros.tracking.estimate import TrackerSettings
-
-Array = NDArray[np.float64]
 
 ROOM = 2.0
 """Gate of the held-out part's tracking over its residual: less would refuse a wrong model's poses

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import extensions
+from anser_ros.arrays import Array, Booleans
 from anser_ros.chain.chain import Chain
 from anser_ros.chain.tracking_half import TrackingHalf
 from anser_ros.errors import BagError, ParameterError
@@ -94,9 +94,6 @@ def track(
     return Evaluation(sensors, bodies, seconds, summary, others)
 
 
-Array = NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class PoseSeries:
     """Holds the estimates of one sensor or body, one a frame, and their errors where known."""
@@ -107,7 +104,7 @@ class PoseSeries:
     orientation_error: Array
 
     @property
-    def ok(self) -> NDArray[np.bool_]:
+    def ok(self) -> Booleans:
         """Return the mask (F,) of the frames in which a pose was given."""
         return np.array([estimate.state == OK for estimate in self.estimates], dtype=bool)
 

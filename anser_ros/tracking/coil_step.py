@@ -9,8 +9,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.stamps import NANO
 from anser_ros.tracking.descent import descend
@@ -18,9 +18,6 @@ from anser_ros.tracking.estimate import TrackerSettings, add_frame, scale_of_fra
 from anser_ros.tracking.solve import MAX_EVALUATIONS, CoilSolution, coil_covariance
 from anser_ros.tracking.solve_context import fill_model_errors
 from anser_ros.tracking.solve_verdict import SOUND, SYSTEMATIC, fault_of, usual_and_most
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 SUSPICIOUS_JUMP_M = 0.02
 """A pose that moved further from one frame to the next, m, is confirmed by a scan, for it may be

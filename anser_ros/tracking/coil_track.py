@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import TrackingError
 from anser_ros.stamps import NANO
 from anser_ros.tracking.coil_step import (
@@ -21,10 +22,8 @@ from anser_ros.tracking.coil_step import (
     SELDOM,
     UNKNOWN,
     UNKNOWNS,
-    Array,
     CoilMemory,
     Followed,
-    Integers,
     follow_coils,
     freedom_of,
     remember,

@@ -4,15 +4,13 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import inlined
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.settings import Accuracy, ToolSettings
 from anser_ros.tracking.solve import ROLL_VARIANCE
-
-Array = NDArray[np.float64]
 
 USUAL_GATE = 4.0
 """Largest residual of a pose in units of the expected one, unless a setting says another. Smaller,

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import Integers
 from anser_ros.integrity import pose_checks
 from anser_ros.integrity.pose_checks import (
     STREAM_GAP_S,
@@ -29,7 +29,6 @@ from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils
 from anser_ros.tracking.solve import add_motion
 
-Array = NDArray[np.float64]
 Estimates = list[PoseEstimate]
 
 CONTRADICTS = (states.RESIDUAL, states.INCONSISTENT)
@@ -105,7 +104,7 @@ class ModelRecord:
 class RigidBody:
     """Holds a body's coils: their rows among the sensors, their places, and what was found."""
 
-    rows: NDArray[np.int64]
+    rows: Integers
     coils: BodyCoils
     result: BodyResult
 

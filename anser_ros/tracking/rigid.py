@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import dipole_field, fill_coil_basis
@@ -27,7 +28,7 @@ from anser_ros.tracking.descent import (
     limit_step,
 )
 from anser_ros.tracking.seed import SeedGrid
-from anser_ros.tracking.solve import Array, RealField
+from anser_ros.tracking.solve import RealField
 
 
 @inlined

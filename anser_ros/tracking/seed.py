@@ -18,13 +18,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import dipole_field, fill_fields
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.descent import damped_step
-from anser_ros.tracking.solve import Array, CoilSolution, RealField, solve_coil
+from anser_ros.tracking.solve import CoilSolution, RealField, solve_coil
 
 LARGEST_MOVE_M = 0.05
 """Longest step of the position, m; beyond it the linearised field is no guide any more."""

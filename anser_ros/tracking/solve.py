@@ -15,17 +15,14 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from anser_ros.arrays import AnyArray, Array
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.dipole import dipole_rows
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.tracking.descent import damped_step, descend
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 MAX_EVALUATIONS = 40
 """Evaluations after which a descent is given up: good starts need a few, and a frame is short."""
@@ -41,12 +38,7 @@ class RealField:
     moments: Array  # (N, 2K), A m^2; for every emitter its real part, then its imaginary part
 
     @classmethod
-    def of(
-        cls,
-        positions: NDArray[np.generic],
-        directions: NDArray[np.generic],
-        moments: NDArray[np.generic],
-    ) -> 'RealField':
+    def of(cls, positions: AnyArray, directions: AnyArray, moments: AnyArray) -> 'RealField':
         """Lay out dipoles with complex magnitudes, shape (N, K).
 
         Raises `TrackingError` when a value is not finite.
@@ -98,8 +90,8 @@ def solve_coil(
     field: RealField,
     flux: Array,
     whitening: Array,
-    position: NDArray[np.generic],
-    axis: NDArray[np.generic],
+    position: AnyArray,
+    axis: AnyArray,
     low: Array,
     high: Array,
     length_m: float = 0.0,

@@ -16,9 +16,9 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import FieldModel
@@ -48,9 +48,6 @@ from anser_ros.tracking.solve_context import (
     depends_on,
     without_dead,
 )
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 def _add(counters: Counter[str], name: str, by: int) -> None:
@@ -102,7 +99,7 @@ class TrackedScene:
     correction: Correction | None = None  # Of the model's effects
     table: SensorTable = field(init=False)  # The sensors as the model's effects have them
     # Rows and coils of the bodies whose six degrees of freedom their coils see
-    bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = field(init=False)
+    bodies: dict[str, tuple[Integers, BodyCoils]] = field(init=False)
     # The context of the last frame in which emitters were dead
     reduced: ReducedScene | None = None
 
@@ -239,9 +236,9 @@ class Tracker:
     def update(
         self,
         stamp_ns: int,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
-        flags: NDArray[np.generic] | None = None,
+        channels: AnyArray,
+        flux: AnyArray,
+        flags: AnyArray | None = None,
         withheld: Withheld | None = None,
     ) -> list[PoseEstimate]:
         """Estimate the poses of one frame: one a sensor, then one a rigid body.
@@ -280,7 +277,7 @@ class Tracker:
             flux, context = flux[:, frame.living], self._scene.reduced.context
         return self._solved(frame.stamp_ns, np.ascontiguousarray(flux), codes, context)
 
-    def _few_emitters(self, living: NDArray[np.bool_]) -> str:
+    def _few_emitters(self, living: Booleans) -> str:
         emitters = () if self.model is None else self.model.emitters
         silent = [name for name, lives in zip(emitters, living, strict=True) if not lives]
         return (
@@ -288,7 +285,7 @@ class Tracker:
             f'{FEWEST_EMITTERS} needed'
         )
 
-    def _corrected(self, frame: Frame) -> tuple[ComplexArray, NDArray[np.int64]]:
+    def _corrected(self, frame: Frame) -> tuple[ComplexArray, Integers]:
         """Fluxes (S, K) without what the model's effects did to them, and the readings' codes."""
         correction = self._scene.correction
         if correction is None or not correction.changes_flux:
@@ -302,7 +299,7 @@ class Tracker:
         return flux, codes
 
     def _solved(
-        self, stamp_ns: int, flux: ComplexArray, codes: NDArray[np.int64], context: SolveContext
+        self, stamp_ns: int, flux: ComplexArray, codes: Integers, context: SolveContext
     ) -> list[PoseEstimate]:
         """Return the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,)."""
         values = flux.view(np.float64)
@@ -330,7 +327,7 @@ class Tracker:
         return [estimate.with_shift(context.shift_sigma_m) for estimate in judged]
 
     def _solved_coils(
-        self, stamp_ns: int, values: Array, codes: NDArray[np.int64], context: SolveContext
+        self, stamp_ns: int, values: Array, codes: Integers, context: SolveContext
     ) -> list[CoilResult]:
         table, past, settings, results = self._scene.table, self._past, self.settings, []
         tracks, lengths = past.coils, table.length.tolist()

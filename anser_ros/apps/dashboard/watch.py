@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import ComplexArray, Integers
 from anser_ros.diagnosis.diagnose import diagnose
 from anser_ros.diagnosis.problem import FEWEST_POSED_FRAMES, Problem, State, evaluate, rms
 from anser_ros.diagnosis.search import SearchSettings
@@ -26,8 +26,6 @@ from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes, unit_quaternions
 from anser_ros.wire.setup import Setup
-
-Array = NDArray[np.float64]
 
 OPTICAL, RIGID = 'optical poses', 'rigidity of the tools'
 LIGHT_SEARCH = SearchSettings(most_effects=1, finalists=4, iterations=6)
@@ -204,10 +202,8 @@ MARGIN_NS = 1_000_000_000
 class FluxRows:
     """Holds readings of one topic: stamp, fluxes (S, K) and flags (S,), of the same channels."""
 
-    channel: NDArray[np.int64] | None = None
-    rows: deque[tuple[int, NDArray[np.complex128], NDArray[np.int64]]] = field(
-        default_factory=deque
-    )
+    channel: Integers | None = None
+    rows: deque[tuple[int, ComplexArray, Integers]] = field(default_factory=deque)
 
     def stream(self) -> RecordedFluxes | None:
         """Return them as if they had been recorded; None without any."""

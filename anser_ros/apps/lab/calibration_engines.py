@@ -13,10 +13,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.one_place import calibrate_at_one_place
 from anser_ros.apps.lab.still import STILL_ONLY, calibrate_still
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import PoseWhitener, Progress, pose_precision, pose_terms
@@ -41,9 +41,6 @@ from anser_ros.sessions.calibration import SCAN, Engine, at_constant_strength, g
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 POINT, SIZED = COAXIAL[:2]
 """Layouts of emitters without a size, and of those that have no more than a size."""
@@ -134,10 +131,7 @@ def _solved(normal: Array, right: Array) -> Array:
 
 
 def _sums(
-    sources: _SizedSources,
-    calibration: Calibration,
-    folds: Sequence[NDArray[np.int64]],
-    blocks: NDArray[np.int64],
+    sources: _SizedSources, calibration: Calibration, folds: Sequence[Integers], blocks: Integers
 ) -> tuple[Array, Array]:
     """Normal equations of each block, (B, 8K, 8K) and (B, 8K)."""
     ways = np.diag(np.tile(WAYS, len(sources.sizes_m2)))

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from anser_ros.apps.lab.metal_lattice import Coils, KnownMetal, load_known_metal
@@ -23,6 +22,7 @@ from anser_ros.apps.lab.metal_track import (
     predicted,
     updated,
 )
+from anser_ros.arrays import Array
 from anser_ros.chain.frame import Answer, ChainFrame
 from anser_ros.chain.model_half import poses_of, tool_readings
 from anser_ros.errors import BagError, ModelFileError
@@ -40,8 +40,6 @@ from anser_ros.settings import ToolSettings
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import NO_GATE, PoseEstimate, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
-
-Array = NDArray[np.float64]
 
 SPACING_M = 0.08
 """Of the places that are tried: about what a track finds back from."""

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.source_calibration import KINDS, SourceReadings, SourcesFit, SourcesFitter
 from anser_ros.apps.lab.still_fit import figures_of
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.calibration.held_out import HeldOut, rms
 from anser_ros.calibration.layouts import Generator, Layout
 from anser_ros.calibration.least_squares import as_real
@@ -29,8 +29,7 @@ from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import PlacedPoints
 from anser_ros.settings import Accuracy
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
 NOISY = 5.0
 """Times the median noise from which on a sensor is called noisy: two frames of four emitters make
@@ -118,7 +117,7 @@ def _mean(measured: Measurements, accuracy: Accuracy) -> tuple[SourceReadings, A
 
 
 def _noise(
-    measured: Measurements, mean: NDArray[np.complex128], parts: int, accuracy: Accuracy
+    measured: Measurements, mean: ComplexArray, parts: int, accuracy: Accuracy
 ) -> tuple[Array, Array]:
     """Noise of a part of each sensor's reading, T, and its ratio to the median sensor's.
 
@@ -164,7 +163,7 @@ def _fitted(readings: SourceReadings, kinds: Sequence[str]) -> SourcesFit:
     return SourcesFitter(readings, (low - margin, high + margin), kinds).fit()
 
 
-def _dipoles(fit: SourcesFit) -> tuple[Array, Array, NDArray[np.complex128]]:
+def _dipoles(fit: SourcesFit) -> tuple[Array, Array, ComplexArray]:
     """Positions, directions and moments (N, K): each source's own dipoles drive it alone."""
     sites = [one.sites for one in fit.sources]
     moments = scipy.linalg.block_diag(*(_phasors(one.moments)[:, None] for one in fit.sources))
@@ -175,7 +174,7 @@ def _dipoles(fit: SourcesFit) -> tuple[Array, Array, NDArray[np.complex128]]:
     return positions, directions, moments.astype(complex)
 
 
-def _phasors(parts: Array) -> NDArray[np.complex128]:
+def _phasors(parts: Array) -> ComplexArray:
     """Complex numbers (...) of their parts (..., C)."""
     return np.asarray(parts[..., 0] + (1j * parts[..., 1] if parts.shape[-1] == 2 else 0.0))
 
@@ -200,9 +199,7 @@ def _held_out(
     )
 
 
-def _reversed(
-    channels: NDArray[np.int64], evidence: Array, held_out: Array
-) -> tuple[EffectRecord, ...]:
+def _reversed(channels: Integers, evidence: Array, held_out: Array) -> tuple[EffectRecord, ...]:
     """A record of the channels that are the wrong way round, with the least evidence of one."""
     if not channels.size:
         return ()
@@ -211,7 +208,7 @@ def _reversed(
     return (EffectRecord('sensor_polarity', {'channels': channels.tolist()}, {}, found),)
 
 
-def _noisy(channels: NDArray[np.int64], ratio: Array) -> tuple[EffectRecord, ...]:
+def _noisy(channels: Integers, ratio: Array) -> tuple[EffectRecord, ...]:
     """A record of each channel with more noise than the median one."""
     return tuple(
         EffectRecord('excess_noise', {'factor': float(ratio[k]), 'channels': [int(channels[k])]})

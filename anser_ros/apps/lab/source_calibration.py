@@ -12,15 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.still_fit import DIPOLE_PAYS, FREEDOM, LEAST_CLEARANCE, student_weight
+from anser_ros.arrays import Array, Booleans
 from anser_ros.calibration.readings import DipoleSites
 from anser_ros.errors import FitError
 from anser_ros.physics.sensor import PlacedPoints
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
 KINDS = ('places', 'axes', 'gains')
 """Kinds of sensors' errors whose widths are found where they are asked for: m, rad, relative."""

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anser_ros.apps.lab.still_model import POSE, Columns, StillModel, StillUnknowns
+from anser_ros.arrays import Array, Booleans, ComplexArray
 from anser_ros.calibration.layouts import SPREAD, UNIT_Z, coaxial, fit_coaxial
 from anser_ros.calibration.moments import FitFigures
 from anser_ros.calibration.population import LEAST_EVIDENCE
@@ -27,8 +27,6 @@ from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 FREEDOM = 4.0
 """Degrees of freedom of Student's t, the distribution of a channel's readings in a frame: a few
@@ -166,13 +164,13 @@ class StillSystem:
         left = rest - np.einsum('sra,sa->sr', columns.own, own)
         self.residual = left.reshape(self.sensors, parts, self.frames).transpose(2, 0, 1)
 
-    def student_weights(self, usable: NDArray[np.bool_]) -> Array:
+    def student_weights(self, usable: Booleans) -> Array:
         """Return weights (F, S) of the readings by what is left of them; 0 where unusable."""
         parts = self.model.parts
         size = (self.residual**2).sum(axis=2) / self.widths.noise_t**2
         return np.where(usable, student_weight(size, parts), 0.0)
 
-    def log_evidence(self, usable: NDArray[np.bool_]) -> float:
+    def log_evidence(self, usable: Booleans) -> float:
         """Return Laplace's approximation of the log evidence, up to a constant of the readings."""
         parts, noise = self.model.parts, self.widths.noise_t
         size = (self.residual**2).sum(axis=2)[usable] / noise**2
@@ -253,7 +251,7 @@ class StillFit:
     evidence: dict[str, float]  # log evidence that each kind of error added to those before it
 
     @property
-    def moments(self) -> NDArray[np.complex128]:
+    def moments(self) -> ComplexArray:
         """Return the moments (N, K), A m^2."""
         return self.model.phasors(self.unknowns.moments)
 

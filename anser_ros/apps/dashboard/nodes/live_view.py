@@ -8,14 +8,13 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.nodes import traces
 from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime.diagnostics import LastStatus
 from anser_ros.wire.setup import Setup
 
-Array = NDArray[np.float64]
 HISTORY = 240
 """Points of the curves over time: two minutes at half a second per point."""
 FRESH_S = 0.6

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import ComplexArray, Integers
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import FieldFunction, default_clouds, excitation_for
@@ -27,9 +27,6 @@ from anser_ros.sessions.session import Session
 from anser_ros.settings import Accuracy
 from anser_ros.stamps import NANO
 from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 class FreeDipoles:
@@ -110,7 +107,7 @@ class AblationRow:
     rmse_m: float  # of all tool coils tracked singly, against the optical pose
 
 
-def spread_out(references: SensorTable, count: int) -> NDArray[np.int64]:
+def spread_out(references: SensorTable, count: int) -> Integers:
     """Return the rows of some references, each as far as possible from those before it.
 
     Coils at the place of another one come last, in the order of how different their axes are.
@@ -156,8 +153,8 @@ def ablate(
 def _models(
     session: Session,
     model: FieldModel,
-    clean: NDArray[np.complex128],
-    chosen: NDArray[np.int64],
+    clean: ComplexArray,
+    chosen: Integers,
     method: str,
     every: int,
 ) -> list[FieldModel]:

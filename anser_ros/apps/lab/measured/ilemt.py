@@ -11,7 +11,6 @@ fine ones (`ld`), the three sensor fixtures together.
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.lab.measured.recipe import (
@@ -23,9 +22,8 @@ from anser_ros.apps.lab.measured.recipe import (
     vector,
     write_frames,
 )
+from anser_ros.arrays import Array
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
-
-Array = NDArray[np.float64]
 
 NAME, BODY = 'ilemt', 'premo'
 X, Y, Z = np.eye(3)
