@@ -15,6 +15,7 @@ from anser_ros.apps.poses.start import (
     first_cost,
     first_fit,
     is_at_rest,
+    longest_recording,
     pose_problem,
     turn_misfit,
 )
@@ -116,10 +117,12 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     if best < (TURNED_SHARE if is_turned else RIGHT_MISFIT_SHARE) * cost:
         return reading.applied(session), reading.record(cost, best, ratio)
     if cost > HOPELESS_M:
+        reach = longest_recording(pose_problem(session))
         raise PlausibilityError(
             f'{session.path}: tracked and optical poses do not belong together: hand-eye is off '
-            f'by {1e3 * cost:.0f} mm in the median, and by {1e3 * best:.0f} mm when quaternions '
-            f'are read in another order or sense'
+            f'by {1e3 * cost:.0f} mm in the median at the best offset of their clocks, up to '
+            f'{reach:.0f} s, and by {1e3 * best:.0f} mm when quaternions are read in another '
+            'order or sense; are they of one body at the same time?'
         )
     return as_written, record
 

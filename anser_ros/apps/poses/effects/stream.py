@@ -100,7 +100,7 @@ class MissingPoses(PoseEffect):
         """Return a record for each stream that lacks poses."""
         found = []
         for poses in residuals.session.streams.values():
-            spans = _gaps(poses)
+            spans = _gaps(poses, residuals.session)
             lost = poses.missing.size / max(poses.missing.size + poses.size, 1)
             length = max(float(np.ptp(poses.time)), 1e-9)
             silent = sum(b - a for a, b in spans) / length
@@ -179,7 +179,8 @@ def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
     return np.asarray(near & (way > 2 * NEAR * MOVING_M))
 
 
-def _gaps(poses: PoseSequence) -> list[tuple[float, float]]:
+def _gaps(poses: PoseSequence, session: PoseSession) -> list[tuple[float, float]]:
+    """Spans, s, without poses; none in which all streams pause, as between two recordings."""
     steps = np.diff(poses.time)
     if steps.size < 10:
         return []
@@ -188,7 +189,10 @@ def _gaps(poses: PoseSequence) -> list[tuple[float, float]]:
     pauses = gaps[steps[gaps] > PAUSE_S]
     if pauses.size >= MANY_PAUSES:
         gaps = np.setdiff1d(gaps, pauses)
-    return [(float(poses.time[g]), float(poses.time[g + 1])) for g in gaps]
+    every = np.sort(np.concatenate([np.r_[p.time, p.missing] for p in session.streams.values()]))
+    ends = every[np.flatnonzero(np.diff(every) > PAUSE_S)]
+    spans = [(float(poses.time[g]), float(poses.time[g + 1])) for g in gaps]
+    return [(a, b) for a, b in spans if not np.any((ends >= a) & (ends < b))]
 
 
 LEAST_S = 2e-3
