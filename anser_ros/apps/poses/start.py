@@ -109,6 +109,8 @@ def pose_problem(session: PoseSession) -> PoseProblem:
 
 def is_at_rest(poses: PoseSequence) -> bool:
     """Return whether a body stays where it is: what differs between its poses is noise."""
+    if not poses.size:
+        return False
     turns = Rotation.from_quat(poses.quaternion)
     turned = HAND_M * (turns.mean().inv() * turns).as_rotvec()
     return _extent(np.concatenate([poses.position, turned], axis=1)) < AT_REST_M

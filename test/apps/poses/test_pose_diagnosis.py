@@ -433,3 +433,64 @@ def test_bodies_at_rest_have_no_clock_however_many_and_noisy_they_are():
         assert pose_problem(at_rest(5, count)).path.is_at_rest
     names = named(diagnose_poses(at_rest(5, 20)))
     assert not set(names) & {'time_offset', 'clock_rate', 'stamp_jitter', 'tracker_lag'}
+
+
+def test_turns_that_change_at_a_time_are_an_episode_of_the_sensor_that_turns_most():
+    world = World(1, duration=86.0, sensors=2, rate=5.0)
+    world.jitter = 0.017
+
+    def after(streams):
+        for name, degrees in (('sensor_0', 3.0), ('sensor_1', 0.5)):
+            rows = streams[name]
+            late = rows[0][:, None] > 68
+            turn = Rotation.from_rotvec(late * np.deg2rad(degrees) * [0.6, -0.5, 0.62])
+            rows[1] = rows[1] + 1e-3 * late * [0.6, 0.5, -0.6]
+            rows[2] = (turn * Rotation.from_quat(rows[2])).as_quat()
+        return streams
+
+    world.after = after
+    metal = named(diagnose_poses(world.session()))['moving_metal'].parameters
+    assert metal['sensors'] == ['sensor_0']
+    assert metal['t_start_s'] == pytest.approx(69, abs=2)
+    assert metal['t_end_s'] == pytest.approx(87, abs=2)
+
+
+def test_metal_at_a_place_is_named_at_every_visit_and_neither_as_noise_nor_as_a_map():
+    world, middles = World(1, duration=90.0, sensors=2, rate=5.0), (15.0, 34.0, 55.0, 76.0)
+    plain, spot = world._place, np.array([0.12, -0.02, 0.03])
+
+    def place(time):
+        away = np.min(np.abs(np.subtract.outer(time, middles)), axis=1)
+        there = 1 / (1 + np.exp((away - 1.6) / 0.2))
+        return plain(time) * (1 - there)[:, None] + there[:, None] * (spot + 0.2 * plain(time))
+
+    def after(streams):
+        for name, share in (('sensor_0', 1.0), ('sensor_1', 0.6)):
+            rows = streams[name]
+            body = world.body(rows[0])[0] - [0.05, 0.02, -0.3]
+            near = share * np.exp(-(((body - spot) / 0.03) ** 2).sum(axis=1))[:, None]
+            rows[1] = rows[1] + 0.015 * near * [0.7, 0.5, -0.5]
+            turn = Rotation.from_rotvec(0.14 * near * [0.5, 0.5, 0.7])
+            rows[2] = (turn * Rotation.from_quat(rows[2])).as_quat()
+        return streams
+
+    world.follow(place, world._turn)
+    world.after = after
+    records = [r for r in diagnose_poses(world.session()).records if r.name != 'hand_eye']
+    assert {r.name for r in records} == {'moving_metal'}
+    found = [(r.parameters['t_start_s'] + r.parameters['t_end_s']) / 2 - 1 for r in records]
+    np.testing.assert_allclose(found, middles, atol=1)
+
+
+def test_a_scale_of_all_sensors_is_named_as_such_beside_a_bend():
+    world = World(1, duration=30.0, sensors=3, rate=20.0)
+    world.scale = 1.012
+
+    def bend(sensor, place):
+        x, y, z = ((place - MIDDLE) / 0.08).T
+        return place + 8e-4 * np.stack([x * y, z**2 - 0.5, x * z], axis=1)
+
+    world.bend = bend
+    found = named(diagnose_poses(world.session()))
+    assert found['optical_scale'].parameters['scale'] == pytest.approx(1.012, abs=2e-3)
+    assert set(found) <= {'optical_scale', 'field_distortion'}

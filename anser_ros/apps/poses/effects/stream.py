@@ -252,7 +252,7 @@ class ReceiptJitter(PoseEffect):
 
     name = 'stamp_jitter'
     summary = 'stamps are those of receipt, and jitter'
-    advice = 'Use the counter of the device as stamp (import_poses --stamps device).'
+    advice = 'Use the counter of the device (import_poses --stamps device), if it is not in use.'
     units = {'rms_s': 's'}
     needs_levers = True
     makes_jitter = True
@@ -388,7 +388,7 @@ class PoseExcessNoise(PoseEffect):
 
     name = 'excess_noise'
     summary = "a sensor's noise is larger than the others'"
-    advice = 'Exchange the sensor or its cable, and record again.'
+    advice = 'Record again with sensors at equal distances: its place and rounding may make it.'
     units = {'factor': '1'}
     makes_jitter = True
 
@@ -424,7 +424,7 @@ class RangeNoise(PoseEffect):
 
     name = 'range_noise'
     summary = 'jitter grows with the distance from the field generator'
-    advice = 'Work nearer to the field generator.'
+    advice = 'Compare it with the data sheet; nearer to the field generator it is less.'
     units = {'exponent': '1', 'reference_m': 'm'}
     makes_jitter = True
 
