@@ -23,9 +23,6 @@ POSES_OF_WINDOW = 4.5  # on average, so that most windows can be judged
 TIMES = 9.0
 """Squared error over the median window's from which a window belongs to an episode: three times
 the error, which the range of places in a session hardly makes."""
-LOUD = 3.0
-"""The same of a window in which a sensor leaves the others on its body by `TIMES`: stamps that
-jitter make every window loud."""
 LONGEST = 0.4
 """Share (0 to 1) of the windows that episodes may be: the median window must be a quiet one, and a
 tenth is left for what else is loud."""
@@ -73,36 +70,37 @@ class Episode:
     place: Array | None = None  # (3,), where it is off whenever it passes, m; None where it moved
 
 
-@dataclass(frozen=True)
-class _Sizes:
-    """Holds a sensor's squared errors over those of its median window: of places, and of turns."""
+def _sizes(
+    sensing: Sensing, residuals: PoseResiduals, is_beside: bool
+) -> tuple[Array, dict[int, Array]]:
+    """Squared errors of places and of turns over those of the median window: of poses (n, 2), and
+    of the means of windows (2,), in which jitter cancels.
 
-    poses: Array  # (n, 2)
-    windows: dict[int, Array]  # (2,), the median of each window that can be judged
-
-    def loud(self, times: float = TIMES) -> list[int]:
-        """Return the windows whose squared error is so many times that of the median one."""
-        return [w for w, size in self.windows.items() if size.max() > times]
-
-
-def _sizes(sensing: Sensing, window: NDArray[np.int64], count: int) -> _Sizes:
-    """Sizes of places by their squares, and of turns by their means, in which jitter cancels.
-
-    Frames go a little way with an episode, and turns with them: they count from their middle.
+    Frames go a little way with an episode, so errors count from the middle of the windows; or
+    beside the other sensors, whose clock and reference are the same, so that no error of these is
+    in the means.
     """
-    judged = [w for w in range(count) if np.count_nonzero(window == w) >= FEWEST_POSES_OF_WINDOW]
-    if not judged:
-        return _Sizes(np.zeros((window.size, 2)), {})
-    turns = sensing.residual[:, 3:]
-    middles = np.array([np.median(turns[window == w], axis=0) for w in judged])
-    off = np.linalg.norm(middles - np.median(middles, axis=0), axis=1) ** 2
-    from_middle = turns - np.median(middles, axis=0)
-    halves = sensing.residual[:, :3], from_middle
-    square = np.stack([np.sum(half**2, axis=1) for half in halves], axis=1)
-    medians = np.array([np.median(square[window == w], axis=0) for w in judged])
-    usual = np.maximum(np.median(medians, axis=0), 1e-18)
-    sizes = np.stack([medians[:, 0] / usual[0], off / max(np.median(off), 1e-18)], axis=1)
-    return _Sizes(square / usual, dict(zip(judged, sizes, strict=True)))
+    window, middles = windows_of(sensing, residuals), _middles(sensing, residuals)
+    if is_beside:
+        others = [_middles(one, residuals) for one in residuals.sensors if one is not sensing]
+        middles = {
+            w: middle - np.median([one[w] for one in others], axis=0)
+            for w, middle in middles.items()
+            if others and all(w in one for one in others)
+        }
+    if not middles:
+        return np.zeros((window.size, 2)), {}
+    centre = np.median(list(middles.values()), axis=0)
+    square = _halves(sensing.residual - centre)
+    usual = np.median([np.median(square[window == w], axis=0) for w in middles], axis=0)
+    means = _halves(np.array(list(middles.values())) - centre)
+    means /= np.maximum(np.median(means, axis=0), 1e-18)
+    return square / np.maximum(usual, 1e-18), dict(zip(middles, means, strict=True))
+
+
+def _halves(errors: Array) -> Array:
+    """Squares of errors (n, 6) of places and of turns, (n, 2)."""
+    return np.asarray(np.sum(errors.reshape(-1, 2, 3) ** 2, axis=2))
 
 
 def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
@@ -111,28 +109,35 @@ def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
     Where it was there at no other time, the body shows it, if all others on it are right
     meanwhile; or the place does, if the sensor is off in the same way whenever it comes back.
     """
+    own = _episode(sensing, residuals, False)
+    return own if own.windows else _episode(sensing, residuals, True)
+
+
+def _episode(sensing: Sensing, residuals: PoseResiduals, is_beside: bool) -> Episode:
     window, count = windows_of(sensing, residuals), window_count(residuals)
-    sizes = _sizes(sensing, window, count)
-    if len(sizes.windows) < count // 3:
+    poses, sizes = _sizes(sensing, residuals, is_beside)
+    is_off, place = poses.max(axis=1) > TIMES, sensing.view.measured
+    loud = [w for w, size in sizes.items() if size.max() > TIMES]
+    high = [w for w in loud if is_beside or _is_shift(sensing, window == w)]
+    if len(sizes) < count // 3 or len(high) > LONGEST * len(sizes):
         return Episode()
-    high = {w for w in sizes.loud() if _is_shift(sensing, window == w)}
-    runs = [w for w in sorted(high) if w - 1 in high or w + 1 in high]
-    if len(high) <= LONGEST * len(sizes.windows):
-        place = _place_of(sensing, window, sorted(high), sizes.poses.max(axis=1) > TIMES)
-        if place is not None:
-            return Episode(tuple(sorted(high)), place=place)
-    if runs and len(runs) <= LONGEST * len(sizes.windows):
-        inside = np.isin(window, runs)
-        outside = (window >= 0) & ~inside & (sizes.poses.max(axis=1) < TIMES)
-        place, is_alone = sensing.view.measured, _is_alone(sensing, residuals, runs)
-        is_turned = not any(sizes.windows[w][0] > TIMES for w in runs)
-        if is_turned:  # turns err with orientation as well as place, but not for so long
-            is_other = _lasts(runs, count) and _spread(place[inside]) > 0.5 * _spread(place)
-        else:
-            is_other = bool(outside.any()) and _is_revisited(place[inside], place[outside])
-        if is_alone or is_other:
-            return Episode(tuple(runs), is_alone)
-    return _by_the_body(sensing, residuals, sizes)
+    passed = _place_of(sensing, window, high, is_off)
+    if passed is not None and not is_beside:
+        return Episode(tuple(high), place=passed)
+    runs = [w for w in high if w - 1 in high or w + 1 in high]
+    if not runs:
+        return Episode()
+    inside = np.isin(window, runs)
+    is_alone = _is_alone(sensing, residuals, runs)
+    if is_alone or is_beside:
+        return Episode(tuple(runs), True) if is_alone else Episode()
+    if not any(sizes[w][0] > TIMES for w in runs):
+        # Turns err with orientation as well as place, but not for so long.
+        is_other = _lasts(runs, count) and _spread(place[inside]) > 0.5 * _spread(place)
+    else:
+        outside = (window >= 0) & ~inside & ~is_off
+        is_other = bool(outside.any()) and _is_revisited(place[inside], place[outside])
+    return Episode(tuple(runs)) if is_other else Episode()
 
 
 def _spread(place: Array) -> float:
@@ -161,11 +166,14 @@ def _place_of(
     away = np.linalg.norm(place - middle, axis=1)
     near = [mean for mean in means if np.linalg.norm(mean - middle) < NEAR_M]
     is_there = len(near) >= max(FEWEST_VISITS, ALWAYS * len(means))
-    is_off_there = np.mean(is_off[judged & (away < NEAR_M)]) > ALWAYS
-    is_right_elsewhere = np.mean(is_off[judged & (away > 2 * NEAR_M)]) < SELDOM
+    there, elsewhere = judged & (away < NEAR_M), judged & (away > 2 * NEAR_M)
     right = np.linalg.norm(place[judged & ~is_off], axis=1)
+    if not (is_there and there.any() and elsewhere.any() and right.size):
+        return None
+    is_off_there = np.mean(is_off[there]) > ALWAYS
+    is_right_elsewhere = np.mean(is_off[elsewhere]) < SELDOM
     is_inside = np.linalg.norm(middle) < np.percentile(right, FARTHER)
-    return middle if is_there and is_off_there and is_right_elsewhere and is_inside else None
+    return middle if is_off_there and is_right_elsewhere and is_inside else None
 
 
 def in_episode(sensing: Sensing, residuals: PoseResiduals) -> Mask:
@@ -180,32 +188,11 @@ def _is_revisited(inside: Array, outside: Array) -> bool:
     return bool(np.mean(distance < NEAR_M) > REVISITED_SHARE)
 
 
-def _by_the_body(sensing: Sensing, residuals: PoseResiduals, sizes: _Sizes) -> Episode:
-    """When a sensor leaves the others on its body, whose clock and reference are the same.
-
-    What all of them share, errors of the stamps before all, is in no difference of two.
-    """
-    own = _middles(sensing, residuals)
-    others = [_middles(one, residuals) for one in residuals.sensors if one is not sensing]
-    apart = {
-        w: float(np.sum((own[w] - np.median([one[w] for one in others], axis=0)) ** 2))
-        for w in sizes.windows
-        if others and all(w in one for one in others)
-    }
-    if not apart:
-        return Episode()
-    usual = TIMES * float(np.median(list(apart.values())))
-    high = [w for w in apart if apart[w] > usual and sizes.windows[w][0] > LOUD]
-    runs = [w for w in high if w - 1 in high or w + 1 in high]
-    is_alone = 0 < len(runs) <= LONGEST * len(apart) and _is_alone(sensing, residuals, runs)
-    return Episode(tuple(runs), True) if is_alone else Episode()
-
-
 def _middles(sensing: Sensing, residuals: PoseResiduals) -> dict[int, Array]:
-    """The median residual (3,), m, of each window that can be judged."""
+    """The median residual (6,), m and rad, of each window that can be judged."""
     window = windows_of(sensing, residuals)
     return {
-        int(w): np.median(sensing.residual[window == w, :3], axis=0)
+        int(w): np.median(sensing.residual[window == w], axis=0)
         for w in np.unique(window[window >= 0])
         if np.count_nonzero(window == w) >= FEWEST_POSES_OF_WINDOW
     }
@@ -217,7 +204,7 @@ def _is_alone(sensing: Sensing, residuals: PoseResiduals, runs: list[int]) -> bo
         return False
 
     def error(one: Sensing) -> float:
-        middles = [v for w, v in _middles(one, residuals).items() if w in runs]
+        middles = [v[:3] for w, v in _middles(one, residuals).items() if w in runs]
         return float(np.median(np.sum(np.square(middles), axis=1))) if middles else np.inf
 
     others = [error(one) for one in residuals.sensors if one is not sensing]
