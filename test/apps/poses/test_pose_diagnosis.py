@@ -449,7 +449,8 @@ def test_turns_that_change_at_a_time_are_an_episode_of_the_sensor_that_turns_mos
         return streams
 
     world.after = after
-    metal = named(diagnose_poses(world.session()))['moving_metal'].parameters
+    records = diagnose_poses(world.session()).records
+    (metal,) = (r.parameters for r in records if r.name == 'moving_metal')
     assert metal['sensors'] == ['sensor_0']
     assert metal['t_start_s'] == pytest.approx(69, abs=2)
     assert metal['t_end_s'] == pytest.approx(87, abs=2)

@@ -80,7 +80,10 @@ def _sizes(
     beside the other sensors, whose clock and reference are the same, so that no error of these is
     in the means.
     """
-    window, middles = windows_of(sensing, residuals), _middles(sensing, residuals)
+    window, errors = windows_of(sensing, residuals), sensing.residual
+    if not is_beside:  # without what errors of the stamps make
+        errors = sensing.noise.whitened(errors, sensing.view.velocity)
+    middles = _middles(sensing, residuals, errors)
     if is_beside:
         others = [_middles(one, residuals) for one in residuals.sensors if one is not sensing]
         middles = {
@@ -91,7 +94,7 @@ def _sizes(
     if not middles:
         return np.zeros((window.size, 2)), {}
     centre = np.median(list(middles.values()), axis=0)
-    square = _halves(sensing.residual - centre)
+    square = _halves(errors - centre)
     usual = np.median([np.median(square[window == w], axis=0) for w in middles], axis=0)
     means = _halves(np.array(list(middles.values())) - centre)
     means /= np.maximum(np.median(means, axis=0), 1e-18)
@@ -188,11 +191,14 @@ def _is_revisited(inside: Array, outside: Array) -> bool:
     return bool(np.mean(distance < NEAR_M) > REVISITED_SHARE)
 
 
-def _middles(sensing: Sensing, residuals: PoseResiduals) -> dict[int, Array]:
-    """The median residual (6,), m and rad, of each window that can be judged."""
+def _middles(
+    sensing: Sensing, residuals: PoseResiduals, errors: Array | None = None
+) -> dict[int, Array]:
+    """The median of errors (n, 6), or of the residual, in each window that can be judged."""
+    errors = sensing.residual if errors is None else errors
     window = windows_of(sensing, residuals)
     return {
-        int(w): np.median(sensing.residual[window == w], axis=0)
+        int(w): np.median(errors[window == w], axis=0)
         for w in np.unique(window[window >= 0])
         if np.count_nonzero(window == w) >= FEWEST_POSES_OF_WINDOW
     }
