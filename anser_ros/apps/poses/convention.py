@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import Role, effect_with
+from anser_ros.apps.poses.problem import PoseProblem
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession
 from anser_ros.apps.poses.start import (
     coarse_offset,
     first_cost,
     first_fit,
     is_at_rest,
+    longest_recording,
     pose_problem,
     turn_misfit,
 )
@@ -111,15 +113,21 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     is_turned = cost < POOR_M and _is_turned(as_written)
     if cost < POOR_M and not is_turned:
         return as_written, record
-    trials = [(_cost(reading.applied(session)), reading) for reading in _readings(unit)]
+    offset = coarse_offset(_few(as_written))  # which no reading of the tracked poses changes
+    trials = [
+        (_cost(reading.applied(session), None if reading.stream == REFERENCE else offset), reading)
+        for reading in _readings(unit)
+    ]
     best, reading = min(trials, key=lambda pair: pair[0])
     if best < (TURNED_SHARE if is_turned else RIGHT_MISFIT_SHARE) * cost:
         return reading.applied(session), reading.record(cost, best, ratio)
     if cost > HOPELESS_M:
+        reach = longest_recording(pose_problem(session))
         raise PlausibilityError(
             f'{session.path}: tracked and optical poses do not belong together: hand-eye is off '
-            f'by {1e3 * cost:.0f} mm in the median, and by {1e3 * best:.0f} mm when quaternions '
-            f'are read in another order or sense'
+            f'by {1e3 * cost:.0f} mm in the median at the best offset of their clocks, up to '
+            f'{reach:.0f} s, and by {1e3 * best:.0f} mm when quaternions are read in another '
+            'order or sense; are they of one body at the same time?'
         )
     return as_written, record
 
@@ -156,11 +164,16 @@ def _readings(unit: str) -> Iterator[PoseReading]:
             yield PoseReading(stream, quaternion, handedness, unit)
 
 
-def _cost(session: PoseSession) -> float:
+def _few(session: PoseSession) -> PoseProblem:
     problem = pose_problem(session)
     step = max(1, max(poses.size for poses in problem.sensors) // FEW_POSES)
-    problem = problem.rows([np.arange(0, poses.size, step) for poses in problem.sensors])
-    return first_cost(first_fit(problem, coarse_offset(problem), False))
+    return problem.rows([np.arange(0, poses.size, step) for poses in problem.sensors])
+
+
+def _cost(session: PoseSession, offset: float | None = None) -> float:
+    problem = _few(session)
+    offset = coarse_offset(problem) if offset is None else offset
+    return first_cost(first_fit(problem, offset, False))
 
 
 def _is_turned(session: PoseSession) -> bool:

@@ -214,10 +214,6 @@ class PoseEffect(BaseEffect[PoseTerm]):
         """Return what is left of a term beside one scale of all sensors; None where nothing is."""
         return term
 
-    def whole(self, term: PoseTerm) -> PoseTerm | None:
-        """Return a map with what it lacks beside a scale, of zeros; None where nothing lacks."""
-        return None
-
     def is_scale(self, term: PoseTerm) -> bool:
         """Return whether a term is one scale, of a sensor or of all."""
         return False

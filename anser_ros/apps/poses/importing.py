@@ -195,6 +195,10 @@ Piece = tuple[str, Array, Array, Array]
 BETWEEN_FILES_S = 10.0
 """Pause, s, between recordings without a host's time that are put one after the other. A pose is
 not interpolated over a tenth of it."""
+SET_S, CLOCKS_APART = 0.3, 3e-3
+"""Time, s, and share of the time passed, by which two clocks that nobody sets move against each
+other from recording to recording: recordings start late by some 40 ms, and quartz errs by less
+than a thousandth. A counter that starts anew differs by seconds."""
 MOST_RESTARTS = 5
 """Falls of a device's counter in one recording up to which they are restarts; of more, rows are in
 another order."""
@@ -231,9 +235,8 @@ def import_poses(
             f'{len(tracked)} files of tracked poses and {len(reference)} of the reference; '
             'they belong together one by one'
         )
-    pieces: list[Piece] = []
+    recordings: list[dict[str, Array]] = []
     lost: list[str] = []
-    free = 0.0  # where the next recording without a host's time begins, s
     for number, path in enumerate(tracked):
         rows, unread = read_form(path)
         groups, files = _named(rows, None, unit, quaternion), [(path, unread)]
@@ -243,16 +246,11 @@ def import_poses(
             files.append((reference[number], unread))
         words = 'lines of {} that are no poses, and are left out: {}'
         lost += [words.format(*one) for one in files if one[1]]
-        times = {label: _times(table, stamps) for label, table in groups.items()}
-        for label, (time, _) in times.items():
-            if not np.isfinite(time).any():
-                raise ParameterError(f'{path}: {label}: no pose has a time')
         for label, table in groups.items():
-            time, is_host = times[label]
-            begin = 0.0 if is_host else _begin(label, times) - free
-            pieces.append((label, time - begin, table[:, 2:5], table[:, 5:]))
-        if not all(is_host for _, is_host in times.values()):
-            free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
+            if not np.isfinite(table[:, :2]).any():
+                raise ParameterError(f'{path}: {label}: no pose has a time')
+        recordings.append(groups)
+    pieces = _placed(recordings, stamps)
     session = _session(str(tracked[0]), _renamed(pieces, names or {}))
     return replace(session, lost='; '.join(lost))
 
@@ -268,10 +266,44 @@ def _renamed(pieces: Sequence[Piece], names: Mapping[str, str]) -> list[Piece]:
     return [(names.get(piece[0], piece[0]), *piece[1:]) for piece in pieces]
 
 
-def _begin(label: str, times: Mapping[str, tuple[Array, bool]]) -> float:
-    """Where a device's own time begins: two devices that count for themselves start together."""
-    same = [t for key, (t, _) in times.items() if (key == REFERENCE) == (label == REFERENCE)]
-    return min(float(np.nanmin(t)) for t in same)
+def _placed(recordings: Sequence[Mapping[str, Array]], stamps: str) -> list[Piece]:
+    """All recordings on one axis of time. Two devices that count for themselves start together,
+    and their counters go on in the next recording if both have moved on alike since the last.
+    """
+    times: list[dict[str, tuple[Array, bool]]] = [{} for _ in recordings]
+    for label in dict.fromkeys(label for groups in recordings for label in groups):
+        own = [k for k, groups in enumerate(recordings) if label in groups]
+        found = _times([recordings[k][label] for k in own], stamps)
+        for k, one in zip(own, found, strict=True):
+            times[k][label] = one
+    pieces: list[Piece] = []
+    free = 0.0  # where the next recording without a host's time begins, s
+    zero: dict[bool, float] = {}
+    last: dict[bool, float] = {}
+    for groups, known in zip(recordings, times, strict=True):
+        begin: dict[bool, float] = {}  # by whether it is the reference
+        for label, (time, is_host) in known.items():
+            if not is_host:
+                key = label == REFERENCE
+                begin[key] = min(begin.get(key, np.inf), float(np.nanmin(time)))
+        runs_on = len(begin) == len(last) == 2 and _runs_on(
+            last[False] - last[True], begin[False] - begin[True], begin[True] - last[True]
+        )
+        if not runs_on:
+            zero = {key: value - free for key, value in begin.items()}
+        last = begin
+        for label, table in groups.items():
+            time, is_host = known[label]
+            shift = 0.0 if is_host else zero[label == REFERENCE]
+            pieces.append((label, time - shift, table[:, 2:5], table[:, 5:]))
+        if begin:
+            free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
+    return pieces
+
+
+def _runs_on(before: float, after: float, elapsed: float) -> bool:
+    """Whether two counters, apart so much before and after a time, s, have not been set since."""
+    return elapsed > 0 and abs(after - before) < SET_S + CLOCKS_APART * elapsed
 
 
 def _named(
@@ -292,21 +324,37 @@ def _named(
     return found
 
 
-def _times(table: Array, stamps: str) -> tuple[Array, bool]:
-    """Times of a group of rows, s, and whether they are on the host's axis."""
-    host, device = table[:, 0], table[:, 1].copy()
-    if not np.isfinite(host).any():
-        return _continued(device), False
-    if stamps == 'host' or not np.isfinite(device).any():
-        return host, True
-    order = np.argsort(host, kind='stable')  # lines may be in another order than they came
-    count = _restarts(device[order])
-    for number in np.unique(count):
-        rows_of_it = order[count == number]
-        late = host[rows_of_it] - device[rows_of_it]
-        if np.isfinite(late).any():
-            device[rows_of_it] += np.nanmin(late)
-    return device, True
+def _times(tables: Sequence[Array], stamps: str) -> list[tuple[Array, bool]]:
+    """Times of a stream's recordings, s, and whether they are on the host's axis.
+
+    A device's counter that runs on has one zero on that axis, whose drift is its clock's rate.
+    """
+    out, pieces = [], []
+    for table in tables:
+        host, device = table[:, 0], table[:, 1].copy()
+        if not np.isfinite(host).any():
+            out.append((_continued(device), False))
+            continue
+        if stamps == 'host' or not np.isfinite(device).any():
+            out.append((host, True))
+            continue
+        out.append((device, True))
+        order = np.argsort(host, kind='stable')  # lines may be in another order than they came
+        count = _restarts(device[order])
+        for number in np.unique(count):
+            rows = order[count == number]
+            late = host[rows] - device[rows]
+            if np.isfinite(late).any():
+                pieces.append(
+                    (device, rows, float(np.nanmin(late)), float(np.nanmin(device[rows])))
+                )
+    zero, last = 0.0, None
+    for device, rows, late, begin in pieces:
+        if last is None or not _runs_on(last[0], late, begin - last[1]):
+            zero = late
+        last = late, begin
+        device[rows] += zero
+    return out
 
 
 def _restarts(counter: Array) -> NDArray[np.int64]:

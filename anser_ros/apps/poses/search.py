@@ -290,7 +290,7 @@ def search_effects(
     if not is_known:
         fit = with_noise(start, False)
     how = _PoseSelection(is_known, say or (lambda text: None))
-    fit = how.thinned(_one_map(how.grown(fit)))
+    fit = how.thinned(how.grown(fit))
     return PoseSearch(fit, tuple(how.evidence), tuple(how.refused), is_known)
 
 
@@ -429,15 +429,3 @@ def _simplest(accepted: list[tuple[float, PoseFit]]) -> PoseFit:
         and (gain >= least or fit.terms[-1].role is not Role.SCALE)
     ]
     return max(plain or accepted, key=lambda pair: pair[0])[1]
-
-
-def _one_map(fit: PoseFit) -> PoseFit:
-    """A whole map instead of a scale and what is bent besides, where it explains as much."""
-    pairs = [(t, whole) for t in fit.terms if (whole := t.effect.whole(t)) is not None]
-    bent = [t for t, _ in pairs]
-    rest = [t for t in fit.terms if t not in bent and t.role is not Role.SCALE]
-    if not bent or len(rest) + len(bent) == len(fit.terms):
-        return fit
-    problem = fit.state.problem
-    trial = fit_poses(problem, [*rest, pairs[0][1]])
-    return trial if trial.held_out(True) < (1 + LEAST_EXPLAINED) * fit.held_out(True) else fit

@@ -138,15 +138,6 @@ class FieldDistortion(PoseEffect):
         has_lowest = own.get('lowest', 1) <= site.get('lowest', 1)
         return bool(has_lowest and own['degree'] >= site.get('degree', 1))
 
-    def whole(self, term: PoseTerm) -> PoseTerm | None:
-        """Return the map of the same degree with its linear part, on all sensors."""
-        if 'lowest' not in term.site:
-            return None
-        site: PoseSite = {**term.site}
-        site.pop('lowest', None)
-        site.pop('sensor', None)
-        return PoseTerm(self, site, np.zeros(3 * _count(site)))
-
     def _derivative(self, term: PoseTerm, position: Array) -> Array:
         """What each parameter moves positions (n, 3) by, shape (n, 3, q), m."""
         centre, size = np.asarray(term.site['centre_m']), term.site['size_m']

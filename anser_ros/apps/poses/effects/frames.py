@@ -175,7 +175,7 @@ class PoseTimeOffset(NumberEffect):
     summary = 'the tracked stamps are late (positive) or early by the optical clock'
     advice = 'Correct the stamps by it; both streams stamped by one clock do not have it.'
     units = {'offset_s': 's'}
-    plausible = {'offset_s': (-5.0, 5.0)}
+    plausible = {'offset_s': (-3600.0, 3600.0)}  # a clock may be off by an hour of the day
     remedy = Remedy.OPTICAL
     role = Role.OFFSET
     key = 'offset_s'

@@ -100,7 +100,7 @@ class MissingPoses(PoseEffect):
         """Return a record for each stream that lacks poses."""
         found = []
         for poses in residuals.session.streams.values():
-            spans = _gaps(poses)
+            spans = _gaps(poses, residuals.session)
             lost = poses.missing.size / max(poses.missing.size + poses.size, 1)
             length = max(float(np.ptp(poses.time)), 1e-9)
             silent = sum(b - a for a, b in spans) / length
@@ -179,7 +179,8 @@ def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
     return np.asarray(near & (way > 2 * NEAR * MOVING_M))
 
 
-def _gaps(poses: PoseSequence) -> list[tuple[float, float]]:
+def _gaps(poses: PoseSequence, session: PoseSession) -> list[tuple[float, float]]:
+    """Spans, s, without poses; none in which all streams pause, as between two recordings."""
     steps = np.diff(poses.time)
     if steps.size < 10:
         return []
@@ -188,7 +189,10 @@ def _gaps(poses: PoseSequence) -> list[tuple[float, float]]:
     pauses = gaps[steps[gaps] > PAUSE_S]
     if pauses.size >= MANY_PAUSES:
         gaps = np.setdiff1d(gaps, pauses)
-    return [(float(poses.time[g]), float(poses.time[g + 1])) for g in gaps]
+    every = np.sort(np.concatenate([np.r_[p.time, p.missing] for p in session.streams.values()]))
+    ends = every[np.flatnonzero(np.diff(every) > PAUSE_S)]
+    spans = [(float(poses.time[g]), float(poses.time[g + 1])) for g in gaps]
+    return [(a, b) for a, b in spans if not np.any((ends >= a) & (ends < b))]
 
 
 LEAST_S = 2e-3
@@ -248,7 +252,7 @@ class ReceiptJitter(PoseEffect):
 
     name = 'stamp_jitter'
     summary = 'stamps are those of receipt, and jitter'
-    advice = 'Use the counter of the device as stamp (import_poses --stamps device).'
+    advice = 'Use the counter of the device (import_poses --stamps device), if it is not in use.'
     units = {'rms_s': 's'}
     needs_levers = True
     makes_jitter = True
@@ -384,7 +388,7 @@ class PoseExcessNoise(PoseEffect):
 
     name = 'excess_noise'
     summary = "a sensor's noise is larger than the others'"
-    advice = 'Exchange the sensor or its cable, and record again.'
+    advice = 'Record again with sensors at equal distances: its place and rounding may make it.'
     units = {'factor': '1'}
     makes_jitter = True
 
@@ -420,7 +424,7 @@ class RangeNoise(PoseEffect):
 
     name = 'range_noise'
     summary = 'jitter grows with the distance from the field generator'
-    advice = 'Work nearer to the field generator.'
+    advice = 'Compare it with the data sheet; nearer to the field generator it is less.'
     units = {'exponent': '1', 'reference_m': 'm'}
     makes_jitter = True
 
