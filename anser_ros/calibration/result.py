@@ -229,22 +229,29 @@ class Residuals:
 
     each_t: Array  # (K,): root mean square of the magnitude of each emitter's complex residual, T
     span_t: float  # range of the measured in-phase fluxes, T
+    unexplained: float  # median magnitude of a residual over that of a reading
 
     @property
     def rmse_t(self) -> float:
         """Return the root mean square over the readings of all emitters, T."""
         return float(np.sqrt(np.mean(self.each_t**2)))
 
+    @classmethod
+    def of(cls, left: ComplexArray, read: ComplexArray) -> 'Residuals':
+        """Return what is ``left`` of what was ``read``, both (N, K), T."""
+        size, whole = np.abs(left), np.abs(read)
+        each_t, span_t = np.sqrt((size**2).mean(axis=0)), np.ptp(read.real)
+        return cls(each_t, float(span_t), float(np.median(size) / np.median(whole)))
+
 
 def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residuals:
     """Return a model's residuals of the usable readings at the measured poses."""
-    power, count = np.zeros(len(model.emitters)), 0
-    low, high = np.inf, -np.inf
-    for points, axes, lengths, flux in usable_readings(measurements):
-        error = flux - model.flux(points, axes, lengths)
-        power, count = power + (np.abs(error) ** 2).sum(axis=0), count + len(error)
-        low, high = min(low, float(flux.real.min())), max(high, float(flux.real.max()))
-    return Residuals(np.sqrt(power / count), high - low)
+    blocks = [
+        (flux - model.flux(points, axes, lengths), flux)
+        for points, axes, lengths, flux in usable_readings(measurements)
+    ]
+    left, read = (np.concatenate(part) for part in zip(*blocks, strict=True))
+    return Residuals.of(left, read)
 
 
 @dataclass(frozen=True)

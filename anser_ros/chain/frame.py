@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from anser_ros.arrays import ComplexArray, Integers
 from anser_ros.field.model import FieldModel
 from anser_ros.pose_states import Withheld
 
@@ -13,9 +11,9 @@ from anser_ros.pose_states import Withheld
 class FrameReadings:
     """Holds what S sensors read in one frame: channels, fluxes (S, K), T, and flag bits."""
 
-    channels: NDArray[np.int64]
-    flux: NDArray[np.complex128]
-    flags: NDArray[np.int64]
+    channels: Integers
+    flux: ComplexArray
+    flags: Integers
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from anser_ros.arrays import Array
 from anser_ros.chain.frame import Answer, ChainFrame, FrameReadings
 from anser_ros.effects.correction import Correction
 from anser_ros.field.model import FieldModel
@@ -17,7 +15,7 @@ from anser_ros.refit.model import RefitResult
 from anser_ros.refit.witness import ToolReading
 from anser_ros.tracking.estimate import PoseEstimate
 
-ToolPose = tuple[NDArray[np.float64], NDArray[np.float64]]
+ToolPose = tuple[Array, Array]
 """Position (3,), m, and rotation (3, 3) of a body in frame fg."""
 
 

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import extensions
+from anser_ros.arrays import Array
 from anser_ros.cli.commands import COMPOSED, NODES
 from anser_ros.cli.main import check_packages
 from anser_ros.cli.output import add_json, add_out, make_new_folder
@@ -109,7 +109,7 @@ def _chains(results: Results) -> list[tuple[int, str, str]]:
     return list(zip(range(len(names)), names, COLOURS, strict=False))[::-1]
 
 
-def broken(stamp_s: NDArray[np.float64], values: NDArray[np.float64]) -> Any:
+def broken(stamp_s: Array, values: Array) -> Any:
     """Return stamps and values with a NaN in every gap, so that no line is drawn across it."""
     gaps = np.flatnonzero(np.diff(stamp_s) > GAP_S) + 1
     middle = (stamp_s[gaps - 1] + stamp_s[gaps]) / 2
@@ -160,7 +160,7 @@ def _draw_error(axes: Any, results: Results, shown: int) -> None:
     axes.grid(alpha=0.3, which='both')
 
 
-def _joined(results: Results, kind: str, rank: int) -> NDArray[np.float64]:
+def _joined(results: Results, kind: str, rank: int) -> Array:
     return np.concatenate([results[f'{kind}_{rank}_{i}'] for i in range(len(results['names']))])
 
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     Effect,
@@ -67,7 +66,7 @@ class GainOfChannels(ComplexGain):
         out[:, rows] = np.stack([own, 1j * own], axis=-1)
         return out
 
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         own = np.isin(channels, term.channels)
         return np.diag(np.where(own, 1 + complex(*term.theta), 1.0))
 
@@ -111,7 +110,7 @@ class CommonGain(Effect[Term]):
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         return np.asarray(view.linear[..., None] / (1 + term.theta[0]))
 
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         return np.asarray((1 + term.theta[0]) * np.eye(channels.size, dtype=complex))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
@@ -197,7 +196,7 @@ class ChannelCrosstalk(Effect[Term]):
             matrix[place] = value
         return matrix
 
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         """Mix the cluster's channels; one that is not there leaks nothing."""
         matrix, block = np.eye(channels.size, dtype=complex), self._matrix(term)
         place = {int(c): row for row, c in enumerate(channels)}
@@ -262,7 +261,7 @@ class Pickup(Effect[Term]):
             out[:, row, k, k], out[:, row, k, emitters + k] = PICKUP_UNIT, 1j * PICKUP_UNIT
         return out
 
-    def offset(self, term: Term, channels: NDArray[np.int64], emitters: int) -> ComplexArray:
+    def offset(self, term: Term, channels: Integers, emitters: int) -> ComplexArray:
         out = np.zeros((channels.size, emitters), dtype=complex)
         out[channels == term.site['channel']] = complex_of(term.theta * PICKUP_UNIT)
         return out
@@ -389,7 +388,7 @@ class Saturation(Effect[SaturationTerm]):
         return out
 
     def compress(
-        self, term: SaturationTerm, channels: NDArray[np.int64], flux: ComplexArray
+        self, term: SaturationTerm, channels: Integers, flux: ComplexArray
     ) -> ComplexArray:
         out, weights = flux.copy(), term.weights
         for row in np.flatnonzero(channels == term.site['channel']):

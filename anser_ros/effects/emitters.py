@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from itertools import combinations, permutations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.channels import ComplexGain
 from anser_ros.effects.effect import Effect, Remedy, Site, Term, needed, recorded_site, sigmas
@@ -109,7 +108,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         start, coils = np.array([0.0, np.log(0.5 * duration)]), range(apparatus.emitters)
         return [CoilDriftTerm(self, {'coil': k}, start, duration=duration) for k in coils]
 
-    def amounts(self, term: CoilDriftTerm) -> NDArray[np.int64]:
+    def amounts(self, term: CoilDriftTerm) -> Integers:
         """Return the amount's index alone: a drift of nothing has any time constant."""
         return np.array([0])
 

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     Effect,
@@ -147,7 +146,7 @@ class OpticalScale(OpticalEffect[Term]):
     def prior(self, term: Term) -> Array:
         return np.concatenate([np.full(term.theta.size - 3, 0.01), np.full(3, 5e-3)])
 
-    def amounts(self, term: Term) -> NDArray[np.int64]:
+    def amounts(self, term: Term) -> Integers:
         """Return the scale's index alone: a shift is a registration's."""
         return np.array([0])
 
@@ -219,7 +218,7 @@ class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
         duration = max(apparatus.duration, 1e-3)
         return RegistrationDriftTerm(self, {}, np.zeros(6), duration=duration)
 
-    def amounts(self, term: RegistrationDriftTerm) -> NDArray[np.int64]:
+    def amounts(self, term: RegistrationDriftTerm) -> Integers:
         """Return the growth's index alone: a constant shift is a registration's."""
         return np.arange(3, 6)
 

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term, needed, recorded_site
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
@@ -34,7 +33,7 @@ class SwappedChannels(Wiring):
     units = {'channels': '1', 'read_as': '1'}
     remedy = Remedy.FLUX
 
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         """Return a permutation; channels of which one is missing stay as they are."""
         row = {int(c): i for i, c in enumerate(channels)}
         matrix = np.eye(channels.size, dtype=complex)
@@ -81,7 +80,7 @@ class SensorPolarity(Wiring):
     units = {'channels': '1'}
     remedy = Remedy.FLUX
 
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         signs = np.where(np.isin(channels, term.site['channels']), -1.0, 1.0)
         return np.diag(signs).astype(complex)
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.errors import FitError, SetupError
 from anser_ros.nodes.streams.clouds import FLUX_NOISE, STAMP_SIGMA
 from anser_ros.settings import Accuracy
@@ -36,8 +36,8 @@ PATIENCE_NS = 300_000_000
 class Staleness:
     """Says why sensors are stale; each array has a place for each of them, shape (S,)."""
 
-    age_s: NDArray[np.float64]
-    noiseless: NDArray[np.bool_]
+    age_s: Array
+    noiseless: Booleans
 
     def __or__(self, later: Staleness) -> Staleness:
         """What holds of one or the other; of two ages that of the later counts."""
@@ -53,7 +53,7 @@ class FluxFrame:
     reference: FluxPoints
     host_ns: int
     window: FluxWindow
-    flags: NDArray[np.int64]
+    flags: Integers
     staleness: Staleness
     repeats: bool = False
 
@@ -245,7 +245,7 @@ class FluxStream:
         saturated = window.saturated[self._columns]
         stale = window.stuck[self._columns] | window.stuck[self._current_column]
         stale |= ((staleness.age_s > 0) | staleness.noiseless) & ~saturated
-        flags: NDArray[np.int64] = saturated * SATURATED | stale * STALE
+        flags: Integers = saturated * SATURATED | stale * STALE
         if window.dropped:
             flags |= DROPPED
         split = self._split
@@ -271,9 +271,7 @@ class FluxStream:
         )
 
 
-def _points(
-    rows: SensorRows, flux: NDArray[np.complex128], flags: NDArray[np.int64]
-) -> FluxPoints:
+def _points(rows: SensorRows, flux: ComplexArray, flags: Integers) -> FluxPoints:
     return FluxPoints(rows.channel, flags, flux, rows.position, rows.axis)
 
 

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import ComplexArray
 from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
@@ -334,7 +333,7 @@ class FieldModelNode(AnserNode):
             withheld = self._refit.withheld if self._follows else ''
             self._serve(self._model, self.get_clock().now().nanoseconds, withheld)
 
-    def _follow(self, baseline: NDArray[np.complex128]) -> None:
+    def _follow(self, baseline: ComplexArray) -> None:
         """Refit to what differs from a baseline, shape (S, K), T, as soon as that can be done."""
         self._refit.begin(baseline)
         if self._refit.current is None:

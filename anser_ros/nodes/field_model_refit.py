@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import ComplexArray
 from anser_ros.chain.model_half import ModelHalf
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
@@ -72,7 +72,7 @@ class RefitStart:
             self._tables = self._worker.submit(self._work_tables_out)
         return self._tables
 
-    def begin(self, baseline: NDArray[np.complex128]) -> None:
+    def begin(self, baseline: ComplexArray) -> None:
         """Begin to make the refit to what differs from a baseline, in place of one being made.
 
         The baseline, shape (R, K), T, is what the references read without metal.
@@ -138,9 +138,7 @@ class RefitStart:
             raise _EndedError
         self._share = share
 
-    def _make(
-        self, baseline: NDArray[np.complex128], made: Future[tables.RefitTables]
-    ) -> LiveRefit:
+    def _make(self, baseline: ComplexArray, made: Future[tables.RefitTables]) -> LiveRefit:
         ready, settings = made.result(), self._setup.refit
         self._share = 1.0
         refit = LiveRefit(self._model, self._references, baseline, settings, tables=ready)
@@ -173,7 +171,7 @@ class ActiveRefit(ModelHalf):
         self._has_looked = False
         self._confirmed: RefitResult | None = None
         self.start: RefitStart | None = None
-        self._baseline: NDArray[np.complex128] | None = None
+        self._baseline: ComplexArray | None = None
         self.update_s = 0.0
 
     def prepare(
@@ -199,7 +197,7 @@ class ActiveRefit(ModelHalf):
         if again and baseline is not None:
             self.begin(baseline)
 
-    def begin(self, baseline: NDArray[np.complex128]) -> None:
+    def begin(self, baseline: ComplexArray) -> None:
         """Begin to make a refit to what differs from a baseline, shape (S, K), T.
 
         No pose is given before the first one is there, since metal may come meanwhile; one that is

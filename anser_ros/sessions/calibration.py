@@ -54,8 +54,9 @@ FIELD_REACH_M = 0.015
 ASIDE = 0.3
 """Distance of a look's free dipoles at the wiring from each emitter's middle, in its sides."""
 MOST_UNEXPLAINED = 0.05
-"""Share of the signal that a calibration leaves at most: good ones leave a thousandth, those of a
-layout that is too coarse a hundredth, wrong signs or poses a tenth and more."""
+"""Share of most readings that a calibration leaves at most: good ones leave a thousandth, those of
+a layout that is too coarse a hundredth, wrong signs or poses a tenth and more. Outliers of the
+optics count as any other readings."""
 UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 
@@ -289,7 +290,7 @@ def _fit_as_scan(
         same = replace(options, layout=calibration.layout)
         calibration = fit_scan(bare, names, generator, same, progress)
     if options.layout is None:
-        check_explained(calibration, measurements)
+        check_explained(calibration)
     scan = calibration.scan
     scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
     return replace(calibration, scan=scan)
@@ -309,10 +310,9 @@ def places_about(generator: Generator) -> Array:
     return np.asarray((generator.centres[:, None] + around).reshape(-1, 3))
 
 
-def check_explained(calibration: Calibration, measurements: Sequence[Measurements]) -> None:
-    """Raise `FitError` where a model leaves so much of the signal that it is none."""
-    signal = [np.abs(m.flux[m.usable]) ** 2 / 2 for m in measurements]
-    share = calibration.residuals.rmse_t / float(np.sqrt(np.mean(np.concatenate(signal))))
+def check_explained(calibration: Calibration) -> None:
+    """Raise `FitError` where a model leaves so much of most readings that it is none."""
+    share = calibration.residuals.unexplained
     if share > MOST_UNEXPLAINED:
         raise FitError(
             f'no field explains the scan: {100 * share:.0f} % of the signal is left. Are axes, '

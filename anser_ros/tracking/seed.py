@@ -16,9 +16,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anser_ros.arrays import Array
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import dipole_field, fill_fields
@@ -312,7 +311,7 @@ def build_grid(
     return SeedGrid(points, triangles @ white, triangles, np.array(sigma), spacing_m)
 
 
-def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[NDArray[np.int64], Array, Array]:
+def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[Integers, Array, Array]:
     """Return the cheapest distinct grid points for fluxes (2K,), T, ``count`` of them at most.
 
     They are indices, best first; with them come the best unit axis (G, 3) at every grid point, and
@@ -345,7 +344,7 @@ def _polish(
     high: Array,
     length_m: float,
     gate: float,
-    starts: NDArray[np.int64],
+    starts: Integers,
     axes: Array,
 ) -> list[CoilSolution]:
     """Distinct solutions that these grid points lead to."""

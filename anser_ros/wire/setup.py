@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, sections_of, settings_from
@@ -85,9 +85,9 @@ class SensorSpec:
 class SensorRows(NamedTuple):
     """Holds channels (S,), positions, m, and unit axes (S, 3), in the frames of bodies."""
 
-    channel: NDArray[np.int64]
-    position: NDArray[np.float64]
-    axis: NDArray[np.float64]
+    channel: Integers
+    position: Array
+    axis: Array
 
     @staticmethod
     def of(sensors: Sequence[SensorSpec], fixed_only: bool = False) -> 'SensorRows':

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import AnserError, BagError, ModelFileError, ParameterError, SetupError
 
 
@@ -46,7 +46,7 @@ def numbers_of(
     names: Sequence[str],
     *,
     with_gaps: bool = False,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return columns (rows, names) as finite numbers, gaps as NaN if allowed; `ParameterError`."""
     try:
         values = np.array(
@@ -61,7 +61,7 @@ def numbers_of(
     return values
 
 
-def read_fiducials(path: Path) -> NDArray[np.float64]:
+def read_fiducials(path: Path) -> Array:
     """Return the positions (P, 3), m, of a list of fiducials; raises `BagError`."""
     lines = read_text(path).splitlines()
     rows = [line.split(',') for line in lines if line.strip() and not line.startswith('#')]

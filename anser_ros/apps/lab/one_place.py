@@ -92,9 +92,7 @@ def calibrate_at_one_place(
         layout=Layout('sources', strays, 1.0, 0.0, words=WORDS.format(strays)),
         damping=0.0,
         n_measurements=int(posed.usable.sum()),
-        residuals=Residuals(
-            np.sqrt((np.abs(left) ** 2).mean(axis=0)), float(flux.real.max() - flux.real.min())
-        ),
+        residuals=Residuals.of(left, flux),
         scan=Scan((right,), accuracy, effects, _noisy(posed.sensors.channel, noise_ratio)),
         undetermined=_unclear(posed, fit, readings.used & ~turned) if looked_for else (),
         more={'sources': _places(emitters, fit), 'sensor_widths': dict(fit.widths)},

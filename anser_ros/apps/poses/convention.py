@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import Role, effect_with
@@ -20,11 +19,10 @@ from anser_ros.apps.poses.start import (
     pose_problem,
     turn_misfit,
 )
+from anser_ros.arrays import Array
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.plausibility import LENGTH_M, check_positions
-
-Array = NDArray[np.float64]
 
 POOR_M = 8e-3
 """Median misfit of hand-eye, m and tenths of rad together, from which other readings are tried:

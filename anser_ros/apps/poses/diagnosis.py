@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.convention import read_rightly
@@ -45,11 +44,10 @@ from anser_ros.apps.poses.start import (
     train_blocks,
     untangled,
 )
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.diagnosis.problem import TEST_EVERY
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
-
-Array = NDArray[np.float64]
 
 FEWEST_RECORDINGS = 8
 """Recordings at rest from which each is judged by a fit of others: of fewer the rest does not
@@ -80,7 +78,7 @@ def errors_of(state: PoseState) -> HeldOutErrors:
 
 
 def held_out(
-    problem: PoseProblem, found: PoseFit, test: NDArray[np.int64]
+    problem: PoseProblem, found: PoseFit, test: Integers
 ) -> tuple[PoseState, PoseState, HeldOutErrors]:
     """Return held-out poses before and after, and what registration alone leaves of them."""
     folds = [(found, test)]
@@ -198,7 +196,7 @@ def _share(part: PosePart, name: str) -> float:
     return explained / max(total, 1e-18) - len(numbers) / max(len(residual), 1)
 
 
-def _groups(part: PosePart, used: NDArray[np.bool_], name: str) -> NDArray[np.int64]:
+def _groups(part: PosePart, used: Booleans, name: str) -> Integers:
     if name == 'time':
         time = part.view.time[used]
         return np.asarray(np.argsort(np.argsort(time)) * GROUPS**2 // time.size, dtype=np.int64)
@@ -325,7 +323,7 @@ def diagnose_poses(
     )
 
 
-def _confirmed(search: PoseSearch, problem: PoseProblem, test: NDArray[np.int64]) -> PoseSearch:
+def _confirmed(search: PoseSearch, problem: PoseProblem, test: Integers) -> PoseSearch:
     """The search without effects of place that positions do not confirm."""
     fit = search.fit
     for index, term in enumerate(fit.terms):

@@ -9,7 +9,6 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv, ndtri
@@ -17,10 +16,9 @@ from scipy.special import gammaincinv, ndtri
 from anser_ros.apps.poses.effect import PoseTerm, Role
 from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState, stamp_step
 from anser_ros.apps.poses.sequence import PoseSequence, PoseSession
+from anser_ros.arrays import Array, Booleans
 from anser_ros.diagnosis.engine import JointFit, descended, stepped
 from anser_ros.effects.effect import sigmas
-
-Array = NDArray[np.float64]
 
 STUDENT_FREEDOM = 4.0
 """Degrees of freedom of Student's distribution by which poses are weighted in a robust fit: the
@@ -165,7 +163,7 @@ def _spread(part: PosePart) -> PoseNoise:
     )
 
 
-def unexplained_poses(state: PoseState) -> tuple[NDArray[np.bool_], ...]:
+def unexplained_poses(state: PoseState) -> tuple[Booleans, ...]:
     """Return the poses that nothing explains: far beyond the spread of their sensor's others."""
     found = []
     for part in state.parts:
@@ -234,7 +232,7 @@ leaves less, as the frames take up what goes with its turns, and with it wrong l
 
 def is_lever_determined(
     part: PosePart, jitter_rad: float, error_m: float = OWN_ERROR_M
-) -> NDArray[np.bool_]:
+) -> Booleans:
     """Return the mask (3,) of the components of a lever arm that the motion determines.
 
     Errors of the measured rotations make a lever arm too small by their share of the rotations'

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.sessions.plausibility import LENGTH_M
 from anser_ros.stamps import NANO
@@ -25,8 +25,6 @@ from anser_ros.wire.recorded import (
     pose_setup,
     tracked_topic,
 )
-
-Array = NDArray[np.float64]
 
 ORDERS = {
     'xyzw': ((0, 1, 2, 3), 1.0),
@@ -357,7 +355,7 @@ def _times(tables: Sequence[Array], stamps: str) -> list[tuple[Array, bool]]:
     return out
 
 
-def _restarts(counter: Array) -> NDArray[np.int64]:
+def _restarts(counter: Array) -> Integers:
     """How often a counter has restarted before each of its values: it falls by more than a second.
 
     Where there are many falls, rows are in no order, and no counter restarts.

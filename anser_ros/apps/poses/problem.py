@@ -9,18 +9,17 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import PoseSetting, PoseTerm, PoseView, Role, frames_of
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSequence, PoseSession
+from anser_ros.arrays import AnyArray, Array, Booleans, Integers
 from anser_ros.calibration.readings import FOLDS
 from anser_ros.diagnosis.engine import BlockSums, JointState, block_sums, joined
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
-Ints = NDArray[np.int64]
+Ints = Integers
 
 FILTER_STEP = 0.05
 """Share of a filter's time constant by which it is changed for differences. Smaller meets the
@@ -66,7 +65,7 @@ class PoseProblem:
     weight: tuple[Array, ...]  # (n,), square root of what a pose counts; zero leaves it out
     noise: tuple[PoseNoise, ...]
 
-    def rows(self, keep: Sequence[NDArray[np.generic]]) -> 'PoseProblem':
+    def rows(self, keep: Sequence[AnyArray]) -> 'PoseProblem':
         """Return the poses of each sensor that are named by index or mask."""
         rows: dict[str, Any] = {
             key: tuple(v[k] for v, k in zip(getattr(self, key), keep, strict=True))

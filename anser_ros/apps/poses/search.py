@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.effect import PoseTerm, Role, pose_effects
 from anser_ros.apps.poses.fit import (
@@ -27,11 +26,10 @@ from anser_ros.apps.poses.fit import (
 from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseState, stamp_step
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.apps.poses.start import FEWEST_HAND_EYE_POSES
+from anser_ros.arrays import Array
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN, PER_PARAMETER
 from anser_ros.diagnosis.engine import ForwardSelection, Scorer, is_covered
 from anser_ros.errors import DiagnosisError
-
-Array = NDArray[np.float64]
 
 LEAST_EXPLAINED = 0.015
 """Share of the sum of squares that an effect must explain on unseen blocks: errors of trackers are

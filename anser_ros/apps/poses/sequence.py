@@ -7,16 +7,15 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import AnyArray, Array, Booleans
 from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.stamps import NANO, Order, order_of
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
 REFERENCE = 'optical'
 """Name of the reference among a session's streams."""
@@ -56,7 +55,7 @@ class PoseSequence:
         """Return rotation matrices, shape (n, 3, 3), from the sensor's frame to the tracker's."""
         return np.asarray(Rotation.from_quat(self.quaternion).as_matrix()).reshape(-1, 3, 3)
 
-    def rows(self, keep: NDArray[np.generic] | slice) -> 'PoseSequence':
+    def rows(self, keep: AnyArray | slice) -> 'PoseSequence':
         """Return the poses that are named by index, mask or slice."""
         return replace(
             self,

@@ -5,13 +5,13 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import PoseSetting, PoseSite, PoseTerm, Role, effect_with
 from anser_ros.apps.poses.fit import PoseFit, robust_fit
 from anser_ros.apps.poses.problem import PoseNoise, PoseProblem, predicted
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSequence, PoseSession, jumping_poses
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.calibration.readings import fold_of_frames
 from anser_ros.diagnosis.problem import BLOCKS, TEST_EVERY
 from anser_ros.errors import DiagnosisError, FitError
@@ -19,9 +19,8 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.physics.rotations import nearest_rotation
 
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
-Array = NDArray[np.float64]
 
 PAUSE_S = 2.0
 """Pause, s, that parts static recordings; where there are several, each is a block."""
@@ -181,7 +180,7 @@ def _recordings(
     return track, kept, still / max(sum(p.size for p in sensors.values()), 1)
 
 
-def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArray[np.int64], ...]:
+def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[Integers, ...]:
     """Equal stretches of time, or the recordings where there are several."""
     if starts.size + 1 >= FEWEST_PARTS:
         return tuple(np.searchsorted(starts, p.time, side='right') for p in sensors)
@@ -193,7 +192,7 @@ def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArra
     )
 
 
-def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArray[np.int64], ...]:
+def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[Integers, ...]:
     """Cells of space dealt to folds; blocks of time where all is at one place."""
     places = [poses.position for poses in sensors]
     every = np.concatenate(places)
@@ -204,7 +203,7 @@ def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArr
         return _time_blocks(sensors, starts)
 
 
-def train_blocks(problem: PoseProblem) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def train_blocks(problem: PoseProblem) -> tuple[Integers, Integers]:
     """Return blocks of time to choose and fit on, and those that are held out."""
     every = np.unique(np.concatenate(problem.blocks))
     held = np.arange(every.size) % TEST_EVERY == TEST_EVERY - 2

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.assessment.intervals import (
@@ -29,10 +28,9 @@ from anser_ros.apps.poses.assessment.intervals import (
 )
 from anser_ros.apps.poses.assessment.rest import StillPoint
 from anser_ros.apps.poses.sequence import PoseSequence
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.physics.rotations import axis_angles
-
-Array = NDArray[np.float64]
 
 SPACING_M = 0.05
 """Distance of neighbouring holes of the protocol's board, m."""
@@ -214,7 +212,7 @@ def _group(
 
 
 def grouped(
-    unit: str, words: Sequence[str], signed: Array, clusters: Sequence[NDArray[np.int64]],
+    unit: str, words: Sequence[str], signed: Array, clusters: Sequence[Integers],
     rng: np.random.Generator,
 ) -> ErrorGroup:  # fmt: skip
     """Return errors with intervals from resamples of clusters, the widest of several ways."""

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.assessment.distances import (
     ORDERS,
@@ -44,9 +43,8 @@ from anser_ros.apps.poses.assessment.source import AssessedPoses
 from anser_ros.apps.poses.hand_eye import HandEye, fit_hand_eye
 from anser_ros.apps.poses.problem import predicted
 from anser_ros.apps.poses.sequence import PoseSequence
+from anser_ros.arrays import Array
 from anser_ros.errors import FitError, ParameterError
-
-Array = NDArray[np.float64]
 
 GROUPS = 5  # groups of speeds, with equal numbers of poses: a row of the table each
 FEWEST_MOVING_POSES = 100

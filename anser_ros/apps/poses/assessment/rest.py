@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -16,9 +15,8 @@ from anser_ros.apps.poses.assessment.intervals import (
     independent_for_variance,
 )
 from anser_ros.apps.poses.sequence import PoseSequence
+from anser_ros.arrays import Array
 from anser_ros.errors import FitError
-
-Array = NDArray[np.float64]
 
 WINDOW_S, WINDOW_POSES = 0.25, 3.0
 """Window whose middle pose is compared with its neighbours', s and poses: noise has fallen in it,

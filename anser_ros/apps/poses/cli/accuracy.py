@@ -11,7 +11,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.assessment.distances import ORDERS, RING_STEP_DEG, SPACING_M, ErrorGroup
@@ -40,6 +39,7 @@ from anser_ros.apps.poses.assessment.source import read_poses
 from anser_ros.apps.poses.cli.pose_source import add_source_options, source_of
 from anser_ros.apps.poses.corrector import as_document
 from anser_ros.apps.poses.sequence import missing_words
+from anser_ros.arrays import Array
 from anser_ros.cli.output import (
     Result,
     Tell,
@@ -63,8 +63,6 @@ from anser_ros.cli.page import (
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.wire.text_files import numbers_of, read_rows
-
-Array = NDArray[np.float64]
 
 SEED = 1
 """Seed of the resamples, so that the same recordings give the same intervals."""

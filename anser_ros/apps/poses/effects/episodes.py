@@ -4,15 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anser_ros.apps.poses.effect import PoseEffect
 from anser_ros.apps.poses.problem import PoseResiduals, Sensing
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.field.model import EffectRecord
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
 WINDOWS, FEWEST_WINDOWS, WINDOW_S = 40, 15, 1.0
 """Windows of time that a session is cut into: an episode of a twentieth is seen in two. A long
@@ -53,7 +52,7 @@ def window_count(residuals: PoseResiduals) -> int:
     return int(np.clip(poses // POSES_OF_WINDOW, FEWEST_WINDOWS, most))
 
 
-def windows_of(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.int64]:
+def windows_of(sensing: Sensing, residuals: PoseResiduals) -> Integers:
     """Return the window of each pose of a sensor that counts; -1 for the others."""
     share = (sensing.view.time - residuals.setting.start) / max(residuals.setting.duration, 1e-9)
     count = window_count(residuals)
@@ -155,7 +154,7 @@ def _lasts(runs: Sequence[int], count: int) -> bool:
 
 
 def _place_of(
-    sensing: Sensing, window: NDArray[np.int64], high: Sequence[int], is_off: Mask
+    sensing: Sensing, window: Integers, high: Sequence[int], is_off: Mask
 ) -> Array | None:
     """The place (3,), m, of what a sensor passes, and is off whenever it does; None for none.
 

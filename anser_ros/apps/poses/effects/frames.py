@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import (
@@ -22,10 +21,9 @@ from anser_ros.apps.poses.effect import (
 )
 from anser_ros.apps.poses.effects.episodes import LooseMount
 from anser_ros.apps.poses.sequence import OpticalPath, filtered
+from anser_ros.arrays import Array
 from anser_ros.effects.base import Remedy
 from anser_ros.field.model import EffectRecord
-
-Array = NDArray[np.float64]
 
 
 class FrameConvention(PoseEffect):

@@ -3,21 +3,20 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from anser_ros.apps.poses.effect import PoseEffect
 from anser_ros.apps.poses.effects.episodes import in_episode
 from anser_ros.apps.poses.problem import PoseResiduals, Sensing, jitter, stamp_step
 from anser_ros.apps.poses.sequence import PoseSequence, PoseSession, jumping_poses
+from anser_ros.arrays import Array, Booleans
 from anser_ros.diagnosis.decisions import FEWEST_OUTLIERS
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S
 from anser_ros.sessions.plausibility import FROZEN_S
 
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
-Array = NDArray[np.float64]
 
 FEWEST_STALE = 0.02
 """Share (0 to 1) of poses of a moving body from which repeats are named: one in 60 comes again
@@ -168,7 +167,7 @@ def _leaping(reference: PoseSequence | None) -> list[EffectRecord]:
     return [EffectRecord(PoseOutliers.name, values, {'fraction': sigma})]
 
 
-def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
+def _moving(poses: PoseSequence) -> Booleans:
     """Where a body moves between poses, judged by those some before and after."""
     n = poses.size
     before = np.maximum(np.arange(n) - NEAR, 0)
