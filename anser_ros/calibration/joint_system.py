@@ -25,8 +25,6 @@ from anser_ros.calibration.readings import DipoleSites, basis_rows, flux_slopes,
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
 from anser_ros.field.measurements import Measurements
 
-Index = Integers
-
 LEAST_MOST_MODES, MOST_MODES = 160, 240
 """Modes of the field at most, for a scan of minutes and for a short one. What 160 miss of a wide
 board's field passes for 0.1 mm of lever arm, with a poor camera."""
@@ -267,7 +265,7 @@ class Eliminated:
         power = (self.scores**2).sum(axis=0) * count / max(count - 1, 1)
         return np.asarray(power / np.maximum(np.diag(self.information), 1e-300))
 
-    def likelihood(self, values: Array, kinds: Sequence[Index]) -> tuple[Array, Array]:
+    def likelihood(self, values: Array, kinds: Sequence[Integers]) -> tuple[Array, Array]:
         """Return information (Q, Q) of the parameters, and its product with their best values.
 
         ``values`` (Q,): the present ones. ``kinds``: indices of parameters of a kind: those whose

@@ -16,8 +16,6 @@ import scipy.linalg
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.parallel import in_order, slices
 
-Index = Integers
-
 RIGHT_SCALE = 1e9
 """Factor of the right-hand sides in a Gram matrix: fluxes are then of a size with the columns."""
 
@@ -34,7 +32,7 @@ class TriangularFactor:
         stack = np.concatenate([self.triangle, np.concatenate([matrix, right], axis=1)])
         self.triangle = np.asarray(np.linalg.qr(stack, mode='r'))
 
-    def spectrum(self, some: Index | None = None) -> 'Spectrum':
+    def spectrum(self, some: Integers | None = None) -> 'Spectrum':
         """Return the singular value decomposition of the column-scaled problem.
 
         ``some``: the unknowns that there are; all by default.
@@ -64,7 +62,7 @@ class GramFactor:
         block = np.concatenate([matrix, right * RIGHT_SCALE], axis=1)
         self.gram += block.T @ block
 
-    def spectrum(self, some: Index | None = None) -> 'Spectrum':
+    def spectrum(self, some: Integers | None = None) -> 'Spectrum':
         """Return the same by eigenvectors."""
         rows = np.arange(self.unknowns) if some is None else some
         n, total = rows.size, self.unknowns

@@ -25,8 +25,6 @@ from anser_ros.calibration.sensor_parameters import (
 )
 from anser_ros.field.measurements import Measurements
 
-Index = Integers
-
 WIDTH_STEPS = 40
 """Fixed-point steps of the widths; they settle within some ten."""
 NARROWEST = {'gains': 1e-6, 'delays': 1e-12, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9}
@@ -105,7 +103,9 @@ class Population:
     def __init__(self, parameters: SensorParameters) -> None:
         self.parameters = parameters
         self.groups = parameters.groups()
-        self.alone: dict[str, Index] = {kind: np.zeros(0, dtype=np.int64) for kind in POPULATIONS}
+        self.alone: dict[str, Integers] = {
+            kind: np.zeros(0, dtype=np.int64) for kind in POPULATIONS
+        }
 
     def fit(self, likelihood: Likelihood, fixed: Sequence[str] = ()) -> Posterior:
         """Return the parameters with the most probable widths; ``fixed`` kinds stay at zero."""
@@ -307,16 +307,10 @@ def alike_sigma_m(
     jitter of poses has no part in it.
     For each of the measurements, ``steps`` (F, 6) to where the fluxes put the poses.
     """
-    place, time, step, of = (
-        np.concatenate(each)
-        for each in zip(
-            *(
-                (m.position[k], m.time[k], s[k, :3], np.full(int(k.sum()), i))
-                for i, (m, s, k) in enumerate(zip(parts, steps, kept, strict=True))
-            ),
-            strict=True,
-        )
-    )
+    place = np.concatenate([m.position[k] for m, k in zip(parts, kept, strict=True)])
+    time = np.concatenate([m.time[k] for m, k in zip(parts, kept, strict=True)])
+    step = np.concatenate([s[k, :3] for s, k in zip(steps, kept, strict=True)])
+    of = np.repeat(np.arange(len(parts)), [int(k.sum()) for k in kept])
     if len(place) <= NEAREST:
         return 0.0
     distance, row = cKDTree(place).query(place, NEAREST + 1)

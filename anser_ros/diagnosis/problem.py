@@ -21,9 +21,6 @@ from anser_ros.parallel import in_order, slices, slices_of
 from anser_ros.physics.dipole import field_basis, flux_basis
 from anser_ros.settings import Accuracy
 
-Mask = Booleans
-
-
 REFERENCE_CHANGE = 0.01
 """Relative error of the change that a reference sensor with the default survey errors sees."""
 CHANGE_LENGTH_M = 0.03
@@ -176,7 +173,7 @@ class Problem:
     fields: Fields
     apparatus: Apparatus
     spread: Spread
-    good: tuple[Mask, ...]  # (F, S), values that take part (valid, and no outliers)
+    good: tuple[Booleans, ...]  # (F, S), values that take part (valid, and no outliers)
     # (F, S), by how much a modelled flux may be off where the model's scan has gaps, T a
     # component.
     gaps_t: tuple[Array, ...]

@@ -11,8 +11,6 @@ from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, tool_parts
 from anser_ros.effects.effect import Family
 
-Mask = Booleans
-
 WINDOW = 11
 """Neighbouring frames whose median an outlier stands out from: up to five bad ones in a row."""
 
@@ -59,7 +57,7 @@ def _ratio(usual: float, values: int) -> float:
     return max(usual, float(chdtri(values, decisions.RARE)) / values)
 
 
-def _stands_out(values: Array, ratio: float) -> Mask:
+def _stands_out(values: Array, ratio: float) -> Booleans:
     """Above ``ratio`` times the median of the neighbours in time, and above noise."""
     local = median_filter(values, size=(WINDOW, 1), mode='nearest')
     return np.asarray(values > ratio * np.maximum(local, 1.0))

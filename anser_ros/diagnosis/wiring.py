@@ -29,8 +29,6 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
 
-Mask = Booleans
-
 
 @dataclass(frozen=True)
 class _Readings:
@@ -39,10 +37,12 @@ class _Readings:
     channels: Integers  # (S,)
     seen: ComplexArray  # (F, S, K), T
     wanted: ComplexArray  # (F, S, K), T
-    driven: Mask  # (S,), sensors that receive anything
+    driven: Booleans  # (S,), sensors that receive anything
 
     @staticmethod
-    def of(tool: Measurements, good: Mask, terms: Sequence[Term], fields: Fields) -> '_Readings':
+    def of(
+        tool: Measurements, good: Booleans, terms: Sequence[Term], fields: Fields
+    ) -> '_Readings':
         wanted = np.where(good[..., None], tool_view(tool, terms, fields).flux, 0.0)
         seen = np.where(good[..., None], tool.flux, 0.0)
         return _Readings(tool.sensors.channel, seen, wanted, ~_silent(seen, wanted))
@@ -63,8 +63,8 @@ def _power(values: ComplexArray, axes: tuple[int, ...] = (0, 1, 2)) -> Array:
     return np.asarray(np.sum(np.abs(values) ** 2, axis=axes))
 
 
-def _silent(seen: ComplexArray, wanted: ComplexArray) -> Mask:
-    """Mask (S,) of sensors with hardly any of the reading that they should have."""
+def _silent(seen: ComplexArray, wanted: ComplexArray) -> Booleans:
+    """Booleans (S,) of sensors with hardly any of the reading that they should have."""
     power, expected = _power(seen, (0, 2)), _power(wanted, (0, 2))
     return np.asarray((power < decisions.DEAD**2 * expected) & (expected > 0))
 
@@ -228,12 +228,9 @@ def _climbed(start: Array, together: Array) -> Array:
 def _quarter_turns(channels: Integers) -> list[Term]:
     """The quarter turns of a body with these channels, the least first."""
     group = sorted(Rotation.create_group('O'), key=lambda one: round(float(one.magnitude()), 6))
-    found: list[Term] = []
-    for turn in group[1:]:
-        degrees = tuple(np.round(np.degrees(turn.as_rotvec()), 6).tolist())
-        site: Site = {'channels': tuple(channels.tolist()), 'rotation_deg': degrees}
-        found.append(Term(BODY_TURNED, site))
-    return found
+    turns = [np.round(np.degrees(turn.as_rotvec()), 6).tolist() for turn in group[1:]]
+    own = tuple(channels.tolist())
+    return [Term(BODY_TURNED, {'channels': own, 'rotation_deg': tuple(turn)}) for turn in turns]
 
 
 def _turns(plain: _Readings, read: Callable[[Sequence[Term]], _Readings]) -> Iterator[list[Term]]:
@@ -259,7 +256,7 @@ def _likeness(pairs: Sequence[tuple[ComplexArray, ComplexArray]]) -> Array:
     return np.asarray(cross / np.sqrt(np.maximum(np.outer(own, power), 1e-300)))
 
 
-def _moved(alike: Array, is_driven: Mask) -> Integers:
+def _moved(alike: Array, is_driven: Booleans) -> Integers:
     """Rows that are plainly another's; none when they are no permutation."""
     rows = np.arange(len(alike))
     order, own = np.argmax(alike, axis=1), np.diag(alike)
@@ -325,7 +322,7 @@ def _reversed(tools: Sequence[_Readings]) -> list[Term]:
     return found
 
 
-def _is_reversed(seen: ComplexArray, wanted: ComplexArray) -> Mask:
+def _is_reversed(seen: ComplexArray, wanted: ComplexArray) -> Booleans:
     """Which sensors (S,) read minus their prediction, (F, S, K) each."""
     cross, power = np.sum(wanted.conj() * seen, axis=(0, 2)), _power(wanted, (0, 2))
     gain = cross / np.where(power > 0, power, 1.0)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from anser_ros import extensions
-from anser_ros.arrays import Array, Booleans, ComplexArray
+from anser_ros.arrays import Booleans, ComplexArray
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
 from anser_ros.calibration.disturbances import (
     at_strength,
@@ -43,8 +43,6 @@ from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
 from anser_ros.wire.setup import Setup
 
-Mask = Booleans
-
 MOTION_MARGIN_S = 1.0
 """Time (s) before and after a motion that is looked at: it begins before it is seen."""
 FEWEST_STEADY = 10
@@ -55,8 +53,7 @@ ASIDE = 0.3
 """Distance of a look's free dipoles at the wiring from each emitter's middle, in its sides."""
 MOST_UNEXPLAINED = 0.05
 """Share of most readings that a calibration leaves at most: good ones leave a thousandth, those of
-a layout that is too coarse a hundredth, wrong signs or poses a tenth and more. Outliers of the
-optics count as any other readings."""
+a layout that is too coarse a hundredth, wrong signs or poses a tenth and more."""
 UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 
@@ -278,7 +275,9 @@ def _fit_as_scan(
     check_single_coils(measurements)
     setup = sessions[0].setup
     generator = replace(generator_of(setup), nominal=NominalBoard.of(setup).model)
-    wrong = scan_faults([with_pose(m) for m in measurements], places_about(generator))
+    around = ASIDE * generator.side_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    places = (generator.centres[:, None] + around).reshape(-1, 3)
+    wrong = scan_faults([with_pose(m) for m in measurements], places)
     measurements = [rightly_wired(m, wrong) for m in measurements]
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
@@ -302,12 +301,6 @@ def _with_faults(scan: Scan, faults: Sequence[Term]) -> Scan:
     tables = [r for r in records if effect_named(r.name).remedy is Remedy.SENSORS]
     signs = [r for r in records if r not in tables]
     return replace(scan, corrections=(*tables, *scan.corrections, *signs))
-
-
-def places_about(generator: Generator) -> Array:
-    """Return where a scan's emitters may be, for a look at its wiring, (P, 3), m."""
-    around = ASIDE * generator.side_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    return np.asarray((generator.centres[:, None] + around).reshape(-1, 3))
 
 
 def check_explained(calibration: Calibration) -> None:

@@ -25,8 +25,6 @@ another solution of the same fluxes. Smaller, and fast tools are scanned for in 
 larger, and a wrong solution near by is followed."""
 MOST_STEPS = 2.5
 """Motion is carried on for so many of the last step's durations."""
-
-
 UNKNOWNS = 5
 """Numbers that a coil's pose has."""
 SELDOM = 0.1
