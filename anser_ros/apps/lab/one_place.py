@@ -29,8 +29,6 @@ from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import PlacedPoints
 from anser_ros.settings import Accuracy
 
-Mask = Booleans
-
 NOISY = 5.0
 """Times the median noise from which on a sensor is called noisy: two frames of four emitters make
 such a ratio by chance in no sensor of a thousand."""
@@ -214,7 +212,7 @@ def _noisy(channels: Integers, ratio: Array) -> tuple[EffectRecord, ...]:
     )
 
 
-def _unclear(posed: Measurements, fit: SourcesFit, others: Mask) -> tuple[str, ...]:
+def _unclear(posed: Measurements, fit: SourcesFit, others: Booleans) -> tuple[str, ...]:
     """A line for the sensors whose polarity the readings do not determine."""
     rows = np.flatnonzero(others & (fit.sign_evidence >= -LEAST_EVIDENCE))
     if not rows.size:

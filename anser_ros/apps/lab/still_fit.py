@@ -29,11 +29,9 @@ from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.settings import Accuracy
 
 FREEDOM = 4.0
-"""Degrees of freedom of Student's t, the distribution of a channel's readings in a frame: a few
-wild ones lose weight, and the others hardly any."""
+"""Degrees of freedom of Student's t: a few wild readings lose weight, the others hardly any."""
 SHARED = 100.0
-"""How many times tighter an error's sum over all frames is held than the error: what all frames
-share moves the field or turns the sensors."""
+"""How many times tighter errors' sum is held: what all frames share moves the field instead."""
 AT_ONCE = 64
 """Places of a dipole that are judged at a time; each takes three columns for each part."""
 
@@ -216,8 +214,7 @@ NOISE_STEP = 2.0
 MOST_NOISE_STEPS = 20
 """Variations of the noise at most: from any that may be stated to any that is real."""
 DIPOLE_PAYS = 20.0
-"""Log evidence that a free dipole must add: many places were tried, of which the best is always
-better than none."""
+"""Log evidence that a free dipole must add: the best of many places always adds some."""
 MOST_FREE_DIPOLES = 6
 """Free dipoles in addition to the emitters at most; each further one costs a search."""
 REACH = 0.7
@@ -227,8 +224,7 @@ GRID = 0.25
 HALVINGS = 3
 """Refinements of a place, each by half the distance."""
 LEAST_CLEARANCE = 0.05
-"""Least distance of a dipole from every sensor, as a fraction of the sensors' extent: a nearer one
-is felt by one sensor alone, and is that sensor's."""
+"""Least distance of a dipole from sensors, in their extent: a nearer one is one sensor's error."""
 SIZES = (1e-3, 1e-2, 1e-1, 1.0)
 """Expected sizes of a free dipole's field at the nearest sensor, relative to the fluxes."""
 
@@ -276,11 +272,10 @@ class StillFitter:
         self.with_beside = functools.cache(self._with_beside)
 
     def _around(self, centres: Array) -> tuple[DipoleSites, Array]:
-        """Return dipoles about each emitter, and how large their moments may be.
+        """Dipoles about each emitter, and how large their moments may be.
 
-        One dipole finds an emitter's place. Six more about it, at a distance that is small
-        compared with that of the sensors, make the multipoles of its size. All serve all emitters,
-        as the iron of one carries the fields of the others.
+        Six about the one that finds its place make the multipoles of its size. All serve all
+        emitters, as the iron of one carries the fields of the others.
         """
         start = coaxial(centres, np.tile(UNIT_Z, (len(centres), 1)), 1, np.ones(len(centres)))
         weights = [usable_weights(self.measurements)]

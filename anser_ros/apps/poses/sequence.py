@@ -15,8 +15,6 @@ from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.stamps import NANO, Order, order_of
 
-Mask = Booleans
-
 REFERENCE = 'optical'
 """Name of the reference among a session's streams."""
 FARTHEST = 1e6
@@ -65,7 +63,7 @@ class PoseSequence:
         )
 
     @property
-    def repeated(self) -> Mask:
+    def repeated(self) -> Booleans:
         """Return the mask (n,) of poses that are those before them, number for number."""
         same = (np.diff(self.position, axis=0) == 0).all(axis=1)
         same &= (np.diff(self.quaternion, axis=0) == 0).all(axis=1)
@@ -106,7 +104,7 @@ class PoseSession:
         return {**self.sensors, **({} if reference is None else {REFERENCE: reference})}
 
 
-def jumping_poses(poses: PoseSequence) -> Mask:
+def jumping_poses(poses: PoseSequence) -> Booleans:
     """Return the mask (n,) of poses, at most a few in a row, that leap away from their neighbours.
 
     A marker found in its second solution does this: it is far away between two poses that agree.
@@ -271,7 +269,7 @@ class OpticalPath:
                 slopes[a:b] = np.gradient(values[a:b], time[a:b], axis=0)
         return cls(time, gap, is_at_rest, CubicHermiteSpline(time, values, slopes))
 
-    def at(self, time: Array) -> tuple[Array, Array, Array, Mask]:
+    def at(self, time: Array) -> tuple[Array, Array, Array, Booleans]:
         """Return positions (n, 3), rotations (n, 3, 3), velocities (n, 6) in the optical frame,
         validity.
 
@@ -291,7 +289,7 @@ class OpticalPath:
             valid = valid & self.source._valid(time)
         return values[:, :3], matrices, velocity, valid
 
-    def _valid(self, time: Array) -> Mask:
+    def _valid(self, time: Array) -> Booleans:
         """Where it is interpolated: between poses that are near each other."""
         right = np.clip(np.searchsorted(self.knots, time, side='left'), 1, self.knots.size - 1)
         inside = (time >= self.knots[0]) & (time <= self.knots[-1])

@@ -11,8 +11,6 @@ from anser_ros.apps.poses.problem import PoseResiduals, Sensing
 from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.field.model import EffectRecord
 
-Mask = Booleans
-
 WINDOWS, FEWEST_WINDOWS, WINDOW_S = 40, 15, 1.0
 """Windows of time that a session is cut into: an episode of a twentieth is seen in two. A long
 session has more, of a second, which a hand takes to pass a thing. A slow tracker has fewer; of
@@ -154,7 +152,7 @@ def _lasts(runs: Sequence[int], count: int) -> bool:
 
 
 def _place_of(
-    sensing: Sensing, window: Integers, high: Sequence[int], is_off: Mask
+    sensing: Sensing, window: Integers, high: Sequence[int], is_off: Booleans
 ) -> Array | None:
     """The place (3,), m, of what a sensor passes, and is off whenever it does; None for none.
 
@@ -178,7 +176,7 @@ def _place_of(
     return middle if is_off_there and is_right_elsewhere and is_inside else None
 
 
-def in_episode(sensing: Sensing, residuals: PoseResiduals) -> Mask:
+def in_episode(sensing: Sensing, residuals: PoseResiduals) -> Booleans:
     """Return the mask (n,) of a sensor's poses that are in one of its episodes."""
     inside = episode(sensing, residuals).windows
     return np.asarray(np.isin(windows_of(sensing, residuals), inside))
@@ -216,7 +214,7 @@ def _is_alone(sensing: Sensing, residuals: PoseResiduals, runs: list[int]) -> bo
     return bool(others) and max(others) < FAST * error(sensing)
 
 
-def _is_shift(sensing: Sensing, inside: Mask) -> bool:
+def _is_shift(sensing: Sensing, inside: Booleans) -> bool:
     """Whether poses are off or turned the same way, as metal makes them, and not at random."""
     for rows in np.split(sensing.residual[inside], 2, axis=1):
         mean = rows.mean(axis=0)
