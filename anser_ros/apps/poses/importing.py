@@ -412,7 +412,10 @@ def read_pose_session(
         for topic in sorted(streams)
         if topic.startswith(TRACKED) and topic.endswith(ENDING)
     }
-    reference = optical or _only_optical(name, list(streams))
+    optics = [t for t in streams if t.startswith(OPTICAL) and t.endswith(ENDING)]
+    if not optical and len(optics) > 1:
+        raise BagError(f'{name}: several references, name one: {", ".join(sorted(optics))}')
+    reference = optical or next(iter(optics), None)
     topics = [*chosen.values(), *([reference] if reference else [])]
     for topic in topics:
         if topic not in streams:
@@ -432,13 +435,6 @@ def read_pose_session(
     sensors = {label: sequence(label, topic) for label, topic in chosen.items()}
     found = sequence(REFERENCE, reference) if reference else None
     return PoseSession(name, start, sensors, found, salvage.lost)
-
-
-def _only_optical(path: str, topics: list[str]) -> str | None:
-    found = [t for t in topics if t.startswith(OPTICAL) and t.endswith(ENDING)]
-    if len(found) > 1:
-        raise BagError(f'{path}: several references, name one: {", ".join(sorted(found))}')
-    return found[0] if found else None
 
 
 def write_pose_session(path: Path, session: PoseSession) -> None:

@@ -18,8 +18,7 @@ from anser_ros.calibration.readings import FOLDS
 from anser_ros.diagnosis.engine import BlockSums, JointState, block_sums, joined
 
 FILTER_STEP = 0.05
-"""Share of a filter's time constant by which it is changed for differences. Smaller meets the
-filter's grid; larger, its curvature."""
+"""Share of a filter's time constant by which it is changed for differences: its grid is finer."""
 
 
 @dataclass(frozen=True)
@@ -260,15 +259,13 @@ class PoseState(JointState[PoseTerm, PosePart]):
 FINEST_S = 2e-3  # finest step of a poll, s: at 0.5 m/s a finer one moves poses by 0.3 mm rms
 ON_STEP = 0.95  # share of the stamps that lie on a grid for it to be one
 RATE_SHARE = 0.9
-"""Share of the intervals that are one step from which the step may be the tracker's own rate, with
-some poses lost, and no poll's: another clock falls into step for less."""
+"""Share of the intervals of one step from which it may be the tracker's own rate and no poll's."""
 FEWEST_BEATS, ON_BEAT = 4, 0.7
 """Distances between the intervals that are not one step, and the share of them that differ by one
 interval at most, from which they are two clocks' beat; poses lost at random make it once in
 1000."""
 SHARED = 0.05
-"""Share of poses under the stamp of the pose before them from which a grid is a poll's, whatever
-its intervals: a tracker gives each pose a time of its own."""
+"""Share of poses under the stamp before from which a grid is a poll's: a tracker repeats none."""
 
 
 def stamp_step(time: Array) -> float:

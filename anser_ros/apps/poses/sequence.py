@@ -18,8 +18,7 @@ from anser_ros.stamps import NANO, Order, order_of
 REFERENCE = 'optical'
 """Name of the reference among a session's streams."""
 FARTHEST = 1e6
-"""Coordinate, m, from which on it is a device's marker for no pose and no position: no tracker
-sees a thousand kilometres, NDI's marker is 3.7e28."""
+"""Coordinate, m, from which it is a marker for no pose and no position; NDI's is 3.7e28."""
 NO_TURN = 0.1
 """Norm of a quaternion below which it is a marker for no pose; a rounded one has a norm near 1."""
 LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
@@ -27,8 +26,7 @@ LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
 these from each other. A hand that shakes turns back within 5 mm at 20 poses a second."""
 LONGEST_JUMP = 3  # rounds; each takes out one pose of a run, or two from its ends
 NOT_UNIT = 0.05
-"""How far the norm of a quaternion may be from one: four digits are given by the coarsest form.
-Smaller refuses rounded files; larger takes other numbers for quaternions."""
+"""How far the norm of a quaternion may be from one: smaller refuses rounded files."""
 
 
 @dataclass(frozen=True)
@@ -229,8 +227,7 @@ FEWEST_PATH_POSES = 4
 MEDIAN_GAPS = 2.5
 """Gap in median intervals over which a slow reference is interpolated: one pose may be lost."""
 STEPS_A_TAU = 20
-"""Steps of a filter's grid in its time constant. Straight lines between them round off motions;
-eight make the time constant too short by three of its standard deviations."""
+"""Steps of a filter's grid in its time constant: eight make it too short by three sigmas."""
 SMALLEST_STEP_S = 0.002  # grid of a filter, s: a hand moves by 0.2 mm in it
 
 

@@ -508,11 +508,11 @@ def put_back(
 def _merged(
     own: PoseSequence, keep: Booleans, other: PoseSequence, take: Booleans
 ) -> PoseSequence:
-    time = np.concatenate([own.time[keep], other.time[take]])
-    order = np.argsort(time, kind='stable')
-    return replace(
+    left, right = own.rows(keep), other.rows(take)
+    both = replace(
         own,
-        time=time[order],
-        position=np.concatenate([own.position[keep], other.position[take]])[order],
-        quaternion=np.concatenate([own.quaternion[keep], other.quaternion[take]])[order],
+        time=np.concatenate([left.time, right.time]),
+        position=np.concatenate([left.position, right.position]),
+        quaternion=np.concatenate([left.quaternion, right.quaternion]),
     )
+    return both.rows(np.argsort(both.time, kind='stable'))
