@@ -30,8 +30,7 @@ from anser_ros.physics.sensor import PlacedPoints
 from anser_ros.settings import Accuracy
 
 NOISY = 5.0
-"""Times the median noise from which on a sensor is called noisy: two frames of four emitters make
-such a ratio by chance in no sensor of a thousand."""
+"""Times the median noise to be called noisy: chance in no sensor of a thousand with two frames."""
 FEWEST_SCATTERS = 4
 """Degrees of freedom of a sensor's scatter from which on it is called noisy."""
 WORDS = 'a three-component dipole for every emitter, place free, and {} of their stray fields'

@@ -25,7 +25,7 @@ STUDENT_FREEDOM = 4.0
 REWEIGHTINGS = 5
 """Fits of a robust fit after the first: fewer leave bad poses some of their first weight."""
 STANDS_OUT, FAR_OUT = 7.0, 25.0
-"""Distances of a pose from its prediction, in spreads, to stand out where few and where many do."""
+"""Distances of a pose from its prediction, in spreads, to stand out: where few do, and many."""
 FEW_SHARE = 0.03
 """Share of a sensor's poses up to which those that stand out are few: between one window and the
 two that metal must be near to be named (`episodes.WINDOWS`)."""
@@ -209,7 +209,7 @@ LEAST_JITTER_RAD = 1e-5  # no reference measures turns better; none at all has n
 FEWEST_TURNS = 20  # poses that tell a reference's jitter, to 16 %
 MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
 LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
-"""Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given."""
+"""Standard deviation of a lever arm's component, m, or turn, rad, beyond which it is not given."""
 MUCH_TILT = 0.15
 """Turns, rad rms, that move a lever arm of 5 cm by 8 mm, as much as a slow filter does a hand."""
 HARDLY_DETERMINED_M = 0.022

@@ -18,7 +18,7 @@ from anser_ros.calibration.readings import FOLDS
 from anser_ros.diagnosis.engine import BlockSums, JointState, block_sums, joined
 
 FILTER_STEP = 0.05
-"""Share of a filter's time constant by which it is changed for differences: its grid is finer."""
+"""Share of a filter's time constant by which it is changed for differences, above its grid."""
 
 
 @dataclass(frozen=True)

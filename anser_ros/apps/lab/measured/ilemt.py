@@ -80,16 +80,15 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
         )
         setup = Setup('fg', 1.0, Emitter(f'{NAME}_{name}', {}, coils), sensors, VOLUME, STATED)
         for pattern in ('md', 'ld'):
-            flux, position, quaternion = [], [], []
+            flux, held = [], []
             for fixture in FIXTURES:
                 file = existing(folder / where / f'soYoutZup_se{fixture}_{pattern}.npz')
                 with np.load(file) as kept:
                     flux.append(TESLA * kept['coupling'][:, band])
-                    place, turn = poses(kept['stage'], fixture)
-                position.append(place)
-                quaternion.append(turn)
+                    held.append(poses(kept['stage'], fixture))
             bags.append(into / f'{NAME}_{name}_{pattern}.mcap')
-            at = {BODY: (np.concatenate(position), np.concatenate(quaternion))}
+            position, quaternion = (np.concatenate(part) for part in zip(*held, strict=True))
+            at = {BODY: (position, quaternion)}
             write_frames(bags[-1], setup, np.concatenate(flux), at)
     return bags
 

@@ -17,7 +17,7 @@ two. A long session has more, of a second, which a hand takes to pass a thing.""
 FEWEST_POSES_OF_WINDOW = 4  # poses that a window needs to be judged: fewer may be outliers
 POSES_OF_WINDOW = 4.5  # on average, so that most windows can be judged
 TIMES = 9.0
-"""Squared error over the median window's of an episode: places hardly make three times the error."""
+"""Squared error of an episode over the median window's: the range of places hardly makes it."""
 LONGEST = 0.4
 """Share (0 to 1) of the windows that episodes may be: the median window must be a quiet one."""
 ALIKE = 0.4  # share of a window's squared error that its mean must be; noise has a small one
@@ -28,9 +28,9 @@ STRETCH, FILLED = 0.15, 0.8
 """Share of the windows that an episode of one sensor alone must span where its places were visited
 at no other time, and the share of these that are in it: no hand stays so long in a distortion."""
 FEWEST_VISITS, ALWAYS, SELDOM, FARTHER = 2, 0.6, 0.1, 90
-"""Visits to a place that makes the episodes; shares of these that are there, and of the poses there
-that are off; share of those elsewhere that may be; percentile of the right poses' distances that
-it must be nearer than: the edge of the volume errs without metal."""
+"""Visits to a place that makes the episodes; shares of these there, and of the poses there that
+are off; share of those elsewhere that may be; percentile of the right poses' distances, of which
+it must be nearer: the edge of the volume errs without metal."""
 NEIGHBOURS = 3  # windows by which those of one episode are apart at most
 PASSED = 'metal stands at one place, and the sensors are off whenever they pass it'
 LOOSE, FAST = 0.5, 0.25
@@ -68,9 +68,8 @@ def _sizes(
     """Squared errors of places and of turns over those of the median window: of poses (n, 2), and
     of the means of windows (2,), in which jitter cancels.
 
-    Frames go a little way with an episode, so errors count from the middle of the windows; or
-    beside the other sensors, whose clock and reference are the same, so that no error of these is
-    in the means.
+    Errors count from the middle of the windows, as frames go a little way with an episode; or
+    beside the other sensors, which have the same clock and reference.
     """
     window, errors = windows_of(sensing, residuals), sensing.residual
     if not is_beside:  # without what errors of the stamps make
