@@ -110,8 +110,7 @@ TRIAL_S, SEARCH_AGAIN_S = 1.0, 1.0
 """How long they are followed, which is also the longest time without readings for which metal is
 still known to be there, and how long a search that found nothing is not repeated."""
 CERTAIN = 10.0
-"""Logarithm of how much more likely the chosen one must make the readings than no metal, or metal
-`ELSEWHERE_M` away."""
+"""Log likelihood of the chosen one over that of no metal, or of metal `ELSEWHERE_M` away."""
 ELSEWHERE_M = 0.04
 """Distance from which on two tracks are of different places, m."""
 DOUBTFUL, HOPELESS = 3.0, 9.0

@@ -18,7 +18,7 @@ import scipy.linalg
 from scipy.spatial import cKDTree
 
 from anser_ros.apps.lab.still_model import POSE, Columns, StillModel, StillUnknowns
-from anser_ros.arrays import Array, Booleans, ComplexArray
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.layouts import SPREAD, UNIT_Z, coaxial, fit_coaxial
 from anser_ros.calibration.moments import FitFigures
 from anser_ros.calibration.population import LEAST_EVIDENCE
@@ -162,16 +162,16 @@ class StillSystem:
         left = rest - np.einsum('sra,sa->sr', columns.own, own)
         self.residual = left.reshape(self.sensors, parts, self.frames).transpose(2, 0, 1)
 
-    def student_weights(self, usable: Booleans) -> Array:
+    def student_weights(self) -> Array:
         """Return weights (F, S) of the readings by what is left of them; 0 where unusable."""
         parts = self.model.parts
         size = (self.residual**2).sum(axis=2) / self.widths.noise_t**2
-        return np.where(usable, student_weight(size, parts), 0.0)
+        return np.where(self.model.usable, student_weight(size, parts), 0.0)
 
-    def log_evidence(self, usable: Booleans) -> float:
+    def log_evidence(self) -> float:
         """Return Laplace's approximation of the log evidence, up to a constant of the readings."""
         parts, noise = self.model.parts, self.widths.noise_t
-        size = (self.residual**2).sum(axis=2)[usable] / noise**2
+        size = (self.residual**2).sum(axis=2)[self.model.usable] / noise**2
         fit = -0.5 * (FREEDOM + parts) * float(np.log1p(size / FREEDOM).sum())
         fit -= parts * size.size * np.log(noise)
         penalty = float(self.values @ self.prior @ self.values)
@@ -353,14 +353,14 @@ class StillFitter:
             now = system.solution
             sites = self._moved(sites, system.steps)
             if step < STILL_STEPS - 1:
-                weights = system.student_weights(model.usable)
+                weights = system.student_weights()
             if 2 <= step < STILL_STEPS - 2:
                 widths = self._learnt(system, beside)
         determined = 1.0 - system.moment_variance / widths.moments[:, None] ** 2
         return StillFit(
             model, sites, beside, now, np.sqrt(system.sensor_variance),
             np.sqrt(system.frame_variance), widths, weights,
-            float(determined.sum(axis=0).mean()), system.log_evidence(model.usable), {},
+            float(determined.sum(axis=0).mean()), system.log_evidence(), {},
         )  # fmt: skip
 
     def _moved(self, sites: DipoleSites, steps: Array) -> DipoleSites:

@@ -21,7 +21,7 @@ from anser_ros.diagnosis.engine import JointFit, descended, stepped
 from anser_ros.effects.effect import sigmas
 
 STUDENT_FREEDOM = 4.0
-"""Degrees of freedom of Student's distribution by which poses are weighted in a robust fit."""
+"""Degrees of freedom of Student's t in a robust fit, between the mean (infinite) and Cauchy (1)."""
 REWEIGHTINGS = 5
 """Fits of a robust fit after the first: fewer leave bad poses some of their first weight."""
 STANDS_OUT, FAR_OUT = 7.0, 25.0
@@ -31,7 +31,7 @@ FEW_SHARE = 0.03
 two that metal must be near to be named (`episodes.WINDOWS`)."""
 SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
 FEWEST_BLOCKS = 10
-"""Blocks by whose scores the variance of a time beside a poll is judged; fewer are no course."""
+"""Blocks by whose scores the variance of a time beside a poll is judged; fewer show no course."""
 SLOW = 6
 """Tapers of a slow course: fewer take chance for accuracy, more are as quick as a poll's teeth."""
 CHANCE = 0.01

@@ -199,7 +199,7 @@ MOST_RESTARTS = 5
 """Falls of a counter in a recording that may be restarts; with more, rows are in no order."""
 LATEST_S = 9e9
 """Latest time, s: stamps in ns have no room for more in 63 bits."""
-STAMPS = 'host', 'device'  # which time becomes the stamp; the other where a file lacks the one
+STAMPS = ('host', 'device')  # which time becomes the stamp; the other where a file lacks the one
 
 
 def import_poses(
@@ -356,7 +356,9 @@ def _restarts(counter: Array) -> Integers:
     known = np.flatnonzero(np.isfinite(counter))
     falls = np.zeros(counter.size, dtype=np.int64)
     falls[known[1:]] = np.diff(counter[known]) < -1.0
-    return np.asarray(np.cumsum(falls) if falls.sum() <= MOST_RESTARTS else np.zeros_like(falls))
+    if falls.sum() > MOST_RESTARTS:
+        return np.zeros_like(falls)
+    return np.asarray(np.cumsum(falls))
 
 
 def _continued(counter: Array) -> Array:

@@ -39,9 +39,9 @@ poses by `LARGE_M`. Chosen on recordings with and without metal."""
 LARGE_M = 1.5e-3
 """Error, m, that no tracker has of itself: data sheets say 0.5 to 1.4 mm."""
 SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
-"""The same of a scale of one sensor alone, which is few numbers and follows hardly anything."""
+"""The same of a scale of one sensor, which follows hardly anything: more below `SCALE_M`."""
 LEAST_MAP_M = 0.5e-3
-"""How far a map must move poses, m rms: no tracker claims a smaller error of itself."""
+"""Least that a map moves poses and takes off their errors, m rms: no tracker claims less."""
 
 LEAST_SCALE_SIGMAS = 5.0
 """Sigmas by which a scale differs from one, or a sensor's clock from others: chance, 1 in 250."""

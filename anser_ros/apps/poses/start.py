@@ -38,7 +38,7 @@ FAR_STEP_S, FASTEST = 0.1, 3e-3
 """Step, s, of looks beyond that range and at clocks that run apart, by this share at most."""
 LEAST_OVERLAP = 0.25  # share of the poses that must have a reference at an offset
 ALIKE, UNLIKE = 0.8, 0.2
-"""Correlation of one body's motions at the right time (chance: 0.5), and its least growth."""
+"""Correlation of one body's motions at the right time (chance: 0.5), and how much it must gain."""
 HAND_S = 0.3  # time, s, in which a hand turns and moves by what it is told by
 COARSE_OFFSET_MISFIT = 0.8
 """Share of the misfit at no offset below which a coarse offset is taken; chance takes off 6 %."""

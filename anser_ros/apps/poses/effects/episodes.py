@@ -29,8 +29,8 @@ STRETCH, FILLED = 0.15, 0.8
 at no other time, and the share of these that are in it: no hand stays so long in a distortion."""
 FEWEST_VISITS, ALWAYS, SELDOM, FARTHER = 2, 0.6, 0.1, 90
 """Visits to a place that makes the episodes; shares of these there, and of the poses there that
-are off; share of those elsewhere that may be; percentile of the right poses' distances, of which
-it must be nearer: the edge of the volume errs without metal."""
+are off; share of those elsewhere that may be; percentile of the right poses' distances that it
+must be nearer than: the edge of the volume errs without metal."""
 NEIGHBOURS = 3  # windows by which those of one episode are apart at most
 PASSED = 'metal stands at one place, and the sensors are off whenever they pass it'
 LOOSE, FAST = 0.5, 0.25
