@@ -21,7 +21,7 @@ from anser_ros.diagnosis.engine import JointFit, descended, stepped
 from anser_ros.effects.effect import sigmas
 
 STUDENT_FREEDOM = 4.0
-"""Degrees of freedom of Student's t in a robust fit, between the mean (infinite) and Cauchy (1)."""
+"""Degrees of freedom of Student's t in robust fits: between the mean (infinite) and Cauchy (1)."""
 REWEIGHTINGS = 5
 """Fits of a robust fit after the first: fewer leave bad poses some of their first weight."""
 STANDS_OUT, FAR_OUT = 7.0, 25.0
