@@ -47,8 +47,7 @@ POINT, SIZED = COAXIAL[:2]
 STILL = 5.0
 """Standard deviations of the optical jitter within which all poses are one place."""
 LEAST_SIGMAS = 5.0
-"""Standard deviations, of five blocks, at which a size is reported: chance in one emitter of
-130."""
+"""Standard deviations, of five blocks, at which a size is reported: chance in one of 130."""
 STEPS = 4
 """Steps of the fit, each of which leaves a small part of the error before it."""
 WAYS = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-4, 1e-7])

@@ -44,8 +44,7 @@ from anser_ros.tracking.tracker import Tracker
 SPACING_M = 0.08
 """Of the places that are tried: about what a track finds back from."""
 APART_M = 0.15
-"""Distance of starts from each other, m: two that are nearer lead to the same place, and show
-nothing of whether another place explains the readings as well."""
+"""Distance of starts from each other, m: two that are nearer lead to the same place."""
 AT_ONCE = 64
 """Places that are worked out at once."""
 BEYOND_M = 0.4
@@ -111,13 +110,11 @@ TRIAL_S, SEARCH_AGAIN_S = 1.0, 1.0
 """How long they are followed, which is also the longest time without readings for which metal is
 still known to be there, and how long a search that found nothing is not repeated."""
 CERTAIN = 10.0
-"""Logarithm of how much more likely the chosen one must make the readings than no metal, or metal
-`ELSEWHERE_M` away."""
+"""Log likelihood of the chosen one over that of no metal, or of metal `ELSEWHERE_M` away."""
 ELSEWHERE_M = 0.04
 """Distance from which on two tracks are of different places, m."""
 DOUBTFUL, HOPELESS = 3.0, 9.0
-"""Squared misfit, over what is expected, from which on no pose is given, and the track is given
-up."""
+"""Squared misfit, over the expected one, at which no pose is given, and the track is given up."""
 MISFIT_MEMORY_S = 0.5
 """Time over which the misfit is averaged."""
 STRONGER, NEARER = 1.25, 0.8

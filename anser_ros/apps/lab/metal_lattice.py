@@ -240,8 +240,7 @@ lattice is not the metal's true shape."""
 SAMPLES = 3, 3
 """Samples across and up the volume where the effect of answers on the field is compared."""
 LARGEST_M, FARTHEST_M = 2.0, 3.0
-"""Largest body, and farthest place, that a file may state: more is a file in millimetres, and the
-search for the metal would not end."""
+"""Largest body, and farthest place, m, that a file may state: more is a file in millimetres."""
 EVERY = 8
 """Of the poses of the fit, for the same."""
 

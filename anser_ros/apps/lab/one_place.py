@@ -29,11 +29,8 @@ from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import PlacedPoints
 from anser_ros.settings import Accuracy
 
-Mask = Booleans
-
 NOISY = 5.0
-"""Times the median noise from which on a sensor is called noisy: two frames of four emitters make
-such a ratio by chance in no sensor of a thousand."""
+"""Times the median noise to be called noisy: chance in no sensor of a thousand with two frames."""
 FEWEST_SCATTERS = 4
 """Degrees of freedom of a sensor's scatter from which on it is called noisy."""
 WORDS = 'a three-component dipole for every emitter, place free, and {} of their stray fields'
@@ -214,7 +211,7 @@ def _noisy(channels: Integers, ratio: Array) -> tuple[EffectRecord, ...]:
     )
 
 
-def _unclear(posed: Measurements, fit: SourcesFit, others: Mask) -> tuple[str, ...]:
+def _unclear(posed: Measurements, fit: SourcesFit, others: Booleans) -> tuple[str, ...]:
     """A line for the sensors whose polarity the readings do not determine."""
     rows = np.flatnonzero(others & (fit.sign_evidence >= -LEAST_EVIDENCE))
     if not rows.size:

@@ -19,8 +19,6 @@ from anser_ros.calibration.readings import DipoleSites
 from anser_ros.errors import FitError
 from anser_ros.physics.sensor import PlacedPoints
 
-Mask = Booleans
-
 KINDS = ('places', 'axes', 'gains')
 """Kinds of sensors' errors whose widths are found where they are asked for: m, rad, relative."""
 START = {'places': 1e-3, 'axes': 0.03, 'gains': 0.03}
@@ -59,7 +57,7 @@ class SourceReadings:
     points: PlacedPoints  # of the sensors
     flux: Array  # (S, K, C): the C real parts of each source's flux, T
     noise_t: Array  # (S,): noise of a part, T
-    used: Mask  # (S,)
+    used: Booleans  # (S,)
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class _OneEmitter:
     points: PlacedPoints
     flux: Array  # (S, C), T
     noise_t: Array
-    used: Mask
+    used: Booleans
     widths: dict[str, float] | None
 
     def left(self, source: LocatedSource) -> Array:

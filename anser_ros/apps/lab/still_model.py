@@ -25,8 +25,7 @@ from anser_ros.physics.sensor import SensorTable
 DEGREE = 4
 """Degree of the polynomial: that of a plate under an even load, whose bend has fourth powers."""
 FLAT = 0.02
-"""Thickness (rms) of a body's cloud of sensors, as a fraction of its extent (rms), up to which it
-is a plate. A thicker body has no one surface whose lift would move all of its sensors."""
+"""Thickness (rms) of a body's cloud of sensors, over its extent (rms), of a plate at most."""
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ TURNS_SHARE, TURNED_SHARE = 0.8, 0.7
 order although places fit: recordings that were read wrongly left 0.57 to 0.69 and 0.43 to 0.51."""
 FEW_POSES = 150  # poses of a sensor that a reading is judged by, a fit each: a median needs few
 HOPELESS_M = 25e-3
-"""Median misfit, m, with which no reading fits and a session is refused: as much as a wrong
-reading makes at least (`POOR_M`)."""
+"""Median misfit, m, at which a session is refused: a wrong reading makes as much (`POOR_M`)."""
 CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])  # of x y z w: the inverse turn
 UNITS = {
     **LENGTH_M, 'km': 1e3, 'inch taken for mm': 25.4, 'mm taken for inch': 1 / 25.4,

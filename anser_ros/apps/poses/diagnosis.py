@@ -50,8 +50,7 @@ from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 
 FEWEST_RECORDINGS = 8
-"""Recordings at rest from which each is judged by a fit of others: of fewer the rest does not
-determine all frames."""
+"""Recordings at rest from which each is judged by a fit of others: fewer leave frames open."""
 
 
 @dataclass(frozen=True)
@@ -213,8 +212,7 @@ def _groups(part: PosePart, used: Booleans, name: str) -> Integers:
 
 
 ABOVE_FLOOR = 1.3
-"""Factor of the held-out error over the jitter from which something stays unexplained. What is no
-jitter is then 0.8 of it (the root of 1.3 squared less one)."""
+"""Factor of the held-out error over the jitter from which something stays unexplained."""
 
 LEAST_REPORTED_M = 0.3e-3
 """Held-out error, m, below which nothing is said to be unexplained: no tracker promises less. Of

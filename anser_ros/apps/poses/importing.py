@@ -191,19 +191,15 @@ def _table(lines: Sequence[str], path: Path) -> Found:
 Piece = tuple[str, Array, Array, Array]
 """Name of a stream, and of one of its recordings times, s, positions, m, and quaternions."""
 BETWEEN_FILES_S = 10.0
-"""Pause, s, between recordings without a host's time that are put one after the other. A pose is
-not interpolated over a tenth of it."""
+"""Pause, s, between recordings without a host's time; nothing interpolates over a tenth of it."""
 SET_S, CLOCKS_APART = 0.3, 3e-3
-"""Time, s, and share of the time passed, by which two clocks that nobody sets move against each
-other from recording to recording: recordings start late by some 40 ms, and quartz errs by less
-than a thousandth. A counter that starts anew differs by seconds."""
+"""Time, s, and share of the time passed, by which clocks that nobody sets may move against each
+other between recordings: these start late by some 40 ms, and quartz errs by a thousandth."""
 MOST_RESTARTS = 5
-"""Falls of a device's counter in one recording up to which they are restarts; of more, rows are in
-another order."""
+"""Falls of a counter in a recording that may be restarts; with more, rows are in no order."""
 LATEST_S = 9e9
 """Latest time, s: stamps in ns have no room for more in 63 bits."""
-STAMPS = ('host', 'device')
-"""Which of a file's times become stamps; the other is taken where a file lacks the one."""
+STAMPS = ('host', 'device')  # which time becomes the stamp; the other where a file lacks the one
 
 
 def import_poses(
@@ -356,10 +352,7 @@ def _times(tables: Sequence[Array], stamps: str) -> list[tuple[Array, bool]]:
 
 
 def _restarts(counter: Array) -> Integers:
-    """How often a counter has restarted before each of its values: it falls by more than a second.
-
-    Where there are many falls, rows are in no order, and no counter restarts.
-    """
+    """How often a counter has fallen by more than a second before each of its values."""
     known = np.flatnonzero(np.isfinite(counter))
     falls = np.zeros(counter.size, dtype=np.int64)
     falls[known[1:]] = np.diff(counter[known]) < -1.0
@@ -421,7 +414,10 @@ def read_pose_session(
         for topic in sorted(streams)
         if topic.startswith(TRACKED) and topic.endswith(ENDING)
     }
-    reference = optical or _only_optical(name, list(streams))
+    optics = [t for t in streams if t.startswith(OPTICAL) and t.endswith(ENDING)]
+    if not optical and len(optics) > 1:
+        raise BagError(f'{name}: several references, name one: {", ".join(sorted(optics))}')
+    reference = optical or next(iter(optics), None)
     topics = [*chosen.values(), *([reference] if reference else [])]
     for topic in topics:
         if topic not in streams:
@@ -441,13 +437,6 @@ def read_pose_session(
     sensors = {label: sequence(label, topic) for label, topic in chosen.items()}
     found = sequence(REFERENCE, reference) if reference else None
     return PoseSession(name, start, sensors, found, salvage.lost)
-
-
-def _only_optical(path: str, topics: list[str]) -> str | None:
-    found = [t for t in topics if t.startswith(OPTICAL) and t.endswith(ENDING)]
-    if len(found) > 1:
-        raise BagError(f'{path}: several references, name one: {", ".join(sorted(found))}')
-    return found[0] if found else None
 
 
 def write_pose_session(path: Path, session: PoseSession) -> None:

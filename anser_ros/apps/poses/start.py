@@ -19,9 +19,6 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.physics.rotations import nearest_rotation
 
-Mask = Booleans
-
-
 PAUSE_S = 2.0
 """Pause, s, that parts static recordings; where there are several, each is a block."""
 AT_REST_M, POSES_AT_REST = 2e-3, 4
@@ -29,15 +26,11 @@ AT_REST_M, POSES_AT_REST = 2e-3, 4
 HAND_M = 0.1  # a hand's breadth, m: distance at which an angle counts as the displacement it makes
 AT_REST_SHARE = 0.7  # share of poses in recordings at rest from which all is such
 FEWEST_PARTS = 5  # recordings that make blocks of their own; fewer leave too few to hold out
-FEWEST_HAND_EYE_POSES = 8
-"""Poses with a reference that hand-eye needs: it has twelve unknowns, a pose gives six, and as
-many again have to judge it."""
+FEWEST_HAND_EYE_POSES = 8  # poses with a reference: hand-eye has twelve unknowns, a pose gives six
 MOST_POSES = 900
-"""Poses of a sensor that are fitted at most, evenly over the session: more add nothing of errors
-that are alike for seconds, and a session has to be done within seconds."""
+"""Poses of a sensor that are fitted at most: more add nothing of errors alike for seconds."""
 GOLDEN = (5**0.5 - 1) / 2
-"""Squares of whole numbers times it, less whole numbers, are spread evenly and fall into step with
-nothing. Its multiples fall into step with a poll that goes on by as much from pose to pose."""
+"""Its multiples by squares, less whole numbers, are spread evenly, in step with no poll."""
 COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
 COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
@@ -45,13 +38,10 @@ FAR_STEP_S, FASTEST = 0.1, 3e-3
 """Step, s, of looks beyond that range and at clocks that run apart, by this share at most."""
 LEAST_OVERLAP = 0.25  # share of the poses that must have a reference at an offset
 ALIKE, UNLIKE = 0.8, 0.2
-"""Correlation of motions that are of one body at the right time (chance makes 0.5 in half a
-minute), and by how much it must be more than at no such time."""
+"""Correlation of one body's motions at the right time (chance: 0.5), and how much it must gain."""
 HAND_S = 0.3  # time, s, in which a hand turns and moves by what it is told by
 COARSE_OFFSET_MISFIT = 0.8
-"""Share of the misfit at no offset below which a coarse offset is taken. Chance takes off 6 % (the
-least of 61 mean distances of 300 poses); an offset of a step moves a hand many times the
-misfit."""
+"""Share of the misfit at no offset below which a coarse offset is taken; chance takes off 6 %."""
 START_NOISE = PoseNoise(2e-3, 0.02)  # m, rad: of the first fit, which then finds its own
 
 
@@ -120,11 +110,7 @@ def _extent(values: Array) -> float:
 
 
 def _thinned(poses: PoseSequence) -> PoseSequence:
-    """Not more than `MOST_POSES` poses: one of each few neighbours.
-
-    Which of them changes from group to group: every third pose, say, falls into step with a poll,
-    and the mean error of its stamps is then not that of all.
-    """
+    """At most `MOST_POSES` poses, one of a few neighbours, in no rhythm that a poll may have."""
     step = max(1, -(-poses.size // MOST_POSES))
     groups = np.arange(poses.size // step)
     return poses.rows(step * groups + (step * (GOLDEN * groups**2 % 1)).astype(np.int64))
@@ -139,11 +125,9 @@ def _pauses(sensors: Sequence[PoseSequence]) -> Array:
 def _recordings(
     reference: PoseSequence, sensors: Mapping[str, PoseSequence], starts: Array
 ) -> tuple[PoseTrack, dict[str, PoseSequence], float]:
-    """The track of a reference, over the whole of each recording in which it is at rest; a few of
-    the poses of these, whose errors are alike however many there are; and the share that all were.
+    """The reference's track, throughout each recording at rest; a few poses of these; their share.
 
-    Two programs that record one after the other share no time, and still the place. A noisy sensor
-    is at rest where its reference is.
+    Two programs that record one after the other share no time, and still the place.
     """
     streams = [reference, *sensors.values()]
     common = _pauses(streams)
@@ -249,8 +233,7 @@ def _most_alike(
 ) -> tuple[float, float]:
     """The offset, s, and rate, of some, at which motions are alike, if they are not as it is.
 
-    How far, and by what angle, a body moves between two times is the same for all frames and in
-    all readings of quaternions, but for lever arms.
+    Ways and angles between two times are the same in all frames, but for lever arms.
     """
     pairs = []
     for poses in problem.sensors:
@@ -403,15 +386,13 @@ def _middle(turns: Rotation) -> Array:
 def first_fit(problem: PoseProblem, offset: float, is_one_frame: bool) -> PoseFit:
     """Return the best robust fit of the two frames from several starts."""
     offset, rate = coarse_rate(problem, offset)
-    frames = _frames(problem, offset, is_one_frame)
-    starts = [started(problem, offset, frame, rate) for frame in frames]
-    fits = [robust_fit(problem, terms) for terms in starts]
+    frames = [None] if is_one_frame else _frames(problem, offset)
+    fits = [robust_fit(problem, started(problem, offset, frame, rate)) for frame in frames]
     return min(fits, key=first_cost)
 
 
-def _frames(problem: PoseProblem, offset: float, is_one_frame: bool) -> list[Array | None]:
-    if is_one_frame:
-        return [None]
+def _frames(problem: PoseProblem, offset: float) -> list[Array]:
+    """The rotations to start from, by places and by turns."""
     poses = max(problem.sensors, key=lambda p: p.size)
     place, turn, _, known = problem.path.at(poses.time - offset)
     turned = Rotation.from_matrix(turn[known]).as_quat()
@@ -438,8 +419,7 @@ FAR, FITS = 8.0, 0.25
 """Distance of a pose from its own prediction, in spreads, from which it may be another sensor's,
 and the share of it that is left from the other's prediction."""
 EARLY = 0.4
-"""Share of a session by which the sensors' names are meant, where they are exchanged for half of
-it. Smaller determines no lever arms; larger meets the exchange itself."""
+"""Share of a session that says whose names are meant: smaller determines no lever arms."""
 NEAR_S = 1.0  # s; nearer spans are one: nobody swaps two plugs and back in a second
 FEWEST, LEAST_SHARE = 5, 0.01  # poses in a span, and share of a sensor's poses, that are a swap
 
@@ -473,7 +453,7 @@ def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
     return put_back(session, swapped_spans(problem, fit))
 
 
-def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Mask, Mask]:
+def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Booleans, Booleans]:
     """Masks of the poses of sensor i that fit where j should be, and that rather fit there."""
     own = replace(problem, noise=fit.state.problem.noise).state(fit.terms).parts[i]
     renamed = replace(problem.sensors[i], name=problem.sensors[j].name)
@@ -486,13 +466,11 @@ def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Mask
     return (here > FAR) & (there < FITS * here) & (own.weight > 0), there < here
 
 
-def _runs(time: Array, mask: Mask, rather: Mask) -> list[tuple[float, float]]:
+def _runs(time: Array, mask: Booleans, rather: Booleans) -> list[tuple[float, float]]:
     """Spans in which a mask holds, as far as poses rather fit the other sensor."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    runs = zip(edges[::2], edges[1::2], strict=True)
     spans: list[tuple[float, float]] = []
-    for first, last in runs:
-        a, b = int(first), int(last)
+    for a, b in edges.reshape(-1, 2).tolist():
         while a > 0 and rather[a - 1]:
             a -= 1
         while b < time.size and rather[b]:
@@ -527,12 +505,14 @@ def put_back(
     return replace(session, sensors=sensors), records
 
 
-def _merged(own: PoseSequence, keep: Mask, other: PoseSequence, take: Mask) -> PoseSequence:
-    time = np.concatenate([own.time[keep], other.time[take]])
-    order = np.argsort(time, kind='stable')
-    return replace(
+def _merged(
+    own: PoseSequence, keep: Booleans, other: PoseSequence, take: Booleans
+) -> PoseSequence:
+    left, right = own.rows(keep), other.rows(take)
+    both = replace(
         own,
-        time=time[order],
-        position=np.concatenate([own.position[keep], other.position[take]])[order],
-        quaternion=np.concatenate([own.quaternion[keep], other.quaternion[take]])[order],
+        time=np.concatenate([left.time, right.time]),
+        position=np.concatenate([left.position, right.position]),
+        quaternion=np.concatenate([left.quaternion, right.quaternion]),
     )
+    return both.rows(np.argsort(both.time, kind='stable'))

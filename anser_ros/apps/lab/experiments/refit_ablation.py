@@ -90,8 +90,7 @@ class FreeDipoles:
 
 
 REACH_M = 0.15
-"""Largest distance of a solution from the optical position, m; a wrong model may not lead a pose
-farther astray."""
+"""Largest distance of a solution from the optical position, m, however wrong the model."""
 COUNTS = (4, 8, 16, 32)
 """Numbers of reference coils that are compared; the demo's board has 32."""
 FROZEN, FREE, SHARED = 'frozen model', 'free dipoles', 'shared polarisability'

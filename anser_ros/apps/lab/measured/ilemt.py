@@ -27,14 +27,11 @@ from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 NAME, BODY = 'ilemt', 'premo'
 X, Y, Z = np.eye(3)
-FG = np.stack([Z, X, Y])
-"""Rows: axes of fg in the source fixture's frame."""
-HOME_M = np.array([0.0, 0.243, 0.012])
-"""The stage's zero in the source fixture's frame, by a ruler."""
+FG = np.stack([Z, X, Y])  # rows: axes of fg in the source fixture's frame
+HOME_M = np.array([0.0, 0.243, 0.012])  # the stage's zero in that frame, by a ruler
 FIXTURES = {'YoutZup': (Y, Z), 'ZinXdown': (-Z, -X), 'ZinYup': (-Z, Y)}
 """Axes of the sensor that point away from the source and up."""
-AXES = (Y, X, -Z)
-"""Of the sensor's three coils on its mover."""
+AXES = (Y, X, -Z)  # of the sensor's three coils on its mover
 DIPOLE = ((0.030, 0.045, -0.020), (-0.035, 0.050, -0.020), (0.0, 0.055, 0.035))
 CONCENTRIC = ((-0.015, 0.0, 0.010),) * 3
 """Middles of the source's coils in its fixture's frame, m, by a ruler."""
@@ -83,16 +80,15 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
         )
         setup = Setup('fg', 1.0, Emitter(f'{NAME}_{name}', {}, coils), sensors, VOLUME, STATED)
         for pattern in ('md', 'ld'):
-            flux, position, quaternion = [], [], []
+            flux, held = [], []
             for fixture in FIXTURES:
                 file = existing(folder / where / f'soYoutZup_se{fixture}_{pattern}.npz')
                 with np.load(file) as kept:
                     flux.append(TESLA * kept['coupling'][:, band])
-                    place, turn = poses(kept['stage'], fixture)
-                position.append(place)
-                quaternion.append(turn)
+                    held.append(poses(kept['stage'], fixture))
             bags.append(into / f'{NAME}_{name}_{pattern}.mcap')
-            at = {BODY: (np.concatenate(position), np.concatenate(quaternion))}
+            position, quaternion = (np.concatenate(part) for part in zip(*held, strict=True))
+            at = {BODY: (position, quaternion)}
             write_frames(bags[-1], setup, np.concatenate(flux), at)
     return bags
 
@@ -115,20 +111,16 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
         _, name, pattern = learnt.stem.split('_')
         error = ran(out / f'{learnt.stem}_tracked', 'evaluation.json')
         paper = PAPER.get(name, (None, None)) if pattern == 'md' else (None, None)
-        what = f'{name}, learnt on {pattern}'
+        note = f'{pattern}; scored on the other'
         for key, scale, unit, theirs in (
             ('position_rmse_m', 1e3, 'mm', paper[0]),
             ('orientation_rmse_rad', np.degrees(1.0), 'deg', paper[1]),
             ('tracked_fraction', 100.0, '%', None),
         ):
             value = float(scale * figure(error, 'bodies', BODY, key))
-            words = f'{what}: {key.rpartition("_")[0].replace("_", " ")}'
-            found.append(
-                ReportRow(
-                    NAME, words, float('nan'), value, unit, f'{pattern}; scored on the other',
-                    special=theirs,
-                )
-            )  # fmt: skip
+            what = key.rpartition('_')[0].replace('_', ' ')
+            words = f'{name}, learnt on {pattern}: {what}'
+            found.append(ReportRow(NAME, words, float('nan'), value, unit, note, special=theirs))
     return found
 
 

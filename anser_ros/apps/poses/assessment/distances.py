@@ -50,8 +50,7 @@ COMMON_ERROR_SIGMAS = 1.0
 """Correlation of the errors of parallel neighbouring distances, in its standard errors, from which
 on they count as alike: in doubt the interval is the wider one. Chosen on simulated boards."""
 PARTS = 3
-"""Strips of a board, along and across, that are drawn again where lines are alike: with fewer
-nothing can be drawn, and more are alike themselves."""
+"""Strips of a board, along and across, that are drawn again where lines are alike."""
 ROTATION = 'Rotation error statistics'
 ORDERS = ('rows', 'serpentine')
 

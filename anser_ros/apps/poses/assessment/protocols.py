@@ -50,8 +50,7 @@ GROUPS = 5  # groups of speeds, with equal numbers of poses: a row of the table 
 FEWEST_MOVING_POSES = 100
 """Fewer leave a group less than 20, whose 95th percentile would be one pose."""
 SLOWEST_M_S = 0.02
-"""Median speed below which a recording is of a rest, where a jitter of 0.1 mm is 5 ms of
-latency."""
+"""Median speed of a rest at most, where a jitter of 0.1 mm is 5 ms of latency."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ FEWEST_WINDOWS = 4
 """Windows of a pause, each half over the one before: fewer don't show whether the tool moved."""
 NOISE_TIMES = 5.0  # windows' own scatter by which their middle may differ in a pause
 LEAST_MOVE_M, LEAST_MOVE_RAD = 0.7e-3, 0.012
-"""Difference that is a move whatever the noise: m, rad. A hand that holds a tool on a divot moves
-it by less."""
+"""Difference that is a move whatever the noise, m, rad: a hand on a divot moves a tool less."""
 MOST_MOVE_M, MOST_MOVE_RAD = 2.5e-3, 0.05
 """Difference that is a move however noisy: m, rad. A scan that steps on with every pose is noise
 by its differences, and no rest."""

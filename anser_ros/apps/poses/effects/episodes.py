@@ -11,33 +11,26 @@ from anser_ros.apps.poses.problem import PoseResiduals, Sensing
 from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.field.model import EffectRecord
 
-Mask = Booleans
-
 WINDOWS, FEWEST_WINDOWS, WINDOW_S = 40, 15, 1.0
-"""Windows of time that a session is cut into: an episode of a twentieth is seen in two. A long
-session has more, of a second, which a hand takes to pass a thing. A slow tracker has fewer; of
-fewer yet an episode is too large a part."""
+"""Windows of time of a session, and fewest of a slow tracker: an episode of a twentieth is seen in
+two. A long session has more, of a second, which a hand takes to pass a thing."""
 FEWEST_POSES_OF_WINDOW = 4  # poses that a window needs to be judged: fewer may be outliers
 POSES_OF_WINDOW = 4.5  # on average, so that most windows can be judged
 TIMES = 9.0
-"""Squared error over the median window's from which a window belongs to an episode: three times
-the error, which the range of places in a session hardly makes."""
+"""Squared error of an episode over the median window's: the range of places hardly makes it."""
 LONGEST = 0.4
-"""Share (0 to 1) of the windows that episodes may be: the median window must be a quiet one, and a
-tenth is left for what else is loud."""
+"""Share (0 to 1) of the windows that episodes may be: the median window must be a quiet one."""
 ALIKE = 0.4  # share of a window's squared error that its mean must be; noise has a small one
 NEAR_M = 0.03
-"""Distance within which a place outside the episode is the same place: metal changes over its own
-size, centimetres."""
+"""Distance, m, of places that are the same: metal changes over its own size, centimetres."""
 REVISITED_SHARE = 0.5  # share of the episode's places that must have been visited outside it
 STRETCH, FILLED = 0.15, 0.8
 """Share of the windows that an episode of one sensor alone must span where its places were visited
 at no other time, and the share of these that are in it: no hand stays so long in a distortion."""
 FEWEST_VISITS, ALWAYS, SELDOM, FARTHER = 2, 0.6, 0.1, 90
-"""Visits to a place from which it makes the episodes; the shares of these that are there, and of
-the poses there that are off; the share of those elsewhere that may be; and the percentile of the
-right poses' distances from the field generator that it must be nearer than: the edge of the
-volume errs without metal."""
+"""Visits to a place that makes the episodes; shares of these there, and of the poses there that
+are off; share of those elsewhere that may be; percentile of the right poses' distances that it
+must be nearer than: the edge of the volume errs without metal."""
 NEIGHBOURS = 3  # windows by which those of one episode are apart at most
 PASSED = 'metal stands at one place, and the sensors are off whenever they pass it'
 LOOSE, FAST = 0.5, 0.25
@@ -75,9 +68,8 @@ def _sizes(
     """Squared errors of places and of turns over those of the median window: of poses (n, 2), and
     of the means of windows (2,), in which jitter cancels.
 
-    Frames go a little way with an episode, so errors count from the middle of the windows; or
-    beside the other sensors, whose clock and reference are the same, so that no error of these is
-    in the means.
+    Errors count from the middle of the windows, as frames go a little way with an episode; or
+    beside the other sensors, which have the same clock and reference.
     """
     window, errors = windows_of(sensing, residuals), sensing.residual
     if not is_beside:  # without what errors of the stamps make
@@ -154,7 +146,7 @@ def _lasts(runs: Sequence[int], count: int) -> bool:
 
 
 def _place_of(
-    sensing: Sensing, window: Integers, high: Sequence[int], is_off: Mask
+    sensing: Sensing, window: Integers, high: Sequence[int], is_off: Booleans
 ) -> Array | None:
     """The place (3,), m, of what a sensor passes, and is off whenever it does; None for none.
 
@@ -178,7 +170,7 @@ def _place_of(
     return middle if is_off_there and is_right_elsewhere and is_inside else None
 
 
-def in_episode(sensing: Sensing, residuals: PoseResiduals) -> Mask:
+def in_episode(sensing: Sensing, residuals: PoseResiduals) -> Booleans:
     """Return the mask (n,) of a sensor's poses that are in one of its episodes."""
     inside = episode(sensing, residuals).windows
     return np.asarray(np.isin(windows_of(sensing, residuals), inside))
@@ -216,7 +208,7 @@ def _is_alone(sensing: Sensing, residuals: PoseResiduals, runs: list[int]) -> bo
     return bool(others) and max(others) < FAST * error(sensing)
 
 
-def _is_shift(sensing: Sensing, inside: Mask) -> bool:
+def _is_shift(sensing: Sensing, inside: Booleans) -> bool:
     """Whether poses are off or turned the same way, as metal makes them, and not at random."""
     for rows in np.split(sensing.residual[inside], 2, axis=1):
         mean = rows.mean(axis=0)

@@ -15,18 +15,13 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S
 from anser_ros.sessions.plausibility import FROZEN_S
 
-Mask = Booleans
-
-
 FEWEST_STALE = 0.02
-"""Share (0 to 1) of poses of a moving body from which repeats are named: one in 60 comes again
-where a tracker of 60 Hz is polled a hertz too fast, which harms nothing."""
+"""Share (0 to 1) of poses in motion from which repeats are named: one in 60 harms nothing."""
 FEWEST_MOVING = 20  # poses of a moving body by which repeats are judged
 MOVING_M = 5e-4
 """Way between two poses, m, from which a body moves: trackers resolve a tenth of it."""
 FROZEN_WAY_M = 0.01
-"""Way of another stream, m, while one stands still that is frozen: far more than any tracker's
-jitter."""
+"""Way of another stream, m, while one is frozen: far more than any tracker's jitter."""
 NEAR = 3  # poses before and after that motion is judged by: one wrong neighbour decides nothing
 FEWEST_MISSING = 0.005  # share of poses, or of the time, from which missing ones are named
 FEWEST_MARKED, FEWEST_MARKED_SHARE = 5, 1e-3
@@ -195,11 +190,9 @@ def _gaps(poses: PoseSequence, session: PoseSession) -> list[tuple[float, float]
 
 
 LEAST_S = 2e-3
-"""Error of the stamps, s, from which it is named: less moves a hand by a tenth of a millimetre.
-Smaller names what harms nobody; larger leaves errors of a fast hand unnamed."""
+"""Error of the stamps, s, from which it is named: less moves a hand by a tenth of a millimetre."""
 LEAST_LIKELIHOOD_GAIN = 25.0
-"""Minus twice the log likelihood that it must take off in the median sensor; chance takes one, and
-so much once in two million sensors."""
+"""Minus twice the log likelihood that it must take off in the median sensor; chance takes one."""
 STEP_SHARE = (0.15, 0.7)
 """Error over the step that rounding to a step makes: 0.29 if even, more if a poll is late."""
 
@@ -225,9 +218,8 @@ def _stamp_error(residuals: PoseResiduals) -> tuple[float, float, float]:
 def _sigma(residuals: PoseResiduals) -> float:
     """Standard deviation of the median error of the stamps, s.
 
-    By Fisher's information about a variance: each pose has one degree of freedom along its
-    velocity, and tells as much of the stamps' error as that is of its error there. Sensors that
-    differ by more than this have errors of their own; those that share stamps share the error.
+    By Fisher's information about a variance: a pose has one degree of freedom along its velocity.
+    Sensors that differ by more have errors of their own; those that share stamps share the error.
     """
     sensors = residuals.sensors
     errors = np.array([s.noise.stamp_s for s in sensors])
@@ -290,27 +282,22 @@ class QuantisedStamps(PoseEffect):
 
 
 NOISIER = 2.0
-"""Factor over the other sensors' median noise from which a sensor's is named; sensors of one kind
-at one place differ by a half."""
+"""Factor over other sensors' median noise to be named; those of one kind differ by a half."""
 GROWN = 2.0
-"""Factor of the jitter over that of a watch's first look from which it is reported: of trackers it
-grows by half over their volume."""
+"""Factor over a first look's jitter to be reported: over a tracker's volume it grows by half."""
 WIDEST = 1.3
 """Ratio of far to near distances (95 to 5 %) without which no power law of it can be seen."""
 LEAST_LAW_SIGMAS = 5.0
-"""Standard deviations by which the noise must differ from a constant: by the likelihood, and by
-those of the exponent, which few distances leave large."""
+"""Sigmas by which the noise must differ from a constant, by likelihood and by its exponent."""
 EXPONENTS = (2.8, 6.5)
-"""Exponents of the noise that a field makes: the signal falls with the third power, the gradient
-with the fourth; what is outside is something else."""
+"""Exponents of a field's noise: the signal falls with the third power, its gradient the fourth."""
 SHARES = np.array([1, 4, 1]) / 6
 """Shares of the variances of three poses in that of their second difference."""
 NEW_SHARE = 18 / 35
 """Share of squared second differences that is new: neighbours share values. Their correlations are
 -2/3 and 1/6, those of squares 4/9 and 1/36, on both sides."""
 REACHED = 12.0
-"""Squared deviation over its variance by the law that noise does not reach: once in 1e5. A pose
-that the law does not reach has another cause, and one that it reaches is no outlier."""
+"""Squared deviation over its variance by the law that noise does not reach: once in 1e5."""
 AT_REST_M_S, HARDLY_EVER = 0.01, 0.1
 """Speed, m/s, below which a body counts as at rest (a hand drifts by less), and share of poses in
 motion below which it always is."""
@@ -372,7 +359,7 @@ def _likeliest(square: Array, place: Array) -> Array:
     return np.asarray(min(tries, key=lambda result: float(result.fun)).x)
 
 
-def _jitter(sensing: Sensing, chosen: Mask) -> tuple[Array, Array]:
+def _jitter(sensing: Sensing, chosen: Booleans) -> tuple[Array, Array]:
     """`jitter` of those of some poses (n,) in which the body moves; of all where it hardly does.
 
     A body that rests at one place and moves at others jitters less at the one.
@@ -429,9 +416,7 @@ class RangeNoise(PoseEffect):
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a power law of all sensors together, each with a level of its own."""
-        # Each sensor has a level of its own, so only what changes within one tells a power.
-        # Poses far away stand out from a noise that is taken as one; the law judges them too.
-        # Those of an episode are off by something else.
+        # Far poses stand out from one common noise; those of an episode have another cause.
         every = [
             _jitter(one, (one.used | one.out) & ~in_episode(one, residuals))
             for one in residuals.sensors
