@@ -38,7 +38,7 @@ _ROW_BITS = np.uint32(20)
 them are the lowest bits of its fingerprint, which let one in 4096 pass that is another."""
 MOST_ROWS = 2**20
 """Longest history, samples, that these bits allow: 2.6 s at 400 kS/s."""
-_ROW_MASK = np.uint32(MOST_ROWS - 1)
+_ROW_MASK = np.uint32(MOST_ROWS - 1)  # of the row in a slot
 PROBE_SAMPLES = (128, 512, 2048)
 """Samples after which each fingerprint that all others are compared with is taken anew: in a ring
 shorter than one of these it comes again for certain; longer ones have anchors (all but 1e-14)."""

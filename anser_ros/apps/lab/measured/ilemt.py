@@ -26,7 +26,7 @@ from anser_ros.arrays import Array
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 NAME, BODY = 'ilemt', 'premo'
-X, Y, Z = np.eye(3)
+X, Y, Z = np.eye(3)  # unit vectors of any frame
 FG = np.stack([Z, X, Y])  # rows: axes of fg in the source fixture's frame
 HOME_M = np.array([0.0, 0.243, 0.012])  # the stage's zero in that frame, by a ruler
 FIXTURES = {'YoutZup': (Y, Z), 'ZinXdown': (-Z, -X), 'ZinYup': (-Z, Y)}
@@ -43,9 +43,10 @@ SETS = {
 """Folder, places of the coils, band and tones, Hz, of each set."""
 PAPER = {'dipole': (0.272, 0.210), 'concentric': (0.416, 0.273)}
 """Errors of the makers' own calibration, mm and degrees rms, on data of the same source."""
-TESLA = 1e-5
+TESLA = 1e-5  # T of a unit of the readings: nominal, cancels in all errors
 STATED = {'flux_noise_t': 2e-10, 'optical_position_m': 6.2e-5, 'optical_rotation_rad': 1.7e-3}
-VOLUME = ((-0.09, -0.11, 0.14), (0.12, 0.11, 0.35))
+"""Noise at rest, and what is left of the stage's errors."""
+VOLUME = ((-0.09, -0.11, 0.14), (0.12, 0.11, 0.35))  # m: all poses, and some beside
 STAGE = (  # from axis, to axis, place and error, mm: the makers' measurement of their stage
     (2, 0, ((-46, -20, 0, 20, 50), (-0.14, -0.01, 0.05, 0.085, 0.1))),
     (2, 2, ((-46, -21, 4, 29, 49), (0.0, -0.05, -0.09, -0.115, -0.13))),
