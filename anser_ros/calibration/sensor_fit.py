@@ -258,7 +258,10 @@ class SensorFitter:
     def fit(self) -> SensorFit:
         """Find field and parameters, first with few frames and then with all."""
         thin = [tool.measured for tool in self._tools(COARSE_ROWS)]
-        begun = [copy(self)._begun(sites) for sites in rich_bases(thin, self.generator)[:2]]
+        layer, *others = rich_bases(thin, self.generator)[:2]
+        begun = [copy(self)._begun(layer)]
+        if begun[0].parameters is self.parameters:  # else there are too few readings for any
+            begun += [copy(self)._begun(sites) for sites in others]
         return richest(begun, [one.noise_t for one in begun])._ended()
 
     def _begun(self, sites: DipoleSites) -> 'SensorFitter':
