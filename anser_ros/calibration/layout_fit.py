@@ -218,26 +218,23 @@ def rich_layout(measurements: Sequence[Measurements], generator: Generator) -> L
     return replace(RICH, count=count, extension=extension)
 
 
-def rich_bases(measurements: Sequence[Measurements], generator: Generator) -> list[DipoleSites]:
-    """Return sets of dipoles of which one makes the field at poses that are yet to be corrected.
+def free_bases(measurements: Sequence[Measurements], generator: Generator) -> list[DipoleSites]:
+    """Return dipoles about the emitters, wherever they are and whatever their shape.
 
-    A fine layer over the board; where no drawing says that there is one, also clusters about the
-    emitters, wherever they are and whatever their shape, shared by all and each its own.
+    First those that all emitters share, then each emitter's own; none where there is a drawing.
     """
-    bases = [place(rich_layout(measurements, generator), generator)]
-    if generator.nominal is None:
-        posed = [with_pose(m) for m in measurements]
-        weights = [usable_weights(m) for m in posed]
-        own = fit_clusters(posed, weights, generator.centres)
-        bases += [own.shared, own]
-    return bases
+    if generator.nominal is not None:
+        return []
+    posed = [with_pose(m) for m in measurements]
+    own = fit_clusters(posed, [usable_weights(m) for m in posed], generator.centres)
+    return [own.shared, own]
 
 
 Tried = TypeVar('Tried')
 
 
 def richest(tried: Sequence[Tried], noise_t: Sequence[float]) -> Tried:
-    """Return the fit of the last of `rich_bases` that leaves about as little noise as any, T."""
+    """Return the fit of the last basis that leaves about as little noise as any, T."""
     limit = AS_GOOD * min(noise_t)
     return [one for one, noise in zip(tried, noise_t, strict=True) if noise <= limit][-1]
 
@@ -347,5 +344,5 @@ class LayoutFitter:
     @cached_property
     def rich(self) -> tuple[MomentFitter, MomentFit]:
         """Return the fit at whose poses dipoles are moved."""
-        bases = rich_bases(self.measurements, self.placer.generator)
+        bases = [self._layer, *free_bases(self.measurements, self.placer.generator)]
         return rich_fit(self.measurements, bases, self.accuracy)

@@ -19,8 +19,8 @@ import numpy as np
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.calibration.layout_fit import (
     LayoutPlacer,
+    free_bases,
     lowest_height,
-    rich_bases,
     rich_fit,
     rich_layout,
 )
@@ -289,7 +289,7 @@ def choose_layout(
     if rows < rich.count**2:
         rich = replace(rich, count=affordable[-1])
     placer = LayoutPlacer(generator, measurements)
-    bases = [place(rich, generator), *rich_bases(measurements, generator)[1:]]
+    bases = [place(rich, generator), *free_bases(measurements, generator)]
     sites = bases[0] if len(bases) == 1 else rich_fit(measurements, bases, accuracy)[0].dipoles
     scorer = LayoutScorer(measurements, folds, sites, accuracy, placer)
     search = _Search(scorer, generator, progress)

@@ -35,8 +35,14 @@ from anser_ros.calibration.joint_system import (
     open_directions,
     tied_parts,
 )
-from anser_ros.calibration.layout_fit import RICH_DAMPING, ScaledNominal, rich_bases, richest
-from anser_ros.calibration.layouts import Generator
+from anser_ros.calibration.layout_fit import (
+    RICH_DAMPING,
+    ScaledNominal,
+    free_bases,
+    rich_layout,
+    richest,
+)
+from anser_ros.calibration.layouts import Generator, place
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import (
     SMALLEST_NOISE_T,
@@ -258,10 +264,10 @@ class SensorFitter:
     def fit(self) -> SensorFit:
         """Find field and parameters, first with few frames and then with all."""
         thin = [tool.measured for tool in self._tools(COARSE_ROWS)]
-        layer, *others = rich_bases(thin, self.generator)[:2]
+        layer = place(rich_layout(thin, self.generator), self.generator)
         begun = [copy(self)._begun(layer)]
         if begun[0].parameters is self.parameters:  # else there are too few readings for any
-            begun += [copy(self)._begun(sites) for sites in others]
+            begun += [copy(self)._begun(s) for s in free_bases(thin, self.generator)[:1]]
         return richest(begun, [one.noise_t for one in begun])._ended()
 
     def _begun(self, sites: DipoleSites) -> 'SensorFitter':

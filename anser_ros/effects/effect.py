@@ -254,6 +254,8 @@ class Effect(BaseEffect[TermT]):
     followed: ClassVar[bool] = False
     # whether several of it at once are as likely as one, and no stand-in for what they share
     gregarious: ClassVar[bool] = False
+    # whether it is how a part is installed: installed anew, parts are a rival of metal at rest
+    installed: ClassVar[bool] = False
     # relative error of what it changes at a reference, beyond the survey's, where the field's
     # gradient close to an emitter is known less well than the field
     gradient_error: ClassVar[float] = 0.0
@@ -268,7 +270,7 @@ class Effect(BaseEffect[TermT]):
 
     def anew(self, apparatus: Apparatus) -> Sequence[TermT]:
         """Return what it is where the same parts are set up anew: a rival of metal at rest."""
-        return ()
+        return self.candidates(apparatus) if self.installed else ()
 
     def columns(self, term: TermT, view: View) -> ComplexArray | None:
         """Return the derivative of the view's flux by the parameters, (F, S, K, q), or None."""

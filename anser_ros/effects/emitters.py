@@ -20,18 +20,23 @@ from anser_ros.field.model import (
 )
 
 
+def _of_one(term: Term, emitters: int, factor: complex) -> ComplexArray:
+    """Return the matrix (1, K, K) that multiplies the term's emitter by a factor."""
+    matrix = np.eye(emitters, dtype=complex)
+    matrix[term.site['coil'], term.site['coil']] = factor
+    return matrix[None]
+
+
 class CoilGain(ComplexGain):
     """Is the complex gain of one emitter."""
 
     name = 'coil_gain'
     summary = "an emitter's strength is not the calibrated one"
     units = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
+    installed = True
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         return [Term(self, {'coil': k}, np.zeros(2)) for k in range(apparatus.emitters)]
-
-    def anew(self, apparatus: Apparatus) -> Sequence[Term]:
-        return self.candidates(apparatus)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         own = view.linear[:, :, term.site['coil']] / (1 + complex(*term.theta))
@@ -40,9 +45,7 @@ class CoilGain(ComplexGain):
         return out
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        matrix = np.eye(omega.size, dtype=complex)
-        matrix[term.site['coil'], term.site['coil']] = 1 + complex(*term.theta)
-        return matrix[None]
+        return _of_one(term, omega.size, 1 + complex(*term.theta))
 
 
 PHASE_UNIT = 1e-3
@@ -71,9 +74,7 @@ class CoilPhase(Effect[Term]):
         return out
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        matrix = np.eye(omega.size, dtype=complex)
-        matrix[term.site['coil'], term.site['coil']] = np.exp(1j * PHASE_UNIT * term.theta[0])
-        return matrix[None]
+        return _of_one(term, omega.size, np.exp(1j * PHASE_UNIT * term.theta[0]))
 
 
 PROBED_SHARES = (0.1, 0.5, 2.5)
@@ -243,14 +244,12 @@ class CoilMoved(Effect[Term]):
     plausible = {'shift_m': (-0.03, 0.03)}
     remedy = Remedy.FIELD
     typical = 3e-3  # emitters shift by some millimetres
+    installed = True
     gradient_error = 0.07  # less lets references outvote tools with gradients that are guesses
     recorded = {'shift_m': (3, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         return [Term(self, {'coil': k}, np.zeros(3)) for k in range(apparatus.emitters)]
-
-    def anew(self, apparatus: Apparatus) -> Sequence[Term]:
-        return self.candidates(apparatus)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Move the sensor the other way, which does the same as moving the source."""

@@ -101,9 +101,7 @@ class Registration(OpticalEffect[Term]):
     plausible = {'rotation_deg': (-10.0, 10.0), 'translation_m': (-0.05, 0.05)}
     recorded = {'rotation_deg': (3, 180.0 / np.pi), 'translation_m': (3, 1.0)}
     typical = (0.02, 0.02, 0.02, 5e-3, 5e-3, 5e-3)
-
-    def anew(self, apparatus: Apparatus) -> Sequence[Term]:
-        return self.candidates(apparatus)
+    installed = True
 
     def slopes(self, term: Term, view: View) -> ComplexArray:
         """Return the derivative by a turn about fg's origin and a shift, made the other way."""

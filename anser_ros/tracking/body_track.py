@@ -267,13 +267,11 @@ def _on_other_sides(frame: BodyFrame, fit: BodyFit) -> list[BodyFit]:
     other side the field that half a turn about z makes of it: what is read cannot tell them apart.
     """
     solution, middle = fit.solution, frame.context.middle
-    lever = frame.coils.subset(fit.used).offsets.mean(axis=0)
+    lever = frame.coils.offsets[fit.used].mean(axis=0)
     place, found = solution.position + solution.rotation @ lever - middle, []
     for signs in OTHER_SIDES:
-        across = middle + signs * place
-        if np.linalg.norm(across - middle - place) > SAME_PLACE_M and (
-            frame.settings.box.contains(across)
-        ):
+        across, away = middle + signs * place, (signs - 1.0) * place
+        if np.linalg.norm(away) > SAME_PLACE_M and frame.settings.box.contains(across):
             rotation = -signs[:, None] * solution.rotation
             found.append(_solve(frame, fit.used, (across - rotation @ lever, rotation)))
     return found
