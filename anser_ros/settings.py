@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import ParameterError
 
 
@@ -71,7 +71,7 @@ class Accuracy(_Stated):
     stamp_sigma_s: float = _value(0.3e-3, 'error of a flux stamp, s', 0.0, 0.1)
 
     @property
-    def pose_jitter(self) -> NDArray[np.float64]:
+    def pose_jitter(self) -> Array:
         """Return the jitter of an optical pose along (m) and about (rad) the axes, shape (6,)."""
         return np.repeat([self.optical_position_m, self.optical_rotation_rad], 3)
 

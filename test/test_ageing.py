@@ -180,7 +180,7 @@ def test_poses_wait_for_references_that_are_announced_and_not_for_others(recorde
 
     session, model = recorded
     sensors, announced = session.reference.sensors, [0]
-    watch = PlaceWatch.of(model, sensors, session.setup, lambda: announced[0])
+    watch = PlaceWatch(board_place_of(model, sensors, session.setup), lambda: announced[0])
     assert watch.is_waiting, 'whoever sends references may not be known yet'
     monkeypatch.setattr(field_model_io, 'DISCOVERY_S', 0.0)
     assert not watch.is_waiting
@@ -190,5 +190,6 @@ def test_poses_wait_for_references_that_are_announced_and_not_for_others(recorde
     window = SimpleNamespace(full=False)
     assert watch.look(frame, window) and not watch.is_waiting and not watch.misplaced
     assert not watch.look(frame, window), 'it is said once'
-    bare = PlaceWatch.of(model, sensors.select(np.zeros(0, int)), session.setup, lambda: 1)
+    none = sensors.select(np.zeros(0, int))
+    bare = PlaceWatch(board_place_of(model, none, session.setup), lambda: 1)
     assert not bare.is_waiting and not PlaceWatch().is_waiting

@@ -14,7 +14,7 @@ from anser_ros.cli import calibrate as command
 from anser_ros.cli.main import main
 from anser_ros.errors import FitError
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.calibration import calibrate_sessions, generator_of
+from anser_ros.sessions.calibration import calibrate_sessions, check_explained, generator_of
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
@@ -223,3 +223,25 @@ def test_a_board_of_unknown_kind_still_calibrates(factory):
     assert found.nominal_rmse_t is None
     assert found.better_than_nominal
     assert found.residuals.rmse_t < 1e-9
+
+
+def test_a_reversed_sensor_of_a_scan_is_named_and_used(factory):
+    tool, options = factory.tools[0], Options(layout=Layout('layer', 10, 1.25, 0.0))
+    channel = int(tool.sensors.channel[1])
+    flux = tool.flux.copy()
+    flux[:, 1] *= -1.0
+    wrong = replace(factory, tools=(replace(tool, flux=flux), *factory.tools[1:]))
+    right, found = (calibrate_sessions([session], options) for session in (factory, wrong))
+    assert [e.name for e in right.model.effects] == []
+    (record,) = found.model.effects
+    assert (record.name, record.parameters) == ('sensor_polarity', {'channels': [channel]})
+    assert found.residuals.rmse_t == pytest.approx(right.residuals.rmse_t)
+
+
+def test_what_no_field_explains_is_no_calibration(factory):
+    tool, options = factory.tools[0], Options(layout=Layout('layer', 10, 1.25, 0.0))
+    mixed = replace(tool, flux=np.roll(tool.flux, len(tool.flux) // 3, axis=0))
+    found = calibrate_sessions([replace(factory, tools=(mixed,))], options)
+    check_explained(calibrate_sessions([factory], options))
+    with pytest.raises(FitError, match=r'no field explains the scan: \d+ % of the signal'):
+        check_explained(found)

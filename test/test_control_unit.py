@@ -164,7 +164,7 @@ class TestEffects:
 
     def test_effects_on_samples_do_what_they_say(self):
         clean = self.codes()
-        leaky = self.codes(effects.RawChannelCrosstalk((3, 5), ((1.0, 0.1), (0.0, 1.0))))
+        leaky = self.codes(effects.channel_crosstalk([3, 5], np.array([[1.0, 0.1], [0.0, 1.0]])))
         assert np.abs(leaky[:, 3] - clean[:, 3] - 0.1 * clean[:, 5]).max() <= 1
         assert np.array_equal(np.delete(leaky, 3, 1), np.delete(clean, 3, 1))
         limit = 5.0 * np.abs(clean[:, 20]).max() / 32768
@@ -174,7 +174,7 @@ class TestEffects:
         loose = self.codes(effects.loose(20, share=0.5, period_s=0.02, rest=0.0))
         assert np.abs(loose[:400, 20]).max() == 0
         assert np.array_equal(loose[400:800], clean[400:800])
-        swung = self.codes(effects.GainRipple(0.1, 0.4))
+        swung = self.codes(effects.gain_ripple(0.1, 0.4))
         assert np.abs(swung[-1, 20] - 1.1 * clean[-1, 20]) <= 1
         scaled = self.codes(effects.with_gain(20, 0.5))
         assert np.abs(scaled[:, 20] - 0.5 * clean[:, 20]).max() <= 1
@@ -184,12 +184,12 @@ class TestEffects:
         assert np.abs(crossed[:, 20] - expected).max() <= 2
 
     def test_tilted_sensor_is_tilted_in_the_world_only(self):
-        real = effects.TiltedSensor(2, (0.0, 0.6, 0.8)).setup(SETUP)
+        real = effects.tilted(2, (0.0, 0.6, 0.8)).setup(SETUP)
         assert real.sensors[2].axis == (0.0, 0.6, 0.8)
         assert real.sensors[3:] == SETUP.sensors[3:]
 
     def test_drift_begins_with_the_first_start(self):
-        drift = effects.CoilWeakens(2, -0.5, 0.05)
+        drift = effects.weakening(2, -0.5, 0.05)
 
         def current_share(unit, seconds):
             unit.advance(int(seconds * unit.sample_rate_hz))
@@ -206,7 +206,7 @@ class TestEffects:
         assert again[0] < 0.52, 'a second start does not cool the coils'
 
     def test_optical_clock(self):
-        clock = effects.OpticalClock(early_s=0.03, fast_ppm=1000.0)
+        clock = effects.optical_clock(early_s=0.03, fast_ppm=1000.0)
         assert clock.optical_time(0.0) == -0.03
         assert clock.optical_time(10.0) == pytest.approx(9.98)
 

@@ -33,7 +33,7 @@ ALLOWED = {
 GENERAL = {'base', 'correction', 'effect'}
 """Modules in the room of effects that are about no single one; others may import these."""
 MAY_IMPORT = {
-    'diagnosis/screening.py': {'seen'},
+    'diagnosis/wiring.py': {'seen'},
     'diagnosis/diagnose.py': {'seen'},
     'diagnosis/fit.py': {'metal_at_rest'},
     'diagnosis/departure.py': {'moving_metal'},

@@ -25,10 +25,11 @@ ALLOWED = {
     'refit': {'integrity', 'frames', 'field', 'metal', 'physics'},
     'effects': {'field', 'metal', 'physics'},
     'tracking': {'integrity', 'frames', 'effects', 'field', 'physics'},
+    'chain': {'tracking', 'refit', 'integrity', 'effects', 'frames', 'field', 'physics'},
     'diagnosis': {'effects', 'field', 'metal', 'physics'},
     'sessions': {
-        'wire', 'frames', 'integrity', 'diagnosis', 'tracking', 'calibration', 'refit', 'effects',
-        'field', 'physics',
+        'wire', 'frames', 'integrity', 'diagnosis', 'chain', 'tracking', 'calibration', 'refit',
+        'effects', 'field', 'physics',
     },
     'simulation': {'sessions', 'metal', 'physics', 'wire'},
     'api': {'sessions', 'tracking', 'calibration', 'field', 'wire'},
@@ -38,8 +39,8 @@ ALLOWED = {
         'field', 'physics', 'signals', 'wire',
     },
     'nodes': {
-        'simulation', 'sessions', 'tracking', 'refit', 'integrity', 'effects', 'frames', 'field',
-        'physics', 'signals', 'wire',
+        'simulation', 'sessions', 'chain', 'tracking', 'refit', 'integrity', 'effects', 'frames',
+        'field', 'physics', 'signals', 'wire',
     },
 }  # fmt: skip
 APPS = {path.name for path in (PACKAGE / 'apps').iterdir() if (path / 'extension.py').is_file()}

@@ -3,95 +3,35 @@
 import signal
 import socket
 import threading
+import time
+from collections import Counter
 from dataclasses import make_dataclass
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import PATIENCE_S, ask, diagnostics, skip_if_too_slow, spin_until
+from conftest import ask, diagnostics, skip_if_too_slow, spin_until
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import Parameter
+from refit_world import anser_world
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
+from tracking_world import setup_of, triaxial_tool
 
+from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import ParameterError
-from anser_ros.nodes.live import CHAIN
+from anser_ros.nodes.acquisition import Acquisition
+from anser_ros.nodes.field_model import FieldModelNode
+from anser_ros.nodes.live import CHAIN, join
 from anser_ros.nodes.runtime import process, qos
-from anser_ros.nodes.runtime.handover import DirectSubscription, HandedFlux, Handover, NewestWorker
-from anser_ros.nodes.runtime.node import AnserNode
-from anser_ros.nodes.runtime.parameters import names_for
-from anser_ros.nodes.streams.one_source import OneSource
+from anser_ros.nodes.runtime.parameters import is_known, names_for
+from anser_ros.nodes.streams.one_source import Backlog
+from anser_ros.nodes.tracker import TrackerNode
+from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux
-
-
-def test_what_is_offered_goes_to_all_who_take_it_and_what_lasts_to_later_ones():
-    handover, first, second, late = Handover(), [], [], []
-    handover.offer('/a')
-    handover.offer('/b', lasts=True)
-    assert handover.offers('/a') and not handover.offers('/c')
-    taking = handover.take('/a', first.append)
-    handover.take('/a', second.append)
-    what = object()
-    handover.give('/a', what)
-    handover.drop(taking)
-    handover.give('/a', 2)
-    assert first == [what] and second == [what, 2]
-    handover.give('/b', what)
-    handover.take('/b', late.append)
-    assert late == [what]
-
-
-def test_what_takes_long_is_done_aside_with_the_newest():
-    """Who gives goes on at once; what came meanwhile gives way to the last, topic by topic."""
-    began, goes_on, done, skipped = threading.Event(), threading.Event(), [], []
-
-    def slow(what):
-        began.set()
-        assert goes_on.wait(PATIENCE_S)
-        done.append(what)
-        if what == 'b4':
-            finished.set()
-
-    finished = threading.Event()
-    aside = NewestWorker(lambda: skipped.append(1))
-    aside.put('/a', slow, 'a1')
-    assert began.wait(PATIENCE_S)
-    for k in range(2, 5):
-        aside.put('/a', slow, f'a{k}')
-        aside.put('/b', slow, f'b{k}')
-    goes_on.set()
-    assert finished.wait(PATIENCE_S)
-    aside.end(10)
-    assert done == ['a1', 'a4', 'b4'] and len(skipped) == 4
-
-
-def test_what_is_worked_on_aside_has_nothing_to_do_with_a_node_that_is_gone(ros):
-    """The thread ends with its node, and what it still does then is no fault of a callback."""
-    began, goes_on = threading.Event(), threading.Event()
-
-    class Slow(AnserNode):
-        NAME = 'slow'
-        WORKS_ASIDE = True
-
-        def take(self, _what):
-            began.set()
-            goes_on.wait(PATIENCE_S)
-            self.get_clock().now()
-            raise RuntimeError('the node is gone')
-
-    handover = Handover()
-    handover.offer('/anser/news')
-    node = Slow(handover=handover)
-    node.create_subscription(String, 'news', node.take, qos.STREAM)
-    handover.give('/anser/news', 'first')
-    assert began.wait(PATIENCE_S)
-    assert not node.stop_working(), 'it is still at it'
-    thread = node._aside._thread
-    node.destroy_node()
-    goes_on.set()
-    thread.join(10)
-    assert not thread.is_alive() and node.counters['callback_faults'] == 0
+from anser_ros.wire.setup import dump_setup
 
 
 def test_handed_fluxes_are_those_that_are_published():
@@ -141,30 +81,85 @@ def test_a_file_tells_which_values_it_has_for_one_node(tmp_path):
     assert list(names_for(arguments, 'acquisition')) == []
 
 
-def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros):
-    class Giver(AnserNode):
-        NAME = 'giver'
+TOOL = triaxial_tool(first=50)
 
-    class Taker(AnserNode):
-        NAME = 'taker'
 
-    handover, got = Handover(), []
-    giver = Giver(handover=handover, beside=(Giver, Taker))
-    publisher = giver.create_publisher(PointCloud2, 'tool/flux', qos.STREAM)
-    giver.offer(publisher)
-    taker = Taker(handover=handover, beside=(Giver, Taker))
-    source = OneSource(taker, PointCloud2, 'tool/flux', got.append, qos.STREAM)
-    assert isinstance(source.subscription, DirectSubscription)
-    frame = HandedFlux(1, 'fg', FluxPoints(*5 * [np.zeros(0)]))
-    giver.hand_over(publisher, frame)
-    assert got == [frame] and got[0] is frame
-    stranger = ros.create_node('stranger')
-    stranger.create_publisher(PointCloud2, '/anser/tool/flux', qos.STREAM)
-    assert spin_until(stranger, lambda: '2 publishers' in source.complaint)
-    giver.hand_over(publisher, frame)
-    assert len(got) == 1
-    for node in (giver, taker, stranger):
+@pytest.fixture
+def joined(ros, shared_tables, tmp_path):
+    """Field model and tracker of one process, and the chain through both."""
+    world = anser_world()
+    save_model(tmp_path / 'model.yaml', world.model)
+    values = {'model_file': str(tmp_path / 'model.yaml'), 'refit': False, 'keep_state': False}
+    text = dump_setup(setup_of(TOOL, setup_of(world.references).sensors))
+    nodes = []
+    for kind in (FieldModelNode, TrackerNode):
+        own = {name: value for name, value in values.items() if is_known(kind.PARAMETERS, name)}
+        given = [Parameter(name, value=value) for name, value in own.items()]
+        nodes.append(kind(beside=CHAIN, parameter_overrides=given))
+        nodes[-1]._on_setup(String(data=text))
+    yield SimpleNamespace(model=nodes[0], tracker=nodes[1], world=world, chain=None)
+    for node in nodes:
         node.destroy_node()
+
+
+def frame_of(joined, stamp_ns):
+    """A frame of the tool at rest and of the references, new noise in each."""
+    rng, place = np.random.default_rng(stamp_ns), TOOL.position + [0.0, 0.0, 0.2]
+    flux = joined.world.model.flux(place, TOOL.axis, TOOL.length)
+    tools, references = (
+        FrameReadings(table.channel, exact + joined.world.noise(rng)[: len(exact)],
+                      np.zeros(len(exact), dtype=int))
+        for table, exact in ((TOOL, flux), (joined.world.references, joined.world.baseline))
+    )  # fmt: skip
+    return ChainFrame(stamp_ns, tools, references)
+
+
+def test_frames_pass_the_nodes_of_one_process_as_objects(joined, ros):
+    """Each is tracked by the model of the one before; a second sender is still told."""
+    join(acquisition := SimpleNamespace(), joined.model, joined.tracker)
+    first_ns = time.time_ns()
+    states = [
+        {one.state for one in acquisition.chain.step(frame_of(joined, first_ns + n * 20_000_000))}
+        for n in range(3)
+    ]
+    assert joined.model.counters['frames'] == 3 == joined.tracker.counters['frames']
+    assert joined.tracker.counters['callback_faults'] == 0
+    assert states[-1] == {'ok'}
+    for node in (joined.model, joined.tracker):
+        assert node._fluxes.subscription is None, 'it would process everything twice'
+    assert joined.tracker._intake.newest is joined.model._output.newest
+    stranger = ros.create_node('stranger')
+    for _ in range(2):
+        stranger.create_publisher(PointCloud2, '/anser/tool/flux', qos.STREAM)
+    source = joined.tracker._fluxes
+    assert spin_until(stranger, lambda: '2 publishers' in source.complaint)
+    found = acquisition.chain.step(frame_of(joined, first_ns + 60_000_000))
+    assert {one.state for one in found} == {'two_sources'}
+    stranger.destroy_node()
+
+
+def test_a_late_frame_passes_without_its_references_at_most_twice():
+    """So that a slow machine loses no window."""
+    passed, counted = [], Counter()
+    unheard = SimpleNamespace(get_subscription_count=lambda: 0)
+    node = SimpleNamespace(
+        _accuracy=SimpleNamespace(must_republish=lambda *_: False),
+        _wall_clock=SimpleNamespace(offset_ns=lambda: 5), _backlog=Backlog(0.02),
+        _reference_publisher=unheard, _tool_publisher=unheard,
+        _interval=SimpleNamespace(add=lambda *_: None), chain=SimpleNamespace(step=passed.append),
+        count=lambda name, by: counted.update({name: by}),
+    )  # fmt: skip
+    points = FluxPoints(np.arange(1), np.zeros(1, int), np.ones((1, 8), complex), *2 * [None])
+    frame = SimpleNamespace(tool=points, reference=points, host_ns=1)
+    stream = SimpleNamespace(clock=SimpleNamespace(sigma_s=0.0))
+    refitted = [
+        Acquisition._publish_frame(node, stream, frame, time.monotonic_ns() - round(age_s * 1e9))
+        for age_s in (0.0, 0.1, 0.1, 0.1, 0.0)
+    ]
+    assert refitted == [True, False, False, True, True]
+    assert [one.reference is None for one in passed] == [False, True, True, False, False]
+    assert all(one.tools is not None and one.stamp_ns == 6 for one in passed)
+    assert counted == {'refits_left_out': 2}
 
 
 def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):

@@ -18,8 +18,7 @@ from anser_ros.field.model import (
 from anser_ros.field.nominal import nominal_model
 from anser_ros.fingerprint import fingerprint_of
 from anser_ros.nodes.streams.clouds import GivenModel
-from anser_ros.nodes.tracker_models import ActiveModel
-from anser_ros.physics.volume import TrackedVolume
+from anser_ros.nodes.tracker_models import ModelReader
 from anser_ros.pose_states import code_of
 from anser_ros.sessions.starting_model import (
     as_saved,
@@ -213,15 +212,14 @@ def test_a_model_of_another_board_or_tool_is_refused_with_both_named():
 def test_dipoles_and_effects_have_to_be_of_one_model(own, served, effects, state):
     models = [certain_model(), replace(certain_model(), effects=(gain(0),))]
     file_model = None if own is None else models[own]
-    in_force = ActiveModel(SETUP, TrackedVolume((-0.2, -0.2, 0.05), (0.2, 0.2, 0.3)), file_model)
+    reader = ModelReader(SETUP, file_model, 'mine')
     told = '' if served is None else models[served].fingerprint
     error = ModelError(0.0, np.zeros((0, 1, 8), complex), fingerprint=told, effects=effects)
     given = GivenModel(
         5, DipolePoints(*(getattr(models[0], n) for n in ('positions', 'directions',
                                                                'moments'))), error
     )  # fmt: skip
-    in_force.put(given, in_force.field_of(given))
-    withheld = in_force.at(10).withheld
+    withheld = reader.answer(given).withheld
     assert (withheld.state if withheld else '') == state
     if state:
         assert told in withheld.reason
@@ -241,14 +239,11 @@ def test_an_uncertainty_that_names_no_model_is_read_as_before():
 @pytest.mark.parametrize(('allowed', 'state'), [(False, 'uncalibrated'), (True, '')])
 def test_the_drawing_gives_poses_only_where_it_may(allowed, state):
     model = certain_model()
-    in_force = ActiveModel(
-        SETUP, TrackedVolume((-0.2, -0.2, 0.05), (0.2, 0.2, 0.3)), None, allowed
-    )
+    reader = ModelReader(SETUP, None, 'mine', allowed)
     error = ModelError(0.0, np.zeros((0, 1, 8), complex), withheld=code_of('uncalibrated'))
     points = DipolePoints(model.positions, model.directions, model.moments)
     given = GivenModel(5, points, error)
-    in_force.put(given, in_force.field_of(given))
-    withheld = in_force.at(10).withheld
+    withheld = reader.answer(given).withheld
     assert (withheld.state if withheld else '') == state
     drawn = nominal_model(anser_board())
     assert is_nominal(drawn) and is_nominal(from_document(to_document(drawn)))

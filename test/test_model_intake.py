@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tracking_world import certain_model, setup_of, triaxial_tool
 
+from anser_ros.chain.order import MOST_LATE, AnsweredFrames
 from anser_ros.nodes.streams.clouds import ModelWriter
-from anser_ros.nodes.tracker_models import MOST_LATE, ActiveModel, AnsweredFrames, ModelIntake
-from anser_ros.physics.volume import TrackedVolume
+from anser_ros.nodes.tracker_models import ModelIntake, ModelReader
 
 pytest.importorskip('sensor_msgs')
 MODEL = certain_model()
@@ -56,11 +56,10 @@ def test_an_uncertainty_that_comes_after_its_model_is_put_right():
     assert size_of(intake.take_error(errors[1])) == 2
 
 
-def test_a_model_that_is_handed_over_is_the_one_of_its_messages():
-    maker, intake = ModelWriter(), ModelIntake()
+def test_a_model_is_the_one_of_its_messages():
+    maker = ModelWriter()
     given = maker.given(uncertain(1), FIRST_NS, True, 2)
     read = taken(ModelIntake(), maker, uncertain(1), FIRST_NS, True, 2)
-    assert intake.take(given) is given is intake.newest and intake.has_error
     assert maker.given(uncertain(1), FIRST_NS + 1, True).error is not given.error
     for name in ('stamp_ns', 'follows', 'withheld'):
         assert getattr(given, name) == getattr(read, name)
@@ -85,62 +84,26 @@ def test_what_is_not_said_yet_is_unknown_but_a_shift_from_the_file():
     assert not intake.has_error
     given = ModelIntake().take(messages([0])[1][0])
     setup = setup_of(triaxial_tool())
-    assert given.field_model(setup, None).shift_sigma_m == 0.0
-    assert given.field_model(setup, replace(MODEL, shift_sigma_m=1e-3)).shift_sigma_m == 1e-3
+    for own, size in ((None, 0.0), (replace(MODEL, shift_sigma_m=1e-3), 1e-3)):
+        assert ModelReader(setup, own, '').answer(given).model.shift_sigma_m == size
 
 
-def test_the_model_in_force_ages_by_the_clock_of_the_frames():
-    model, maker, intake = certain_model(), ModelWriter(), ModelIntake()
-    setup = setup_of(triaxial_tool())
-    force = ActiveModel(setup, TrackedVolume(), None)
-    assert force.at(10**9).model is None and force.at(10**9).withheld is None
-
-    def publish(stamp_ns, follows=True, withheld=0):
-        given = taken(intake, maker, model, stamp_ns, follows, withheld)
-        force.put(given, force.field_of(given))
-
-    first, second = 10**12, 10**9
-    publish(first, follows=False)
-    assert force.at(first + 100 * second).withheld is None, 'it follows nothing'
-    publish(first)
-    assert force.at(first + second // 4).withheld is None
-    assert force.at(first + second).withheld.state == 'references_lost'
-    publish(first + second, withheld=1)
-    assert 'no reference readings yet, or too few' in force.at(first + second).withheld.reason
-    publish(first + 2 * second)
-    assert force.at(first + 2 * second).withheld is None
-    publish(first + 2 * second + 1, withheld=2)
-    assert force.at(first + 2 * second + 1).withheld.state == 'references_doubtful'
-    # The server's own stamp while a recording of another day is played: of no age to the frames.
-    publish(10**18)
-    assert force.at(first + 2 * second + second // 4).withheld is None
-    assert force.at(first + 3 * second).withheld.state == 'references_lost'
-
-
-def test_the_model_for_the_next_frame_is_aged_before_it_comes():
+def test_published_models_become_answers_that_share_what_is_the_same():
     maker, intake, now = ModelWriter(), ModelIntake(), 10**12
-    force = ActiveModel(setup_of(triaxial_tool()), TrackedVolume(), None)
-    assert force.soon() is None
-    for frame in range(2):
-        model = replace(MODEL, moments=(1.0 + 0.01 * frame) * MODEL.moments)
-        given = taken(intake, maker, model, now + frame, True)
-        force.put(given, force.field_of(given))
-    aged = force.soon()
-    assert aged is not force.field and aged.modes is not None
-    assert force.at(now + 20_000_000).model is aged
-
-
-@pytest.mark.parametrize('late_s', [1, 6, 60])
-def test_an_answer_to_an_old_frame_is_late_however_old_the_frame(late_s):
-    """Beyond some age it was once taken for one by another clock, and trusted anew."""
-    model, maker, intake = certain_model(), ModelWriter(), ModelIntake()
-    force = ActiveModel(setup_of(triaxial_tool()), TrackedVolume(), None)
-    now = 10**12
-    force.at(now)
-    stamp = now - late_s * 10**9
-    given = taken(intake, maker, model, stamp, True)
-    force.put(given, force.field_of(given))
-    assert force.at(now + 1).withheld.state == 'references_lost'
+    reader = ModelReader(setup_of(triaxial_tool()), None, 'nominal')
+    assert reader.own.model is None and not reader.own.follows
+    answers = [
+        reader.answer(taken(intake, maker, MODEL, now + n, n > 0, withheld))
+        for n, withheld in enumerate((0, 0, 1, 2))
+    ]
+    assert [one.stamp_ns for one in answers] == [now, now + 1, now + 2, now + 3]
+    assert [one.follows for one in answers] == [False, True, True, True]
+    assert answers[0].withheld is None and answers[1].withheld is None
+    assert 'no reference readings yet, or too few' in answers[2].withheld.reason
+    assert answers[3].withheld.state == 'references_doubtful'
+    given = maker.given(MODEL, now + 4, True, 2)  # of the same uncertainty, so not said again
+    last = reader.answer(intake.take(maker.dipoles(given, 'fg')))
+    assert last.model is answers[3].model and last.name == str(now + 4)
 
 
 STEP_NS = 20_000_000

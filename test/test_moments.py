@@ -179,10 +179,10 @@ def test_a_fit_starts_where_another_one_ended(rng):
     offsets = first.states[0].offset.copy()
     other = MomentFitter([world.measurements], layer, 1e-4, Accuracy())
     other.start_at(first)
-    moments, spectrum = other.solve(exact=False)
+    moments, spectra = other.solve(exact=False)
     assert np.allclose(moments, found.moments, rtol=1e-9, atol=0.0)
     assert other.noise_t == first.noise_t
-    other.correct(moments, spectrum.freedom(1e-4))
+    other.correct(moments, other.freedom(spectra))
     assert np.array_equal(first.states[0].offset, offsets)
     assert not np.array_equal(other.states[0].offset, offsets)
 

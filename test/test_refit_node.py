@@ -268,7 +268,7 @@ def test_a_pose_in_another_frame_or_of_nothing_is_refused(ros):
 
 def test_markers_of_nothing_and_of_one_source(ros):
     assert [m.action for m in metal_markers(None, 'fg', 5).markers] == [Marker.DELETEALL]
-    metal = Metal(np.ones((1, 3)), np.array([-3.0 + 0j]), np.array([1e-6]), np.ones(3), 0.05)
+    metal = Metal(np.ones((1, 3)), np.array([-3.0 + 0j]), np.array([1e-6]), np.ones(3))
     markers = metal_markers(metal, 'fg', 7_000_000_001).markers
     assert [m.type for m in markers[1:]] == [Marker.SPHERE_LIST, Marker.SPHERE]
     assert markers[1].scale.x == pytest.approx(0.008)

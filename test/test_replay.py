@@ -318,7 +318,9 @@ def test_all_started_in_the_same_moment_lose_no_frame(start, domain, tmp_path, f
 
     def nodes():
         start('field_model', '--ros-args', '-p', 'allow_uncalibrated:=true')
-        start('tracker', '--ros-args', '-p', 'gate:=1e5', '-p', 'max_sigma_m:=1.0')
+        # A frame waits for the model of its instant, however long a busy machine takes.
+        gate = '-p', 'gate:=1e5', '-p', 'max_sigma_m:=1.0'
+        start('tracker', '--ros-args', *gate, '-p', 'model_wait_s:=10.0')
         return start('recorder', '--ros-args', '-p', f'directory:={tmp_path}', '-p', 'name:=bag')
 
     recorder = nodes() if first == 'nodes' else None

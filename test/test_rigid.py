@@ -5,12 +5,15 @@ import pytest
 from tracking_world import NOISE_T, certain_model, fluxes, random_pose, triaxial_tool
 
 from anser_ros.errors import TrackingError
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils, common_factor, solve_body, start_from_coils
 from anser_ros.tracking.solve import RealField, bounded_inverse
 from anser_ros.tracking.solve_context import NOT_FINITE, fill_model_errors, source_spacing
+from anser_ros.tracking.tracker import Tracker
 
 SEED = 41
 MODEL = certain_model()
@@ -185,3 +188,26 @@ def test_dipoles_are_as_far_apart_as_their_nearest_neighbours_elsewhere():
     places = np.array([[0, 0, 0.1], [0, 0, 0.1], [0.03, 0, 0.1], [0.03, 0.05, 0.1], [0.03, 0, 0]])
     np.testing.assert_allclose(source_spacing(places, 0.02), [0.03, 0.03, 0.03, 0.05, 0.0])
     np.testing.assert_allclose(source_spacing(places[:2], 0.02), 0.0)
+
+
+@pytest.mark.parametrize(
+    ('spread_m', 'floor_m', 'state'),
+    [(0.0, -0.3, 'ambiguous'), (0.0, 0.05, 'ok'), (0.05, -0.3, 'ok')],
+)
+def test_the_opposite_place_around_a_source_is_ambiguous_where_nothing_tells_it(
+    rng, spread_m, floor_m, state
+):
+    place = spread_m * np.array([[0.0, 0.0, 1.0], [0.0, 1.0, -0.5], [1.0, -0.5, 0.0]])
+    names, tones = ('a', 'b', 'c'), (7e3, 8e3, 9e3)
+    source = FieldModel(place, np.eye(3), 0.05 * np.eye(3, dtype=complex), names, tones)
+    tool = TOOL.select([0, 1, 2])
+    volume = TrackedVolume((-0.3, -0.3, floor_m), (0.3, 0.3, 0.3))
+    tracker = Tracker(source, tool, TrackerSettings(volume=volume, flux_noise_t=NOISE_T))
+    for i in range(6):
+        position = np.array([0.1 * np.sin(i / 9), 0.1 * np.cos(i / 9), 0.15])
+        flux = fluxes(source, tool, position, rotation_of_vector([0.3, 0.2, i / 20]), rng)
+        body = {e.name: e for e in tracker.update(40_000_000 * (i + 1), tool.channel, flux)}[
+            tool.body[0]
+        ]
+        assert body.state == state
+        assert state != 'ok' or np.linalg.norm(body.position - position) < 1e-3

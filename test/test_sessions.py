@@ -90,10 +90,11 @@ class TestTrack:
         frames = list(frames_of(metal))
         stamps = [frame.stamp_ns for frame in frames]
         assert stamps == sorted(set(stamps)) and stamps[0] == metal.start_ns
-        first = next(frame.tools for frame in frames if frame.tools is not None)
+        one = next(frame for frame in frames if frame.tools is not None)
+        first = one.tools
         assert first.channels.tolist() == metal.sensors.channel.tolist()
         assert np.array_equal(first.flux, metal.tools[0].flux[0])
-        assert (first.in_phase().flux.imag == 0.0).all()
+        assert (one.in_phase().tools.flux.imag == 0.0).all()
 
     def test_nothing_to_compare_has_no_figures_and_no_tools_are_refused(self, moving, model):
         figures = metrics(pose_series('tool_a/0/x', (), np.empty((0, 3)), np.empty((0, 3))))

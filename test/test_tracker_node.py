@@ -91,7 +91,7 @@ def test_states_without_model_setup_or_data(tracker):
     tracker.say_flux(flux)
     tracker.spin_until(lambda: tracker.node.counters['fluxes_before_setup'] == 1)
     tracker.say_setup()
-    tracker.spin_until(lambda: tracker.node._tracker is not None)
+    tracker.spin_until(lambda: tracker.node._half is not None)
     tracker.say_flux(flux)
     wait_frame(tracker, 1)
     tracker.node.publish_diagnostics()
@@ -143,7 +143,7 @@ def test_the_gate_may_change_while_it_runs(tracker):
     ready(tracker)
     results = tracker.node.set_parameters([Parameter('gate', value=7.5)])
     assert results[0].successful
-    assert tracker.node._tracker.settings.gate == 7.5
+    assert tracker.node._half.tracker.settings.gate == 7.5
     assert tracker.node.status().level == 0
     tracker.node.set_parameters([Parameter('gate', value=1e6)])
     assert tracker.node.status().level == 1 and 'gate of 1e+06' in tracker.node.status().message
@@ -197,8 +197,8 @@ def test_what_acquisition_measures_meanwhile_changes_settings_only(tracker):
     ready(tracker)
     say_flux()
     wait_frame(tracker, 1)
-    topics, context = dict(node._topics), node._tracker._scene.context
-    noise = node._tracker.settings.flux_noise_t
+    topics, context = dict(node._topics), node._half.tracker._scene.context
+    noise = node._half.tracker.settings.flux_noise_t
     plain = setup_of(SENSORS, reference_specs())
 
     def measured(**values):
@@ -209,13 +209,13 @@ def test_what_acquisition_measures_meanwhile_changes_settings_only(tracker):
 
     measured(stamp_sigma_s=3e-4)
     wait_frame(tracker, 2)
-    assert node._tracker.settings.stamp_sigma_s == 3e-4
-    assert node._tracker._scene.context is context, 'which takes a tenth of a second to make'
-    assert node._tracker.counters['cold_starts'] == len(SENSORS.name)
+    assert node._half.tracker.settings.stamp_sigma_s == 3e-4
+    assert node._half.tracker._scene.context is context, 'which takes a tenth of a second to make'
+    assert node._half.tracker.counters['cold_starts'] == len(SENSORS.name)
     measured(stamp_sigma_s=3e-4, flux_noise_t=2.0 * noise)
     wait_frame(tracker, 3)
-    assert node._tracker.settings.flux_noise_t == 2.0 * noise
-    assert np.all(node._tracker._scene.context.sigma > context.sigma)
+    assert node._half.tracker.settings.flux_noise_t == 2.0 * noise
+    assert np.all(node._half.tracker._scene.context.sigma > context.sigma)
     assert node._topics == topics
     assert {topic.estimate.state for topic in topics.values()} == {'ok'}
 
@@ -241,7 +241,7 @@ def test_both_nodes_track_a_recorded_session(ros, shared):
         bench.connect(bench.setup, bench.flux)
         bench.say_setup(dump_setup(session.setup))
         bench.spin_until(
-            lambda: node.counters['models'] >= 1 and node._tracker.model.modes is not None
+            lambda: node.counters['models'] >= 1 and node._half.tracker.model.modes is not None
         )
         bench.spin_until(
             lambda: all(t._pose.get_subscription_count() for t in node._topics.values())

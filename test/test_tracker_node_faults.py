@@ -134,7 +134,7 @@ def test_bad_fluxes_have_their_counters_and_a_dead_emitter_is_named(tracker):
         tracker.stamp_ns += later_ns
         tracker.say_flux(values)
         wait_frame(tracker, 1)
-    tracker.spin_until(lambda: node._tracker.counters['time_jumps_forward'] == 1)
+    tracker.spin_until(lambda: node._half.tracker.counters['time_jumps_forward'] == 1)
     node.publish_diagnostics()
     # The words about the first frame without the emitter may still be on their way; only those
     # that know of the jump were published after the last frame.
@@ -179,7 +179,7 @@ def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, li
 
     for _ in range(100):
         tracker.say_flux(fluxes(certain_model(), SENSORS, *place, rng))
-    tracker.spin_until(lambda: node._tracker._past.intake.last_ns == tracker.stamp_ns)
+    tracker.spin_until(lambda: node._half.tracker._past.intake.last_ns == tracker.stamp_ns)
     assert (node.counters['frames_skipped'] > 20) if live else not node.counters['frames_skipped']
     assert node.counters['frames_skipped'] + node.counters['frames'] == 120
     node.publish_diagnostics()

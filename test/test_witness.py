@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from refit_world import NOISE_T, anser_world, metal_block, metal_flux
 from tracked_tool import CHANNELS, MODEL
 from tracking_world import flux_points, triaxial_tool
 
+from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError
 from anser_ros.nodes.field_model_io import ToolWitnesses
-from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode
+from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.witness import (
     CONTRADICTION_S,
@@ -220,7 +222,7 @@ def flux(stamp_ns, level):
     """A frame of all of the tool's channels, each emitter with the same flux."""
     values = np.full((len(CHANNELS), 8), level, dtype=np.complex128)
     values[2] = np.nan
-    return HandedFlux(stamp_ns, 'fg', flux_points(values, channels=CHANNELS))
+    return FluxCloud('fg').message(flux_points(values, channels=CHANNELS), stamp_ns)
 
 
 def pose(stamp_ns, x, frame_id='fg'):
@@ -242,8 +244,22 @@ def test_readings_and_poses_of_one_frame_come_together_in_any_order(witnesses):
     assert len(refit.given) == 2, 'no frame twice, none without readings'
     for (reading,), x, level in zip(refit.given, (0.01, 0.02), (1e-9, 2e-9), strict=True):
         assert reading.position[0] == x and np.array_equal(reading.rotation, np.eye(3))
-        assert (reading.flux == level).all()
+        assert (reading.flux == np.float32(level)).all()
         assert len(reading.table) == len(TOOL) - 1, 'the one without a reading is left out'
+
+
+def test_frames_of_the_same_process_come_with_the_poses_that_were_found(witnesses):
+    refit, values = Refit(), np.full((len(CHANNELS), 8), 1e-9, dtype=np.complex128)
+    tools = FrameReadings(np.array(CHANNELS), values, np.zeros(len(CHANNELS), int))
+    turn, good = np.eye(3), {'state': 'ok', 'position': np.ones(3)}
+    found = [
+        SimpleNamespace(name=name, rotation=rotation, **good)
+        for name, rotation in (('tool_a', turn), ('tool_a/0/x', None))
+    ]
+    witnesses.note(ChainFrame(100, tools, None), found)
+    witnesses.pass_on(refit, 100)
+    ((reading,),) = refit.given
+    assert reading.rotation is turn and len(reading.table) == len(TOOL)
 
 
 def test_what_has_no_partner_is_forgotten_and_an_earlier_recording_is_taken(witnesses):

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from anser_ros.arrays import Array
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.stamps import NANO
 from anser_ros.wire.bag_writer import SessionWriter
@@ -48,9 +49,6 @@ def load_setup(source: SetupSource) -> Setup:
     if isinstance(source, str):
         return parse_setup(source)
     return parse_setup(read_text(source, SetupError))
-
-
-Array = NDArray[np.float64]
 
 
 def write_session(

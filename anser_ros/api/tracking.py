@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.api.model import Model
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.pose_states import OK
 from anser_ros.sessions.evaluation_files import to_document
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import PoseSeries, track_session
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import TrackerSettings
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class TrackedPoses:
     """
 
     name: str
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Integers
     time: Array
     state: NDArray[np.str_]
     position: Array
@@ -64,7 +63,7 @@ class TrackedPoses:
     reason: tuple[str, ...]
 
     @property
-    def ok(self) -> NDArray[np.bool_]:
+    def ok(self) -> Booleans:
         """Return the mask (F,) of the frames that have a pose."""
         return np.asarray(self.state == OK)
 

@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Booleans, Integers
 from anser_ros.calibration.held_out import HeldOut, gaps_of, predict_held_out
 from anser_ros.calibration.layout_fit import LayoutFit, LayoutFitter
-from anser_ros.calibration.layouts import Generator, Layout, place
+from anser_ros.calibration.layouts import FREE_KINDS, Generator, Layout, place
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.readings import (
     check_agreement,
@@ -70,7 +70,7 @@ def correct_scan(
     generator: Generator,
     options: Options,
     progress: Progress | None = None,
-    steady: Sequence[NDArray[np.bool_]] | None = None,
+    steady: Sequence[Booleans] | None = None,
 ) -> Scan:
     """Return the measurements as ideal sensors would have given them, and what was not.
 
@@ -166,7 +166,7 @@ def _fitted(fitter: LayoutFitter, candidate: LayoutCandidate) -> LayoutFit:
 def _winner(
     selection: Selection,
     thin: Sequence[Measurements],
-    folds: Sequence[NDArray[np.int64]],
+    folds: Sequence[Integers],
     generator: Generator,
     accuracy: Accuracy,
     damping: float | None,
@@ -205,6 +205,8 @@ def best_damped(
     """
     start = DAMPINGS.index(candidate.damping)
     around = [*DAMPINGS[max(start - 1, 0) : start], *DAMPINGS[start + 1 : start + 2]]
+    if candidate.layout.kind in FREE_KINDS:  # whose poses are as exact in the comparison
+        return candidate, held_out
     near = [replace(candidate, damping=damping) for damping in around]
     other, result = min(((one, tested(one)) for one in near), key=lambda pair: pair[1].score_t)
     while result.score_t < held_out.score_t:

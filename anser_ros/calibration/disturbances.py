@@ -9,16 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_propagation
 from scipy.spatial import cKDTree
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.field.measurements import Measurements
 from anser_ros.settings import RefitSettings
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 BIN_S = 0.5
 """Length of the stretches, s, in which changes are looked for: metal comes and goes in seconds."""
@@ -51,12 +48,12 @@ class Span:
     start_s: float
     end_s: float
 
-    def holds(self, time: Array) -> Mask:
+    def holds(self, time: Array) -> Booleans:
         """Return a mask of the times, s, that lie in the span."""
         return np.asarray((time >= self.start_s) & (time <= self.end_s))
 
 
-def glitches(steps: Array, usable: Mask, stated: Array) -> Mask:
+def glitches(steps: Array, usable: Booleans, stated: Array) -> Booleans:
     """Return which frames' poses are far from where their fluxes put them, shape (F,).
 
     ``steps`` (F, 6): from each optical pose to where the fluxes put it, m and rad. ``usable``
@@ -71,7 +68,7 @@ def glitches(steps: Array, usable: Mask, stated: Array) -> Mask:
     return np.asarray((np.abs(steps - middle) > GLITCH * np.maximum(spread, stated)).any(axis=1))
 
 
-def stretches(time: Array) -> NDArray[np.int64]:
+def stretches(time: Array) -> Integers:
     """Return the number of the stretch of time that each frame is in, shape (F,)."""
     if time.size < 2:
         return np.zeros(time.size, dtype=np.int64)
@@ -79,7 +76,7 @@ def stretches(time: Array) -> NDArray[np.int64]:
     return np.asarray(np.floor((time - time[0]) / length), dtype=np.int64)
 
 
-def unsteady_references(reference: Measurements) -> Mask:
+def unsteady_references(reference: Measurements) -> Booleans:
     """Return which frames' references differ from their steady readings, shape (F,).
 
     The noise is that of differences between frames; the steady readings are those on which most
@@ -114,7 +111,7 @@ def unsteady_references(reference: Measurements) -> Mask:
     return np.asarray(binary_propagation(excess > SEEN, mask=excess > EDGE)[bins])
 
 
-def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask:
+def unsteady_tool(time: Array, place: Array, power: Array, usable: Booleans) -> Booleans:
     """Return which frames lie in stretches that no pose explains, shape (F,).
 
     ``time`` (F,): s, ascending. ``place`` (F, 3): of the body, m. ``power`` (F,): mean square of
@@ -145,7 +142,7 @@ def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask
     return found
 
 
-def spans_of(time: Array, unsteady: Mask) -> list[Span]:
+def spans_of(time: Array, unsteady: Booleans) -> list[Span]:
     """Return the spans that a mask covers; gaps shorter than two stretches are closed."""
     spans: list[Span] = []
     step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
@@ -158,15 +155,13 @@ def spans_of(time: Array, unsteady: Mask) -> list[Span]:
     return spans
 
 
-def outside(time: Array, spans: Sequence[Span]) -> Mask:
+def outside(time: Array, spans: Sequence[Span]) -> Booleans:
     """Return which times lie in none of the spans."""
     out = np.ones(time.size, dtype=bool)
     for span in spans:
         out &= ~span.holds(time)
     return out
 
-
-ComplexArray = NDArray[np.complex128]
 
 FEWEST_SENSORS = RefitSettings.min_references
 """References that have to be read throughout: with fewer, metal may look like a strength."""

@@ -9,14 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, Booleans
 from anser_ros.calibration.readings import fold_of_frames
 from anser_ros.errors import FitError
-
-Array = NDArray[np.float64]
 
 FLAT = 1e-6
 """Part of the largest extent below which a direction carries no trend: only rounding differs."""
@@ -216,7 +214,7 @@ class _Pairs:
         is_plane = registers and spread[2] < PLANE * spread[0]
         self.normal: Array | None = axes[2] if is_plane else None
 
-    def registration(self, train: NDArray[np.bool_]) -> tuple[Array, Array]:
+    def registration(self, train: Booleans) -> tuple[Array, Array]:
         """Rotation and translation (m) from the frame of the true positions to the tracked."""
         if not self._registers:
             return np.eye(3), np.zeros(3)
@@ -224,7 +222,7 @@ class _Pairs:
         turn = Rotation.align_vectors(self.tracked[train] - aim, self.true[train] - middle)[0]
         return turn.as_matrix(), np.asarray(aim - turn.apply(middle))
 
-    def errors(self, some: NDArray[np.bool_], rotation: Array, translation: Array) -> Array:
+    def errors(self, some: Booleans, rotation: Array, translation: Array) -> Array:
         """Return truth minus tracked positions, m, in their frame; only what is corrected."""
         lacking = self.true[some] @ rotation.T + translation - self.tracked[some]
         if self.normal is None:

@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.calibration.layout_fit import LayoutFit
-from anser_ros.calibration.least_squares import ComplexArray, as_complex
+from anser_ros.calibration.least_squares import as_complex
 from anser_ros.calibration.moments import (
     MomentFit,
     PoseTerms,
@@ -35,8 +35,6 @@ from anser_ros.parallel import in_order
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 GRID = (7, 7, 4)
 """Places along x, y and z of the scanned box at which the field's uncertainty is looked at."""
@@ -139,7 +137,7 @@ class HeldOut:
 
 def predict_held_out(
     measurements: Sequence[Measurements],
-    folds: Sequence[NDArray[np.int64]],
+    folds: Sequence[Integers],
     fit: Callable[[int], LayoutFit],
     accuracy: Accuracy,
     reference: MomentFit,

@@ -17,16 +17,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.calibration.least_squares import NormalFactor, as_complex, as_real, subtract_gram
 from anser_ros.calibration.moments import PoseTerms, PoseWhitener, pose_slopes
 from anser_ros.calibration.readings import DipoleSites, basis_rows, flux_slopes, frame_blocks
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
 from anser_ros.field.measurements import Measurements
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 LEAST_MOST_MODES, MOST_MODES = 160, 240
 """Modes of the field at most, for a scan of minutes and for a short one. What 160 miss of a wide
@@ -41,6 +38,9 @@ SYSTEM_ROWS = 1200
 """Readings in memory at a time: each has a row for every parameter."""
 POSE_ROWS = 1800
 """Rows of the open poses, six a frame, that are subtracted together at least."""
+FAR_LESS, MOST_RATIO = 4.0, 1e3
+"""Ratio of scatters from which on a kind of parameters is known better than the others: such as
+delays, which only show where nothing else does; and the most that is made of it."""
 LEAST_OPEN = 1e-4
 """Variance that open poses add to a part's readings on average, relative to the noise's, up to
 which they have nothing to do with it: 1e-9 without metal, 4e-5 to 1e-4 near large pieces."""
@@ -125,7 +125,7 @@ def open_directions(
     return np.asarray(along.reshape(len(along), 6, *linear.slope.shape[1:3]))
 
 
-def tied_parts(along: Sequence[Array]) -> NDArray[np.bool_]:
+def tied_parts(along: Sequence[Array]) -> Booleans:
     """Return to which parts (2K,) open poses add more than `LEAST_OPEN`, in any of the bodies."""
     added = np.array([(a**2).sum(axis=(0, 1, 2)) / max(len(a) * a.shape[2], 1) for a in along])
     return np.asarray((added > LEAST_OPEN).any(axis=0))
@@ -138,9 +138,7 @@ class JointSystem:
     poses tie together.
     """
 
-    def __init__(
-        self, parameters: SensorParameters, modes: FieldModes, tied: NDArray[np.bool_]
-    ) -> None:
+    def __init__(self, parameters: SensorParameters, modes: FieldModes, tied: Booleans) -> None:
         self.parameters, self.modes, self.tied = parameters, modes, tied
         self.parts, self.count = tied.size, modes.size.size
         rest = len(parameters) + 1
@@ -258,10 +256,33 @@ class Eliminated:
         The median over the parameters, for a sensor that changes scatters its own alone; one
         without parameters.
         """
+        return float(np.median(self.scatter)) if self.scatter.size else 1.0
+
+    @property
+    def scatter(self) -> Array:
+        """Return the same of each parameter, (Q,)."""
         count = len(self.scores)
         power = (self.scores**2).sum(axis=0) * count / max(count - 1, 1)
-        size = np.maximum(np.diag(self.information), 1e-300)
-        return float(np.median(power / size)) if size.size else 1.0
+        return np.asarray(power / np.maximum(np.diag(self.information), 1e-300))
+
+    def likelihood(self, values: Array, kinds: Sequence[Integers]) -> tuple[Array, Array]:
+        """Return information (Q, Q) of the parameters, and its product with their best values.
+
+        ``values`` (Q,): the present ones. ``kinds``: indices of parameters of a kind: those whose
+        scores scatter far less than the others' are not weakened by what makes the others scatter.
+        """
+        more = np.ones(values.size)
+        for rows in kinds:
+            ratio = self.inflation / max(float(np.median(self.scatter[rows])), 1e-300)
+            if ratio > FAR_LESS:
+                more[rows] = np.sqrt(min(ratio, MOST_RATIO))
+        information = self.information * np.outer(more, more)
+        if (more == 1.0).all():
+            return information, self.gradient + information @ values
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.information), 1e-300))
+        scaled = self.information * np.outer(scale, scale)
+        step = scale * np.linalg.lstsq(scaled, scale * self.gradient, rcond=1e-12)[0]
+        return information, information @ (values + step)
 
     def field_step(self, step: Array, modes: int) -> Array:
         """Return the field's step (M, 2K) that goes with a step of the parameters (Q,)."""

@@ -10,23 +10,35 @@ again (`join_regions`). `LayoutFitter` does what several fits have in common onc
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anser_ros.calibration.layouts import Generator, Layout, fit_coaxial, place
-from anser_ros.calibration.least_squares import ComplexArray, GramFactor, as_complex, as_real
+from anser_ros.arrays import Array, ComplexArray
+from anser_ros.calibration.layouts import (
+    FREE_KINDS,
+    Generator,
+    Layout,
+    fit_clusters,
+    fit_coaxial,
+    place,
+)
+from anser_ros.calibration.least_squares import GramFactor, as_complex, as_real
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
 from anser_ros.calibration.placement import CoilPlacer, PositionFitter
-from anser_ros.calibration.readings import DipoleSites, basis_rows, frame_blocks, usable_readings
+from anser_ros.calibration.readings import (
+    DipoleSites,
+    basis_rows,
+    frame_blocks,
+    usable_readings,
+    usable_weights,
+    with_pose,
+)
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 POINTS_ALONG = 11
 """Points along x and y (half along z) where dipoles are to make the nominal field: 2000 equations
@@ -119,7 +131,7 @@ def join_regions(
     fit: MomentFit,
     damping: float,
     layer: DipoleSites,
-) -> NDArray[np.complex128]:
+) -> ComplexArray:
     """Return the moments of a finer layer that make the blended field of the regions.
 
     ``fit``: the common fit: its poses and weights are kept, and the damping pulls the regions'
@@ -172,6 +184,9 @@ MOVING_DAMPING = 1e-4
 """Damping while dipoles are moved: it keeps two that come close from growing huge moments."""
 MOST_MOVING_ROWS = 6000
 """Readings by which dipoles are moved at most: some hundred positions need no more."""
+AS_GOOD = 1.5
+"""Factor by which the noise of fewer dipoles may be larger than that of more, as of a layer:
+these take up errors of the sensors, and of the poses of one region for another."""
 LEAST_HEIGHT_M = 0.01
 """Height of the lowest reading at least, m, for recordings in which a sensor touches the board."""
 LEAST_EXTENSION = 1.1
@@ -201,6 +216,36 @@ def rich_layout(measurements: Sequence[Measurements], generator: Generator) -> L
     count = int(np.clip(np.ceil(width * RICH.extension / spacing) + 1, RICH.count, RICH_MOST))
     extension = float(np.clip(spacing * (count - 1) / width, LEAST_EXTENSION, RICH.extension))
     return replace(RICH, count=count, extension=extension)
+
+
+def free_bases(measurements: Sequence[Measurements], generator: Generator) -> list[DipoleSites]:
+    """Return dipoles about the emitters, wherever they are and whatever their shape.
+
+    First those that all emitters share, then each emitter's own; none where there is a drawing.
+    """
+    if generator.nominal is not None:
+        return []
+    posed = [with_pose(m) for m in measurements]
+    own = fit_clusters(posed, [usable_weights(m) for m in posed], generator.centres)
+    return [own.shared, own]
+
+
+Tried = TypeVar('Tried')
+
+
+def richest(tried: Sequence[Tried], noise_t: Sequence[float]) -> Tried:
+    """Return the fit of the last basis that leaves about as little noise as any, T."""
+    limit = AS_GOOD * min(noise_t)
+    return [one for one, noise in zip(tried, noise_t, strict=True) if noise <= limit][-1]
+
+
+def rich_fit(
+    measurements: Sequence[Measurements], bases: Sequence[DipoleSites], accuracy: Accuracy
+) -> tuple[MomentFitter, MomentFit]:
+    """Return the fit of those of several dipoles that leave least for each degree of freedom."""
+    fitters = [MomentFitter(measurements, sites, RICH_DAMPING, accuracy) for sites in bases]
+    fits = [(fitter, fitter.fit(3, exact=False)) for fitter in fitters]
+    return richest(fits, [fit.noise_t for _, fit in fits])
 
 
 class LayoutPlacer:
@@ -241,6 +286,9 @@ class LayoutPlacer:
         shares = [w[::step] for w in weights]
         if layout.kind == 'drawing' and self.scaled is not None:
             return CoilPlacer(self.scaled.nominal).fit(thin, shares)
+        if layout.kind in FREE_KINDS:
+            found = fit_clusters(thin, shares, self.generator.centres)
+            return found if layout.kind == 'cluster' else found.shared, None
         dipoles, prior = self.placed(layout)
         if layout.kind == 'coaxial':
             found = fit_coaxial(thin, shares, dipoles, layout.count)
@@ -271,7 +319,7 @@ class LayoutFitter:
         dipoles, prior = self._sites(layout)
         fitter = MomentFitter(self.measurements, dipoles, damping, self.accuracy, prior)
         if layout.moved:
-            fitter.start_at(self._rich[0])
+            fitter.start_at(self.rich[0])
         fit = fitter.fit(alternations, progress, exact)
         if not layout.local:
             return LayoutFit(dipoles, fit)
@@ -281,7 +329,7 @@ class LayoutFitter:
     def _sites(self, layout: Layout) -> tuple[DipoleSites, ComplexArray | None]:
         if layout not in self._placed:
             if layout.moved:
-                _, fit = self._rich
+                _, fit = self.rich
                 found = self.placer.moved(layout, fit.measurements, fit.weights)
             else:
                 found = self.placer.placed(layout)
@@ -294,7 +342,7 @@ class LayoutFitter:
         return place(rich_layout(self.measurements, generator), generator)
 
     @cached_property
-    def _rich(self) -> tuple[MomentFitter, MomentFit]:
-        """The fit of a rich layer, at whose poses dipoles are moved."""
-        fitter = MomentFitter(self.measurements, self._layer, RICH_DAMPING, self.accuracy)
-        return fitter, fitter.fit(3, exact=False)
+    def rich(self) -> tuple[MomentFitter, MomentFit]:
+        """Return the fit at whose poses dipoles are moved."""
+        bases = [self._layer, *free_bases(self.measurements, self.placer.generator)]
+        return rich_fit(self.measurements, bases, self.accuracy)

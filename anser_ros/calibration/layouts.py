@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from anser_ros.arrays import Array
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.readings import DipoleSites, weighted_readings
 from anser_ros.field.measurements import Measurements
@@ -23,7 +23,8 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import tilted
 
-Array = NDArray[np.float64]
+Rows = tuple[Array, Array, Array, Array, Array]
+"""Points, axes, lengths, roots of weights and real fluxes of readings, (P, ...)."""
 
 SPREAD = 0.2
 """Distance of neighbouring dipoles, as a fraction s of that from the source to the nearest sensor:
@@ -71,9 +72,8 @@ def fit_coaxial(
 
 
 def _one_source(
-    rows: tuple[Array, Array, Array, Array, Array], centre: Array, axis: Array, count: int,
-    near: float,
-) -> tuple[Array, Array, float]:  # fmt: skip
+    rows: Rows, centre: Array, axis: Array, count: int, near: float
+) -> tuple[Array, Array, float]:
     """Place, axis and spacing of one emitter's source, from rows (P, ...) and fluxes (P, 2)."""
     points, normals, lengths, root, flux = rows
     weighted = flux * root[:, None]
@@ -101,17 +101,73 @@ def _one_source(
     return centre + near * x[:3], tilted(axis[None], x[None, 3:])[0], spacing
 
 
-def _best_vector(rows: tuple[Array, Array, Array, Array, Array], centre: Array) -> Array:
+def _best_vector(rows: Rows, centre: Array) -> Array:
     """Moment vector (real part) of one dipole at a place that explains the fluxes best."""
-    points, normals, lengths, root, flux = rows
-    where = np.tile(centre, (3, 1))
-    basis = flux_basis(points, normals, lengths, where, np.eye(3)) * root[:, None]
-    moments = np.linalg.lstsq(basis, flux * root[:, None], rcond=1e-12)[0]
+    moments, _ = _one_vector(rows, centre)
     return np.asarray(moments[:, int(np.argmax((moments**2).sum(axis=0)))])
+
+
+def _one_vector(rows: Rows, centre: Array) -> tuple[Array, Array]:
+    """Moments (3, 2) of one dipole at a place that explain the fluxes best, and what is left."""
+    points, normals, lengths, root, flux = rows
+    where, weighted = np.tile(centre, (3, 1)), flux * root[:, None]
+    basis = flux_basis(points, normals, lengths, where, np.eye(3)) * root[:, None]
+    moments = np.linalg.lstsq(basis, weighted, rcond=1e-12)[0]
+    return np.asarray(moments), np.asarray(weighted - basis @ moments)
 
 
 UNIT_Z = np.array([0.0, 0.0, 1.0])
 """Direction of the dipoles of a flat layer, the normal of the board."""
+
+
+CLUSTER = np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+"""Places of a cluster's dipoles, in its spacing: three components in the middle and at six places
+around it make every dipole and quadrupole, and all octupoles but one."""
+FREE_KINDS = ('cluster', 'shared_cluster')
+"""Kinds of layouts of clusters: of each emitter its own, or of all the same ones, as currents in
+one coil that another drives ask for."""
+SAME_PLACE = 0.5
+"""Distance of two emitters' middles, in spacings, below which one cluster does for both."""
+
+
+def clusters(centres: Array, spacing_m: float) -> DipoleSites:
+    """Return dipoles around emitters of any shape, with middles (K, 3), m, frame fg.
+
+
+    Moments grow with the power of a source's size over the spacing: damping, which holds all of
+    them alike, holds each multipole as much as a source of that size lets it be.
+    """
+    near = np.linalg.norm(centres[:, None] - centres, axis=2) <= SAME_PLACE * spacing_m
+    first = near.argmax(axis=1)
+    of, where = np.unique(first, return_inverse=True)
+    places = centres[of][:, None, :] + spacing_m * CLUSTER
+    sites = DipoleSites.of_any_direction(places.reshape(-1, 3))
+    own = np.repeat(np.arange(len(of)), 3 * len(CLUSTER))[:, None] == where
+    return DipoleSites(sites.positions, sites.directions, own)
+
+
+def fit_clusters(
+    corrected: Sequence[Measurements], weights: Sequence[Array], centres: Array
+) -> DipoleSites:
+    """Return clusters about the places where one dipole of any direction explains each emitter.
+
+    ``centres`` (K, 3): about where the emitters are, m, frame fg.
+    """
+    (points, normals, lengths, measured), root = weighted_readings(corrected, weights)
+    flux, found, near = as_real(measured), [], []
+    for k, centre in enumerate(centres):
+        pair = np.ascontiguousarray(flux[:, 2 * k : 2 * k + 2])
+        rows = (points, normals, lengths, root, pair)
+        reach = float(np.linalg.norm(points - centre, axis=1).min())
+        size = max(float(np.linalg.norm(pair * root[:, None])), 1e-300)
+
+        def left(x: Array, rows: Rows = rows, start: Array = centre, by: float = size) -> Array:
+            return _one_vector(rows, start + x)[1].ravel() / by
+
+        solution = least_squares(left, np.zeros(3), x_scale=reach, ftol=ENDED, xtol=1e-9)
+        found.append(centre + np.asarray(solution.x))
+        near.append(float(np.linalg.norm(points - found[-1], axis=1).min()))
+    return clusters(np.array(found), SPREAD * min(near))
 
 
 @dataclass(frozen=True)
@@ -149,8 +205,9 @@ class Layout:
     """Describes a rule by which dipoles are placed and fitted."""
 
     # 'layer' of z-dipoles, 'layer_xyz' of dipoles with three free components, z-dipoles on the
-    # 'coils', 'coaxial' dipoles along an axis of its own for each coil, those of the coils of the
-    # 'drawing', or another rule, which has its own words
+    # 'coils', 'coaxial' dipoles along an axis of its own for each coil, a 'cluster' or
+    # 'shared_cluster' about each, those of the coils of the 'drawing', or another rule, which has
+    # its own words
     kind: str
     count: int  # dipoles along a side of the layer, of each coil, along each axis, or in all
     extension: float  # size of the layer as a multiple of the field generator's
@@ -166,6 +223,9 @@ class Layout:
             return self.words
         if self.kind == 'coaxial':
             return f'{self.count} on an axis of its own for every emitter, place and axis free'
+        if self.kind in FREE_KINDS:
+            more = '' if self.kind == 'cluster' else ', shared by all emitters'
+            return f'{self.count} of any direction about every emitter, place free{more}'
         if self.kind == 'drawing':
             return f'{self.count} of the drawn coils, each coil placed where it fits, pulled to it'
         more = ', pulled to the drawn board' if self.prior == 'nominal' else ''
@@ -195,6 +255,9 @@ def place(layout: Layout, generator: Generator) -> DipoleSites:
         count = len(generator.centres)
         upright, spacing = np.tile(UNIT_Z, (count, 1)), np.full(count, FIRST_SPACING_M)
         return coaxial(generator.centres, upright, layout.count, spacing)
+    if layout.kind in FREE_KINDS:
+        found = clusters(generator.centres, SPREAD * generator.side_m)
+        return found if layout.kind == 'cluster' else found.shared
     flat = grid(layout.count, generator.half_extent * layout.extension)
     middle = generator.middle
     positions = np.empty((flat.shape[0], 3))

@@ -12,12 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.parallel import in_order, slices
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 RIGHT_SCALE = 1e9
 """Factor of the right-hand sides in a Gram matrix: fluxes are then of a size with the columns."""
@@ -35,10 +32,14 @@ class TriangularFactor:
         stack = np.concatenate([self.triangle, np.concatenate([matrix, right], axis=1)])
         self.triangle = np.asarray(np.linalg.qr(stack, mode='r'))
 
-    def spectrum(self) -> 'Spectrum':
-        """Return the singular value decomposition of the column-scaled problem."""
+    def spectrum(self, some: Integers | None = None) -> 'Spectrum':
+        """Return the singular value decomposition of the column-scaled problem.
+
+        ``some``: the unknowns that there are; all by default.
+        """
         n = self.unknowns
         matrix, right = self.triangle[:n, :n], self.triangle[:n, n:]
+        matrix = matrix if some is None else matrix[:, some]
         scale = np.linalg.norm(matrix, axis=0)
         scale[scale == 0.0] = 1.0
         u, s, vt = np.linalg.svd(matrix / scale, full_matrices=False)
@@ -61,16 +62,18 @@ class GramFactor:
         block = np.concatenate([matrix, right * RIGHT_SCALE], axis=1)
         self.gram += block.T @ block
 
-    def spectrum(self) -> 'Spectrum':
-        """Return the singular value decomposition of the problem by eigenvectors."""
-        n = self.unknowns
-        scale = np.sqrt(np.diag(self.gram)[:n])
+    def spectrum(self, some: Integers | None = None) -> 'Spectrum':
+        """Return the same by eigenvectors."""
+        rows = np.arange(self.unknowns) if some is None else some
+        n, total = rows.size, self.unknowns
+        scale = np.sqrt(np.diag(self.gram)[rows])
         scale[scale == 0.0] = 1.0
-        values, vectors = np.linalg.eigh(self.gram[:n, :n] / np.outer(scale, scale))
+        inner = self.gram[np.ix_(rows, rows)]
+        values, vectors = np.linalg.eigh(inner / np.outer(scale, scale))
         floor = values[-1] * np.finfo(float).eps * n
         s = np.sqrt(np.maximum(values, floor))[::-1]
         v = vectors[:, ::-1].T
-        right = self.gram[:n, n:] / (scale[:, None] * RIGHT_SCALE)
+        right = self.gram[rows, total:] / (scale[:, None] * RIGHT_SCALE)
         return Spectrum(scale, s, v, (v @ right) / s[:, None])
 
 

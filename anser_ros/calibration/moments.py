@@ -16,9 +16,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.least_squares import (
     GramFactor,
     Spectrum,
@@ -37,9 +37,6 @@ from anser_ros.calibration.readings import (
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 OUTLIER_SCALE = 3.0
 """Residuals larger than this many times the median residual lose weight. A smaller value takes
@@ -291,8 +288,8 @@ class MomentFitter:
             for state in other.states
         ]
 
-    def solve(self, exact: bool = True) -> tuple[ComplexArray, Spectrum]:
-        """Return the moments (N, K) at the present poses and weights, with their spectrum.
+    def solve(self, exact: bool = True) -> tuple[ComplexArray, list[Spectrum]]:
+        """Return the moments (N, K) at the present poses and weights, with each group's spectrum.
 
         With ``exact`` they are solved by QR, otherwise by inner products, which is faster.
         """
@@ -305,8 +302,18 @@ class MomentFitter:
                 root = np.sqrt(state.weights[block].reshape(-1, 1))
                 right = as_real(part.flux).reshape(-1, 2 * self.emitters)
                 factor.add(root * basis_rows(part, self.dipoles), root * right)
-        spectrum = factor.spectrum()
-        return as_complex(spectrum.solve(self.damping, self.prior)), spectrum
+        moments, spectra = np.zeros((len(self.dipoles), 2 * self.emitters)), []
+        for emitters, rows in self.dipoles.groups(self.emitters):
+            parts = np.repeat(2 * np.array(emitters), 2) + np.tile([0, 1], len(emitters))
+            spectrum = factor.spectrum(rows)
+            prior = None if self.prior is None else self.prior[rows]
+            moments[np.ix_(rows, parts)] = spectrum.solve(self.damping, prior)[:, parts]
+            spectra.append(spectrum)
+        return as_complex(moments), spectra
+
+    def freedom(self, spectra: Sequence[Spectrum]) -> float:
+        """Return the effective number of parameters of an emitter."""
+        return float(np.mean([spectrum.freedom(self.damping) for spectrum in spectra]))
 
     def correct(self, moments: ComplexArray, freedom: float) -> float:
         """Move all poses to their most probable values and return the new noise estimate, T.
@@ -340,27 +347,27 @@ class MomentFitter:
     ) -> MomentFit:
         """Alternate until the noise estimate no longer changes; the last solution may be exact."""
         done = 0
-        moments, spectrum = self.solve(exact=False)
+        moments, spectra = self.solve(exact=False)
         for done in range(1, alternations + 1):
             before = self.noise_t
-            self.noise_t = self.correct(moments, spectrum.freedom(self.damping))
+            self.noise_t = self.correct(moments, self.freedom(spectra))
             last = done == alternations or (
                 done > 1 and abs(before - self.noise_t) < CONVERGED * self.noise_t
             )
-            moments, spectrum = self.solve(exact=exact and last)
+            moments, spectra = self.solve(exact=exact and last)
             if progress is not None:
                 progress('moments', done / alternations)
             if last:
                 break
-        values = spectrum.values
+        values = [spectrum.values for spectrum in spectra]
         return MomentFit(
             moments=moments,
             measurements=tuple(state.corrected for state in self.states),
             weights=tuple(state.weights for state in self.states),
             noise_t=self.noise_t,
             quadrature_noise_t=self.quadrature_noise_t,
-            rank=spectrum.rank,
-            freedom=spectrum.freedom(self.damping),
-            condition=float(values[0] / max(values[-1], np.finfo(float).tiny)),
+            rank=sum(spectrum.rank for spectrum in spectra),
+            freedom=self.freedom(spectra),
+            condition=max(float(v[0] / max(v[-1], np.finfo(float).tiny)) for v in values),
             alternations=done,
         )

@@ -12,16 +12,14 @@ size depends neither on the number of emitters nor on that of readings.
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration.least_squares import ComplexArray, as_real
+from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.readings import BLOCK_ROWS, DipoleSites, frame_blocks, weighted_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import GAUSS_OFFSET, dipole_rows, fill_fields, flux_basis
-
-Array = NDArray[np.float64]
 
 SHIFT_M = 2e-3
 """Prior width of a coil's shift along each axis, m: some times what boards differ by."""
@@ -63,7 +61,7 @@ class CoilPlacer:
             strength = self.nominal.moments[rows, k]
 
             def field(
-                at: Array, rows: NDArray[np.int64] = rows, strength: ComplexArray = strength
+                at: Array, rows: Integers = rows, strength: ComplexArray = strength
             ) -> ComplexArray:
                 place, turned = self._placed(rows, at)
                 made = flux_basis(points, axes, lengths, place, turned) @ strength
@@ -74,7 +72,7 @@ class CoilPlacer:
             moments[rows, k] = gain * strength
         return DipoleSites(positions, directions), moments
 
-    def _placed(self, rows: NDArray[np.int64], at: Array) -> tuple[Array, Array]:
+    def _placed(self, rows: Integers, at: Array) -> tuple[Array, Array]:
         """Return a coil's dipoles shifted by at[:3] (m) and turned by at[3:] (rad) about it."""
         where = self.nominal.positions[rows]
         middle = where.mean(axis=0)

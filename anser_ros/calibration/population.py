@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.calibration.sensor_parameters import (
     AS_PLACES,
     POPULATIONS,
@@ -24,12 +25,9 @@ from anser_ros.calibration.sensor_parameters import (
 )
 from anser_ros.field.measurements import Measurements
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 WIDTH_STEPS = 40
 """Fixed-point steps of the widths; they settle within some ten."""
-NARROWEST = {'gains': 1e-6, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9}
+NARROWEST = {'gains': 1e-6, 'delays': 1e-12, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9}
 """Least width of a population, in its own unit: no spread at all."""
 LEAST_EVIDENCE = 5.0
 """Gain of the log probability for which a kind of error is kept: odds of 150 to 1."""
@@ -105,7 +103,9 @@ class Population:
     def __init__(self, parameters: SensorParameters) -> None:
         self.parameters = parameters
         self.groups = parameters.groups()
-        self.alone: dict[str, Index] = {kind: np.zeros(0, dtype=np.int64) for kind in POPULATIONS}
+        self.alone: dict[str, Integers] = {
+            kind: np.zeros(0, dtype=np.int64) for kind in POPULATIONS
+        }
 
     def fit(self, likelihood: Likelihood, fixed: Sequence[str] = ()) -> Posterior:
         """Return the parameters with the most probable widths; ``fixed`` kinds stay at zero."""
@@ -290,11 +290,44 @@ def interpolation_share(measurements: Measurements) -> Array:
     return np.asarray((1.0 - along) ** 2 + along**2)
 
 
+APART_S = 1.0
+"""Time, s, from which on two poses of the reference share no sample of it."""
+NEAREST = 8
+"""Poses beside each one among which the nearest of another time is looked for."""
+NEAR = 0.2
+"""Distance of these at most, as a fraction of the poses' extent: farther errors are other ones."""
+
+
+def alike_sigma_m(
+    parts: Sequence[Measurements], steps: Sequence[Array], kept: Sequence[Booleans]
+) -> float:
+    """Return how far poses at the same place are off together, m along each axis, one sigma.
+
+    That is what field and sensors cannot explain, and the reference's own errors by place; the
+    jitter of poses has no part in it.
+    For each of the measurements, ``steps`` (F, 6) to where the fluxes put the poses.
+    """
+    place = np.concatenate([m.position[k] for m, k in zip(parts, kept, strict=True)])
+    time = np.concatenate([m.time[k] for m, k in zip(parts, kept, strict=True)])
+    step = np.concatenate([s[k, :3] for s, k in zip(steps, kept, strict=True)])
+    of = np.repeat(np.arange(len(parts)), [int(k.sum()) for k in kept])
+    if len(place) <= NEAREST:
+        return 0.0
+    distance, row = cKDTree(place).query(place, NEAREST + 1)
+    other = (np.abs(time[row] - time[:, None]) >= APART_S) | (of[row] != of[:, None])
+    other &= distance < NEAR * float(np.ptp(place, axis=0).max())
+    some, first = np.flatnonzero(other.any(axis=1)), other.argmax(axis=1)
+    if len(some) <= NEAREST:
+        return 0.0
+    product = (step[some] * step[row[some, first[some]]]).mean()
+    return float(np.sqrt(max(product, 0.0)))
+
+
 def estimate_noise(
     steps: Sequence[Array],
     variances: Sequence[Array],
     shares: Sequence[Array],
-    kept: Sequence[NDArray[np.bool_]],
+    kept: Sequence[Booleans],
     present: OpticalNoise,
 ) -> OpticalNoise:
     """Estimate the jitter from the poses' most probable steps.

@@ -9,15 +9,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis, flux_jacobian
 from anser_ros.physics.sensor import along_each_axis
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 BLOCK_ROWS = 8192
 """Readings that are in memory at a time as rows of a matrix. With 400 dipoles such a block takes
@@ -84,14 +81,29 @@ class DipoleSites:
 
     positions: Array
     directions: Array
+    own: Booleans | None = None  # (N, K): whose dipoles they are; None if everybody's
 
     def __len__(self) -> int:
         return int(self.positions.shape[0])
+
+    def groups(self, emitters: int) -> list[tuple[list[int], Integers]]:
+        """Return emitters that have the same dipoles, with the indices of these."""
+        if self.own is None:
+            return [(list(range(emitters)), np.arange(len(self)))]
+        alike: dict[bytes, list[int]] = {}
+        for k in range(emitters):
+            alike.setdefault(self.own[:, k].tobytes(), []).append(k)
+        return [(some, np.flatnonzero(self.own[:, some[0]])) for some in alike.values()]
 
     @staticmethod
     def of_any_direction(places: Array) -> 'DipoleSites':
         """Return three dipoles, along x, y and z, at each of P places (P, 3), m."""
         return DipoleSites(*along_each_axis(places))
+
+    @property
+    def shared(self) -> 'DipoleSites':
+        """Return the same dipoles, of which every emitter may have moments."""
+        return DipoleSites(self.positions, self.directions)
 
     def joined(self, other: 'DipoleSites') -> 'DipoleSites':
         """Return these dipoles, then the others."""
@@ -135,7 +147,7 @@ SMALLEST_SHARE = 0.15
 of a flat volume would otherwise hold frames of the same places."""
 
 
-def fold_of_frames(positions: Sequence[Array]) -> list[NDArray[np.int64]]:
+def fold_of_frames(positions: Sequence[Array]) -> list[Integers]:
     """Return the fold of every frame.
 
     Space is cut into equal cells, `CELLS_ALONG` along the longest direction. Cell (i, j, k) goes

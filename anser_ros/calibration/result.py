@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.disturbances import spans_of
 from anser_ros.calibration.held_out import HeldOut, rms
 from anser_ros.calibration.layouts import Layout
@@ -23,10 +23,9 @@ from anser_ros.field.model import EffectRecord, FieldModel, plain
 from anser_ros.physics.rotations import tilted
 from anser_ros.settings import Accuracy
 
-Array = NDArray[np.float64]
-
 SPREADS = {
     'gains': 'sensor_gain_spread',
+    'delays': 'sensor_delay_spread',
     'axes': 'sensor_axis_spread',
     'places': 'sensor_place_spread',
     'offsets': 'sensor_pickup_spread',
@@ -35,7 +34,7 @@ SPREADS = {
 FEWEST_REFLECTED = 1e-3
 """Share of frames with a wrong optical pose from which on they are reported."""
 UNITS = {
-    'gains': (100.0, '%'), 'axes': (1e3, 'mrad'), 'places': (1e3, 'mm'),
+    'gains': (100.0, '%'), 'delays': (1e6, 'us'), 'axes': (1e3, 'mrad'), 'places': (1e3, 'mm'),
     'lever_arm': (1e3, 'mm'), 'time_offset': (1e3, 'ms'), 'clock_rate': (1e6, 'ppm'),
     'offsets': (100.0, '% of the fluxes'),
 }  # fmt: skip
@@ -53,7 +52,7 @@ def undetermined_words(result: SensorFit) -> tuple[str, ...]:
     )
 
 
-def drift_records(strength: NDArray[np.complex128]) -> tuple[EffectRecord, ...]:
+def drift_records(strength: ComplexArray) -> tuple[EffectRecord, ...]:
     """Return the emitters that drifted in a scan, from their strengths (F, K), and how far."""
     size = np.abs(strength)
     records = []
@@ -187,6 +186,10 @@ def _single(kind: str, channel: int, axis: Array, value: Array, sigma: Array) ->
         stated |= {'gain': abs(gain), 'phase_deg': float(np.degrees(np.angle(gain)))}
         phase_deg = float(np.degrees(sigma[1] / abs(gain)))
         sigmas = {'gain': float(sigma[0]), 'phase_deg': phase_deg}
+    elif kind == 'delays':
+        name = SPREADS[kind]
+        stated = {'channels': [channel], 'values': [value.tolist()]}
+        sigmas = {'values': [sigma.tolist()]}
     elif kind == 'offsets':
         name = 'pickup'
         stated['phasor_t'] = value.reshape(-1, 2).tolist()
@@ -226,22 +229,29 @@ class Residuals:
 
     each_t: Array  # (K,): root mean square of the magnitude of each emitter's complex residual, T
     span_t: float  # range of the measured in-phase fluxes, T
+    unexplained: float  # median magnitude of a residual over that of a reading
 
     @property
     def rmse_t(self) -> float:
         """Return the root mean square over the readings of all emitters, T."""
         return float(np.sqrt(np.mean(self.each_t**2)))
 
+    @classmethod
+    def of(cls, left: ComplexArray, read: ComplexArray) -> 'Residuals':
+        """Return what is ``left`` of what was ``read``, both (N, K), T."""
+        size, whole = np.abs(left), np.abs(read)
+        each_t, span_t = np.sqrt((size**2).mean(axis=0)), np.ptp(read.real)
+        return cls(each_t, float(span_t), float(np.median(size) / np.median(whole)))
+
 
 def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residuals:
     """Return a model's residuals of the usable readings at the measured poses."""
-    power, count = np.zeros(len(model.emitters)), 0
-    low, high = np.inf, -np.inf
-    for points, axes, lengths, flux in usable_readings(measurements):
-        error = flux - model.flux(points, axes, lengths)
-        power, count = power + (np.abs(error) ** 2).sum(axis=0), count + len(error)
-        low, high = min(low, float(flux.real.min())), max(high, float(flux.real.max()))
-    return Residuals(np.sqrt(power / count), high - low)
+    blocks = [
+        (flux - model.flux(points, axes, lengths), flux)
+        for points, axes, lengths, flux in usable_readings(measurements)
+    ]
+    left, read = (np.concatenate(part) for part in zip(*blocks, strict=True))
+    return Residuals.of(left, read)
 
 
 @dataclass(frozen=True)
@@ -400,6 +410,6 @@ def _optical(noise: OpticalNoise) -> dict[str, Any]:
     }
 
 
-def _outlier_fraction(weights: Sequence[NDArray[np.float64]]) -> float:
+def _outlier_fraction(weights: Sequence[Array]) -> float:
     every = np.concatenate([w.ravel() for w in weights])
     return float((every[every > 0.0] < OUTLIER_WEIGHT).mean())

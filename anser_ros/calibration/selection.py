@@ -15,11 +15,17 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anser_ros.calibration.layout_fit import LayoutPlacer, lowest_height, rich_layout
-from anser_ros.calibration.layouts import Generator, Layout, place
-from anser_ros.calibration.least_squares import ComplexArray, as_real
+from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.calibration.layout_fit import (
+    LayoutPlacer,
+    free_bases,
+    lowest_height,
+    rich_fit,
+    rich_layout,
+)
+from anser_ros.calibration.layouts import FREE_KINDS, Generator, Layout, place
+from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import (
     MomentFit,
     MomentFitter,
@@ -34,8 +40,6 @@ from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.parallel import in_order
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 DAMPINGS = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 """Dampings: from far above a Gram matrix's rounding (1e-8) to where only the prior is left."""
@@ -64,7 +68,7 @@ class _BodyReadings:
     """
 
     def __init__(
-        self, corrected: Measurements, measured: Measurements, folds: NDArray[np.int64],
+        self, corrected: Measurements, measured: Measurements, folds: Integers,
         weights: Array, dipoles: DipoleSites, fit: MomentFit, precision: Array,
     ) -> None:  # fmt: skip
         self.corrected, self.folds, self.weights = corrected, folds, weights
@@ -83,7 +87,7 @@ class LayoutScorer:
     def __init__(
         self,
         measurements: Sequence[Measurements],
-        folds: Sequence[NDArray[np.int64]],
+        folds: Sequence[Integers],
         rich: DipoleSites,
         accuracy: Accuracy,
         placer: LayoutPlacer,
@@ -117,7 +121,7 @@ class LayoutScorer:
             matrices, grams = same or self._tables(sites)
             start = None if prior is None else as_real(prior) / self.noise_t
             total = sum(gram for other, gram in grams.items() if other != fold)
-            moments = _ridge(np.asarray(total), len(sites), start)
+            moments = _ridges(np.asarray(total), sites, start)
             for body, matrix in zip(self._bodies, matrices, strict=True):
                 if fold in body.whiteners:
                     part, used = self._chi(body, matrix, fold, moments)
@@ -174,6 +178,18 @@ class LayoutScorer:
         return np.array(sums), float(body.weights[mask].sum()) * target.shape[2]
 
 
+def _ridges(gram: Array, sites: DipoleSites, prior: Array | None) -> Array:
+    """Return damped solutions (D, N, M) of a Gram matrix, for each emitter of its own dipoles."""
+    count, parts = len(sites), len(gram) - len(sites)
+    out = np.zeros((len(DAMPINGS), count, parts))
+    for emitters, rows in sites.groups(parts // 2):
+        own = np.repeat(2 * np.array(emitters), 2) + np.tile([0, 1], len(emitters))
+        every = np.concatenate([rows, count + own])
+        start = None if prior is None else prior[np.ix_(rows, own)]
+        out[:, rows[:, None], own] = _ridge(gram[np.ix_(every, every)], rows.size, start)
+    return out
+
+
 def _ridge(gram: Array, unknowns: int, prior: Array | None) -> Array:
     """Return damped solutions (D, N, M) from a Gram matrix of columns and right-hand sides."""
     scale = np.sqrt(np.maximum(np.diag(gram)[:unknowns], 0.0))
@@ -217,6 +233,8 @@ MOVING = (
 """Layouts from which dipoles are moved; one does the work of several fixed ones."""
 COAXIAL = tuple(Layout('coaxial', n, 1.0, 0.0, moved=True) for n in (1, 3, 5))
 """Layouts for emitters of unknown geometry: see `coaxial`."""
+FREE = tuple(Layout(kind, 7, 1.0, 0.0, moved=True) for kind in FREE_KINDS)
+"""The same, of any shape: see `clusters`."""
 LOCAL_COUNT = 10
 """Dipoles along a side of the layer that every region of a local model has."""
 LOCAL_READINGS = 24
@@ -249,7 +267,7 @@ def thin_frames(measurements: Sequence[Measurements]) -> list[Measurements]:
 
 def choose_layout(
     measurements: Sequence[Measurements],
-    folds: Sequence[NDArray[np.int64]],
+    folds: Sequence[Integers],
     generator: Generator,
     accuracy: Accuracy,
     progress: Progress | None = None,
@@ -271,7 +289,9 @@ def choose_layout(
     if rows < rich.count**2:
         rich = replace(rich, count=affordable[-1])
     placer = LayoutPlacer(generator, measurements)
-    scorer = LayoutScorer(measurements, folds, place(rich, generator), accuracy, placer)
+    bases = [place(rich, generator), *free_bases(measurements, generator)]
+    sites = bases[0] if len(bases) == 1 else rich_fit(measurements, bases, accuracy)[0].dipoles
+    scorer = LayoutScorer(measurements, folds, sites, accuracy, placer)
     search = _Search(scorer, generator, progress)
     if asked is not None:
         finalists = [search.score(asked)]
@@ -330,7 +350,12 @@ class _Search:
             found.append(min(map(self.score, moving), key=lambda c: c.score))
         if self.generator.nominal is None:
             # A few dipoles more cost a tracker nothing: the best of them, not the leanest.
-            found.append(min(map(self.score, COAXIAL), key=lambda c: c.score))
+            straight, free = (
+                min(map(self.score, some), key=lambda c: c.score) for some in (COAXIAL, FREE)
+            )
+            # What has an axis keeps it unless that is clearly wrong.
+            is_clear = free.score * (1.0 + LEAST_GAIN) < straight.score
+            found.append(free if is_clear else straight)
         else:
             coils = CoilPlacer(self.generator.nominal)
             if coils.possible and len(coils.sites) <= MOST_DIPOLES:

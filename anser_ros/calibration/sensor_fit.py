@@ -14,12 +14,13 @@ shift of all sensors is one of the field, which the drawing fixes.
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.calibration.disturbances import glitches, outside, spans_of, unsteady_tool
 from anser_ros.calibration.joint_system import (
     LEAST_MOST_MODES,
@@ -34,9 +35,15 @@ from anser_ros.calibration.joint_system import (
     open_directions,
     tied_parts,
 )
-from anser_ros.calibration.layout_fit import RICH_DAMPING, ScaledNominal, rich_layout
+from anser_ros.calibration.layout_fit import (
+    RICH_DAMPING,
+    ScaledNominal,
+    free_bases,
+    rich_layout,
+    richest,
+)
 from anser_ros.calibration.layouts import Generator, place
-from anser_ros.calibration.least_squares import ComplexArray, as_real
+from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import (
     SMALLEST_NOISE_T,
     MomentFitter,
@@ -51,12 +58,19 @@ from anser_ros.calibration.population import (
     OpticalNoise,
     Population,
     Posterior,
+    alike_sigma_m,
     estimate_noise,
     interpolation_share,
     solve,
     width_by_evidence,
 )
-from anser_ros.calibration.readings import basis_rows, frame_blocks, usable_weights, with_pose
+from anser_ros.calibration.readings import (
+    DipoleSites,
+    basis_rows,
+    frame_blocks,
+    usable_weights,
+    with_pose,
+)
 from anser_ros.calibration.sensor_parameters import (
     CLOCKS,
     EACH,
@@ -67,8 +81,6 @@ from anser_ros.calibration.sensor_parameters import (
 )
 from anser_ros.field.measurements import Measurements
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 CERTAIN = 6.0
 """Standard deviations between two sessions from which on they contradict each other."""
@@ -89,7 +101,10 @@ class Contradiction:
 
 
 def contradictions(
-    parts: Sequence[Measurements], kinds: Sequence[str], sums: Callable[..., Eliminated]
+    parts: Sequence[Measurements],
+    kinds: Sequence[str],
+    sums: Callable[..., Eliminated],
+    tones_hz: Sequence[float] = (),
 ) -> tuple[Contradiction, ...]:
     """Return of what two sessions say different things, the worst pair of each once.
 
@@ -100,7 +115,7 @@ def contradictions(
     if len(set(bodies)) == len(bodies):
         return ()
     apart = [replace(part, body=str(i)) for i, part in enumerate(parts)]
-    parameters = SensorParameters(apart, [kind for kind in kinds if kind not in CLOCKS])
+    parameters = SensorParameters(apart, [k for k in kinds if k not in CLOCKS], tones_hz)
     rest = sums(parameters, apart)
     inflation = max(1.0, rest.inflation)
     information = rest.information / inflation + parameters.rule()
@@ -127,7 +142,7 @@ def contradictions(
 
 def _pairs(
     parameters: SensorParameters, kind: str, i: int, j: int
-) -> list[tuple[str, NDArray[np.int64], NDArray[np.int64]]]:
+) -> list[tuple[str, Integers, Integers]]:
     """Each sensor's name (none for a body's own) with its rows for two of the measurements."""
     slices = [parameters.slices[kind, str(index)] for index in (i, j)]
     one, other = (np.arange(s.start, s.stop) for s in slices)
@@ -150,11 +165,11 @@ class SensorFit:
     noise_t: float  # noise of a phasor component, with what the field's model misses, T
     optical: OpticalNoise  # jitter of the optical poses
     # parameters of channels that stand outside their population
-    alone: dict[str, NDArray[np.int64]]
+    alone: dict[str, Integers]
     # kept, steady: frames of each of the measurements whose pose and field are good, and those in
     # which nothing moved
-    kept: tuple[NDArray[np.bool_], ...]
-    steady: tuple[NDArray[np.bool_], ...]
+    kept: tuple[Booleans, ...]
+    steady: tuple[Booleans, ...]
     reflected: float  # share of the frames whose pose is not where the fluxes put it
     # kinds that the scan does not determine, with the standard deviation that it leaves; these are
     # as the setup says, or as their prior makes them
@@ -210,8 +225,8 @@ class _Tool:
     """One body's frames with a pose, with their present weights."""
 
     measured: Measurements  # as recorded
-    known: NDArray[np.bool_]  # (F,): frames that nothing speaks against beforehand
-    steady: NDArray[np.bool_]  # (F,): those of them in which the tool saw nothing move either
+    known: Booleans  # (F,): frames that nothing speaks against beforehand
+    steady: Booleans  # (F,): those of them in which the tool saw nothing move either
     weights: Array  # (F, S): of the readings, in [0, 1]
 
 
@@ -228,14 +243,14 @@ class SensorFitter:
         generator: Generator,
         accuracy: Accuracy,
         progress: Progress | None = None,
-        steady: Sequence[NDArray[np.bool_]] | None = None,
+        steady: Sequence[Booleans] | None = None,
     ) -> None:
         self.measured = list(measurements)
         every = [np.ones(len(m.time), dtype=bool) for m in measurements]
         self.steady = every if steady is None else list(steady)
         self.generator, self.accuracy, self.nominal = generator, accuracy, generator.nominal
         self.progress = progress
-        self.parameters = SensorParameters(measurements, kinds)
+        self.parameters = SensorParameters(measurements, kinds, generator.frequencies_hz)
         self.population = Population(self.parameters)
         self.values, self.field = np.zeros(len(self.parameters)), np.zeros((0, 0))
         self.likelihood: Likelihood
@@ -244,11 +259,21 @@ class SensorFitter:
         self.optical = LOOSE
         self.field_width = WIDTH_ALONE if generator.nominal is None else FIELD_WIDTH
         self.inflation = 1.0
+        self.alike_m = 0.0  # m along each axis by which poses at one place are off together
 
     def fit(self) -> SensorFit:
         """Find field and parameters, first with few frames and then with all."""
+        thin = [tool.measured for tool in self._tools(COARSE_ROWS)]
+        layer = place(rich_layout(thin, self.generator), self.generator)
+        begun = [copy(self)._begun(layer)]
+        if begun[0].parameters is self.parameters:  # else there are too few readings for any
+            begun += [copy(self)._begun(s) for s in free_bases(thin, self.generator)[:1]]
+        return richest(begun, [one.noise_t for one in begun])._ended()
+
+    def _begun(self, sites: DipoleSites) -> 'SensorFitter':
+        """Bring field and parameters near where they belong, with few frames."""
         tools = self._tools(COARSE_ROWS)
-        self._start(tools)
+        self._start(tools, sites)
         self._fix_if_too_few(tools)
         self.solved = min(COARSE_MODES, self.modes.size.size)
         for step in range(COARSE_STEPS):
@@ -256,6 +281,9 @@ class SensorFitter:
             size = self._step(tools, inspect=step > 0)
             if step > 2 and size < 10.0 * SMALL_STEP:
                 break
+        return self
+
+    def _ended(self) -> SensorFit:
         tools, self.solved = self._tools(MOST_ROWS), self.modes.size.size
         for step in range(FINE_STEPS):
             self._report(COARSE_STEPS + 3 * step)
@@ -296,10 +324,11 @@ class SensorFitter:
         )
         kept, reflected = self._all_frames(steady)
         mean = self.optical.mean_sigma_m(sum(int(mask.sum()) for mask in kept))
+        shift = self.population.shift_sigma_m(self.likelihood, whole)
         return SensorFit(
             self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
             self.population.alone, kept, steady, reflected, self._undetermined(),
-            float(np.hypot(mean, self.population.shift_sigma_m(self.likelihood, whole))),
+            float(np.hypot(np.hypot(mean, shift), self.alike_m)),
             self._contradictions(tools, tuple(evidence)),
         )  # fmt: skip
 
@@ -328,7 +357,8 @@ class SensorFitter:
             linear = [linearise(part, self.modes, self.field) for part in parts]
             return self._sums(tools, parameters, linear)
 
-        return contradictions([self._corrected(tool) for tool in tools], kinds, sums)
+        parts, tones_hz = [self._corrected(tool) for tool in tools], self.parameters.tones_hz
+        return contradictions(parts, kinds, sums, tones_hz)
 
     def _undetermined(self) -> dict[str, float]:
         """Kinds that the scan does not determine, those among them that were not even tried."""
@@ -352,10 +382,9 @@ class SensorFitter:
             out.append(_Tool(thin, mask, mask, usable_weights(thin)))
         return out
 
-    def _start(self, tools: Sequence[_Tool]) -> None:
+    def _start(self, tools: Sequence[_Tool], sites: DipoleSites) -> None:
         """Set up the field's modes, and its first amplitudes as a plain fit has them."""
         measured = [tool.measured for tool in tools]
-        sites = place(rich_layout(measured, self.generator), self.generator)
         total = sum(m.flux.shape[0] * m.flux.shape[1] for m in self.measured)
         share = min(1.0, MOST_ROWS / max(total, 1))
         frames = max(share * sum(len(m.time) for m in self.measured), 1.0)
@@ -384,7 +413,7 @@ class SensorFitter:
         """A tool's frames by the present estimate; those without a pose lose their weight."""
         errors = self.parameters.errors_of(tool.measured.body, self.values)
         out = errors.apply(tool.measured)
-        lost: NDArray[np.bool_] = np.asarray(~np.isfinite(out.position).all(axis=1))
+        lost: Booleans = np.asarray(~np.isfinite(out.position).all(axis=1))
         if lost.any():
             tool.weights[lost] = 0.0
             out = replace(
@@ -408,10 +437,10 @@ class SensorFitter:
         # made good by a shift of the field and of the tool, which no single frame contradicts.
         # The next step uses it: what the jitter of the poses limits would not scale with it.
         readings = sum(float(tool.weights.sum()) for tool in tools) * self.field.shape[1]
+        kinds = [rows for _, rows in self.population.groups]
+        information, natural = rest.likelihood(self.values, kinds)
         self.likelihood = Likelihood(
-            rest.information + self.parameters.rule(),
-            rest.gradient + rest.information @ self.values,
-            readings / self.inflation,
+            information + self.parameters.rule(), natural, readings / self.inflation
         )
         self.inflation = max(1.0, rest.inflation * self.inflation) if inspect else 1.0
         # Nothing is held here: while a clock is off, poses look too bad to tell it.
@@ -475,10 +504,9 @@ class SensorFitter:
         free = self.solved * self.field.shape[1]
         self.noise_t = max(np.sqrt(power / max(count - free, 0.2 * count)), SMALLEST_NOISE_T)
         self.optical = estimate_noise(steps, variances, shares, kept, self.optical)
+        self.alike_m = alike_sigma_m([at.part for at in linear], steps, kept)
 
-    def _wrong_poses(
-        self, at: Linear, weights: Array, judged: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.bool_], Array]:
+    def _wrong_poses(self, at: Linear, weights: Array, judged: Booleans) -> tuple[Booleans, Array]:
         """Frames whose poses are far from where the fluxes put them, and what no pose explains."""
         step, left = most_probable_step(at, weights, self.noise_t, FREE_POSE)
         scaled = step / np.sqrt(interpolation_share(at.part))[:, None]
@@ -490,9 +518,7 @@ class SensorFitter:
         white = PoseWhitener(at.slope, weights, self.noise_t, prior)
         return white.step(at.residual), np.diagonal(white.inverse, axis1=1, axis2=2)
 
-    def _all_frames(
-        self, steady: Sequence[NDArray[np.bool_]]
-    ) -> tuple[tuple[NDArray[np.bool_], ...], float]:
+    def _all_frames(self, steady: Sequence[Booleans]) -> tuple[tuple[Booleans, ...], float]:
         """Which of all frames are good, and the share of those whose pose is not."""
         out, bad, seen = [], 0, 0
         for whole, mask in zip(self.measured, steady, strict=True):

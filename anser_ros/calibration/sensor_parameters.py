@@ -1,7 +1,8 @@
 """Lists the errors that a scan's sensors, optics and clocks may have, and their effect on fluxes.
 
-A body's S sensors have a complex gain each (real part minus one, imaginary part), a tilt of the
-axis (rad, along two directions across the surveyed axis) and a place (m, in the body's frame);
+A body's S sensors have a complex gain each (real part minus one, imaginary part), a delay (s,
+which turns each tone by its distance from the mean tone), a tilt of the axis (rad, along two
+directions across the surveyed axis) and a place (m, in the body's frame);
 the body has a lever arm (m). The optical clock, which all bodies share, has an offset (s) in the
 middle of the scan and a rate (s a second).
 """
@@ -11,36 +12,33 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.rotations import tangents, tilted
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
-KINDS = ('gains', 'axes', 'places', 'lever_arm', 'time_offset', 'clock_rate')
+KINDS = ('gains', 'delays', 'axes', 'places', 'lever_arm', 'time_offset', 'clock_rate')
 EXTRA_KINDS = ('offsets',)
 """Kinds that are estimated only when asked for: constant phasors of every channel, such as the
 field of the surroundings in magnetometers."""
-POPULATIONS = ('gains', 'axes', 'places', 'offsets')
+POPULATIONS = ('gains', 'delays', 'axes', 'places', 'offsets')
 """Kinds that every sensor has a value of: one population with one spread."""
 CLOCKS = ('time_offset', 'clock_rate')
 """Kinds that all bodies share."""
-EACH = {'gains': 2, 'axes': 2, 'places': 3}
+EACH = {'gains': 2, 'delays': 1, 'axes': 2, 'places': 3}
 """Parameters a sensor; offsets have the two parts of every emitter's phasor."""
 PRIOR = {
-    'gains': 0.05, 'axes': 0.05, 'places': 5e-3, 'lever_arm': 5e-3,
+    'gains': 0.05, 'delays': 1e-5, 'axes': 0.05, 'places': 5e-3, 'lever_arm': 5e-3,
     'time_offset': 0.1, 'clock_rate': 3e-3, 'offsets': 0.3,
 }  # fmt: skip
-"""Standard deviation of each parameter before any data: relative, rad, m, m, s, s a second,
+"""Standard deviation of each parameter before any data: relative, s, rad, m, m, s, s a second,
 relative to the fluxes' root mean square. Wide, for they only hold what the data leave open."""
 USEFUL = {
-    'gains': 2e-3, 'axes': 5e-3, 'places': 2e-4, 'lever_arm': 2e-4, 'time_offset': 1e-3,
-    'clock_rate': 1e-4, 'offsets': 2e-3,
+    'gains': 2e-3, 'delays': 1e-7, 'axes': 5e-3, 'places': 2e-4, 'lever_arm': 2e-4,
+    'time_offset': 1e-3, 'clock_rate': 1e-4, 'offsets': 2e-3,
 }  # fmt: skip
 """Standard deviation, in the parameters' own units, beyond which a scan does not determine them:
 that much makes errors of some tenths of a millimetre, as a tool that was not calibrated has."""
@@ -66,6 +64,7 @@ class BodyErrors:
     """Holds estimated errors of the sensors of one body and of the optical clock."""
 
     gain: ComplexArray  # (S,): factor of each sensor's fluxes
+    turn: ComplexArray  # (S, K) or (S, 1): factor of each of its tones, of modulus one
     axis: Array  # (S, 3): unit axes in the body's frame
     place: Array  # (S, 3): shift of each sensor in the body's frame, m, without the lever arm
     lever_arm: Array  # (3,): shift of all sensors in the body's frame, m
@@ -83,7 +82,7 @@ class BodyErrors:
         sensors = measurements.sensors
         out = replace(
             measurements,
-            flux=(measurements.flux - self.pickup) / self.gain[:, None],
+            flux=(measurements.flux - self.pickup) / (self.gain[:, None] * self.turn),
             sensors=replace(
                 sensors, position=sensors.position + self.place + self.lever_arm, axis=self.axis
             ),
@@ -97,9 +96,12 @@ class BodyErrors:
         return replace(out, track=track, position=position, rotation=rotation, has_pose=seen)
 
 
-def has_turned(measurements: Measurements) -> bool:
-    """Return whether a body turned about two axes, without which a lever arm shifts the field."""
-    rotation = measurements.rotation[measurements.has_pose]
+def has_turned(measurements: Sequence[Measurements]) -> bool:
+    """Return whether a body turned about two axes, without which a lever arm shifts the field.
+
+    ``measurements``: of the body, in all sessions: several that turn about one axis each will do.
+    """
+    rotation = np.concatenate([m.rotation[m.has_pose] for m in measurements])
     if len(rotation) < 2:
         return False
     turns = Rotation.from_matrix(rotation[0].T @ rotation).as_rotvec()
@@ -116,12 +118,22 @@ def velocity_of(measurements: Measurements) -> Array:
 class SensorParameters:
     """Orders the parameters in their vector, and knows what they do to fluxes."""
 
-    def __init__(self, measurements: Sequence[Measurements], kinds: Sequence[str]) -> None:
+    def __init__(
+        self,
+        measurements: Sequence[Measurements],
+        kinds: Sequence[str],
+        tones_hz: Sequence[float] = (),
+    ) -> None:
+        omega = 2.0 * np.pi * np.array(tones_hz or (0.0,))
+        self.tones_hz, self.omega = tuple(tones_hz), omega - omega.mean()
         estimated = (
             set(kinds) if all(m.is_followed for m in measurements) else {*kinds} - {*CLOCKS}
         )
-        if not all(has_turned(m) for m in measurements):
+        bodies = {m.body for m in measurements}
+        if not all(has_turned([m for m in measurements if m.body == body]) for body in bodies):
             estimated -= {SHARED_SHIFT}
+        if not self.omega.any():
+            estimated -= {'delays'}
         known = (*KINDS, *EXTRA_KINDS)
         self.asked = tuple(kind for kind in known if kind in kinds)
         self.kinds = tuple(kind for kind in known if kind in estimated)
@@ -155,12 +167,12 @@ class SensorParameters:
     def __len__(self) -> int:
         return self._size
 
-    def rows(self, kind: str) -> NDArray[np.int64]:
+    def rows(self, kind: str) -> Integers:
         """Return the indices of all parameters of a kind."""
         found = [np.arange(s.start, s.stop) for (own, _), s in self.slices.items() if own == kind]
         return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
 
-    def groups(self) -> list[tuple[str, NDArray[np.int64]]]:
+    def groups(self) -> list[tuple[str, Integers]]:
         """Return parameters that share a prior's width: a kind's, with gain and phase apart."""
         out = []
         for kind in self.kinds:
@@ -175,7 +187,7 @@ class SensorParameters:
             width[rows] = PRIOR[kind]
         return width
 
-    def gains_at_one_place(self) -> list[NDArray[np.int64]]:
+    def gains_at_one_place(self) -> list[Integers]:
         """Return indices of the gains (real parts) of the sensors at each place with several."""
         out = []
         for body, table in zip(self.bodies, self.tables, strict=True):
@@ -186,10 +198,10 @@ class SensorParameters:
     def rule(self) -> Array:
         """Return the information (Q, Q) of the rule for what no data determine.
 
-        The mean of all gains is one, and the mean of a body's places is zero.
+        The mean of all gains is one; those of all delays and of a body's places are zero.
         """
         out = np.zeros((len(self), len(self)))
-        groups = [rows for kind, rows in self.groups() if kind == 'gains']
+        groups = [rows for kind, rows in self.groups() if kind in ('gains', 'delays')]
         for (kind, _), own in self.slices.items():
             if kind == 'places':
                 groups += [np.arange(own.start + j, own.stop, 3) for j in range(3)]
@@ -229,13 +241,14 @@ class SensorParameters:
 
         count, tilts = len(table), self.of('axes', body, values)
         gains, pickups = part('gains', count, 2), part('offsets', count, 2 * self.emitters)
+        turn = np.exp(-1j * part('delays', count, 1) * self.omega)
         gain = 1.0 + gains[:, 0] + 1j * gains[:, 1]
         pickup = np.asarray(self.unit_t * (pickups[:, 0::2] + 1j * pickups[:, 1::2]), complex)
         axis = table.axis if tilts is None else tilted(table.axis, tilts)
         place, lever = part('places', count, 3), part('lever_arm', 3)
         clock = [float(part(kind, 1)[0]) for kind in CLOCKS]
         return BodyErrors(
-            gain, axis, place, lever, pickup, clock[0] - clock[1] * self.middle_s, clock[1]
+            gain, turn, axis, place, lever, pickup, clock[0] - clock[1] * self.middle_s, clock[1]
         )
 
     def derivatives(
@@ -255,6 +268,8 @@ class SensorParameters:
         if (own := self.slices.get(('gains', part.body))) is not None:
             out[:, each, own.start + 2 * each] = modelled
             out[:, each, own.start + 2 * each + 1] = 1j * modelled
+        if (own := self.slices.get(('delays', part.body))) is not None:
+            out[:, each, own.start + each] = -1j * self.omega * modelled
         if (own := self.slices.get(('offsets', part.body))) is not None:
             for k in range(emitters):
                 column = own.start + 2 * (emitters * each + k)

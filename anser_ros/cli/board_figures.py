@@ -1,7 +1,8 @@
-"""Draws boards: coils of a setup, proposed places, and names that cover nothing."""
+"""Draws boards: coils of a setup, proposed places, and names that cover no other."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -9,8 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.text import Text
-from numpy.typing import ArrayLike, NDArray
+from matplotlib.patheffects import withStroke
 
 from anser_ros.cli.page import legend_under, spell_out
 from anser_ros.physics.sensor import SensorTable
@@ -19,16 +19,10 @@ from anser_ros.refit.design import Design
 from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.wire.setup import SensorRows, SensorSpec, Setup
 
-Array = NDArray[np.float64]
-
-DISTANCES_PT = (4.0, 8.0, 14.0, 22.0, 32.0, 44.0)
+DISTANCES_PT = (4.0, 10.0, 18.0, 28.0)
 """Distances of a name from its point that are tried, points."""
-LEADER_PT = 14.0
-"""Distance from which on a thin line leads from a name to its point, points."""
-DIRECTIONS = 16
-"""Directions about a point in which its name is tried."""
-MARGIN_PT = 2.0
-"""Least distance of a name from another one and from what is drawn, points."""
+TURNS = np.deg2rad([0, 30, -30, 60, -60, 90, -90, 135, -135, 180])
+"""Turns of a name from its wanted direction that are tried, rad."""
 
 
 class Label(NamedTuple):
@@ -39,65 +33,29 @@ class Label(NamedTuple):
     away: tuple[float, float] = (0.0, 0.0)  # where the name should lie from the point; or anywhere
 
 
-def name_points(axes: Axes, labels: Sequence[Label], drawn: ArrayLike, size: float) -> None:
-    """Write names of a size, points, beside their points, once all else is drawn.
+def name_points(axes: Axes, labels: Sequence[Label], size: float) -> None:
+    """Write names of a size, points, beside their points, where they cover no other text.
 
-    That may be by ``figure.draw_without_rendering()``, which settles the layout and with it the
-    scale. Texts of the axes, and points ``drawn``, shape (n, 2), are not covered.
+    The layout has to be settled, as by ``figure.draw_without_rendering()``.
     """
-    figure = axes.figure.figure  # not a figure inside it; older versions have no other way
-    dots = figure.dpi / 72.0  # pixels in a point
-    margin = MARGIN_PT * dots
-    taken = [_box(text) for text in axes.texts]
-    covered = axes.transData.transform(np.asarray(drawn, dtype=np.float64).reshape(-1, 2))
-    frame = np.array(axes.get_window_extent().extents)
+    halo = [withStroke(linewidth=1.5, foreground='white')]
+    taken = [text.get_window_extent() for text in axes.texts]
     for label in labels:
         note = axes.annotate(
             label.text, label.at, (0, 0), textcoords='offset points', fontsize=size, ha='center',
-            va='center',
+            va='center', path_effects=halo,
         )  # fmt: skip
-        here = axes.transData.transform(label.at)
-        there = axes.transData.transform(np.add(label.at, label.away))
-        box = _box(note)
-        half = 0.5 * (box[2:] - box[:2])
-        reach = 2.0 * half + margin + DISTANCES_PT[-1] * dots
-        near = covered[np.all(np.abs(covered - here) <= reach, axis=1)]
-        shift, distance = _best(here, there - here, half, dots, margin, frame, taken, near)
-        note.set_position((shift / dots).tolist())
-        taken.append(np.concatenate([here + shift - half, here + shift + half]))
-        if distance >= LEADER_PT:
-            axes.annotate(
-                '', label.at, (shift / dots).tolist(), textcoords='offset points',
-                arrowprops={'arrowstyle': '-', 'lw': 0.4, 'color': '0.5', 'shrinkA': size / 2,
-                            'shrinkB': 1.0},
-            )  # fmt: skip
-
-
-def _box(text: Text) -> Array:
-    """Left, lower, right and upper end of a text, in pixels."""
-    return np.array(text.get_window_extent().extents)
-
-
-def _best(
-    here: Array, away: Array, half: Array, dots: float, margin: float, frame: Array,
-    taken: Sequence[Array], covered: Array,
-) -> tuple[Array, float]:  # fmt: skip
-    """Nearest free shift of a name, pixels, in the direction nearest to the wanted; its length."""
-    begin = float(np.arctan2(away[1], away[0])) if away.any() else -0.75 * np.pi
-    turns = np.arange(DIRECTIONS)
-    angle = begin + 2.0 * np.pi / DIRECTIONS * np.where(turns % 2, (turns + 1) // 2, -(turns // 2))
-    way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    # Where a box of this size is beside the point, whichever way it is.
-    beside = np.min(half / np.maximum(np.abs(way), 1e-9), axis=1)
-    reach = np.add.outer(dots * np.array(DISTANCES_PT), beside)
-    shift = (reach[..., None] * way).reshape(-1, 2)
-    low, high = here + shift - half - margin, here + shift + half + margin
-    hidden = np.all((covered > low[:, None]) & (covered < high[:, None]), axis=2).sum(axis=1)
-    other = np.reshape(taken, (-1, 4))
-    across = np.all((low[:, None] < other[:, 2:]) & (high[:, None] > other[:, :2]), axis=2)
-    outside = np.any((low < frame[:2]) | (high > frame[2:]), axis=1)
-    best = int(np.argmin(100.0 * across.sum(axis=1) + 100.0 * outside + hidden))
-    return shift[best], DISTANCES_PT[best // DIRECTIONS]
+        box = note.get_window_extent()
+        half = 0.5 * 72.0 / axes.figure.dpi * np.array([box.width, box.height])  # points
+        begin = np.arctan2(*label.away[::-1]) if any(label.away) else -0.75 * np.pi
+        for distance, turn in product(DISTANCES_PT, TURNS):
+            way = np.array([np.cos(begin + turn), np.sin(begin + turn)])
+            beside = np.min(half / np.maximum(np.abs(way), 1e-9))
+            note.set_position(((distance + beside) * way).tolist())
+            box = note.get_window_extent()
+            if not box.count_overlaps(taken):
+                break
+        taken.append(box)
 
 
 SIDES = ((0, 1, 'from above'), (0, 2, 'from the side'))
@@ -106,8 +64,6 @@ ARROW = 0.08
 """Length of a coil's axis as drawn, as a part of what the panel shows."""
 LEVEL = 0.05
 """Largest part of an axis in a panel of a coil that points at the viewer."""
-LINE_POINTS = 20
-"""Points of an arrow, or of a side of a coil, that no name should cover."""
 MOST_TICKS = 8
 """Numbers along an axis that have room beside each other."""
 SMALLEST_MM = 5.0
@@ -122,14 +78,14 @@ def setup_figure(setup: Setup) -> Figure:
     )
     named = []
     for panel, (across, up, title) in zip(panels[0], SIDES, strict=True):
-        lines = _board(panel, setup, across, up)
-        labels, drawn = _sensors(panel, setup.reference_sensors, across, up, names=False)
-        named.append((panel, labels, np.vstack([lines, drawn])))
+        _board(panel, setup, across, up)
+        references = setup.reference_sensors
+        named.append((panel, _sensors(panel, references, across, up, names=False)))
         panel.set_title(f'board, {title}')
     for line, body in zip(panels[1:], setup.bodies, strict=True):
         coils = tuple(sensor for sensor in setup.sensors if sensor.body == body)
         for panel, (across, up, title) in zip(line, SIDES, strict=True):
-            named.append((panel, *_sensors(panel, coils, across, up, names=True)))
+            named.append((panel, _sensors(panel, coils, across, up, names=True)))
             panel.plot(0, 0, '+', color='0.4')
             panel.set_title(f'{body}, {title}')
     for line in panels:
@@ -139,21 +95,18 @@ def setup_figure(setup: Setup) -> Figure:
             panel.locator_params(nbins=MOST_TICKS)
             panel.grid(alpha=0.3)
     figure.draw_without_rendering()
-    for panel, labels, drawn in named:
-        name_points(panel, labels, drawn, size=6.0)
+    for panel, labels in named:
+        name_points(panel, labels, size=6.0)
     return figure
 
 
-def _board(panel: Any, setup: Setup, across: int, up: int) -> Array:
-    """Draw emitters and tracked volume; points of the lines."""
-    lines = []
+def _board(panel: Any, setup: Setup, across: int, up: int) -> None:
     board = NominalBoard.of(setup).board
     for rank, coil in enumerate(setup.emitter.coils):
         centre = 1e3 * np.array(coil.centre_m)
         if board is not None:
             corners = 1e3 * np.vstack([board.paths[rank], board.paths[rank][:1]])
             panel.plot(corners[:, across], corners[:, up], color='C0', lw=0.5)
-            lines.append(corners[:, [across, up]])
         if up == 1:  # from the side they lie on each other
             panel.annotate(
                 f'{coil.name}\n{coil.frequency_hz:g} Hz', centre[:2], fontsize=6, ha='center',
@@ -166,23 +119,14 @@ def _board(panel: Any, setup: Setup, across: int, up: int) -> Array:
         Rectangle((low[across], low[up]), size[across], size[up], fill=False, ls='--', color='0.5')
     )
     panel.annotate('tracked volume', (low[across], high[up]), fontsize=7, color='0.4', va='bottom')
-    round_it = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
-    lines.append(low[[across, up]] + round_it * size[[across, up]])
-    return np.vstack([_along(line) for line in lines])
-
-
-def _along(line: Array) -> Array:
-    """Points along a line of corners (n, 2), some to each side."""
-    steps = np.linspace(0.0, 1.0, LINE_POINTS)[:, None, None]
-    return np.asarray((line[:-1] + steps * np.diff(line, axis=0)).reshape(-1, 2))
 
 
 def _sensors(
     panel: Any, sensors: tuple[SensorSpec, ...], across: int, up: int, *, names: bool
-) -> tuple[list[Label], Array]:
-    """Draw coils as arrows; their names, and the points that names should not cover."""
+) -> list[Label]:
+    """Draw coils as arrows, and return their names."""
     if not sensors:
-        return [], np.zeros((0, 2))
+        return []
     sides = [across, up]
     _, position, axis = SensorRows.of(sensors)
     place = 1e3 * position
@@ -211,13 +155,11 @@ def _sensors(
     panel.update_datalim(ends)
     panel.margins(0.4 if names else 0.1)
     panel.autoscale_view()
-    return labels, np.vstack([_along(np.stack(one)) for one in zip(place, ends, strict=True)])
+    return labels
 
 
 PLACE_ARROW = 0.15
 """Length of an axis in the picture, in halves of the board."""
-ARROW_POINTS = 8
-"""Points of an arrow that no number should cover."""
 
 
 def places_figure(
@@ -232,23 +174,22 @@ def places_figure(
     chosen = list(designs[-1].coils)
     named = []
     for axes, sides in ((above, [0, 1]), (side, [0, 2])):
-        labels, drawn = _draw_places(axes, candidates, chosen, region, sides)
-        named.append((axes, labels, drawn))
+        named.append((axes, _draw_places(axes, candidates, chosen, region, sides)))
     above.set_title('from above')
     side.set_title('from the side')
     _draw_errors(right, designs, random)
     for panel in (above, right):  # below, where no place and no error lies
         legend_under(panel, 0.14, columns=2)
     figure.draw_without_rendering()
-    for axes, labels, drawn in named:
-        name_points(axes, labels, drawn, size=8.0)
+    for axes, labels in named:
+        name_points(axes, labels, size=8.0)
     return figure
 
 
 def _draw_places(
     axes: Any, candidates: SensorTable, chosen: list[int], region: Region, sides: list[int]
-) -> tuple[list[Label], Any]:
-    """Draw candidates, chosen coils and board; the coils' numbers, and what these should spare."""
+) -> list[Label]:
+    """Draw candidates, chosen coils and board, and return the coils' numbers."""
     axes.plot(*candidates.position[:, sides].T, '.', color='0.75', label='candidates')
     at, axis = candidates.position[chosen][:, sides], candidates.axis[chosen][:, sides]
     size = PLACE_ARROW * region.half
@@ -264,13 +205,10 @@ def _draw_places(
     axes.set_aspect('equal', 'datalim')
     axes.locator_params(axis='x', nbins=5)
     axes.set(xlabel='x / m', ylabel=f'{"xyz"[sides[1]]} / m')
-    labels = [
+    return [
         Label(str(rank), tuple(point), tuple(-way))
         for rank, (point, way) in enumerate(zip(at.tolist(), axis, strict=True), start=1)
     ]
-    steps = np.linspace(0.0, 1.0, ARROW_POINTS)[:, None, None]
-    arrows = (at + steps * size * axis).reshape(-1, 2)
-    return labels, np.vstack([candidates.position[:, sides], arrows])
 
 
 def _draw_errors(

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 
+from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration, to_document
@@ -165,9 +165,14 @@ def _short(value: Any) -> str:
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
-SHOWN_UNITS = {'1': (100.0, '%'), 'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 'T': (1e9, 'nT')}
+SHOWN_UNITS = {
+    '1': (100.0, '%'),
+    'rad': (1e3, 'mrad'),
+    'm': (1e3, 'mm'),
+    'T': (1e9, 'nT'),
+    's': (1e6, 'us'),
+}
 """Factor and unit in which values of each SI unit are shown."""
 MOST_TICKS = 9
 """Channels that are named on the axis of a picture; of more, some at even steps."""

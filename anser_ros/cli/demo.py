@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import extensions
+from anser_ros.arrays import Array
 from anser_ros.cli.commands import COMPOSED, NODES
 from anser_ros.cli.main import check_packages
 from anser_ros.cli.output import add_json, add_out, make_new_folder
@@ -45,14 +45,11 @@ SMOOTH = 25
 """Number of poses of the running median by which the reported sigma is drawn."""
 METAL_NEAR_M = 0.3
 """Distance of the disc from the board, m, up to which the picture marks the metal as near."""
-VISITS_APART_S = 3.0
-"""Time, s, after which metal that is near again counts as a further visit."""
 
 
 def load(path: Path) -> Results:
-    """Return the arrays of the file that the monitor wrote."""
     with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+        return dict(stored)
 
 
 def summarise(results: Results) -> dict[str, dict[str, Any]]:
@@ -112,7 +109,7 @@ def _chains(results: Results) -> list[tuple[int, str, str]]:
     return list(zip(range(len(names)), names, COLOURS, strict=False))[::-1]
 
 
-def broken(stamp_s: NDArray[np.float64], values: NDArray[np.float64]) -> Any:
+def broken(stamp_s: Array, values: Array) -> Any:
     """Return stamps and values with a NaN in every gap, so that no line is drawn across it."""
     gaps = np.flatnonzero(np.diff(stamp_s) > GAP_S) + 1
     middle = (stamp_s[gaps - 1] + stamp_s[gaps]) / 2
@@ -147,34 +144,23 @@ def _draw_error(axes: Any, results: Results, shown: int) -> None:
         axes.plot(stamp - begin, error, '.', ms=2.5, color=colour, label=label)
     stamp, sigma = results[f'stamp_0_{shown}'], 1e3 * results[f'sigma_0_{shown}']
     if stamp.size:
-        at, level = broken(stamp - begin, _smoothed(sigma))
+        from scipy.ndimage import median_filter
+
+        at, level = broken(stamp - begin, median_filter(sigma, SMOOTH, mode='nearest'))
         words = 'half to twice the sigma, live'
         axes.fill_between(at, level / 2, 2 * level, color='k', alpha=0.15, lw=0, label=words)
-    _shade_metal(axes, results['metal'], begin)
+    seen_s, near = results['metal'][:, 0] - begin, results['metal'][:, 1] < METAL_NEAR_M
+    if near.any():
+        axes.fill_between(
+            seen_s, 0, 1, where=near, transform=axes.get_xaxis_transform(), color='tab:red',
+            alpha=0.12, lw=0, label='metal near',
+        )  # fmt: skip
     axes.set(xlabel='time, s', ylabel='position error, mm', yscale='log')
     axes.set_xlim(0.0, max(end - begin, 1.0))
     axes.grid(alpha=0.3, which='both')
 
 
-def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the running median over `SMOOTH` values."""
-    reach = min(SMOOTH, len(values) - 1 + len(values) % 2) // 2
-    padded = np.pad(values, reach, mode='edge')
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
-    return np.asarray(np.median(windows, axis=1))
-
-
-def _shade_metal(axes: Any, metal: NDArray[np.float64], begin: float) -> None:
-    near = metal[metal[:, 1] < METAL_NEAR_M, 0] - begin
-    if not near.size:
-        return
-    visits = np.split(near, np.flatnonzero(np.diff(near) > VISITS_APART_S) + 1)
-    for rank, visit in enumerate(visits):
-        label = 'metal near' if rank == 0 else None
-        axes.axvspan(visit[0], visit[-1], color='tab:red', alpha=0.12, label=label)
-
-
-def _joined(results: Results, kind: str, rank: int) -> NDArray[np.float64]:
+def _joined(results: Results, kind: str, rank: int) -> Array:
     return np.concatenate([results[f'{kind}_{rank}_{i}'] for i in range(len(results['names']))])
 
 
@@ -199,7 +185,6 @@ SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command line of the demo."""
     parser.epilog = 'example: anser demo --duration 30'
     words = 'duration, from the first pose on, s'
     parser.add_argument('--duration', type=float, default=30.0, metavar='S', help=words)
@@ -373,7 +358,6 @@ def in_namespace(namespace: str) -> list[str]:
 
 
 def simulated_unit(port: Path, **parameters: object) -> list[str]:
-    """Return the command line of the simulated control unit."""
     return node_command(
         'cu_simulator', link=port, board_seed=BOARD_SEED, sample_rate_hz=SAMPLE_RATE_HZ,
         **parameters,
@@ -381,7 +365,6 @@ def simulated_unit(port: Path, **parameters: object) -> list[str]:
 
 
 def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, list[str]]:
-    """The command line of each process by its name."""
     model = config_path('demo_model.yaml')
     apart = in_namespace(f'/anser/{FROZEN}')
     return {

@@ -12,8 +12,8 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.cli import output
 from anser_ros.cli import page as html
 from anser_ros.cli.calibrate import population_figure, population_table
@@ -83,9 +83,6 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         ),
         (*written, args.out / 'model.yaml'),
     )
-
-
-Array = NDArray[np.float64]
 
 
 def strongest(state: State) -> str:

@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import stat
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -44,8 +45,8 @@ LEAST_FREE_BYTES = 2 * 2**30
 PORTS = ('/dev/ttyACM*', '/dev/ttyUSB*')
 SAFE_DOMAINS, DOMAINS = range(102), range(233)
 """Values of ROS_DOMAIN_ID whose ports nobody else is given, and all that DDS has ports for."""
-CLOCK_UNSET = 5
-"""What adjtimex returns if nothing keeps the kernel's clock right (TIME_ERROR)."""
+MOST_CLOCK_ERROR_US = 16_000_000
+"""Largest error, us, that the kernel states of a clock that is kept right, as for timedatectl."""
 TIMEX_BYTES = 512
 """Room for the kernel's record of its clock, bytes: more than any of its versions takes."""
 
@@ -60,7 +61,6 @@ class Observation(NamedTuple):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = 'example: anser doctor --device /dev/ttyACM0'
     parser.add_argument('--device', help="the control unit's port; all usual ones by default")
     parser.add_argument(
@@ -192,15 +192,9 @@ def _group(name: str) -> str:
     return group if about.st_mode & needed == needed and group != 'root' else ''
 
 
-def clock(tool: str = 'timedatectl') -> list[Observation]:
+def clock() -> list[Observation]:
     """Check the system's clock: whether something keeps it right, as two machines need it."""
-    said = ''
-    if shutil.which(tool) is not None:
-        command = [tool, 'show', '-p', 'NTPSynchronized', '--value']
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        said = done.stdout.strip()
-    kept = {'yes': True, 'no': False}.get(said)
-    kept = kernel_clock() if kept is None else kept
+    kept = kernel_clock()
     if kept is None:
         return [Observation('clock', NOTE, 'unknown: no time service reports it')]
     if kept:
@@ -211,11 +205,13 @@ def clock(tool: str = 'timedatectl') -> list[Observation]:
 
 def kernel_clock() -> bool | None:
     """Return whether something keeps the kernel's clock right; None where it does not say."""
+    record = ctypes.create_string_buffer(TIMEX_BYTES)
     try:
-        state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
+        state = ctypes.CDLL(None).adjtimex(record)
     except (OSError, AttributeError):
         return None
-    return None if state < 0 else state != CLOCK_UNSET
+    *_, most_us = struct.unpack_from('@Illl', record)  # modes, offset, frequency, largest error
+    return None if state < 0 else most_us < MOST_CLOCK_ERROR_US
 
 
 def disk(folder: Path) -> list[Observation]:
@@ -270,7 +266,6 @@ def _ros_remedy(last: str) -> str:
 
 
 def graph_findings(graph: dict[str, Any]) -> list[Observation]:
-    """Return what a look at the graph means."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     reach = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
     words = f'{graph["middleware"]}, domain {domain}, discovery {reach}'

@@ -27,8 +27,7 @@ from anser_ros.tracking.estimate import TrackerSettings
 Array = NDArray[np.float64]
 
 MOST_POINTS = 4000
-"""Most points that a figure shows of one coil: more cannot be distinguished, and make files
-large."""
+"""Most points that a figure shows of one coil: more cannot be distinguished."""
 COVERAGE_SIGMAS = np.linspace(0.0, 4.0, 81)
 """Multiples of sigma for which the share of errors within is drawn, to where all should be."""
 ERRORS_HEAD = ('sensor', 'frames', 'tracked', 'RMSE mm', 'PRC95 mm', 'RMSE deg', 'PRC95 deg')
@@ -211,7 +210,6 @@ ALONE = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', *SESSION_KI
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = (
         'example: anser evaluate bags/metal.mcap --model config/demo_model.yaml'
         ' --refit --baseline bags/scan.mcap --out refit/'

@@ -9,7 +9,6 @@ SCHEMA = 'anser_export/1'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = 'example: anser export bags/moving.mcap --format tum --out poses/'
     parser.add_argument('bag', help='bag to read (.mcap file or bag folder)')
     add_out(parser)
@@ -21,7 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def work(args: argparse.Namespace, tell: Tell) -> Result:
-    """Write the files of a bag."""
     make_folder(args.out)
     tell(f'reading {args.bag}')
     found = export_bag(args.bag, args.out, args.format)

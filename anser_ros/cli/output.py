@@ -58,7 +58,6 @@ def stated_values(args: argparse.Namespace) -> dict[str, float]:
 
 
 def add_model(parser: argparse.ArgumentParser, **options: Any) -> None:
-    """Declare ``--model``."""
     words = "model file, or 'nominal' for the setup's own geometry"
     parser.add_argument('--model', help=words, **options)
 
@@ -291,7 +290,6 @@ def number(value: float | None, scale: float = 1.0, form: str = '.3f') -> str:
 
 
 def terminal_table(head: Sequence[str], rows: Iterable[Sequence[str]], **style: Any) -> Table:
-    """Return rows of text as a table for the terminal."""
     shown = Table(*head, **style)
     for row in rows:
         shown.add_row(*row)

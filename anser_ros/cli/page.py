@@ -78,8 +78,6 @@ BEFORE, AFTER = '#c44e52', '#4c72b0'
 
 
 class Html(str):
-    """Text that is HTML already."""
-
     __slots__ = ()
 
 
@@ -119,7 +117,6 @@ def paragraph(words: str, kind: str = '') -> Html:
 
 
 def listed(items: Iterable[str]) -> Html:
-    """Return texts as a list."""
     return Html(f'<ul>{"".join(f"<li>{escaped(item)}</li>" for item in items)}</ul>')
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.cli import output
 from anser_ros.cli.board_figures import places_figure
 from anser_ros.errors import ParameterError, SetupError
@@ -22,8 +22,6 @@ from anser_ros.sessions.session import sensor_table
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
 from anser_ros.wire.tables import read_table
 from anser_ros.wire.text_files import read_config
-
-Array = NDArray[np.float64]
 
 SCHEMA = 'anser_places/1'
 DOCUMENT, TABLE, FIGURE = 'places.json', 'places.csv', 'places.png'

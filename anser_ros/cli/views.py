@@ -26,7 +26,6 @@ NAMESPACE = re.compile(r'^[A-Za-z_]\w*(/[A-Za-z_]\w*)*$')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = 'example: anser views config/demo_setup.yaml --namespace left --out views/'
     parser.add_argument('setup', help='setup document: a path, or a file of config/')
     add_out(parser)
@@ -40,39 +39,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def work(args: argparse.Namespace, tell: Tell) -> Result:
-    """Write both views."""
     space = args.namespace.strip('/')
     if not NAMESPACE.match(space):
         raise ParameterError(f'{args.namespace!r} is not a namespace')
     setup = parse_setup(read_config(args.setup))
     make_folder(args.out)
-    topics = Topics(space, args.optical.rstrip('/'), args.frame_prefix)
+    frame = f'{args.frame_prefix}{setup.frame_id}'
+    topics = Topics(space, args.optical.rstrip('/'), frame)
     rviz = yaml.safe_dump(rviz_view(setup, topics), sort_keys=False, allow_unicode=True)
     written = write_files(args.out, {RVIZ: rviz, FOXGLOVE: foxglove_view(setup, topics)})
     return Result({'schema': SCHEMA, 'files': list(map(str, written))}, written=written)
 
 
 class Topics(NamedTuple):
-    """Holds a board's full names: topics in its namespace and of the optical tracker, frames."""
+    """Holds full names: topics of the nodes and of the optical tracker, and the board's frame."""
 
     namespace: str
     optical_namespace: str
-    prefix: str
-
-    def frame(self, setup: Setup) -> str:
-        """Return the name of the board's frame."""
-        return f'{self.prefix}{setup.frame_id}'
+    frame: str
 
     def own(self, name: str) -> str:
-        """Return the name of a topic of the nodes."""
         return f'/{self.namespace}/{name}'
 
     def pose(self, name: str, ending: str = 'pose') -> str:
-        """Return the name of the topic of a coil's or body's pose."""
         return self.own(f'{topic_of(name)}/{ending}')
 
     def optical(self, body: str) -> str:
-        """Return the name of the topic of a body's optical pose."""
         return f'{self.optical_namespace}/{topic_of(body)}/pose'
 
 
@@ -91,12 +83,11 @@ def _cells(setup: Setup) -> int:
 
 
 def rviz_view(setup: Setup, topics: Topics) -> dict[str, Any]:
-    """Return the whole configuration of RViz as plain data."""
     view: dict[str, Any] = yaml.safe_load(read_config(RVIZ))
     manager = view['Visualization Manager']
     manager['Displays'] = list(_displays(manager['Displays'], setup, topics))
-    manager['Global Options']['Fixed Frame'] = topics.frame(setup)
-    manager['Views']['Current']['Target Frame'] = topics.frame(setup)
+    manager['Global Options']['Fixed Frame'] = topics.frame
+    manager['Views']['Current']['Target Frame'] = topics.frame
     return view
 
 
@@ -107,7 +98,7 @@ def _displays(known: list[Any], setup: Setup, topics: Topics) -> Iterator[dict[s
     optical, *coils = [d for d in known if d['Class'] == f'{kind}Pose']
     clouds = [d for d in known if d['Class'] == f'{kind}PointCloud2']
     grid = copy.deepcopy(first['Grid'])
-    grid.update({'Reference Frame': topics.frame(setup), 'Plane Cell Count': _cells(setup)})
+    grid.update({'Reference Frame': topics.frame, 'Plane Cell Count': _cells(setup)})
     yield grid
     yield first['TF']
     for body in _solid_bodies(setup):
@@ -135,11 +126,10 @@ def _display(known: dict[str, Any], name: str, topic: str, shown: bool = True) -
 
 
 def foxglove_view(setup: Setup, topics: Topics) -> dict[str, Any]:
-    """Return the whole layout of Foxglove as plain data."""
     view: dict[str, Any] = json.loads(read_config(FOXGLOVE))
     panels = view['configById']
     scene = panels['3D!tool']
-    scene['followTf'] = scene['layers']['board']['frameId'] = topics.frame(setup)
+    scene['followTf'] = scene['layers']['board']['frameId'] = topics.frame
     cells = _cells(setup)
     scene['layers']['board'].update({'size': CELL_M * cells, 'divisions': cells})
     known = list(scene['topics'].values())

@@ -146,37 +146,9 @@ def _track() -> None:
 
 
 def _solve_body() -> None:
-    import numpy as np
+    from anser_ros.tracking.tracker import warm_up_bodies
 
-    from anser_ros.integrity.pose_checks import SurveyErrors, distances
-    from anser_ros.tracking.estimate import TrackerSettings
-    from anser_ros.tracking.rigid import (
-        BodyCoils,
-        common_factor,
-        solve_body,
-        start_from_grid,
-        step_to_coils,
-    )
-    from anser_ros.tracking.solve_context import build_context
-
-    model = _demo_model()
-    context = build_context(model, TrackerSettings())
-    coils = BodyCoils(np.zeros((3, 3)), np.eye(3), np.zeros(3))
-    flux = model.flux(coils.offsets + [0.0, 0.0, 0.15], coils.axes, coils.lengths).view(np.float64)
-    weights = np.tile(1.0 / context.sigma, (3, 1))
-    common = common_factor(np.zeros((3, 0, context.sigma.size)), weights)
-    normals, took_part = np.tile(np.eye(6), (3, 1, 1)), np.ones(3, dtype=bool)
-    for start in start_from_grid(context.grid, context.field, coils, flux):
-        found = solve_body(
-            context.field, coils, flux, weights, common, *start, context.low, context.high
-        )
-        body = found.position, found.rotation
-        own = coils.offsets + found.position, coils.axes @ found.rotation.T
-        step_to_coils(*body, coils.offsets, coils.axes, *own, normals, context.low, context.high)
-        distances(
-            (*body, np.eye(6)), coils.offsets, coils.axes, (*own, normals), took_part,
-            SurveyErrors(1e-4, 1e-3, 1e-3),
-        )  # fmt: skip
+    warm_up_bodies(_demo_model())
 
 
 def _refit() -> None:

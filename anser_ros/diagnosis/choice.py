@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.engine import BlockSums, Score, Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
@@ -20,9 +20,6 @@ from anser_ros.diagnosis.screening import noise_scale
 from anser_ros.effects.base import View
 from anser_ros.effects.effect import INEXACT, Family, Term, all_effects
 from anser_ros.parallel import in_order
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 SCALES = np.geomspace(1e-3, 1.0, 7)
 """Spreads that are tried first, as multiples of what the constant effect expects; the estimation
@@ -115,10 +112,7 @@ Place = tuple[Array, BlockSums, float]
 
 
 def moving_starts(
-    problem: Problem,
-    scored: Sequence[tuple[Term, Score]],
-    scorer: Scorer[State],
-    blocks: NDArray[np.int64],
+    problem: Problem, scored: Sequence[tuple[Term, Score]], scorer: Scorer[State], blocks: Integers
 ) -> list[tuple[float, Term]]:
     """Return expected gain and start values of effects that are another one (`Effect.still`) at a
     place for each block; none where one place for the whole session explains as much.
@@ -168,7 +162,7 @@ def _course(places: Sequence[Place], gains: Array) -> tuple[Array, Array]:
     return points[_smoothest(points, gains)], sums.solve(np.full(sums.size, NO_PRIOR))[0]
 
 
-def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:
+def _smoothest(points: Array, gains: Array) -> Integers:
     """Place (by index) in each block: much gain, little way (Viterbi's algorithm)."""
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     step = np.median(np.where(apart > 0, apart, np.inf).min(axis=1))
@@ -356,7 +350,7 @@ def _helps(without: State, with_it: State, columns: Sequence[Array | None]) -> b
 
 def _crowd(fit: Fit, term: Term) -> int:
     """Effects of a fit with the same name, or about the same channel."""
-    alike = sum(t.effect is term.effect for t in fit.effects)
+    alike = 1 if term.effect.gregarious else sum(t.effect is term.effect for t in fit.effects)
     about = [sum(c in _singled(t) for t in fit.effects) for c in _singled(term)]
     return max([alike, *about])
 
@@ -465,9 +459,7 @@ def _varying(state: State, columns: Sequence[Array | None], noise: float) -> flo
     return max(_refits(used, noise, labels) for labels in kinds)
 
 
-def _refits(
-    used: Sequence[tuple[Part, Array]], noise: float, labels: Sequence[NDArray[np.int64]]
-) -> float:
+def _refits(used: Sequence[tuple[Part, Array]], noise: float, labels: Sequence[Integers]) -> float:
     """Power beyond chance that a refit of the values of each label takes off."""
     total = 0.0
     for value in np.unique(np.concatenate([label.ravel() for label in labels])):

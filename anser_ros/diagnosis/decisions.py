@@ -34,6 +34,11 @@ OTHERS_CORRELATION, BETTER = 0.95, 0.1
 """Correlation (0 to 1) with another's prediction, and share of the power that its own leaves which
 the other's may leave, from which a plug is in its socket. A looser pair takes neighbours that read
 alike for exchanged ones; a stricter one misses an exchange if there are other effects."""
+AS_LITTLE = 2.0
+"""Power that an explanation of the wiring may leave over what the best one leaves, so that the one
+with fewer faults is named; and parts that were set up anew, over what metal at rest leaves. Exact
+symmetries leave the same; what is not one leaves tens of times as much. Smaller lets noise choose
+between two names of the same fault."""
 DEAD = 0.02
 """Share of the expected reading below which a channel receives nothing: a fifth of the leak that
 `channel_crosstalk` expects, so that one that its neighbours leak into is not called dead.
@@ -101,6 +106,11 @@ OWN_METAL = 2.0
 below which the metal may be the model's: what was taken off a scan with metal near leaves a field
 that is metal's, by 2.3 of its stated sigmas in `dirty/scan_metal`, the only such scan that was
 tried. Larger hides faint metal (2.0: what moves a tool by 0.03 mm); smaller names what is none."""
+COMPLETE = 3.0
+"""Misfit up to which parts that were set up anew explain a session, so that they are its rival to
+metal at rest. They have so many parameters that beside another effect they take off much of what
+metal does; a model that understates its error left 1.7. Smaller names metal where a source was
+moved; larger misses metal beside another effect."""
 MOST_METALS = 2
 """Active pieces of metal beside which no further metal is looked for. More let what the shapes
 of these leave pass for another piece; fewer leave a second piece to be taken for other effects."""

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.diagnosis.choice import course_of
 from anser_ros.diagnosis.decisions import SOMETHING_LEFT
 from anser_ros.diagnosis.engine import Scorer
@@ -23,9 +23,6 @@ from anser_ros.effects.base import View
 from anser_ros.effects.effect import Richness
 from anser_ros.effects.moving_metal import DepartedMetal, DepartedTerm, FreePath
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 FIRST_KNOTS = 9
 """Knots of a path at first, three seconds apart in half a minute."""
@@ -116,7 +113,7 @@ def _power(state: State) -> float:
 
 
 def _best_starts(
-    problem: Problem, effect: DepartedMetal, blocks: NDArray[np.int64]
+    problem: Problem, effect: DepartedMetal, blocks: Integers
 ) -> list[tuple[DepartedTerm, str]]:
     """The start that predicts left-out blocks best with a compact body, and with pieces."""
     state = evaluate(problem, ())
@@ -135,7 +132,7 @@ def _best_starts(
 
 
 def _starts(
-    problem: Problem, state: State, effect: DepartedMetal, blocks: NDArray[np.int64]
+    problem: Problem, state: State, effect: DepartedMetal, blocks: Integers
 ) -> Iterator[tuple[DepartedTerm, list[str]]]:
     """Paths to try: along the best places block by block, and ways away from the strongest one."""
     duration, still = problem.apparatus.duration, effect.still
@@ -175,9 +172,7 @@ def _ways() -> list[Array]:
     ]
 
 
-def _refined(
-    problem: Problem, start: DepartedTerm, kind: str, blocks: NDArray[np.int64]
-) -> Fit | None:
+def _refined(problem: Problem, start: DepartedTerm, kind: str, blocks: Integers) -> Fit | None:
     """Body and path together, first coarsely; the body is reshaped for the finer path."""
     fitter = Fitter(problem, blocks, DEPARTURE_STEPS)
     shaping = Shaping(fitter, BODY)

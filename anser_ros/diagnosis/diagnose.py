@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.choice import Confirmation, doubtful, refit_spreads
 from anser_ros.diagnosis.fit import FINE, Fit, Fitter, settled
@@ -30,16 +30,14 @@ from anser_ros.diagnosis.screening import (
     not_white,
     outlying_share,
     structure_tests,
-    wiring_faults,
     without_outliers,
 )
 from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
+from anser_ros.diagnosis.wiring import wiring_faults
 from anser_ros.effects.correction import Fields, changed_illumination
 from anser_ros.effects.effect import Family, Remedy, Term
 from anser_ros.effects.seen import EXCESS_NOISE, known_share, outliers_of
 from anser_ros.field.model import Dipoles, EffectRecord, FieldModel
-
-Array = NDArray[np.float64]
 
 SCHEMA = 'anser_diagnosis/1'
 """Name of the document's layout (`docs/interfaces.md`), which stands in it."""
@@ -162,7 +160,7 @@ def corrected_model(
     )
 
 
-def _merged(dipoles: Dipoles) -> tuple[Dipoles, NDArray[np.int64]]:
+def _merged(dipoles: Dipoles) -> tuple[Dipoles, Integers]:
     """Dipoles of the same place and direction added up, and the row that each went to."""
     key = np.round(np.concatenate([dipoles.positions * 1e9, dipoles.directions * 1e9], axis=1))
     _, first, rows = np.unique(key, axis=0, return_index=True, return_inverse=True)

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.diagnosis.decisions import TIME_FOLDS
 from anser_ros.effects.base import BaseTerm
 from anser_ros.parallel import in_order, slices
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Columns = Sequence[Array | None]
 
 BLOCKS_A_THREAD = 4
@@ -32,7 +31,7 @@ class WhitePart(Protocol):
     @property
     def white(self) -> Array: ...
     @property
-    def blocks(self) -> Ints: ...
+    def blocks(self) -> Integers: ...
     @property
     def count(self) -> int: ...
 
@@ -50,11 +49,11 @@ class BlockSums:
         """Return the number of columns."""
         return int(self.right.shape[1])
 
-    def part(self, rows: NDArray[np.int64]) -> 'BlockSums':
+    def part(self, rows: Integers) -> 'BlockSums':
         """Return the sums of some blocks, chosen by index."""
         return BlockSums(self.normal[rows], self.right[rows], self.squares[rows])
 
-    def columns(self, keep: NDArray[np.int64]) -> 'BlockSums':
+    def columns(self, keep: Integers) -> 'BlockSums':
         """Return the sums of some columns, chosen by index."""
         normal = self.normal[:, keep[:, None], keep[None, :]]
         return BlockSums(normal, self.right[:, keep], self.squares)
@@ -130,7 +129,7 @@ def _estimate(normal: Array, right: Array, prior: Array) -> Array:
     return np.asarray(scale * cho_solve(factor, scale * right, check_finite=False))
 
 
-def spans(blocks: Ints, wanted: Ints) -> list[slice | Ints]:
+def spans(blocks: Integers, wanted: Integers) -> list[slice | Integers]:
     """Return the rows of each wanted block; of blocks of time, which are runs, as slices."""
     if np.any(np.diff(blocks) < 0):
         return [np.flatnonzero(blocks == number) for number in wanted]
@@ -139,7 +138,7 @@ def spans(blocks: Ints, wanted: Ints) -> list[slice | Ints]:
     return [slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
 
 
-def block_sums(parts: Sequence[WhitePart], columns: Columns, wanted: Ints) -> BlockSums:
+def block_sums(parts: Sequence[WhitePart], columns: Columns, wanted: Integers) -> BlockSums:
     """Return sums over the blocks that are wanted; columns are one (F, n, q) or None a part."""
     size = width_of(columns)
     normal = np.zeros((wanted.size, size, size))
@@ -168,7 +167,7 @@ def cross_sums(
     right: Columns,
     one: BlockSums,
     other: BlockSums,
-    wanted: Ints,
+    wanted: Integers,
 ) -> BlockSums:
     """Return the sums of two groups of columns side by side, from those of each."""
     a, b = one.size, other.size
@@ -263,7 +262,7 @@ class JointState(Generic[TermT, PartT]):
         chosen = self.terms if terms is None else terms
         return np.concatenate([term.effect.prior(term) for term in chosen] or [np.zeros(0)])
 
-    def sums(self, blocks: Ints) -> BlockSums:
+    def sums(self, blocks: Integers) -> BlockSums:
         """Return the normal equations of all terms, block by block."""
         return block_sums(self.parts, self.designs(self.terms), blocks)
 
@@ -281,7 +280,7 @@ class JointFit(Generic[StateT]):
     """Holds a state at the joint optimum of its terms."""
 
     state: StateT
-    blocks: Ints  # of time, those that take part
+    blocks: Integers  # of time, those that take part
     made: BlockSums | None = None  # the state's sums, where the last step has made them
 
     @cached_property
@@ -324,8 +323,8 @@ FitT = TypeVar('FitT', bound=JointFit[Any])
 
 
 def descended(
-    state: StateT, blocks: Ints, iterations: int
-) -> tuple[StateT, Ints, BlockSums | None]:
+    state: StateT, blocks: Integers, iterations: int
+) -> tuple[StateT, Integers, BlockSums | None]:
     """Lower a sum of squares by damped Gauss-Newton steps until it has settled.
 
     ``iterations``: steps at most. Returns the state, ``blocks``, and the state's sums over these
@@ -382,7 +381,7 @@ class Score:
 class Scorer(Generic[StateT]):
     """Scores candidates against one state; the sums of the active effects are made once."""
 
-    def __init__(self, state: StateT, blocks: Ints) -> None:
+    def __init__(self, state: StateT, blocks: Integers) -> None:
         self.state, self.blocks = state, blocks
         terms = [t for t in state.terms if t.theta.size <= MOST_COLUMNS]
         self._active = state.designs(terms)

@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.diagnosis.decisions import (
     COARSE_REMAINDER,
     PER_PARAMETER,
@@ -32,7 +33,6 @@ from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 from anser_ros.metal.scattering import Shapes
 from anser_ros.parallel import in_order
 
-Array = NDArray[np.float64]
 Known = tuple[list[Array | None], Array]
 """Columns, one array for each part of a state, and their prior sizes."""
 Unit = Callable[[View, Array], NDArray[np.inexact]]
@@ -49,12 +49,7 @@ SCORED_FRAMES = 130
 
 
 def rich_modes(
-    few: State,
-    known: Known,
-    unit: Unit,
-    spreads: Sequence[Array],
-    blocks: NDArray[np.int64],
-    most: int,
+    few: State, known: Known, unit: Unit, spreads: Sequence[Array], blocks: Integers, most: int
 ) -> tuple[float, Array] | None:
     """Return combinations of couplings, of the size that predicts held-out blocks best.
 
@@ -104,7 +99,7 @@ def best_modes(
     few: State,
     known: Known,
     tried: Iterable[tuple[KeyT, Unit, Sequence[Array]]],
-    blocks: NDArray[np.int64],
+    blocks: Integers,
     most: int,
 ) -> tuple[KeyT, Array] | None:
     """Return the key of the shapes that predict held-out blocks best, and their modes.
@@ -134,7 +129,7 @@ def _turned(sums: BlockSums, known: int, root: Array) -> BlockSums:
     return BlockSums(turn.T @ sums.normal @ turn, sums.right @ turn, sums.squares)
 
 
-def thinned(state: State, blocks: NDArray[np.int64]) -> State:
+def thinned(state: State, blocks: Integers) -> State:
     """Return the state with only some frames of every part."""
     few = []
     for part in state.parts:
@@ -186,7 +181,7 @@ class Fitter:
     """States what effects are fitted on, and how."""
 
     problem: Problem
-    blocks: NDArray[np.int64]  # of time, those that take part
+    blocks: Integers  # of time, those that take part
     iterations: int  # most steps of a fit
 
     def fit(self, terms: Sequence[Term], iterations: int | None = None) -> Fit:

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.diagnosis.engine import JointState, width_of
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.correction import Fields, reference_view, tool_view
@@ -20,11 +20,6 @@ from anser_ros.field.model import Dipoles, FieldModel
 from anser_ros.parallel import in_order, slices, slices_of
 from anser_ros.physics.dipole import field_basis, flux_basis
 from anser_ros.settings import Accuracy
-
-Mask = NDArray[np.bool_]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 REFERENCE_CHANGE = 0.01
 """Relative error of the change that a reference sensor with the default survey errors sees."""
@@ -109,7 +104,7 @@ class Whitener:
             penalty = float(np.log1p(values).sum() - np.linalg.slogdet(pose)[1].sum())
         return Whitener(weight, basis, inner, penalty)
 
-    def rows(self, frames: NDArray[np.int64]) -> 'Whitener':
+    def rows(self, frames: Integers) -> 'Whitener':
         """Return the whitener of some frames, chosen by index."""
         if self.basis is None or self.inner is None:
             return Whitener(self.weight[frames])
@@ -172,18 +167,18 @@ class Problem:
     """Holds everything that a diagnosis starts from."""
 
     tools: tuple[Measurements, ...]  # frames with a pose only
-    blocks: tuple[NDArray[np.int64], ...]  # (F,), number of the time block that each frame is in
+    blocks: tuple[Integers, ...]  # (F,), number of the time block that each frame is in
     references: References | None
-    reference_blocks: NDArray[np.int64]  # (B,)
+    reference_blocks: Integers  # (B,)
     fields: Fields
     apparatus: Apparatus
     spread: Spread
-    good: tuple[Mask, ...]  # (F, S), values that take part (valid, and no outliers)
+    good: tuple[Booleans, ...]  # (F, S), values that take part (valid, and no outliers)
     # (F, S), by how much a modelled flux may be off where the model's scan has gaps, T a
     # component.
     gaps_t: tuple[Array, ...]
 
-    def frames(self, keep: Sequence[NDArray[np.generic]], bins: NDArray[np.generic]) -> 'Problem':
+    def frames(self, keep: Sequence[AnyArray], bins: AnyArray) -> 'Problem':
         """Return the frames of each tool, and the bins, that are named by index or mask."""
         references = self.references
         if references is not None:
@@ -207,7 +202,7 @@ class Problem:
         keep = [np.arange(0, tool.time.size, step) for tool in self.tools]
         return self.frames(keep, np.arange(self.reference_blocks.size))
 
-    def in_blocks(self, wanted: NDArray[np.int64], step: int = 1) -> 'Problem':
+    def in_blocks(self, wanted: Integers, step: int = 1) -> 'Problem':
         """Return every ``step``-th frame of some blocks, with the bins of those blocks."""
         keep = [np.flatnonzero(np.isin(blocks, wanted))[::step] for blocks in self.blocks]
         return self.frames(keep, np.flatnonzero(np.isin(self.reference_blocks, wanted)))
@@ -221,14 +216,14 @@ class Part:
     residual: Array
     whitener: Whitener
     white: Array
-    blocks: NDArray[np.int64]
+    blocks: Integers
 
     @property
     def count(self) -> int:
         """Return the number of values that have a weight."""
         return int(np.count_nonzero(self.whitener.weight))
 
-    def frames(self, rows: NDArray[np.int64]) -> 'Part':
+    def frames(self, rows: Integers) -> 'Part':
         """Return the part of some frames, chosen by index."""
         return Part(
             self.view.frames(rows), self.residual[rows], self.whitener.rows(rows),
@@ -425,12 +420,12 @@ MARGIN_S = 0.15
 """Time (s) by which fluxes may lie outside the optical track: a time offset may bring them in."""
 
 
-def test_blocks() -> NDArray[np.int64]:
+def test_blocks() -> Integers:
     """Return the numbers of the blocks that are held out to the end."""
     return np.arange(TEST_EVERY // 2, BLOCKS, TEST_EVERY)
 
 
-def train_blocks() -> NDArray[np.int64]:
+def train_blocks() -> Integers:
     """Return the numbers of the blocks that effects are chosen and fitted on."""
     return np.setdiff1d(np.arange(BLOCKS), test_blocks())
 
@@ -510,7 +505,7 @@ def _gaps_t(tool: Measurements, model: FieldModel) -> Array:
     return model.gaps.sigma_t(*tool.placed(), tool.sensors.length)
 
 
-def _numbers(time: Array, edges: Array) -> NDArray[np.int64]:
+def _numbers(time: Array, edges: Array) -> Integers:
     return np.clip(np.searchsorted(edges, time, side='right') - 1, 0, BLOCKS - 1)
 
 

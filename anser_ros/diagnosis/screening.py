@@ -1,21 +1,15 @@
-"""Looks at residuals alone: what stands out, wiring faults, what they depend on, what is noise."""
+"""Looks at residuals alone: what stands out, what they depend on, what is noise."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import chdtrc, chdtri
 
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, tool_parts
-from anser_ros.effects.effect import Family, Site, Term
-from anser_ros.effects.seen import DEAD_CHANNEL, SENSOR_POLARITY, SWAPPED_CHANNELS, SWAPPED_COILS
-
-ComplexArray = NDArray[np.complex128]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from anser_ros.effects.effect import Family
 
 WINDOW = 11
 """Neighbouring frames whose median an outlier stands out from: up to five bad ones in a row."""
@@ -63,7 +57,7 @@ def _ratio(usual: float, values: int) -> float:
     return max(usual, float(chdtri(values, decisions.RARE)) / values)
 
 
-def _stands_out(values: Array, ratio: float) -> Mask:
+def _stands_out(values: Array, ratio: float) -> Booleans:
     """Above ``ratio`` times the median of the neighbours in time, and above noise."""
     local = median_filter(values, size=(WINDOW, 1), mode='nearest')
     return np.asarray(values > ratio * np.maximum(local, 1.0))
@@ -94,102 +88,6 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
 def clean_start(problem: Problem) -> Problem:
     """Return the problem without what stands out before anything is explained."""
     return without_outliers(problem, evaluate(problem, ()))
-
-
-def wiring_faults(problem: Problem) -> list[Term]:
-    """Return terms for the wiring faults of the tools."""
-    state = evaluate(problem, ())
-    coils = _swapped_coils(state)
-    if coils is not None:
-        return [coils]
-    faults: list[Term] = []
-    dead: list[int] = []
-    turned: list[int] = []
-    for part, tool, usable in zip(tool_parts(state), problem.tools, problem.good, strict=False):
-        channels, silent = tool.sensors.channel, _silent(tool.flux, part.view.flux, usable)
-        dead += channels[silent].tolist()
-        gain, alike = _likeness(tool.flux, part.view.flux, usable)
-        own = np.diag(alike)
-        turned += channels[
-            (np.abs(np.diag(gain) + 1) < decisions.POLARITY_GAIN)
-            & (own > decisions.OWN_CORRELATION)
-            & ~silent
-        ].tolist()
-        order = np.argmax(alike, axis=1)
-        moved = _moved(alike, ~silent)
-        if moved.size:
-            site: Site = {
-                'channels': tuple(int(c) for c in channels[order[moved]]),
-                'read_as': tuple(int(c) for c in channels[moved]),
-            }
-            faults.append(Term(SWAPPED_CHANNELS, site))
-    dead += _silent_references(problem)
-    if turned:
-        faults.append(Term(SENSOR_POLARITY, {'channels': tuple(turned)}))
-    if dead:
-        faults.append(Term(DEAD_CHANNEL, {'channels': tuple(dead)}))
-    return faults
-
-
-def _silent_references(problem: Problem) -> list[int]:
-    """Channels of references with hardly any of their clean reading."""
-    if problem.references is None:
-        return []
-    readings, clean = problem.references.readings, problem.references.baseline
-    wanted = np.broadcast_to(clean, readings.flux.shape)
-    silent = _silent(readings.flux, wanted, readings.valid)
-    return [int(c) for c in readings.sensors.channel[silent]]
-
-
-def _silent(seen: ComplexArray, wanted: ComplexArray, good: Mask) -> Mask:
-    """Mask (S,) of sensors with hardly any of the reading that they should have."""
-    power = np.where(good[..., None], np.abs(seen) ** 2, 0.0).sum(axis=(0, 2))
-    expected = np.where(good[..., None], np.abs(wanted) ** 2, 0.0).sum(axis=(0, 2))
-    return np.asarray((power < decisions.DEAD**2 * expected) & (expected > 0))
-
-
-def _likeness(seen: ComplexArray, wanted: ComplexArray, good: Mask) -> tuple[ComplexArray, Array]:
-    """Gain and correlation of each sensor's readings with each one's prediction, (S, S)."""
-    read = np.where(good[..., None], seen, 0.0)
-    cross = np.einsum('ftk,fsk->st', wanted.conj(), read)
-    power = np.einsum('ftk,fs->st', np.abs(wanted) ** 2, good.astype(float))
-    own = np.sum(np.abs(read) ** 2, axis=(0, 2))
-    gain = cross / np.where(power > 0, power, 1.0)
-    return gain, np.abs(cross) / np.sqrt(np.maximum(power * own[:, None], 1e-300))
-
-
-def _moved(alike: Array, is_driven: Mask) -> NDArray[np.int64]:
-    """Rows that are plainly another's; none when they are no permutation."""
-    rows = np.arange(len(alike))
-    order, own = np.argmax(alike, axis=1), np.diag(alike)
-    best = alike[rows, order]
-    moved = rows[
-        (order != rows)
-        & is_driven
-        & (best > decisions.OTHERS_CORRELATION)
-        & (1 - best**2 < decisions.BETTER * (1 - own**2))
-    ]
-    return np.asarray(moved if set(order[moved]) == set(moved) else moved[:0])
-
-
-def _swapped_coils(state: State) -> Term | None:
-    """Emitters whose tones are like another's prediction, in all tools."""
-    emitters = state.problem.fields.omega.size
-    cross = np.zeros((emitters, emitters), dtype=complex)
-    power, own = np.zeros(emitters), np.zeros(emitters)
-    problem = state.problem
-    for part, tool, good in zip(tool_parts(state), problem.tools, problem.good, strict=False):
-        read = np.where(good[..., None], tool.flux, 0.0)
-        wanted = np.where(good[..., None], part.view.flux, 0.0)
-        cross += np.einsum('fsb,fsa->ab', wanted.conj(), read)
-        power += np.sum(np.abs(wanted) ** 2, axis=(0, 1))
-        own += np.sum(np.abs(read) ** 2, axis=(0, 1))
-    alike = np.abs(cross) / np.sqrt(np.maximum(own[:, None] * power[None, :], 1e-300))
-    order, moved = np.argmax(alike, axis=1), _moved(alike, np.ones(emitters, dtype=bool))
-    if not moved.size:
-        return None
-    true = tuple(int(c) for c in order[moved])
-    return Term(SWAPPED_COILS, {'coils': true, 'read_as': tuple(moved.tolist())})
 
 
 BINS = 12
@@ -260,12 +158,12 @@ def noise_t(state: State) -> float:
     return float(np.sqrt(variance)) * state.problem.spread.flux_t
 
 
-def _quantiles(values: Array, bins: int) -> NDArray[np.int64]:
+def _quantiles(values: Array, bins: int) -> Integers:
     edges = np.quantile(values, np.linspace(0, 1, bins + 1)[1:-1])
     return np.searchsorted(edges, values, side='right')
 
 
-def _cells(part: Part, name: str) -> list[NDArray[np.int64]]:
+def _cells(part: Part, name: str) -> list[Integers]:
     """Cell of each frame by a variable; by the amplitude, those of each reading apart."""
     view = part.view
     if name == 'time':

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Integers
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.choice import (
     at_floor,
@@ -31,7 +31,6 @@ from anser_ros.diagnosis.screening import noise_scale
 from anser_ros.effects.effect import Family, Term, all_effects
 from anser_ros.parallel import in_order, sharing, slices
 
-Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 CANDIDATES_A_THREAD = 16
@@ -46,7 +45,7 @@ class SearchSettings:
     finalists: int = 7  # candidates fitted in full in a round, which a round's time goes into
     iterations: int = 8  # most steps of a fit; most settle in fewer
 
-    def fitter(self, problem: Problem, blocks: NDArray[np.int64]) -> Fitter:
+    def fitter(self, problem: Problem, blocks: Integers) -> Fitter:
         """Return what fits effects on some blocks of a problem with these settings."""
         return Fitter(problem, blocks, self.iterations)
 
@@ -77,7 +76,7 @@ class Search:
 
 def search_effects(
     problem: Problem,
-    blocks: NDArray[np.int64],
+    blocks: Integers,
     start: Sequence[Term] = (),
     settings: SearchSettings | None = None,
     progress: Progress | None = None,
@@ -115,6 +114,7 @@ class _FluxSelection(ForwardSelection[Fit]):
         self._fitter, self._search, self._how = fitter, search, how
         self._say = progress or (lambda text: None)
         self.most = how.most_effects
+        self._most_metals = decisions.MOST_METALS
 
     def addition(self, fit: Fit) -> Fit | None:
         """Return the fit with one effect more, or None when none pays."""
@@ -136,6 +136,9 @@ class _FluxSelection(ForwardSelection[Fit]):
         if term.effect.family.is_metal:
             if gain < decisions.REMNANT * search.metal_gain or _may_be_the_model_s(gain, best):
                 return None
+            if self._is_installed_anew(fit, best, gain):
+                self._most_metals = 0
+                return self.addition(fit)
             search.metal_gain = max(search.metal_gain, gain)
         search.rivals[term.label] = _rivals(gain, best, fitted)
         if term.effect.family is Family.MOVING_METAL:
@@ -170,6 +173,22 @@ class _FluxSelection(ForwardSelection[Fit]):
                 return without
         return None
 
+    def _is_installed_anew(self, before: Fit, metal: Fit, gain: float) -> bool:
+        """Whether metal at rest stands in for parts of the system that were set up anew.
+
+        Their places, strengths and frame, fitted together, then explain as much. What of them has
+        changed is left to the search, and no metal is looked for any more.
+        """
+        if metal.newest.effect.family is not Family.METAL_AT_REST:
+            return False
+        apparatus = self._fitter.problem.apparatus
+        every = [t for effect in all_effects().values() for t in effect.anew(apparatus)]
+        anew = [term for term in every if not is_covered(term, before.terms)]
+        alike = decisions.ALIKE * gain + decisions.AS_GOOD * max(metal.misfit, 1.0)
+        most = min(metal.held_out() + alike, decisions.AS_LITTLE * metal.held_out())
+        fit = self._fitter.fit([*before.terms, *anew])
+        return fit.held_out() < most and fit.misfit < decisions.COMPLETE
+
     def _simplified(self, fit: Fit) -> Fit:
         """Take a simpler effect for an earlier one, which may have absorbed part of the newest."""
         search = self._search
@@ -193,7 +212,7 @@ class _FluxSelection(ForwardSelection[Fit]):
     def _fitted(self, before: Fit, scorer: Scorer[State]) -> list[tuple[float, Fit]]:
         """Gain and fit of the finalists; all candidates go into the table of the round."""
         fitter = self._fitter
-        scored = self._scored(scorer)
+        scored = self._scored(scorer, self._most_metals)
         table = [Candidate(t, s.solution.size, scorer.held_out - s.held_out) for t, s in scored]
         fluctuations = _fluctuating(fitter.problem, before)
         table += [Candidate(t, t.complexity, g) for g, t in fluctuations]
@@ -216,11 +235,9 @@ class _FluxSelection(ForwardSelection[Fit]):
 
     def _others(self, scorer: Scorer[State]) -> list[tuple[Term, Score]]:
         """All candidates but metal, best first."""
-        return self._scored(scorer, most_metals=0)
+        return self._scored(scorer, 0)
 
-    def _scored(
-        self, scorer: Scorer[State], most_metals: int = decisions.MOST_METALS
-    ) -> list[tuple[Term, Score]]:
+    def _scored(self, scorer: Scorer[State], most_metals: int) -> list[tuple[Term, Score]]:
         """All candidates that are not active already, best first."""
         candidates = _candidates(self._fitter.problem, scorer.state.terms, most_metals)
 

@@ -10,13 +10,11 @@ from enum import Enum
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 AnyTerm = TypeVar('AnyTerm', bound='BaseTerm')
 
 
@@ -181,7 +179,7 @@ class View:
         """Return zeros of shape (F, S, K, count), to be filled with columns."""
         return np.zeros((*self.flux.shape, count), dtype=complex)
 
-    def frames(self, rows: NDArray[np.int64]) -> 'View':
+    def frames(self, rows: Integers) -> 'View':
         """Return the view of some frames, named by index."""
         each = (
             'time', 'position', 'rotation', 'velocity', 'centres', 'axes', 'linear', 'flux',

@@ -12,12 +12,10 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
-    Array,
-    ComplexArray,
     Effect,
     Remedy,
     Site,
@@ -68,7 +66,7 @@ class GainOfChannels(ComplexGain):
         out[:, rows] = np.stack([own, 1j * own], axis=-1)
         return out
 
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         own = np.isin(channels, term.channels)
         return np.diag(np.where(own, 1 + complex(*term.theta), 1.0))
 
@@ -94,6 +92,33 @@ class ToolGain(GainOfChannels):
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         tools = [tuple(table.channel.tolist()) for table in apparatus.tools if len(table) > 1]
         return [Term(self, {'channels': channels}, np.zeros(2)) for channels in tools]
+
+
+class CommonGain(Effect[Term]):
+    """Theta is (gain - 1) of all channels, those of the references too."""
+
+    name = 'common_gain'
+    summary = 'the gain of all channels has changed alike'
+    units = {'gain': '1'}
+    plausible = {'gain': (0.5, 2.0)}
+    remedy = Remedy.FLUX
+    typical = 0.1  # gains of a whole system stay within some percent
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        return [Term(self, {}, np.zeros(1))]
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        return np.asarray(view.linear[..., None] / (1 + term.theta[0]))
+
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
+        return np.asarray((1 + term.theta[0]) * np.eye(channels.size, dtype=complex))
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        gain, sigma = 1 + float(term.theta[0]), float(sigmas(covariance)[0])
+        return EffectRecord(self.name, {'gain': gain}, {'gain': sigma})
+
+    def term(self, record: EffectRecord) -> Term:
+        return Term(self, {}, np.array([float(needed(record, 'gain')) - 1]))
 
 
 DELAY_UNIT = 1e-6
@@ -171,7 +196,7 @@ class ChannelCrosstalk(Effect[Term]):
             matrix[place] = value
         return matrix
 
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         """Mix the cluster's channels; one that is not there leaks nothing."""
         matrix, block = np.eye(channels.size, dtype=complex), self._matrix(term)
         place = {int(c): row for row, c in enumerate(channels)}
@@ -236,7 +261,7 @@ class Pickup(Effect[Term]):
             out[:, row, k, k], out[:, row, k, emitters + k] = PICKUP_UNIT, 1j * PICKUP_UNIT
         return out
 
-    def offset(self, term: Term, channels: NDArray[np.int64], emitters: int) -> ComplexArray:
+    def offset(self, term: Term, channels: Integers, emitters: int) -> ComplexArray:
         out = np.zeros((channels.size, emitters), dtype=complex)
         out[channels == term.site['channel']] = complex_of(term.theta * PICKUP_UNIT)
         return out
@@ -363,7 +388,7 @@ class Saturation(Effect[SaturationTerm]):
         return out
 
     def compress(
-        self, term: SaturationTerm, channels: NDArray[np.int64], flux: ComplexArray
+        self, term: SaturationTerm, channels: Integers, flux: ComplexArray
     ) -> ComplexArray:
         out, weights = flux.copy(), term.weights
         for row in np.flatnonzero(channels == term.site['channel']):
@@ -396,6 +421,6 @@ class Saturation(Effect[SaturationTerm]):
 
 
 EFFECTS = (
-    SensorGain(), ToolGain(), PhaseDelay(), ChannelCrosstalk(), Pickup(), ReferenceChanged(),
-    Saturation(),
+    SensorGain(), ToolGain(), CommonGain(), PhaseDelay(), ChannelCrosstalk(), Pickup(),
+    ReferenceChanged(), Saturation(),
 )  # fmt: skip

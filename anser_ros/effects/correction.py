@@ -1,8 +1,9 @@
 """Predicts what sensors read when effects hold, and undoes a model's effects on what is measured.
 
-The forward chain is ``flux = compress(C T (field) + offset)`` with C mixing channels and T mixing
-emitters; it is undone from the outside in, live in the tracker and node, and offline. Effects on
-the field are in the model's dipoles already, and effects that cannot be corrected are skipped.
+The forward chain is ``flux = compress(R C T (field) + offset)`` with C mixing channels, T mixing
+emitters and R factors of both; it is undone from the outside in, live in the tracker and node, and
+offline. Effects on the field are in the model's dipoles already, and effects that cannot be
+corrected are skipped.
 """
 
 from collections.abc import Sequence
@@ -10,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array, ComplexArray, Integers
 from anser_ros.effects.base import View
 from anser_ros.effects.effect import Effect, Remedy, Term, effect_named
 from anser_ros.errors import ModelFileError
@@ -20,9 +21,6 @@ from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 KEPT = 6
 """Sets of sensors whose slopes are kept, some megabytes each."""
@@ -179,6 +177,11 @@ def _measured(view: View, terms: Sequence[Term]) -> View:
         if mixing is not None:
             linear = np.einsum('st,ftk->fsk', mixing, linear)
             slopes = [np.einsum('st,ftik->fsik', mixing, slope) for slope in slopes]
+    for term in terms:
+        factor = term.effect.response(term, channels, view.omega)
+        if factor is not None:
+            linear = linear * factor
+            slopes = [slope * factor[:, None, :] for slope in slopes]
     flux = linear
     for term in terms:
         added = term.effect.offset(term, channels, view.omega.size)
@@ -280,7 +283,7 @@ class Correction:
         return true_track(track, self._with(Remedy.OPTICAL))
 
     def flux(
-        self, time: float, channels: NDArray[np.generic], flux: ComplexArray, *,
+        self, time: float, channels: AnyArray, flux: ComplexArray, *,
         recorded: bool = False,
     ) -> ComplexArray:  # fmt: skip
         """Return a frame's fluxes (S, K), T, as ideal sensors and emitters would have given them.
@@ -302,6 +305,9 @@ class Correction:
         for term in terms:
             added = term.effect.offset(term, number, self.omega.size)
             values = values if added is None else values - added
+        for term in terms:
+            factor = term.effect.response(term, number, self.omega)
+            values = values if factor is None else values / factor
         for term in reversed(terms):
             mixing = term.effect.channel_matrix(term, number)
             if mixing is not None:
@@ -315,7 +321,7 @@ class Correction:
 
     @staticmethod
     def _decompressed(
-        terms: list[Term], channels: NDArray[np.int64], measured: ComplexArray
+        terms: list[Term], channels: Integers, measured: ComplexArray
     ) -> ComplexArray:
         """Fixed point of ``x = measured - (compress(x) - x)``; at most half of x is corrected."""
         x = measured

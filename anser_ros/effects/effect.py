@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import anser_ros.effects
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, BaseEffect, BaseTerm, View
 from anser_ros.effects.base import Remedy as Remedy
 from anser_ros.errors import ModelFileError
@@ -33,9 +34,6 @@ from anser_ros.metal.body import BODIES, COMPACT, ball_modes
 from anser_ros.metal.scattering import Shapes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 class Site(TypedDict, total=False):
@@ -47,6 +45,7 @@ class Site(TypedDict, total=False):
     coils: tuple[int, ...]  # of crosstalk: the one that leaks, and the one that it leaks into
     read_as: tuple[int, ...]  # for each of the channels or coils, the one whose place it has
     body: str
+    rotation_deg: tuple[float, ...]  # rotation vector of a body in its holder, its own frame
     mutual: Literal[True]  # the leak is the same both ways
     shape: str  # curve of a saturation
     sees: str  # what a saturating channel sees: one tone, or all together
@@ -54,6 +53,7 @@ class Site(TypedDict, total=False):
     place: tuple[float, ...]  # where resting metal is looked for, m, frame fg
     z: float  # height of a sheet, m, frame fg
     edge: float  # length of its edge, m
+    axis: tuple[float, ...]  # unit vector of the optical frame along which its lengths are off
 
 
 @dataclass(frozen=True)
@@ -252,6 +252,10 @@ class Effect(BaseEffect[TermT]):
     drifts: ClassVar[bool] = False
     # whether nothing but the reference sensors can follow it live
     followed: ClassVar[bool] = False
+    # whether several of it at once are as likely as one, and no stand-in for what they share
+    gregarious: ClassVar[bool] = False
+    # whether it is how a part is installed: installed anew, parts are a rival of metal at rest
+    installed: ClassVar[bool] = False
     # relative error of what it changes at a reference, beyond the survey's, where the field's
     # gradient close to an emitter is known less well than the field
     gradient_error: ClassVar[float] = 0.0
@@ -264,11 +268,15 @@ class Effect(BaseEffect[TermT]):
         """Return the effect at every site where it may sit, with parameters of zero."""
         return ()
 
+    def anew(self, apparatus: Apparatus) -> Sequence[TermT]:
+        """Return what it is where the same parts are set up anew: a rival of metal at rest."""
+        return self.candidates(apparatus) if self.installed else ()
+
     def columns(self, term: TermT, view: View) -> ComplexArray | None:
         """Return the derivative of the view's flux by the parameters, (F, S, K, q), or None."""
         return None
 
-    def amounts(self, term: TermT) -> NDArray[np.int64]:
+    def amounts(self, term: TermT) -> Integers:
         """Return the indices of the parameters that are all zero when there is no effect."""
         return np.arange(term.theta.size)
 
@@ -383,23 +391,23 @@ class Effect(BaseEffect[TermT]):
         """Return the mixing of the emitters' tones, (F or 1, K, K): row the tone that is read."""
         return None
 
-    def channel_matrix(self, term: TermT, channels: NDArray[np.int64]) -> ComplexArray | None:
+    def channel_matrix(self, term: TermT, channels: Integers) -> ComplexArray | None:
         """Return the mixing of the channels, shape (S, S): row the channel that is read."""
+        return None
+
+    def response(self, term: TermT, channels: Integers, omega: Array) -> ComplexArray | None:
+        """Return the factor of each channel at each tone, (S, K), where they differ by both."""
         return None
 
     def gain_changes(self, term: TermT, sensors: SensorTable) -> Array | None:
         """Return relative changes of gains since, one standard deviation each, shape (G, S)."""
         return None
 
-    def offset(
-        self, term: TermT, channels: NDArray[np.int64], emitters: int
-    ) -> ComplexArray | None:
+    def offset(self, term: TermT, channels: Integers, emitters: int) -> ComplexArray | None:
         """Return phasors that are added, shape (S, K), T."""
         return None
 
-    def compress(
-        self, term: TermT, channels: NDArray[np.int64], flux: ComplexArray
-    ) -> ComplexArray:
+    def compress(self, term: TermT, channels: Integers, flux: ComplexArray) -> ComplexArray:
         """Return what the channels make of fluxes of shape (F, S, K)."""
         return flux
 

@@ -5,21 +5,12 @@ from dataclasses import dataclass
 from itertools import combinations, permutations
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.channels import ComplexGain
-from anser_ros.effects.effect import (
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Site,
-    Term,
-    needed,
-    recorded_site,
-    sigmas,
-)
+from anser_ros.effects.effect import Effect, Remedy, Site, Term, needed, recorded_site, sigmas
 from anser_ros.field.model import (
     Dipoles,
     EffectRecord,
@@ -29,12 +20,20 @@ from anser_ros.field.model import (
 )
 
 
+def _of_one(term: Term, emitters: int, factor: complex) -> ComplexArray:
+    """Return the matrix (1, K, K) that multiplies the term's emitter by a factor."""
+    matrix = np.eye(emitters, dtype=complex)
+    matrix[term.site['coil'], term.site['coil']] = factor
+    return matrix[None]
+
+
 class CoilGain(ComplexGain):
     """Is the complex gain of one emitter."""
 
     name = 'coil_gain'
     summary = "an emitter's strength is not the calibrated one"
     units = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
+    installed = True
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         return [Term(self, {'coil': k}, np.zeros(2)) for k in range(apparatus.emitters)]
@@ -46,9 +45,36 @@ class CoilGain(ComplexGain):
         return out
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        matrix = np.eye(omega.size, dtype=complex)
-        matrix[term.site['coil'], term.site['coil']] = 1 + complex(*term.theta)
-        return matrix[None]
+        return _of_one(term, omega.size, 1 + complex(*term.theta))
+
+
+PHASE_UNIT = 1e-3
+"""theta counts milliradians."""
+
+
+class CoilPhase(Effect[Term]):
+    """Theta is the phase by which an emitter's current is ahead of what it is taken for, mrad."""
+
+    name = 'coil_phase'
+    summary = "an emitter's phase is not the calibrated one"
+    units = {'coil': '1', 'phase_rad': 'rad'}
+    plausible = {'phase_rad': (-0.5, 0.5)}
+    remedy = Remedy.FLUX
+    typical = 30.0  # phases of amplifiers and of their references are off by some degrees
+    recorded = {'phase_rad': (1, PHASE_UNIT)}
+    inexact = 0.05  # phases of single sensors, which it leaves, are off by some mrad too
+    gregarious = True  # one wrong reference of the phases turns all of them, each by its own
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        return [Term(self, {'coil': k}, np.zeros(1)) for k in range(apparatus.emitters)]
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        out = view.columns(1)
+        out[:, :, term.site['coil'], 0] = 1j * PHASE_UNIT * view.linear[:, :, term.site['coil']]
+        return out
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        return _of_one(term, omega.size, np.exp(1j * PHASE_UNIT * term.theta[0]))
 
 
 PROBED_SHARES = (0.1, 0.5, 2.5)
@@ -83,7 +109,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         start, coils = np.array([0.0, np.log(0.5 * duration)]), range(apparatus.emitters)
         return [CoilDriftTerm(self, {'coil': k}, start, duration=duration) for k in coils]
 
-    def amounts(self, term: CoilDriftTerm) -> NDArray[np.int64]:
+    def amounts(self, term: CoilDriftTerm) -> Integers:
         """Return the amount's index alone: a drift of nothing has any time constant."""
         return np.array([0])
 
@@ -218,6 +244,7 @@ class CoilMoved(Effect[Term]):
     plausible = {'shift_m': (-0.03, 0.03)}
     remedy = Remedy.FIELD
     typical = 3e-3  # emitters shift by some millimetres
+    installed = True
     gradient_error = 0.07  # less lets references outvote tools with gradients that are guesses
     recorded = {'shift_m': (3, 1.0)}
 
@@ -234,21 +261,86 @@ class CoilMoved(Effect[Term]):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        return self._shifted(term, base)
+        return self._changed(term, base)
 
     def light(self, term: Term, illumination: Dipoles) -> Dipoles:
-        """Shift the emitter in the field that metal sees, too."""
-        return illumination.joined(self._shifted(term, illumination))
+        """Move the emitter in the field that metal sees, too."""
+        return illumination.joined(self._changed(term, illumination))
 
-    @staticmethod
-    def _shifted(term: Term, base: Dipoles) -> Dipoles:
+    def _changed(self, term: Term, base: Dipoles) -> Dipoles:
+        """Return the emitter where it is, and less it where the model has it."""
         only = np.zeros_like(base.moments)
         only[:, term.site['coil']] = base.moments[:, term.site['coil']]
         used = np.flatnonzero(np.abs(only).any(axis=1))
         place, direction, moment = base.positions[used], base.directions[used], only[used]
-        return Dipoles(place + term.theta, direction, moment).joined(
+        return Dipoles(*self._moved(term, place, direction), moment).joined(
             Dipoles(place, direction, -moment)
         )
+
+    def _moved(self, term: Term, place: Array, direction: Array) -> tuple[Array, Array]:
+        return place + term.theta, direction
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoilTurnedTerm(Term):
+    """Holds an emitter that turns about a point."""
+
+    centre: tuple[float, ...]  # (3,), m, frame fg
+
+
+def _spatial(vector: Array) -> Array:
+    """Return what turn (rad, fixed axes) a step of a rotation vector makes, (3, 3)."""
+    angle, cross = float(np.linalg.norm(vector)), np.cross(vector, np.eye(3)).T
+    if angle < 1e-4:
+        return np.asarray(np.eye(3) + cross / 2)
+    once, twice = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + once * cross + twice * cross @ cross)
+
+
+class CoilTurned(CoilMoved):
+    """Theta is the rotation vector of one emitter about its middle, rad, frame fg."""
+
+    name = 'coil_turned'
+    summary = 'an emitter does not stand as the model has it'
+    units = {'coil': '1', 'rotation_deg': 'deg', 'centre_m': 'm'}
+    plausible = {'rotation_deg': (-15.0, 15.0)}
+    typical = 0.03  # emitters are tilted by some degrees
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        light = apparatus.illumination
+        weight = np.abs(light.moments) / np.maximum(np.abs(light.moments).sum(axis=0), 1e-300)
+        return [
+            CoilTurnedTerm(self, {'coil': k}, np.zeros(3), centre=tuple(centre))
+            for k, centre in enumerate((weight.T @ light.positions).tolist())
+        ]
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Turn the sensors the other way, which does the same as turning the source."""
+        assert isinstance(term, CoilTurnedTerm)
+        coil = term.site['coil']
+        lever = view.centres - term.centre
+        turn = np.cross(lever, view.d_position[..., coil]) + np.cross(
+            view.axes, view.d_axis[..., coil]
+        )
+        out = view.columns(3)
+        out[:, :, coil] = -turn @ _spatial(term.theta)
+        return out
+
+    def _moved(self, term: Term, place: Array, direction: Array) -> tuple[Array, Array]:
+        assert isinstance(term, CoilTurnedTerm)
+        turn = Rotation.from_rotvec(term.theta).as_matrix()
+        return (place - term.centre) @ turn.T + term.centre, direction @ turn.T
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        assert isinstance(term, CoilTurnedTerm)
+        figures = {'rotation_deg': np.degrees(term.theta).tolist(), 'centre_m': list(term.centre)}
+        deviation = {'rotation_deg': np.degrees(sigmas(covariance)).tolist()}
+        return EffectRecord(self.name, {**recorded_site(term), **figures}, deviation)
+
+    def term(self, record: EffectRecord) -> Term:
+        theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
+        centre = tuple(float(value) for value in needed(record, 'centre_m'))
+        return CoilTurnedTerm(self, self.site_of(record), theta, centre=centre)
 
 
 SIZE_UNIT = 1e-4
@@ -340,4 +432,12 @@ class EmitterSize(Effect[EmitterSizeTerm]):
         )  # fmt: skip
 
 
-EFFECTS = CoilGain(), CoilDrift(), CoilCrosstalk(), CoilMoved(), EmitterSize()
+EFFECTS = (
+    CoilGain(),
+    CoilPhase(),
+    CoilDrift(),
+    CoilCrosstalk(),
+    CoilMoved(),
+    CoilTurned(),
+    EmitterSize(),
+)

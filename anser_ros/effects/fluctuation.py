@@ -11,12 +11,11 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.channels import SensorGain, ToolGain
 from anser_ros.effects.effect import (
     READ_SITE,
-    Array,
-    ComplexArray,
     Effect,
     Family,
     FluctuationTerm,

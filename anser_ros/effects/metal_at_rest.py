@@ -11,11 +11,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     FROZEN,
-    Array,
-    ComplexArray,
     Effect,
     Family,
     Remedy,
@@ -75,7 +74,7 @@ def places(apparatus: Apparatus) -> Array:
     return np.asarray(points[~inside & ~on_board])
 
 
-def _within(points: Array, box: Array) -> NDArray[np.bool_]:
+def _within(points: Array, box: Array) -> Booleans:
     return np.asarray(np.all((points > box[0]) & (points < box[1]), axis=1))
 
 
@@ -105,7 +104,7 @@ class StaticMetal(MetalAtRest):
             for place in places(apparatus)
         ]
 
-    def amounts(self, term: Term) -> NDArray[np.int64]:
+    def amounts(self, term: Term) -> Integers:
         return np.arange(3, term.theta.size)
 
     def prior(self, term: Term) -> Array:
@@ -220,7 +219,7 @@ class ConductivePlate(MetalAtRest):
             for edge in (0.6 * size, size, 1.8 * size)
         ]  # fmt: skip
 
-    def amounts(self, term: Term) -> NDArray[np.int64]:
+    def amounts(self, term: Term) -> Integers:
         """Return the edge's index: a sheet without size has no effect."""
         return np.array([1])
 

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
     FROZEN,
     LARGEST,
-    Array,
     BodyTerm,
-    ComplexArray,
     Effect,
     Family,
     Remedy,
@@ -305,7 +304,7 @@ class MovingMetal(Effect[MovingTerm]):
     def body(self, term: MovingTerm) -> MovingTerm:
         return term
 
-    def amounts(self, term: MovingTerm) -> NDArray[np.int64]:
+    def amounts(self, term: MovingTerm) -> Integers:
         return np.arange(term.placed, term.theta.size)
 
     def prior(self, term: MovingTerm) -> Array:

@@ -2,21 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
-    Array,
-    ComplexArray,
     Effect,
     Remedy,
+    Site,
     Term,
     TermT,
     needed,
+    recorded_site,
     sigmas,
 )
 from anser_ros.field.model import EffectRecord
@@ -101,6 +101,7 @@ class Registration(OpticalEffect[Term]):
     plausible = {'rotation_deg': (-10.0, 10.0), 'translation_m': (-0.05, 0.05)}
     recorded = {'rotation_deg': (3, 180.0 / np.pi), 'translation_m': (3, 1.0)}
     typical = (0.02, 0.02, 0.02, 5e-3, 5e-3, 5e-3)
+    installed = True
 
     def slopes(self, term: Term, view: View) -> ComplexArray:
         """Return the derivative by a turn about fg's origin and a shift, made the other way."""
@@ -123,44 +124,75 @@ class Registration(OpticalEffect[Term]):
 
 
 class OpticalScale(OpticalEffect[Term]):
-    """Theta is the scale less one, and times it the point of fg that stays where it is (m).
+    """Theta is the scale less one, and a shift (m); along one axis, two shears after the scale.
 
     Optical positions are ``p (1 + e) - c``; the scale applies about the tracker's own origin,
-    which may be anywhere, so the shift ``c`` is free.
+    which may be anywhere, so the shift ``c`` is free. Where a stage gives the poses each of its
+    axes has its own: ``p + (a . p) w - c`` along the axis a, with ``w = e a + f b + g c`` for the
+    two other axes b and c, towards which it may be skew.
     """
 
     name = 'optical_scale'
     summary = "the optical tracker's millimetre is too long or too short"
-    units = {'scale': '1', 'shift_m': 'm'}
-    plausible = {'scale': (0.9, 1.1), 'shift_m': (-0.1, 0.1)}
-    typical = (0.01, 5e-3, 5e-3, 5e-3)
+    units = {'scale': '1', 'shift_m': 'm', 'axis': '1', 'shear': '1'}
+    plausible = {'scale': (0.9, 1.1), 'shift_m': (-0.1, 0.1), 'shear': (-0.05, 0.05)}
 
-    def amounts(self, term: Term) -> NDArray[np.int64]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        along = [Term(self, {'axis': tuple(axis)}, np.zeros(6)) for axis in np.eye(3).tolist()]
+        return [Term(self, {}, np.zeros(4)), *along] if apparatus.tools else []
+
+    def prior(self, term: Term) -> Array:
+        return np.concatenate([np.full(term.theta.size - 3, 0.01), np.full(3, 5e-3)])
+
+    def amounts(self, term: Term) -> Integers:
         """Return the scale's index alone: a shift is a registration's."""
         return np.array([0])
 
+    def covers(self, term: Term, candidate: Term) -> bool:
+        """Cover an axis beside all of them, and the other way round."""
+        mixed = ('axis' in term.site) is not ('axis' in candidate.site)
+        return super().covers(term, candidate) or (candidate.effect is self and mixed)
+
+    @staticmethod
+    def _stretches(term: Term) -> Array:
+        """Return what a unit of scale and of each shear adds to a position, (q, 3, 3)."""
+        if 'axis' not in term.site:
+            return np.eye(3)[None]
+        first = int(np.argmax(term.site['axis']))
+        return np.array(
+            [np.outer(np.eye(3)[k % 3], np.eye(3)[first]) for k in range(first, first + 3)]
+        )
+
+    def _matrix(self, term: Term) -> Array:
+        return np.asarray(np.eye(3) + np.tensordot(term.theta[:-3], self._stretches(term), 1))
+
     def slopes(self, term: Term, view: View) -> ComplexArray:
         """Return the flux that changes as all sensors move with scale and shift."""
-        out = view.columns(4)
-        larger = 1 + term.theta[0]
-        out[..., 0] = -np.einsum('fsik,fi->fsk', view.d_position, view.position) / larger
-        out[..., 1:] = np.moveaxis(view.d_position, 2, -1) / larger
+        back = np.linalg.inv(self._matrix(term))
+        ways = np.einsum('ij,qjk,fk->fqi', back, self._stretches(term), view.position)
+        out = view.columns(term.theta.size)
+        out[..., :-3] = -np.einsum('fsik,fqi->fskq', view.d_position, ways)
+        out[..., -3:] = np.einsum('fsik,ij->fskj', view.d_position, back)
         return out
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        return replace(track, position=(track.position + term.theta[1:]) / (1 + term.theta[0]))
+        back = np.linalg.inv(self._matrix(term))
+        return replace(track, position=(track.position + term.theta[-3:]) @ back.T)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        sigma = sigmas(covariance)
-        return EffectRecord(
-            self.name,
-            {'scale': 1 + float(term.theta[0]), 'shift_m': term.theta[1:].tolist()},
-            {'scale': float(sigma[0]), 'shift_m': sigma[1:].tolist()},
-        )
+        def figures(scale: float, values: Array) -> dict[str, Any]:
+            shear = {'shear': values[1:-3].tolist()} if 'axis' in term.site else {}
+            return {'scale': scale + float(values[0]), **shear, 'shift_m': values[-3:].tolist()}
+
+        parameters = {**figures(1.0, term.theta), **recorded_site(term)}
+        return EffectRecord(self.name, parameters, figures(0.0, sigmas(covariance)))
 
     def term(self, record: EffectRecord) -> Term:
-        shift = np.asarray(needed(record, 'shift_m'), dtype=np.float64)
-        return Term(self, {}, np.array([float(needed(record, 'scale')) - 1, *shift]))
+        shift, given = needed(record, 'shift_m'), record.parameters
+        theta = [float(needed(record, 'scale')) - 1, *given.get('shear', ()), *shift]
+        axis = given.get('axis')
+        site: Site = {} if axis is None else {'axis': tuple(float(value) for value in axis)}
+        return Term(self, site, np.array(theta))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +216,7 @@ class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
         duration = max(apparatus.duration, 1e-3)
         return RegistrationDriftTerm(self, {}, np.zeros(6), duration=duration)
 
-    def amounts(self, term: RegistrationDriftTerm) -> NDArray[np.int64]:
+    def amounts(self, term: RegistrationDriftTerm) -> Integers:
         """Return the growth's index alone: a constant shift is a registration's."""
         return np.arange(3, 6)
 

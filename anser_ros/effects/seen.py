@@ -5,23 +5,15 @@ outliers in what it leaves, with one number that says how much.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.effect import (
-    Array,
-    ComplexArray,
-    Effect,
-    Family,
-    Remedy,
-    Site,
-    Term,
-    needed,
-    recorded_site,
-)
+from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term, needed, recorded_site
 from anser_ros.field.model import EffectRecord
+from anser_ros.physics.sensor import SensorTable
 
 
 class Wiring(Effect[Term]):
@@ -41,7 +33,7 @@ class SwappedChannels(Wiring):
     units = {'channels': '1', 'read_as': '1'}
     remedy = Remedy.FLUX
 
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         """Return a permutation; channels of which one is missing stay as they are."""
         row = {int(c): i for i, c in enumerate(channels)}
         matrix = np.eye(channels.size, dtype=complex)
@@ -88,13 +80,45 @@ class SensorPolarity(Wiring):
     units = {'channels': '1'}
     remedy = Remedy.FLUX
 
-    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         signs = np.where(np.isin(channels, term.site['channels']), -1.0, 1.0)
         return np.diag(signs).astype(complex)
 
 
+class CoilPolarity(Wiring):
+    """Turns the emitters' signs round, without a parameter."""
+
+    name = 'coil_polarity'
+    summary = 'an emitter is wired the other way round'
+    units = {'coils': '1'}
+    remedy = Remedy.FLUX
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        signs = np.where(np.isin(np.arange(omega.size), term.site['coils']), -1.0, 1.0)
+        return np.diag(signs).astype(complex)[None]
+
+
+class BodyTurned(Wiring):
+    """Turns a body's sensors about its origin by the rotation vector of the site, deg."""
+
+    name = 'body_turned'
+    summary = 'a body stands in its holder by a quarter turn, or its axes are stated so'
+    units = {'channels': '1', 'rotation_deg': 'deg'}
+    remedy = Remedy.SENSORS
+
+    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
+        own = np.isin(sensors.channel, term.site['channels'])[:, None]
+        turn = Rotation.from_rotvec(term.site['rotation_deg'], degrees=True).as_matrix()
+        place, axis = (np.where(own, v @ turn.T, v) for v in (sensors.position, sensors.axis))
+        return replace(sensors, position=place, axis=axis)
+
+    def term(self, record: EffectRecord) -> Term:
+        turn = tuple(float(value) for value in needed(record, 'rotation_deg'))
+        return Term(self, {**self.site_of(record), 'rotation_deg': turn})
+
+
 SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()
-SENSOR_POLARITY = SensorPolarity()
+SENSOR_POLARITY, COIL_POLARITY, BODY_TURNED = SensorPolarity(), CoilPolarity(), BodyTurned()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,6 +194,6 @@ def outliers_of(fraction: float, sigma: float, channels: Sequence[int]) -> SeenT
 
 
 EFFECTS = (
-    SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL, SENSOR_POLARITY, EXCESS_NOISE, OUTLIERS,
-    LOOSE_CONTACT,
+    SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL, SENSOR_POLARITY, COIL_POLARITY,
+    BODY_TURNED, EXCESS_NOISE, OUTLIERS, LOOSE_CONTACT,
 )  # fmt: skip

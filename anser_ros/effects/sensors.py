@@ -5,13 +5,11 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import (
-    Array,
-    ComplexArray,
     Effect,
     Family,
     Remedy,
@@ -56,10 +54,11 @@ class SensorAxis(Effect[SensorAxisTerm]):
             SensorAxisTerm(self, {'channel': c}, np.zeros(2), surveyed=axes[c])
             for c in apparatus.tool_channels
         ]
-        for cluster in apparatus.clusters():
-            if len(apparatus.tool_channels) > len(cluster) and len(cluster) > 1:
-                terms.append(SensorAxisTerm(self, {'channels': cluster}, np.zeros(3)))
-        return terms
+        # The turn of all that a tool has is hardly told from another frame of its poses.
+        return [*terms, *(t for t in self.anew(apparatus) if len(t.channels) < len(axes))]
+
+    def anew(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
+        return [SensorAxisTerm(self, {'channels': c}, np.zeros(3)) for c in apparatus.clusters()]
 
     def columns(self, term: SensorAxisTerm, view: View) -> ComplexArray | None:
         """Return the derivative by the axis, along the tangents or across the cluster's turn."""
@@ -141,7 +140,7 @@ class PlacedElsewhere(Effect[Term]):
     typical = 5e-3  # offsets are some millimetres
     recorded = {'offset_m': (3, 1.0)}
 
-    def rows(self, term: Term, sensors: SensorTable) -> NDArray[np.bool_]:
+    def rows(self, term: Term, sensors: SensorTable) -> Booleans:
         """Return which sensors (S,) are shifted."""
         raise NotImplementedError
 
@@ -175,7 +174,7 @@ class SensorPosition(PlacedElsewhere):
                 groups += [g for g in apparatus.clusters() if own > set(g)]
         return [Term(self, {'channels': group}, np.zeros(3)) for group in groups]
 
-    def rows(self, term: Term, sensors: SensorTable) -> NDArray[np.bool_]:
+    def rows(self, term: Term, sensors: SensorTable) -> Booleans:
         """Return the sensors of the site's channels."""
         return np.isin(sensors.channel, term.site['channels'])
 
@@ -191,7 +190,7 @@ class LeverArm(PlacedElsewhere):
         bodies = [table.body[0] for table in apparatus.tools if len(table)]
         return [Term(self, {'body': body}, np.zeros(3)) for body in bodies]
 
-    def rows(self, term: Term, sensors: SensorTable) -> NDArray[np.bool_]:
+    def rows(self, term: Term, sensors: SensorTable) -> Booleans:
         """Return the sensors of the site's body."""
         return np.array([body == term.site['body'] for body in sensors.body])
 
@@ -300,7 +299,7 @@ class SpreadTerm(Term):
             return self.theta.reshape(max(self.groups) + 1, -1)[list(self.groups)]
         return self.theta.reshape(len(self.members), -1)
 
-    def of(self, channels: NDArray[np.generic]) -> Array:
+    def of(self, channels: AnyArray) -> Array:
         """Return the values of listed channels, a row each; zero for one that is no member."""
         out = np.zeros((len(channels), self.values.shape[1]))
         place = {channel: row for row, channel in enumerate(self.members)}
@@ -402,7 +401,7 @@ class SensorGainSpread(SensorSpread):
         width = float(np.std(term.theta[0::2])) if term.groups else term.spread
         return super().record(replace(term, spread=width), covariance)
 
-    def channel_matrix(self, term: SpreadTerm, channels: NDArray[np.int64]) -> ComplexArray | None:
+    def channel_matrix(self, term: SpreadTerm, channels: Integers) -> ComplexArray | None:
         parts = term.of(channels)
         return np.asarray(np.eye(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
 
@@ -421,6 +420,20 @@ class SensorGainSpread(SensorSpread):
         for row, channels in enumerate(places):
             out[row, channels] = np.sqrt(term.shared) * term.spread
         return out
+
+
+class SensorDelaySpread(SensorSpread):
+    """Values are delays (s) about the mean tone, whose phases are those of the gains."""
+
+    name = 'sensor_delay_spread'
+    summary = "every channel's phase depends on the tone in its own way"
+    units = {'spread': 's', 'channels': '1', 'values': 's'}
+    remedy = Remedy.FLUX
+    parts = ('delay',)
+    faultless = (0.0,)
+
+    def response(self, term: SpreadTerm, channels: Integers, omega: Array) -> ComplexArray | None:
+        return np.asarray(np.exp(-1j * term.of(channels) * (omega - omega.mean())))
 
 
 class SensorAxisSpread(SensorSpread):
@@ -460,14 +473,13 @@ class SensorPickupSpread(SensorSpread):
     plausible = {'spread': (0.0, 1.0)}
     remedy = Remedy.FLUX
 
-    def offset(
-        self, term: SpreadTerm, channels: NDArray[np.int64], emitters: int
-    ) -> ComplexArray | None:
+    def offset(self, term: SpreadTerm, channels: Integers, emitters: int) -> ComplexArray | None:
         parts = term.of(channels)
         return np.asarray(parts[:, 0::2] + 1j * parts[:, 1::2])
 
 
 EFFECTS = (
     SensorAxis(), SensorPosition(), LeverArm(), SensorSize(),
-    SensorGainSpread(), SensorAxisSpread(), SensorPlaceSpread(), SensorPickupSpread(),
+    SensorGainSpread(), SensorDelaySpread(), SensorAxisSpread(), SensorPlaceSpread(),
+    SensorPickupSpread(),
 )  # fmt: skip

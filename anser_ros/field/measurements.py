@@ -3,13 +3,10 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.physics.sensor import SensorTable
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -21,18 +18,18 @@ class Measurements:
     time: Array  # (F,), time since the session's first stamp on the clock of the fluxes, s
     # (F, S, K), complex, flux density along each sensor's axis, T; finite only where ``valid``
     flux: ComplexArray
-    valid: NDArray[np.bool_]  # (F, S), false where the value is missing, not finite or flagged
+    valid: Booleans  # (F, S), false where the value is missing, not finite or flagged
     # (F, S), flag bits of the flux messages (saturated 1, stale 2, dropped samples 4)
-    flags: NDArray[np.int64]
+    flags: Integers
     position: Array  # (F, 3), origin of the body, m, frame fg; NaN where ``has_pose`` is False
     rotation: Array  # (F, 3, 3), rotation matrix from the body's frame to fg
     # (F,), whether the other instrument has a pose at the frame's time
-    has_pose: NDArray[np.bool_]
+    has_pose: Booleans
     # the stream of poses on the same time axis, for effects that shift the clocks
     track: PoseTrack | None = None
 
     @property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> Booleans:
         """Return the mask (F, S) of the values that have a pose and are valid."""
         return np.asarray(self.valid & self.has_pose[:, None])
 
@@ -43,7 +40,7 @@ class Measurements:
             return False
         return float(np.median(np.diff(self.track.time))) <= LONGEST_GAP_S
 
-    def frames(self, rows: NDArray[np.generic] | slice) -> 'Measurements':
+    def frames(self, rows: AnyArray | slice) -> 'Measurements':
         """Return the measurements of the frames given by index, mask or slice."""
         each = ('time', 'flux', 'valid', 'flags', 'position', 'rotation', 'has_pose')
         return replace(self, **{name: getattr(self, name)[rows] for name in each})
@@ -53,7 +50,7 @@ class Measurements:
         position, rotation, has_pose = track.at(self.time)
         return replace(self, track=track, position=position, rotation=rotation, has_pose=has_pose)
 
-    def sensors_only(self, rows: NDArray[np.generic]) -> 'Measurements':
+    def sensors_only(self, rows: AnyArray) -> 'Measurements':
         """Return the measurements of the sensors given by index or mask."""
         each = {name: getattr(self, name)[:, rows] for name in ('flux', 'valid', 'flags')}
         return replace(self, sensors=self.sensors.select(rows), **each)

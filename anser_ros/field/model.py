@@ -14,15 +14,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import ModelFileError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.physics.dipole import dipole_field, flux_basis
 from anser_ros.physics.sensor import along_each_axis
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -64,11 +61,9 @@ class Dipoles:
 
 
 OFF_AXIS = 1e-6
-"""Moment across the axis, as a fraction of the whole, and distance from the axis as a fraction of
-a metre, up to which a dipole is on it: far below what anybody can measure."""
+"""Moment across the axis, of the whole, and distance, m, up to which a dipole is on the axis."""
 STEP_M = 1e-3
-"""Way along the axis over which a second derivative is a difference, m: it errs by 0.3 % at 3 cm.
-A far smaller way makes moments so large that rounding is seen."""
+"""Way along the axis, m, of a second difference: 0.3 % at 3 cm; far less shows rounding."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +78,7 @@ class SymmetryAxis:
 
 
 def symmetry_axis(
-    positions: Array, directions: Array, moments: NDArray[np.complex128]
+    positions: Array, directions: Array, moments: ComplexArray
 ) -> SymmetryAxis | None:
     """Return the axis on which all dipoles lie and along which all moments point, if there is one.
 
@@ -339,10 +334,9 @@ class FieldModel:
 
     def flux(self, points: Array, axes: Array, lengths: Array | None = None) -> ComplexArray:
         """Return each emitter's flux (..., K), T, along unit axes at places, m, in fg."""
-        flat = points.reshape(-1, 3)
         spans = None if lengths is None else np.broadcast_to(lengths, points.shape[:-1]).ravel()
-        basis = flux_basis(flat, axes.reshape(-1, 3), spans, self.positions, self.directions)
-        return np.asarray((basis @ self.moments).reshape(*points.shape[:-1], -1))
+        flux = self.dipoles.flux(points.reshape(-1, 3), axes.reshape(-1, 3), spans)
+        return flux.reshape(*points.shape[:-1], -1)
 
     @property
     def dipoles(self) -> Dipoles:
@@ -355,15 +349,9 @@ class FieldModel:
         """Return this model with M more dipoles, whose moments (M, K), A m^2, count as certain."""
         modes = self.modes
         if modes is not None:
-            pad = np.zeros((modes.shape[0], positions.shape[0], modes.shape[2]), dtype=complex)
-            modes = np.concatenate([modes, pad], axis=1)
-        return replace(
-            self,
-            positions=np.concatenate([self.positions, positions]),
-            directions=np.concatenate([self.directions, directions]),
-            moments=np.concatenate([self.moments, moments]),
-            modes=modes,
-        )
+            modes = np.pad(modes, ((0, 0), (0, len(positions)), (0, 0)))
+        whole = self.dipoles.joined(Dipoles(positions, directions, moments))
+        return replace(self, **vars(whole), modes=modes)
 
 
 def to_document(model: FieldModel) -> dict[str, Any]:
@@ -389,15 +377,7 @@ def to_document(model: FieldModel) -> dict[str, Any]:
         'provenance': dict(model.provenance),
         'flux_error_t': model.flux_error_t,
         'shift_sigma_m': model.shift_sigma_m,
-        'effects': [
-            {
-                'name': effect.name,
-                'parameters': plain(dict(effect.parameters)),
-                'uncertainty': plain(dict(effect.uncertainty)),
-                'evidence': plain(dict(effect.evidence)),
-            }
-            for effect in model.effects
-        ],
+        'effects': [plain(asdict(effect)) for effect in model.effects],
         'columns': ['x', 'y', 'z', 'ux', 'uy', 'uz']
         + [f'm{k}_{part}' for k in range(len(model.emitters)) for part in ('re', 'im')],
         'dipoles': table.tolist(),

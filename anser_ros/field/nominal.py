@@ -10,33 +10,25 @@ a millimetre and the gains of its coils differ. The model carries this uncertain
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.board import Board, loop_field
 from anser_ros.physics.dipole import field_basis
 
-Array = NDArray[np.float64]
-
 LOWEST_M = 0.06
-"""Least height above the copper, m, at which the dipoles have to be right. Closer to the tracks a
-few dipoles cannot follow the field; a smaller value makes the fit coarser everywhere else."""
+"""Least height above the copper, m, at which the few dipoles have to be right."""
 FIT_REACH_M = 0.5
-"""Greatest height, m, of the points that the dipoles are fitted at. Beyond it the field is that
-of the coil's total moment, which the fit has right by then."""
+"""Greatest height, m, of the points that the dipoles are fitted at: beyond, the moment counts."""
 FEWEST_NODES, MOST_NODES = 4, 9
-"""Vertical dipoles along a side of the coil: the first and the last number that are tried. More
-of them follow the field closer to the copper, and each costs time in tracking."""
+"""Vertical dipoles along a side of the coil: the first and the last number that are tried."""
 NODE_SPREADS = np.arange(0.6, 0.96, 0.02)
-"""Sizes of the dipoles' lattice that are tried, as a fraction of the coil's. The best is well
-inside the coil, as the outer nodes of a quadrature are, hence nothing up to 1."""
+"""Sizes of the dipoles' lattice that are tried, as a fraction of the coil's, as a quadrature's."""
 GOOD_MISFIT = 1.5e-4
-"""Relative misfit (rms of the field vector's error over the field) at which no more dipoles are
-tried. It is far below the 2 % by which a coil's moment is off (`GAIN`)."""
+"""Relative misfit (rms) at which no more dipoles are tried: far below a coil's error (`GAIN`)."""
 LARGEST_MISFIT = 1e-2
-"""Relative misfit beyond which the nominal model is refused: half of the tolerance of the gain,
-so that what a model misses is never larger than what the geometry does."""
+"""Relative misfit beyond which the nominal model is refused: half of the gain's tolerance."""
 
 
 GAIN, SHIFT_M, TILT_RAD = 0.02, 5e-4, 5e-3
@@ -75,9 +67,7 @@ def _points(shape: Array, count: int) -> Array:
     return np.stack([x, y, top + height], axis=1)
 
 
-def _design(
-    points: Array, positions: Array, directions: Array, weight: Array
-) -> NDArray[np.float64]:
+def _design(points: Array, positions: Array, directions: Array, weight: Array) -> Array:
     basis = field_basis(points, positions, directions) * weight[:, None, None]
     return np.asarray(basis.swapaxes(1, 2).reshape(-1, len(positions)))
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import ComplexArray, Integers
 from anser_ros.physics.sensor import LARGEST_FLUX_T
 from anser_ros.wire import points
 
@@ -50,7 +51,7 @@ FAULTS: tuple[Fault | None, ...] = (
 )
 
 
-def value_codes(flux: NDArray[np.complex128]) -> NDArray[np.int64]:
+def value_codes(flux: ComplexArray) -> Integers:
     """Return what the values of readings (..., K), T, say about them.
 
     Each is `GOOD`, `NOT_FINITE_CODE` or `ABSURD_CODE`.
@@ -61,9 +62,7 @@ def value_codes(flux: NDArray[np.complex128]) -> NDArray[np.int64]:
     return np.where(np.isfinite(largest), codes, NOT_FINITE_CODE)
 
 
-def reading_codes(
-    flux: NDArray[np.complex128], flags: NDArray[np.integer[Any]]
-) -> NDArray[np.int64]:
+def reading_codes(flux: ComplexArray, flags: NDArray[np.integer[Any]]) -> Integers:
     """Return what is wrong with recorded readings, as `frames.intake` says it of live ones.
 
     ``flux`` (..., K) in T and ``flags`` (...) of `wire.points`, where a channel that is not in its

@@ -20,8 +20,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Booleans, ComplexArray, Integers
 from anser_ros.errors import AnserError, LayoutError
 from anser_ros.frames import faults
 from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE
@@ -29,8 +29,6 @@ from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.sensor import LARGEST_FLUX_T
 from anser_ros.stamps import JUMP_NS, NANO, Order, order_of
 
-Integers = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 Count = Callable[[str, int], None]
 """Takes a counter's name and by how much it rises."""
 
@@ -46,11 +44,11 @@ class Frame:
     # (S,), what is wrong with each reading: places in `frames.faults.FAULTS`, 0 for nothing
     codes: Integers
     # (K,), emitters that a usable sensor receives; None when all are received, or none at all
-    living: NDArray[np.bool_] | None = None
+    living: Booleans | None = None
     goes_back: bool = False  # Whether the stamp is before that of the frame before
 
     @property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> Booleans:
         """Return a mask (S,) of the readings without a fault."""
         return np.asarray(self.codes == GOOD)
 
@@ -96,9 +94,9 @@ class Intake:
     def admit(
         self,
         stamp_ns: int,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
-        flags: NDArray[np.generic] | None = None,
+        channels: AnyArray,
+        flux: AnyArray,
+        flags: AnyArray | None = None,
         emitters: tuple[str, ...] | None = None,
         jump_s: float = JUMP_NS * NANO,
     ) -> Frame | None:
@@ -139,9 +137,9 @@ class Intake:
     def judge(
         self,
         stamp_ns: int,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
-        flags: NDArray[np.generic] | None = None,
+        channels: AnyArray,
+        flux: AnyArray,
+        flags: AnyArray | None = None,
         emitters: int | None = None,
     ) -> Frame:
         """Judge a frame by itself; nothing is counted.

@@ -10,8 +10,8 @@ references.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.clean_references import (
@@ -25,15 +25,10 @@ from anser_ros.physics.sensor import SensorTable, along_each_axis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.settings import Accuracy
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 FAR_M = 5e-4
-"""Distance between the model's board and the references' from which on the model is refused: half
-of the error that a pose may have beside three of its sigmas."""
+"""Distance of the two boards from which on a model is refused: half of what a pose may be off."""
 FAR_SIGMAS = 5.0
-"""The same in standard deviations of that distance, for few sensors or a poor survey: a correct
-model is farther off once in 65 000 times."""
+"""The same in standard deviations: a correct model is farther off once in 65 000 times."""
 EXPLAINED = 1.0
 """Misfit of the typical reference, in what survey and manufacture allow, up to which the distance
 is believed (0.04 and 0.5 on two simulated boards): more is metal, which others judge."""
@@ -41,8 +36,7 @@ MODEL_SHARE = 2e-3
 """Error of a calibrated model's field relative to itself, in the middle of the volume, that
 drawing and shift need not explain. Half and twice as much move the distance by 5 um at most."""
 DRAWN_SHARE = 2e-3
-"""Error of a drawn field with its coils moved, relative to itself, at the references: tracks are
-not where they are drawn, which is 0.07 mm at 10 cm."""
+"""Error of a drawn field relative to itself at the references: tracks 0.07 mm off, at 10 cm."""
 INNER = 0.5
 """Part of the volume, from its middle, in which the model is asked: scans reach that far."""
 SIDE = 4
@@ -50,11 +44,9 @@ SIDE = 4
 EFFECTIVE_READINGS = 40.0
 """So many of these readings count, about one in five: neighbouring points say the same."""
 PRIOR_M, PRIOR_RAD = 5e-3, 0.02
-"""Standard deviations of how far a model lies aside before anything is known, m and rad: a board
-that was put down again by hand."""
+"""Standard deviations of how far a model lies aside, m and rad: a board put down again by hand."""
 WEIGHT_ROUNDS = 12
-"""Rounds in which sensors that do not fit lose weight; from the sixth on the distance stays within
-1 um."""
+"""Rounds in which sensors that do not fit lose weight; from the sixth on 1 um changes."""
 
 
 @dataclass(frozen=True)
@@ -170,10 +162,7 @@ def _of_model(
 def _solved(
     references: tuple[Array, Array], model: tuple[Array, Array]
 ) -> tuple[Array, Array, float]:
-    """Estimate (n,), covariance, and misfit of the typical reference, for a prior of one.
-
-    Readings that do not fit get less weight.
-    """
+    """Estimate (n,), covariance, and misfit of the typical reference, for a prior of one."""
     prior = np.ones(references[0].shape[2])
     weights = [np.ones(len(references[0])), np.ones(len(model[0]))]
     estimate, covariance, misfit = np.zeros(prior.size), np.diag(prior), 0.0

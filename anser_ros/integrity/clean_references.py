@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import ReferenceReadings
 from anser_ros.field.nominal import SHIFT_M, TILT_RAD
@@ -21,18 +21,13 @@ from anser_ros.physics.rotations import tangents
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.settings import Accuracy, RefitSettings
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
-
 FieldAt = Callable[[Array], Array]
 """Drawn field at points (P, 3) in m, frame fg: (P, K, 3) in T."""
 
 STEP_M = 1e-5
 """Step (m) of the differences by which the field changes with place."""
 FREE_GAIN = 0.1
-"""Deviation of an emitter from its nominal strength, which is not judged here: a meter of the
-current that is 10 % off is another fault."""
+"""Deviation of an emitter from its nominal strength, which is not judged here."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +89,7 @@ STABLE_SHARE = 0.25
 """Share of `Accuracy.reference_gain` that a sensor's reading may change by from one day to
 another: more than a warm amplifier does, less than metal that moves poses by 0.1 mm."""
 CERTAIN = 4.0
-"""Changes below so many times their noise do not count; noise alone hardly passes twice its usual
-size, as it is that of readings of all emitters together."""
+"""Changes below so many times their noise do not count; noise seldom passes twice its size."""
 FEWEST_SENSORS = RefitSettings.min_references
 """Sensors that have to be known: with fewer, the emitters' strengths explain what metal does."""
 PARTS = 3
@@ -103,20 +97,17 @@ PARTS = 3
 FEWEST_FRAMES_OF_CHANGE = 12
 """Frames in which a change is looked for: four a part. In fewer, noise hides it."""
 NOTICEABLE = 2e-4
-"""Change of a reading during a recording that counts, as a share of its size: it moves poses by
-more than they jitter."""
+"""Change of a reading, as a share of its size, that counts: poses move more than they jitter."""
 MOST_SENSORS = 0.9
 """Part of the sensors (0 to 1) that must not change by more: on the simulated board metal at the
 limit moves poses by 0.09 mm (median of 53 places), and by 1.1 mm with half of the sensors."""
 SAME_PLACE_M = 1e-4
-"""Farthest that a sensor may be from where it was at the calibration, m: else its old reading is
-worth nothing."""
+"""Farthest, m, that a sensor may be from its place at the calibration for its reading to count."""
 STRENGTH_STEPS = 25
 """Steps in which sensors that changed most lose their say in the emitters' strengths: beside 8 of
 32 that changed by 20 % the others seem to change by 2e-5, and by 5e-3 after 10 steps."""
 DRAWN_GATE = 3.0
-"""Root mean square of all readings' differences from the nominal, in units of what survey and
-manufacture allow (then it is 1), from which on there is metal."""
+"""Root mean square of all differences, over what survey and manufacture allow: above is metal."""
 DRAWING_ERROR = 1e-4
 """Error of a drawn field relative to itself: turns and leads are not drawn to less."""
 

@@ -42,10 +42,6 @@ class FrameModel:
     withheld: Withheld | None = None
 
 
-UNCHANGED_MODEL = FrameModel(None)
-"""For a model that does not follow references."""
-
-
 class ModelAge:
     """Keeps the last models that the references gave, and ages the newest until the next.
 
@@ -94,7 +90,7 @@ class ModelAge:
     def _aged_at(self, stamp_ns: int, why: str) -> FrameModel:
         """The newest model with its age; ``why`` states why the references gave no answer."""
         if not self._answers:
-            return FrameModel(None, Withheld(REFERENCES_LOST, why)) if why else UNCHANGED_MODEL
+            return FrameModel(None, Withheld(REFERENCES_LOST, why) if why else None)
         last_ns, model = self._answers[-1]
         age_ns = stamp_ns - last_ns
         if age_ns > self._longest_ns:

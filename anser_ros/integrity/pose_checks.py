@@ -5,13 +5,10 @@ few wrong poses pass by chance. So after withheld poses a pose needs consistent 
 Points that were recorded one by one, further apart than `STREAM_GAP_S`, have no neighbours in
 time, and each is judged alone.
 
-A body's pose predicts the place of each of its coils, and each coil has its own pose. The two may
-differ by their errors, by the errors of the body's survey, and by the effect of an error of the
-coil's gain. A coil that differs by more is in another place, or is another coil. A coil that took
-part in the body's solve shares its noise with it: the difference of an estimate and one that makes
-better use of the same data has the *difference* of their covariances (Hausman, Econometrica 1978),
-which the coil's own bounds from above. A coil that was left out shares no noise with the body, and
-the covariances add up.
+A body's pose predicts the place of each of its coils, and each coil has its own pose. A coil whose
+two differ by more than their errors, the survey's and that of its gain is in another place, or is
+another coil. If it took part in the body's solve, the difference has the *difference* of the two
+covariances (Hausman, Econometrica 1978), which the coil's own bounds from above; else their sum.
 """
 
 import math
@@ -21,32 +18,25 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from anser_ros.arrays import Array, Booleans
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.stamps import NANO
 
-Array = NDArray[np.float64]
-
 STREAM_GAP_S = 0.5
-"""Frames further apart than this, s, are single points and no stream, as of a robot that stops
-once a second."""
+"""Frames further apart than this, s, are single points and no stream."""
 RECORD_S = 1.0
 """How far back refusals count, s; after a distortion has ended a tool waits as long."""
 MOST_REFUSED = 0.5
-"""Share (0 to 1) of refused frames in the record from which on a good one needs confirmation: a
-pass is then more likely chance than not."""
+"""Share (0 to 1) of refused frames from which on a pass is more likely chance than not."""
 START_FRAMES = 3
-"""Fewest consecutive frames, the last one included, that confirm a pose: 60 ms at 50 Hz. Two wrong
-ones may agree."""
+"""Fewest consecutive frames, the last included, that confirm a pose: two wrong ones may agree."""
 LONGEST_RUN_S = 0.25
-"""Longest run that is asked for, s; the run is as long as the refusal before it up to this: 12
-frames at 50 Hz all pass by chance once in 5e5 times where a third do."""
+"""Longest run asked for, s: 12 frames at 50 Hz pass by chance once in 5e5 where a third do."""
 SIGMAS = 3.0
-"""Allowance for the poses' own errors, in units of `Place.sigma_m`, beside the bounds of the
-motion."""
+"""Allowance for the poses' own errors, in units of `Place.sigma_m`, beside the bounds."""
 
 
 class MotionBounds(NamedTuple):
@@ -163,18 +153,15 @@ class Continuity:
 SELDOM = 1e-6
 """Probability that a sound coil contradicts its body."""
 GATE = float(chdtri(5, SELDOM))
-"""Squared Mahalanobis distance (three of the position, two of the axis) from which on a coil
-contradicts its body; 36, six sigma in one direction."""
+"""Squared Mahalanobis distance from which on a coil contradicts its body: 36, six sigma."""
 
 
 HARMFUL_M = 1e-3
 """An error of a pose that does harm, m, where the pose's own sigma does not say it."""
 BODY_SIGMAS = 3.0
-"""How many of its sigmas a pose may be away from where its body says. An error of a sound pose is
-that large once in 10^5 frames: sigma is that of all three directions together."""
+"""Sigmas that a pose may be off its body, of all three directions: once in 10^5 sound frames."""
 SURVEYS = 6.0
-"""How many times the stated error of the survey, an axis, a coil may be away, if that is more: one
-of 1e7 coils is, if the survey is as stated."""
+"""The same in stated errors of the survey, if that is more: one of 1e7 coils is so far off."""
 
 
 def allowed_m(sigma_m: float, survey_m: float) -> float:
@@ -277,7 +264,7 @@ def distances(
     offsets: Array,
     axes: Array,
     coils: tuple[Array, Array, Array],
-    took_part: NDArray[np.bool_],
+    took_part: Booleans,
     survey: SurveyErrors,
 ) -> Array:
     """Return how far each coil's own pose is from its place in the body, (3, S).

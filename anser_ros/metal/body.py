@@ -24,16 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.field.model import Dipoles
 from anser_ros.metal.scattering import UNIT, Shapes
 from anser_ros.physics.constants import MU_0
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 SMALL = 1e-2
-"""|x| below which the series of q in x^2 is used, with an error under x^4 / 175; the closed form
-loses as many digits as x^2 has zeros."""
+"""|x| below which the series of q in x^2 is used: the closed form loses digits there."""
 
 
 def sphere_polarisability(
@@ -65,20 +62,16 @@ def sphere_polarisability(
 RADIUS = 0.025
 """Of the sphere on which amplitudes are taken, m: it sets their unit, and nothing else."""
 HIGHEST = 4
-"""Largest order l of a multipole. Its field falls with distance r as 1 / r^(l + 2), so higher ones
-matter only to sensors that almost touch the metal."""
+"""Largest order l of a multipole: its field falls as 1 / r^(l + 2)."""
 LARGEST_ORDER_SUM = 6
-"""Largest sum of two orders that are coupled: what they make falls as the radius over the distance
-to the power of the sum and one."""
+"""Largest sum of two orders that are coupled."""
 ODD = 0.2
 """Couplings that a body lacks which is its own mirror image, as a share of others; so much of its
 radius its centre may lie beside the symmetric body's."""
 RADII = (0.008, 0.012, 0.018, 0.027, 0.04, 0.06, 0.09)
-"""Radii (m) of compact bodies that are tried, each half again the one before: from what can hardly
-be seen beside a tracked volume to what is larger than its distance."""
+"""Radii (m) of compact bodies that are tried, each half again as large as the one before."""
 PIECES = (0.01, 0.05, 0.2, 1.0)
-"""Sizes of an extended body's pieces that are tried, in 1e-4 m^3: perfectly conducting balls with
-radii of 5 to 25 mm."""
+"""Sizes of a body's pieces that are tried, 1e-4 m^3: perfectly conducting balls of 5 to 25 mm."""
 FREQUENCY_SLOPE = 0.5
 """Prior size of d(ln T) / d(ln f); a sphere's parts have slopes between -1/2 and 1."""
 
@@ -107,7 +100,7 @@ def _zonal_gradients(order: int) -> Array:
     return np.asarray(along + slope[..., None] * SPHERE_POINTS[:, None, :])
 
 
-def _orders() -> NDArray[np.int64]:
+def _orders() -> Integers:
     """Order of each shape."""
     return np.repeat(np.arange(1, HIGHEST + 1), 2 * np.arange(1, HIGHEST + 1) + 1)
 
@@ -199,14 +192,11 @@ BODIES: Mapping[str, Callable[[], Shapes]] = {
 FINEST = 7
 """Half waves along both edges together, at most, of the shapes that a sheet's answer may have."""
 SHAPE_POINTS = 12
-"""Points along an edge at which the field through a sheet is taken, more than three in the
-shortest of the waves."""
+"""Points along an edge at which the field through a sheet is taken."""
 WIDER = 1.06
-"""Edge of the square that carries the waves, over the sheet's: they vanish at its edges, where the
-currents of the sheet are largest."""
+"""Edge of the waves' square over the sheet's: waves vanish at its edges, currents do not."""
 SHEET_SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
-"""Sizes that are tried of what the couplings of a meshed sheet lack, as shares of a perfect
-conductor's: from what the mesh leaves to holes, rims and a second sheet."""
+"""Sizes tried of what a meshed sheet lacks, as shares of a perfect conductor's couplings."""
 
 
 def _strip_distance(aside: Array) -> Array:

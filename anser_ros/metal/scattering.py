@@ -16,17 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.field.model import Dipoles
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT, MU_0
 from anser_ros.physics.dipole import GAUSS_OFFSET
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 NEGLIGIBLE = 1e-4
-"""Share of the emitters' field that may lie in quadrature and is left out: less than metal is
-known to."""
+"""Share of the emitters' field that may lie in quadrature and is left out."""
 UNIT = 1e-4
 """Couplings count in 1e-4 m^3; a perfectly conducting ball of 25 mm has the polarisability -1."""
 
@@ -38,10 +35,10 @@ class Shapes:
     offsets: Array  # (n, 3), from the centre, m
     # (M, n, 3), amplitude i is the sum of ``functionals[i]`` times the field at the offsets
     functionals: Array
-    first: NDArray[np.int64]  # (P,), a shape of each pair
-    second: NDArray[np.int64]  # (P,), the other shape, first <= second
+    first: Integers  # (P,), a shape of each pair
+    second: Integers  # (P,), the other shape, first <= second
     # The pairs, by index, whose coupling may have a part that grows as log f
-    sloped: NDArray[np.int64]
+    sloped: Integers
 
     @property
     def local(self) -> bool:

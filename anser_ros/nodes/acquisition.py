@@ -10,11 +10,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
+from anser_ros.chain.frame import ChainFrame
 from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes.acquisition_status import (
     Interval,
@@ -27,11 +28,10 @@ from anser_ros.nodes.acquisition_status import (
 )
 from anser_ros.nodes.acquisition_stream import FluxFrame, FluxStream, MeasuredAccuracy, WallClock
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.runtime.process import TURN_S, main
-from anser_ros.nodes.streams.clouds import FluxCloud
+from anser_ros.nodes.streams.clouds import FluxCloud, readings_of
 from anser_ros.nodes.streams.one_source import Backlog, too_slow
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.frames import (
@@ -45,7 +45,7 @@ from anser_ros.wire.frames import (
     SampleBlock,
     Start,
 )
-from anser_ros.wire.points import FluxPoints, as_sent
+from anser_ros.wire.points import as_sent
 from anser_ros.wire.port import (
     DEFAULT_BAUD,
     SILENCE_S,
@@ -57,6 +57,9 @@ from anser_ros.wire.port import (
 from anser_ros.wire.protocols import PROTOCOLS, StreamControl
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.text_files import read_config
+
+if TYPE_CHECKING:
+    from anser_ros.chain.chain import Chain
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,10 @@ WAIT_S = 0.1
 
 
 class Acquisition(AnserNode):
-    """Publishes ``setup``, ``tool/flux`` and ``reference/flux``."""
+    """Publishes ``setup``, ``tool/flux`` and ``reference/flux``.
+
+    ``chain`` is what it takes frames through itself, where other nodes of its process do that.
+    """
 
     NAME = 'acquisition'
     EXAMPLE = '--ros-args -p device:=/dev/ttyACM0 -p setup_file:=config/demo_setup.yaml'
@@ -124,8 +130,6 @@ class Acquisition(AnserNode):
         self._reference_publisher = self.create_publisher(
             PointCloud2, 'reference/flux', qos.STREAM
         )
-        self.offer(self._tool_publisher)
-        self.offer(self._reference_publisher)
         self._cloud = FluxCloud(self._setup.frame_id)
         may_set = table.set_frequencies and PROTOCOLS[table.protocol].sets_tones
         self._control = StreamControl(self._setup.frequencies_hz, set_frequencies=may_set)
@@ -144,6 +148,7 @@ class Acquisition(AnserNode):
         self._wall_clock = WallClock()
         self._asked_ns = 0
         self._start_sent_ns: int | None = None
+        self.chain: Chain | None = None
         self._faults = RecentFaults()
         self._publish_setup(self._setup)
         self._port: ControlUnitPort | None = None
@@ -240,9 +245,10 @@ class Acquisition(AnserNode):
             done, arrival_ns = run.stop, arrivals_ns[run.stop - 1]
             skips = self._backlog.is_hopeless((begin_ns - arrival_ns) / 1e9)
             for frame in stream.push(blocks[run], arrivals_ns[run], skips=skips):
-                self._publish_frame(stream, frame, arrival_ns)
+                could_wait = self._publish_frame(stream, frame, arrival_ns)
                 now_ns = time.monotonic_ns()
-                self._backlog.worked((now_ns - begin_ns) / 1e9)
+                if not could_wait:  # whether a backlog is hopeless depends on all other work
+                    self._backlog.worked((now_ns - begin_ns) / 1e9)
                 begin_ns = now_ns
 
     def _take_answer(self, command: int, tag: int) -> None:
@@ -286,29 +292,32 @@ class Acquisition(AnserNode):
             self._published_setup = text
             self._setup_publisher.publish(String(data=text))
 
-    def _publish_frame(self, stream: FluxStream, frame: FluxFrame, arrival_ns: int) -> None:
+    def _publish_frame(self, stream: FluxStream, frame: FluxFrame, arrival_ns: int) -> bool:
+        """Publish a frame, and take it through the chain; return whether its model was refitted,
+        which is left out, but for every third frame, when the next window is near or waits.
+        """
+        reference = None
         if self._accuracy.must_republish(frame, stream.clock.sigma_s, time.monotonic()):
             self._publish_setup(self._accuracy.stated_in(self._setup, stream.rate_hz))
         # The system's clock may be set while we run; the offset is taken again for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
-        self._hand_over_flux(self._tool_publisher, frame.tool, stamp_ns)
-        publishers = self._tool_publisher, self._reference_publisher
-        for publisher, points in zip(publishers, (frame.tool, frame.reference), strict=True):
+        if self.chain is not None:
+            late = self._backlog.gives_way((time.monotonic_ns() - arrival_ns) / 1e9)
+            self.count('refits_left_out', late)
+            tools, reference = (
+                readings_of(as_sent(points)) if len(points.channel) else None
+                for points in (frame.tool, frame.reference)
+            )
+            reference = None if late else reference
+            self.chain.step(ChainFrame(stamp_ns, tools, reference))
+        # References first: their model is what a tracker in another process waits for.
+        publishers = self._reference_publisher, self._tool_publisher
+        for publisher, points in zip(publishers, (frame.reference, frame.tool), strict=True):
             if len(points.channel) and publisher.get_subscription_count():
                 publisher.publish(self._cloud.packed(points, stamp_ns))
-        # The model is refitted once poses and messages are on their way, if no frame waits.
-        age_s = (time.monotonic_ns() - arrival_ns) / 1e9
-        if self.hands_over and self._backlog.gives_way(age_s):
-            self.count('refits_left_out')
-        else:
-            self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)
         self._frame = frame
         self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
-
-    def _hand_over_flux(self, publisher: Any, points: FluxPoints, stamp_ns: int) -> None:
-        if self.hands_over and len(points.channel):
-            sent = HandedFlux(stamp_ns, self._setup.frame_id, as_sent(points))
-            self.hand_over(publisher, sent)
+        return reference is not None
 
     # Executor thread ----------------------------------------------------------------------
 

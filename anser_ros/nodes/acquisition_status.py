@@ -26,7 +26,6 @@ class Interval:
     repeats: int = 0
 
     def add(self, frame: FluxFrame, delay_s: float) -> None:
-        """Note a published frame."""
         self.frames += 1
         self.delay_sum_s += delay_s
         self.delay_max_s = max(self.delay_max_s, delay_s)
@@ -210,6 +209,5 @@ def sensor_statuses(stream: FluxStream, frame: FluxFrame, past: Interval) -> lis
 
 
 def _rms(values: np.ndarray) -> float:
-    """Root mean square of what is finite; 0 when nothing is."""
     finite = np.abs(values[np.isfinite(values)])
     return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0

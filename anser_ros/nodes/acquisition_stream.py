@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.errors import FitError, SetupError
 from anser_ros.nodes.streams.clouds import FLUX_NOISE, STAMP_SIGMA
 from anser_ros.settings import Accuracy
@@ -29,16 +29,15 @@ from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, Setup
 
 PATIENCE_NS = 300_000_000
-"""Host time (0.3 s) that a frame waits for an arrival that confirms its stamp: stalls of the host
-are shorter."""
+"""Host time (0.3 s) that a frame waits for its stamp to be confirmed: the host stalls for less."""
 
 
 @dataclass(frozen=True)
 class Staleness:
     """Says why sensors are stale; each array has a place for each of them, shape (S,)."""
 
-    age_s: NDArray[np.float64]
-    noiseless: NDArray[np.bool_]
+    age_s: Array
+    noiseless: Booleans
 
     def __or__(self, later: Staleness) -> Staleness:
         """What holds of one or the other; of two ages that of the later counts."""
@@ -54,7 +53,7 @@ class FluxFrame:
     reference: FluxPoints
     host_ns: int
     window: FluxWindow
-    flags: NDArray[np.int64]
+    flags: Integers
     staleness: Staleness
     repeats: bool = False
 
@@ -93,7 +92,11 @@ class FluxStream:
         if not self.sensors:
             raise SetupError('the control unit has none of the channels of the setup')
         self.tones_hz = np.array(hello.frequencies_hz)
-        self.nominal_a = _nominal_currents(setup, hello)
+        # Currents that the setup's field is given for; the control unit's where it says nothing.
+        self.nominal_a = np.array(hello.currents_a, dtype=np.float64)
+        current = setup.emitter.geometry.get('current_a')
+        if isinstance(current, (int, float)) and current > 0:
+            self.nominal_a[:] = current
         rate = hello.sample_rate_hz
         window = round(window_s * rate)
         hop = max(1, round(rate / rate_hz))
@@ -121,7 +124,6 @@ class FluxStream:
         self._reference = SensorRows.of(self.sensors[self._split :], fixed_only=True)
 
     def counts(self) -> dict[str, int]:
-        """Return the counters of the stream by name."""
         return {
             **vars(self.counters),
             'windows_withheld': self.withheld,
@@ -243,7 +245,7 @@ class FluxStream:
         saturated = window.saturated[self._columns]
         stale = window.stuck[self._columns] | window.stuck[self._current_column]
         stale |= ((staleness.age_s > 0) | staleness.noiseless) & ~saturated
-        flags: NDArray[np.int64] = saturated * SATURATED | stale * STALE
+        flags: Integers = saturated * SATURATED | stale * STALE
         if window.dropped:
             flags |= DROPPED
         split = self._split
@@ -269,18 +271,8 @@ class FluxStream:
         )
 
 
-def _points(
-    rows: SensorRows, flux: NDArray[np.complex128], flags: NDArray[np.int64]
-) -> FluxPoints:
+def _points(rows: SensorRows, flux: ComplexArray, flags: Integers) -> FluxPoints:
     return FluxPoints(rows.channel, flags, flux, rows.position, rows.axis)
-
-
-def _nominal_currents(setup: Setup, hello: Hello) -> NDArray[np.float64]:
-    """Currents that the setup's field is given for; the control unit's where it says nothing."""
-    current = setup.emitter.geometry.get('current_a')
-    if isinstance(current, (int, float)) and current > 0:
-        return np.full(len(hello.currents_a), float(current))
-    return np.array(hello.currents_a)
 
 
 EARLIEST_S = 10.0
@@ -333,8 +325,7 @@ _TRIES = 5
 _CLOSE_NS = 20_000
 """Time (20 us) from one reading to the next that is close enough to try no more."""
 _STEP_NS = 5_000_000
-"""Change of the difference (5 ms) that is a setting: a clock that is slewed moves 0.5 ms a
-second."""
+"""Change of the difference (5 ms) that is a setting: a slewed clock moves 0.5 ms a second."""
 
 
 class WallClock:

@@ -245,7 +245,6 @@ class CuSimulator(AnserNode):
             publisher.publish(self._message.packed(now_ns, *numbers))
 
     def on_parameters(self, old: Any, new: Any) -> None:
-        """Switch to the fault that the new parameters name."""
         self._injector = line.FaultInjector(new.fault, new.fault_period_s, new.seed)
 
     def status(self) -> Status:

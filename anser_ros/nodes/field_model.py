@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import ComplexArray
+from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
@@ -38,11 +38,11 @@ from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.streams.clouds import read_frame
+from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
 from anser_ros.nodes.streams.one_source import LOOK_S, NewestSource, sender_words, setup_source
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.frame import MOST_RATE_HZ, Pace, ReadingWindow, check_enough
-from anser_ros.sessions.baseline import clean_flux, clean_mean
+from anser_ros.sessions.baseline import board_place_of, clean_flux, clean_mean
 from anser_ros.sessions.kept_tables import ReadAhead, kept_folder
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import (
@@ -109,14 +109,21 @@ class FieldModelParameters:
     seed: int = stated('seed')
 
 
+LONGEST_WAIT_S = 0.004
+"""Time, s, that a frame's poses may be late by what this node does besides, as it writes to disk;
+a frame whose model would come later has none, and the one before ages."""
+
+
 class FieldModelNode(AnserNode):
-    """Publishes ``field_model``, and answers ``field_model/reset`` and its like."""
+    """Publishes ``field_model``, and answers ``field_model/reset`` and its like.
+
+    Where another node of the process has frames, it calls ``step`` and ``witnessed``.
+    """
 
     NAME = 'field_model'
     EXAMPLE = '--ros-args -p model_file:=config/demo_model.yaml -p baseline_file:=bags/scan.mcap'
     PARAMETERS = FieldModelParameters
     HAS_KERNELS = True
-    WORKS_ASIDE = True  # its first answer takes seconds
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -136,7 +143,6 @@ class FieldModelNode(AnserNode):
         self._trouble = Trouble()
         self._frames: Intake | None = None
         self._stamp_ns, self._received_s = 0, 0.0
-        self._pace = Pace(table.refit_rate_hz)
         self._output = ModelOutput(self)
         self._metal = MetalView(self)
         setups = setup_source(self, self._on_setup)
@@ -146,7 +152,9 @@ class FieldModelNode(AnserNode):
         ahead = ReadAhead(folder, self._file_model if table.refit else None)
         kept = KeptBaseline(folder, name, self._fluxes.sender)
         witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)
-        self._refit = ActiveRefit(witnesses, self._pace, self.count, kept, ahead)
+        self._refit = ActiveRefit(witnesses, Pace(table.refit_rate_hz), self.count, kept, ahead)
+        self.step = self.given(self._take_frame, LONGEST_WAIT_S)
+        self.witnessed = self.given(witnesses.note, LONGEST_WAIT_S)
         self._sources = [setups, self._fluxes, *witnesses.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
@@ -178,14 +186,12 @@ class FieldModelNode(AnserNode):
             return
         self._setup_text, self._setup, table = message.data, setup, self.parameters
         self._trouble.forget()
-        self._refit.forget_baseline()
         self._references = sensor_table(setup.reference_sensors)
         self._frames = Intake(self._references.channel, self.count)
         self._window = ReadingWindow(self._references, len(base.emitters), table.baseline_s)
         self._output.name_origin(base)
         self._unfit, self._base = False, base
-        self._place = PlaceWatch.of(base, self._references, setup, self._fluxes.publishers)
-        self._refit.prepare(setup, base, self._references, table.refit)
+        self._prepare(setup, base, self._references)
         if base is not self._model:
             self._serve(base, self.get_clock().now().nanoseconds)
         self._announce_changes()
@@ -201,38 +207,54 @@ class FieldModelNode(AnserNode):
                 self.get_logger().warning(no_baseline(self.get_namespace()))
 
     def _on_flux(self, message: PointCloud2) -> None:
+        if self._setup is None:
+            self.count('fluxes_before_setup')
+            return
+        try:
+            stamp_ns, points = read_frame(message, self._frame_id, self.count)
+            self._take_readings(stamp_ns, readings_of(points))
+        except AnserError as error:
+            self._refuse('fluxes_refused', error)
+
+    def _take_frame(self, frame: ChainFrame) -> GivenModel | None:
+        """Take a frame of another node of the process, and return the model that now holds."""
+        try:
+            if frame.reference is not None and self._fluxes.accepts({}):
+                self._take_readings(frame.stamp_ns, frame.reference)
+        except AnserError as error:
+            self._refuse('fluxes_refused', error)
+        return self._output.newest
+
+    def _take_readings(self, stamp_ns: int, readings: FrameReadings) -> None:
+        """Judge a frame, check the model's place by it, and let the model follow it."""
         setup, window, frames = self._setup, self._window, self._frames
         if setup is None or window is None or frames is None:
             self.count('fluxes_before_setup')
             return
-        try:
-            stamp_ns, points = read_frame(message, setup.frame_id, self.count)
-            frame = frames.admit(
-                stamp_ns, points.channel, points.flux, points.flags, setup.emitter_names
-            )
-            if frame is None:
-                return
-            for kind, many in frame.kinds.items():
-                self.count(f'readings_{kind}', many)
-            window.add(frame)
-            self._received_s = time.monotonic()
-            start = self._refit.start if self._refit.is_awaited else None
-            if start is not None and not is_live(stamp_ns, time.time_ns()):
-                start.wait()  # a recording that is played is worked off whole
-            self._take_refit()
-            if self._place.look(frame, window) and not self._follows and self._model is not None:
-                self._serve(self._model, stamp_ns)
-            has_none = self._refit.current is None and not self._refit.is_making
-            if has_none and self.parameters.baseline_at_start and window.full:
-                try:
-                    self._follow(clean_mean(window, self._base, self._references, setup))
-                except FitError as error:
-                    self._refuse_baseline(error)
-                    window.clear()
-            if self._refit.current is not None and self._follows:
-                self._update(frame)
-        except AnserError as error:
-            self._refuse('fluxes_refused', error)
+        frame = frames.admit(
+            stamp_ns, readings.channels, readings.flux, readings.flags, setup.emitter_names
+        )
+        if frame is None:
+            return
+        for kind, many in frame.kinds.items():
+            self.count(f'readings_{kind}', many)
+        window.add(frame)
+        self._received_s = time.monotonic()
+        start = self._refit.start if self._refit.is_awaited else None
+        if start is not None and not is_live(stamp_ns, time.time_ns()):
+            start.wait()  # a recording that is played is worked off whole
+        self._take_refit()
+        if self._place.look(frame, window) and not self._follows and self._model is not None:
+            self._serve(self._model, stamp_ns)
+        has_none = self._refit.current is None and not self._refit.is_making
+        if has_none and self.parameters.baseline_at_start and window.full:
+            try:
+                self._follow(clean_mean(window, self._base, self._references, setup))
+            except FitError as error:
+                self._refuse_baseline(error)
+                window.clear()
+        if self._refit.current is not None and self._follows:
+            self._update(frame)
 
     def _update(self, frame: Frame) -> None:
         """Let the model follow the references, not more often than wanted.
@@ -240,14 +262,13 @@ class FieldModelNode(AnserNode):
         Every frame is answered with its active model, even if that is unchanged: so the
         tracker knows the model for each frame, and gives the same poses as offline.
         """
-        result, model = self._refit.follow(frame), self._model
-        if result is None:
-            self.count('frames_between_refits')
-        elif result.is_answer:
-            model = result.model
+        result = self._refit.follow(frame)
+        model = self._refit.answered or self._model
         if model is not None:
             self._serve(model, frame.stamp_ns, self._refit.withheld)
-        if result is not None:
+        if result is None:
+            self.count('frames_between_refits')
+        else:
             self._metal.show(result, self._frame_id, frame.stamp_ns)
 
     @property
@@ -312,7 +333,7 @@ class FieldModelNode(AnserNode):
             withheld = self._refit.withheld if self._follows else ''
             self._serve(self._model, self.get_clock().now().nanoseconds, withheld)
 
-    def _follow(self, baseline: NDArray[np.complex128]) -> None:
+    def _follow(self, baseline: ComplexArray) -> None:
         """Refit to what differs from a baseline, shape (S, K), T, as soon as that can be done."""
         self._refit.begin(baseline)
         if self._refit.current is None:
@@ -343,13 +364,19 @@ class FieldModelNode(AnserNode):
         if base is None:
             return
         if setup is not None and references is not None:
-            self._place = PlaceWatch.of(base, references, setup, self._fluxes.publishers)
-            self._refit.prepare(setup, base, references, self.parameters.refit)
-            self._refit.begin_again()
+            self._prepare(setup, base, references, again=True)
         self._unfit, self._received_s = False, time.monotonic()
         self._trouble.forget()
         self._output.name_origin(base)
         self._serve_start(base)
+
+    def _prepare(
+        self, setup: Setup, base: FieldModel, references: SensorTable, again: bool = False
+    ) -> None:
+        """Prepare for references, ``again`` for those that there is a baseline of."""
+        place = board_place_of(base, references, setup)
+        self._place = PlaceWatch(place, self._fluxes.publishers)
+        self._refit.prepare(setup, base, references, self.parameters.refit, again)
 
     def _serve_start(self, base: FieldModel) -> None:
         """Serve a model that is no answer of the references: trackers wait for the next one."""
@@ -406,7 +433,7 @@ class FieldModelNode(AnserNode):
         """Go on with the new model, at the new rate, or no longer."""
         if old.model_file != new.model_file:
             self._exchange(model_of(new.model_file))
-        self._pace.rate_hz = new.refit_rate_hz
+        self._refit.pace.rate_hz = new.refit_rate_hz
         self._announce_changes()
 
     def status(self) -> Status:
@@ -452,8 +479,7 @@ class FieldModelNode(AnserNode):
 
     def stop_working(self) -> bool:
         """End what is worked on aside, a refit that is being made among it."""
-        has_ended = self._refit.end(LONGEST_END_S)
-        return super().stop_working() and has_ended
+        return self._refit.end(LONGEST_END_S)
 
 
 if __name__ == '__main__':

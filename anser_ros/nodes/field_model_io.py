@@ -8,19 +8,21 @@ goes on and nothing speaks against it.
 import contextlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseStamped
-from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from anser_ros.arrays import Array, ComplexArray
+from anser_ros.chain.frame import ChainFrame, FrameReadings
+from anser_ros.chain.model_half import ToolPose, poses_of, tool_readings
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import AnserError, FitError, FrameError
 from anser_ros.field.model import FieldModel
@@ -29,24 +31,20 @@ from anser_ros.frames.intake import Frame
 from anser_ros.integrity.board_place import BoardPlace
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode
-from anser_ros.nodes.streams.clouds import ModelWriter, read_frame
+from anser_ros.nodes.streams.clouds import GivenModel, ModelWriter, read_frame, readings_of
 from anser_ros.nodes.streams.one_source import OneSource
 from anser_ros.physics.rotations import rotation_of_quaternion
-from anser_ros.physics.sensor import SensorTable
 from anser_ros.pose_states import code_of
 from anser_ros.refit.frame import ReadingWindow
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.model import Metal, RefitResult
-from anser_ros.sessions.baseline import board_place_of
-from anser_ros.sessions.follower import ToolPose, tool_readings
 from anser_ros.sessions.kept_tables import DAMAGED, read_arrays, used_s, write_arrays
 from anser_ros.sessions.session import sensor_table, tracking_noise
 from anser_ros.stamps import set_stamp, stamp_of
-from anser_ros.wire.points import FluxPoints, ModelError
+from anser_ros.tracking.estimate import PoseEstimate
+from anser_ros.wire.points import ModelError
 from anser_ros.wire.recorded import pose_numbers, unit_quaternions
 from anser_ros.wire.setup import Setup, topic_of
-
-Array = NDArray[np.float64]
 
 
 def pose_in(message: PoseStamped, frame_id: str, body: str) -> tuple[Array, Array]:
@@ -64,23 +62,20 @@ def pose_in(message: PoseStamped, frame_id: str, body: str) -> tuple[Array, Arra
 
 
 class ModelOutput(ModelWriter):
-    """Publishes models, and hands them to the nodes of the same process."""
+    """Publishes models, and keeps the ``newest`` for the nodes of the same process."""
 
     def __init__(self, node: AnserNode) -> None:
         super().__init__()
-        self._node = node
+        self.newest: GivenModel | None = None
         self._published: ModelError | None = None
         self.models = node.create_publisher(PointCloud2, 'field_model', qos.MODELS)
         self.errors = node.create_publisher(PointCloud2, 'field_model_error', qos.MODEL_ERRORS)
-        node.offer(self.errors)  # nothing is: a model is handed over with its uncertainty
-        node.offer(self.models, lasts=True)
 
     def publish(
         self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool, withheld: str
     ) -> None:
         """Publish a model, and before it its uncertainty where that is news."""
-        given = self.given(model, stamp_ns, follows, code_of(withheld))
-        self._node.hand_over(self.models, given)
+        self.newest = given = self.given(model, stamp_ns, follows, code_of(withheld))
         if given.error is not self._published:
             self._published = given.error
             self.errors.publish(self.error(given, frame_id))
@@ -204,7 +199,7 @@ class KeptBaseline:
         """Return whether the references have one sender, and the setup is known."""
         return self._path() is not None
 
-    def read(self) -> NDArray[np.complex128] | None:
+    def read(self) -> ComplexArray | None:
         """Return the baseline that another process confirmed lately, shape (R, K), T, or None."""
         path = self._path()
         with contextlib.suppress(*DAMAGED):
@@ -212,7 +207,7 @@ class KeptBaseline:
                 return np.asarray(read_arrays(path)['flux'], dtype=np.complex128)
         return None
 
-    def confirm(self, flux: NDArray[np.complex128]) -> None:
+    def confirm(self, flux: ComplexArray) -> None:
         """Keep a baseline, shape (R, K), T, to which nothing is opposed at this moment.
 
         Raises `OSError` when the disk is full, or must not be written.
@@ -263,13 +258,6 @@ class PlaceWatch:
         self._has_frame = self._has_looked = False
         self._begin_s = time.monotonic()
         self.misplaced = ''
-
-    @classmethod
-    def of(
-        cls, base: FieldModel, references: SensorTable, setup: Setup, announced: Callable[[], int]
-    ) -> 'PlaceWatch':
-        """Return what watches a model."""
-        return cls(board_place_of(base, references, setup), announced)
 
     @property
     def is_open(self) -> bool:
@@ -324,7 +312,7 @@ class ToolWitnesses:
         self._node, self._frame_id, self._refuse = node, frame_id, refuse
         self._is_wanted, self._noise = is_wanted, 0.0
         self._correction: Correction | None = None
-        self._frames: dict[int, FluxPoints] = {}
+        self._frames: dict[int, FrameReadings] = {}
         self._poses: dict[int, dict[str, ToolPose]] = {}
         self._subscriptions: dict[str, Any] = {}
         topics = ('tool/flux',) if is_wanted else ()
@@ -341,7 +329,8 @@ class ToolWitnesses:
         self._correction = Correction.of(model.effects, sensors, model.frequencies_hz)
         self._noise = tracking_noise(setup)
         self._frames, self._poses = {}, {}
-        for body in set(sensors.body) - set(self._subscriptions):
+        has_none = self.sources[0].subscription is None  # poses are given as fluxes are
+        for body in set() if has_none else set(sensors.body) - set(self._subscriptions):
             self._subscriptions[body] = self._node.create_subscription(
                 PoseStamped, f'{topic_of(body)}/pose', partial(self._on_pose, body), qos.STREAM
             )
@@ -355,19 +344,26 @@ class ToolWitnesses:
 
     def pass_on(self, refit: LiveRefit, stamp_ns: int) -> None:
         """Give the refit what the tools read in its last frame, of the stamp given, once."""
-        points, poses = self._frames.pop(stamp_ns, None), self._poses.pop(stamp_ns, None)
+        tools, poses = self._frames.pop(stamp_ns, None), self._poses.pop(stamp_ns, None)
         correction = self._correction
-        if points is None or poses is None or correction is None:
+        if tools is None or poses is None or correction is None:
             return
         poses = {body: pose for body, pose in poses.items() if self._has_one_source(body)}
-        readings = tool_readings(correction, points.channel, points.flux, points.flags, poses)
+        readings = tool_readings(correction, tools, poses)
         if readings:
             refit.witnessed(readings)
             self._node.count('witnessed_frames')
 
+    def note(self, frame: ChainFrame, found: Sequence[PoseEstimate]) -> None:
+        """Take in a frame's tools and poses from the nodes of the same process."""
+        if self._correction is not None and frame.tools is not None:
+            _keep(self._frames, frame.stamp_ns, frame.tools)
+            _keep(self._poses, frame.stamp_ns, poses_of(found))
+
     def _has_one_source(self, body: str) -> bool:
         """Return whether one publisher gives a body's poses; whose is whose is not known else."""
-        count = self._node.count_publishers(self._subscriptions[body].topic_name)
+        known = self._subscriptions.get(body)
+        count = 1 if known is None else self._node.count_publishers(known.topic_name)
         if count > 1:
             text = f'{count} publishers of the pose of {body}: it witnesses nothing'
             self._node.warn('witnesses_of_two_sources', text)
@@ -376,7 +372,7 @@ class ToolWitnesses:
     def _on_flux(self, message: PointCloud2) -> None:
         try:
             stamp_ns, points = read_frame(message, self._frame_id(), self._node.count)
-            _keep(self._frames, stamp_ns, points)
+            _keep(self._frames, stamp_ns, readings_of(points))
         except AnserError as error:
             self._refuse('tool_fluxes_refused', error)
 

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import ComplexArray
+from anser_ros.chain.model_half import ModelHalf
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame
@@ -71,7 +72,7 @@ class RefitStart:
             self._tables = self._worker.submit(self._work_tables_out)
         return self._tables
 
-    def begin(self, baseline: NDArray[np.complex128]) -> None:
+    def begin(self, baseline: ComplexArray) -> None:
         """Begin to make the refit to what differs from a baseline, in place of one being made.
 
         The baseline, shape (R, K), T, is what the references read without metal.
@@ -137,9 +138,7 @@ class RefitStart:
             raise _EndedError
         self._share = share
 
-    def _make(
-        self, baseline: NDArray[np.complex128], made: Future[tables.RefitTables]
-    ) -> LiveRefit:
+    def _make(self, baseline: ComplexArray, made: Future[tables.RefitTables]) -> LiveRefit:
         ready, settings = made.result(), self._setup.refit
         self._share = 1.0
         refit = LiveRefit(self._model, self._references, baseline, settings, tables=ready)
@@ -148,13 +147,12 @@ class RefitStart:
         return refit
 
 
-class ActiveRefit:
+class ActiveRefit(ModelHalf):
     """Keeps the refit, its last result, and what it is made from.
 
     ``count`` counts an event by its name, ``kept`` is what a process after this one takes up, and
     ``ahead`` what is read of it before references and setup are known. ``start`` makes the refits
-    of the active model, None without references; ``result`` is that of the newest frame since the
-    refit began or was reset, and took ``update_s``.
+    of the active model, None without references; the newest ``result`` took ``update_s``.
     """
 
     def __init__(
@@ -165,24 +163,26 @@ class ActiveRefit:
         kept: KeptBaseline,
         ahead: ReadAhead,
     ) -> None:
+        super().__init__(pace)
         # The compiler loads for half a second, now, while the graph is still being discovered.
         loop_field(np.eye(3), np.ones((1, 3)), 1.0)
-        self._witnesses, self._pace, self._count = witnesses, pace, count
+        self._witnesses, self._count = witnesses, count
         self._kept, self._ahead = kept, ahead
         self._has_looked = False
         self._confirmed: RefitResult | None = None
         self.start: RefitStart | None = None
-        self._baseline: NDArray[np.complex128] | None = None
-        self.current: LiveRefit | None = None
-        self.result: RefitResult | None = None
+        self._baseline: ComplexArray | None = None
         self.update_s = 0.0
 
     def prepare(
-        self, setup: Setup, base: FieldModel, references: SensorTable, at_once: bool
+        self, setup: Setup, base: FieldModel, references: SensorTable, at_once: bool, again: bool
     ) -> None:
-        """Be without a refit, and begin at once with what needs no baseline for the next one."""
+        """Be without a refit, and begin at once with what needs no baseline for the next one, or
+        to make it ``again`` to the last baseline, which is dropped else.
+        """
         self.end()
-        self.current = self.result = self.start = None
+        self.follow_by(None)
+        self.start = None
         self._has_looked = False
         self._kept.expect(setup, base)
         self._witnesses.expect(setup, base)
@@ -193,12 +193,11 @@ class ActiveRefit:
                 self.start.prepare()
         else:
             self._ahead.drop()
+        baseline, self._baseline = self._baseline, None
+        if again and baseline is not None:
+            self.begin(baseline)
 
-    def forget_baseline(self) -> None:
-        """Drop the baseline: the readings are to be others."""
-        self._baseline = None
-
-    def begin(self, baseline: NDArray[np.complex128]) -> None:
+    def begin(self, baseline: ComplexArray) -> None:
         """Begin to make a refit to what differs from a baseline, shape (S, K), T.
 
         No pose is given before the first one is there, since metal may come meanwhile; one that is
@@ -209,11 +208,6 @@ class ActiveRefit:
         self._kept.drop()
         self._baseline = baseline
         self.start.begin(baseline)
-
-    def begin_again(self) -> None:
-        """Begin to make one to the last baseline, if there is one."""
-        if self._baseline is not None:
-            self.begin(self._baseline)
 
     def resume(self, is_wanted: bool) -> None:
         """Begin with the baseline of a process before this one, where there is one.
@@ -256,7 +250,7 @@ class ActiveRefit:
         started = None if self.start is None else self.start.taken()
         if started is None:
             return False
-        self.current, self.result = started, None
+        self.follow_by(started)
         self._count('refit_starts')
         return True
 
@@ -281,24 +275,15 @@ class ActiveRefit:
             return REFERENCES_LOST if self.is_awaited else ''
         return self.result.withheld
 
-    def reset(self) -> None:
-        """Let the refit forget all frames, and its last result."""
-        if self.current is not None:
-            self.current.reset()
-        self.result = None
-
-    def follow(self, frame: Frame) -> RefitResult | None:
-        """Return the result of a frame; None where the last one was less than the pace ago."""
-        refit = self.current
-        if refit is None or not self._pace.is_due(frame.stamp_ns):
-            return None
+    def refitted(self, refit: LiveRefit, frame: Frame) -> RefitResult:
+        """Return what the refit makes of a frame, after what tools witness of the one before."""
         begin_s = time.monotonic()
         if self.result is not None:
             self._witnesses.pass_on(refit, self.result.stamp_ns)
-        self.result = refit.follow(frame)
+        result = super().refitted(refit, frame)
         self._count('refits')
         self.update_s = time.monotonic() - begin_s
-        return self.result
+        return result
 
 
 TROUBLED = tuple(WITHHELD)

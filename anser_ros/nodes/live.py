@@ -1,21 +1,27 @@
-"""Runs acquisition, field model and tracker in one process, which hands frames on as objects.
+"""Runs acquisition, field model and tracker in one process, whose frames pass them as objects.
 
-A frame is demodulated and tracked in one thread, and its poses go out first; then its fluxes are
-published, and last another thread refits the model, so that each pose uses the model of the window
-before. Parameters and names are given to one node as ``-p tracker:gate:=4`` and
-``-r tracker:__node:=NAME``.
+A frame is demodulated, tracked and its model refitted in one thread, and its poses go out first:
+each is by the model of the window before. What is published of it is for all others. Parameters
+and names are given to one node as ``-p tracker:gate:=4`` and ``-r tracker:__node:=NAME``.
 """
 
 import sys
 
+from anser_ros.chain.chain import Chain
 from anser_ros.nodes.acquisition import Acquisition
 from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.runtime.process import TURN_S, main
 from anser_ros.nodes.tracker import TrackerNode
 
 CHAIN = (Acquisition, FieldModelNode, TrackerNode)
-"""In the order in which frames pass them: each offers what the next ones take."""
+"""In the order in which they are made and joined."""
+
+
+def join(acquisition: Acquisition, field_model: FieldModelNode, tracker: TrackerNode) -> None:
+    """Let acquisition take its frames through both halves of the chain."""
+    acquisition.chain = Chain(field_model, tracker, lags=True)
+
 
 if __name__ == '__main__':
     sys.setswitchinterval(TURN_S)
-    sys.exit(main(CHAIN, name='live'))
+    sys.exit(main(CHAIN, name='live', join=join))

@@ -177,7 +177,6 @@ class Monitor(AnserNode):
         return '; '.join(self._causes()) or 'no node complains'
 
     def _causes(self) -> list[str]:
-        """What the other nodes complain of."""
         rate_hz = 0.0 if self._setup is None else self._setup.flux_rate_hz
         return causes(self._statuses, self.get_namespace().strip('/'), rate_hz)
 
@@ -233,7 +232,6 @@ class Monitor(AnserNode):
         return caption
 
     def _line(self, rows: dict[str, list[Row]]) -> str:
-        """One line with the medians over all sensors."""
         parts = [self._title()]
         if self._first_s is None:
             return parts[0]

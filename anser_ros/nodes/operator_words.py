@@ -69,7 +69,6 @@ def findings_words(findings: Sequence['EffectRecord']) -> str:
 
 
 def titles_of(findings: Sequence['EffectRecord']) -> str:
-    """Return the names and sites of effects, separated by commas."""
     return ', '.join(title_of(record) for record in findings)
 
 

@@ -5,7 +5,6 @@ the node subscribes to topics as they appear.
 """
 
 import importlib
-import json
 import os
 import statistics
 import struct
@@ -53,19 +52,9 @@ def definition(type_name: str) -> str:
     for current in names:  # which grows meanwhile
         package, _, name = _split(current)
         title = f'{SEPARATOR}\nMSG: {package}/{name}\n' if parts else ''
-        parts.append(title + _file(current, 'msg').read_text(encoding='utf-8'))
+        parts.append(title + _file(current).read_text(encoding='utf-8'))
         names += [one for one in _contained(message_class(current)) if one not in names]
     return '\n'.join(parts)
-
-
-def type_hash(type_name: str) -> str:
-    """Return the type's hash, or nothing where the installation does not have it."""
-    try:
-        document: dict[str, Any] = json.loads(_file(type_name, 'json').read_text('utf-8'))
-        hashes = {entry['type_name']: entry['hash_string'] for entry in document['type_hashes']}
-    except (BagError, ValueError, KeyError, TypeError):
-        return ''
-    return str(hashes.get(type_name, ''))
 
 
 def _split(type_name: str) -> tuple[str, str, str]:
@@ -75,11 +64,11 @@ def _split(type_name: str) -> tuple[str, str, str]:
     return tokens[0], tokens[1], tokens[2]
 
 
-def _file(type_name: str, ending: str) -> Path:
+def _file(type_name: str) -> Path:
     package, kind, name = _split(type_name)
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     for prefix in [*filter(None, prefixes), sys.prefix]:
-        path = Path(prefix, 'share', package, kind, f'{name}.{ending}')
+        path = Path(prefix, 'share', package, kind, f'{name}.msg')
         if path.is_file():
             return path
     raise BagError(f'no definition of {type_name} is installed')
@@ -119,10 +108,6 @@ class TopicLog:
         gaps = f'{self.gaps} gaps up to {self.longest_gap_s:.3g} s'
         found = [f'{self.lost} lost', gaps, f'{self.jumps_back} jumps back in time']
         return ', '.join(words for words in found if not words.startswith('0 '))
-
-    def publishers(self, count: int) -> None:
-        """Note how many publish the topic now."""
-        self.n_publishers = max(self.n_publishers, count)
 
     def add(self, sequence: int | None, stamp_ns: int | None) -> None:
         """Note one message by its publisher's number and its stamp, where it has them."""
@@ -314,13 +299,13 @@ class Recorder(AnserNode):
             self.warn('metadata_errors', _reason(error))
 
     def _discover(self) -> None:
-        """Subscribe to what has appeared since the last time."""
         if self._bag is None:
             return
         added = False
         for topic, type_names in self.get_topic_names_and_types():
             if topic in self._topic_subscriptions:
-                self._logs[topic].publishers(self.count_publishers(topic))
+                log = self._logs[topic]
+                log.n_publishers = max(log.n_publishers, self.count_publishers(topic))
             elif self._wanted(topic) and len(type_names) == 1:
                 added = self._add(topic, type_names[0]) or added
         if added:
@@ -338,7 +323,8 @@ class Recorder(AnserNode):
 
     def _add(self, topic: str, type_name: str) -> bool:
         """Subscribe to one topic; return whether it is recorded from now on."""
-        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        publishers = self.get_publishers_info_by_topic(topic)
+        offered = [info.qos_profile for info in publishers]
         if not offered or self._bag is None:
             return False  # only somebody who listens
         try:
@@ -356,7 +342,9 @@ class Recorder(AnserNode):
             )
             for profile in offered
         ]
-        channel = self._bag.add_topic(topic, type_name, text, profiles, type_hash(type_name))
+        type_hash = str(publishers[0].topic_type_hash)
+        known_hash = type_hash if type_hash.startswith('RIHS') else ''
+        channel = self._bag.add_topic(topic, type_name, text, profiles, known_hash)
         log = self._logs[topic] = TopicLog(len(offered))
         is_stamped = type_name in STAMPED
 
@@ -395,7 +383,6 @@ def _matching(offered: list[QoSProfile]) -> QoSProfile:
 
 
 def _stamp_ns(data: bytes) -> int | None:
-    """Return the stamp of a serialised message that begins with a header."""
     if len(data) < 12:
         return None
     order = '<' if data[1] & 1 else '>'

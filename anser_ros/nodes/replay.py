@@ -73,7 +73,6 @@ class Consumers:
                 self._listeners[topics].discard(name)
 
     def _find(self, topic: str) -> set[str]:
-        """Return the listeners that can be asked."""
         own = self._node.get_fully_qualified_name()
         found = set()
         for info in self._node.get_subscriptions_info_by_topic(topic):
@@ -335,7 +334,6 @@ class Replay(AnserNode):
         return not self._ending.is_set()
 
     def _acknowledged(self, topic: str) -> None:
-        """Wait until all who listen have received what was published."""
         self._outlets[topic].wait_for_all_acked(Duration(seconds=LONGEST_ACK_S))
 
     def _messages(self) -> Iterator[RawMessage]:

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.rotations import axis_angles
 from anser_ros.stamps import LIVE_WITHIN_S
 from anser_ros.wire.setup import Setup
 
-Array = NDArray[np.float64]
 OVERLAP = 5
 """Poses of the last row that the next one's error is of, too."""
 LONGEST_OPTICAL_GAP_S = 0.1
@@ -137,7 +136,6 @@ class PoseTrace:
         return away, axis_angles(np.array(self.axis).reshape(-1, 3), axes)
 
     def row(self, optical: PoseTrack | None, elapsed_s: float) -> Row:
-        """Return a row about what came since the last call."""
         since, self._shown = self._shown, len(self.stamp_s)
         count = self._shown - since
         error = float('nan')

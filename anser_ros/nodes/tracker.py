@@ -15,17 +15,18 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
+from anser_ros.chain.frame import FrameReadings
+from anser_ros.chain.order import AnsweredFrames
+from anser_ros.chain.tracking_half import TrackingHalf
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.model_age import FrameModel
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Trouble
-from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import STALE_AFTER_S, parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.streams.clouds import GivenModel, read_frame
+from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
 from anser_ros.nodes.streams.one_source import (
     NewestSource,
     OneSource,
@@ -34,7 +35,7 @@ from anser_ros.nodes.streams.one_source import (
     too_slow,
 )
 from anser_ros.nodes.streams.readiness import digest_of
-from anser_ros.nodes.tracker_models import ActiveModel, AnsweredFrames, ModelIntake
+from anser_ros.nodes.tracker_models import ModelIntake, ModelReader
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OK, TWO_SOURCES, Withheld
 from anser_ros.sessions.prepared import settings_for
@@ -43,7 +44,6 @@ from anser_ros.sessions.starting_model import check_emitters, model_of
 from anser_ros.stamps import SECOND_NS
 from anser_ros.tracking.estimate import NO_GATE, USUAL_GATE, PoseEstimate, Tip, TrackerSettings
 from anser_ros.tracking.tracker import Tracker, warm_up
-from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Setup, parse_setup
 from anser_ros.wire.setup_values import TipSpec, read_tips, tip_name
 from anser_ros.wire.text_files import read_text
@@ -170,7 +170,10 @@ WIDE_GATE = 2.0 * USUAL_GATE
 
 
 class TrackerNode(AnserNode):
-    """Subscribes to ``setup``, ``field_model`` and ``tool/flux``; publishes poses."""
+    """Subscribes to ``setup``, ``field_model`` and ``tool/flux``; publishes poses.
+
+    Where another node of the process has frames and models, it calls ``step`` and ``use``.
+    """
 
     NAME = 'tracker'
     EXAMPLE = '--ros-args -p model_file:=config/demo_model.yaml'
@@ -187,13 +190,13 @@ class TrackerNode(AnserNode):
         self._tips: dict[str, Tip] = {}
         self._setup_text = ''
         self._setup: Setup | None = None
-        self._tracker: Tracker | None = None
+        self._half: TrackingHalf | None = None
+        self._reader: ModelReader | None = None
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
-        self._active: ActiveModel | None = None
         self._given: GivenModel | None = None
-        self._frames = AnsweredFrames(self._activate, self._track)
-        self._withheld: Withheld | None = None
+        self._frames = AnsweredFrames(self._use_model, self._track)
+        self.use, self.step = self.given(self._take_given), self.given(self._take_frame)
         self._trouble = Trouble()
         self._solve_s = self._diagnosed_s = 0.0
         self._counted = 0, 0
@@ -205,13 +208,17 @@ class TrackerNode(AnserNode):
         take_error = partial(self._take_model, self._intake.take_error)
         self.create_subscription(PointCloud2, 'field_model_error', take_error, qos.MODEL_ERRORS)
         take = partial(self._take_model, self._intake.take)
-        models = OneSource(
+        self._models = OneSource(
             self, PointCloud2, 'field_model', take, qos.MODELS, lasting=self._lasting
         )
         self._fluxes = NewestSource(
-            self, 'tool/flux', self._on_flux, self._on_doubted, works_later=True
+            self,
+            'tool/flux',
+            self._on_flux,
+            partial(self._on_flux, is_doubted=True),
+            works_later=True,
         )
-        self._sources = [setups, models, self._fluxes]
+        self._sources = [setups, self._models, self._fluxes]
         self._wait = self.create_timer(WAIT_PERIOD_S, self._on_wait, clock=self.steady_clock)
         self._wait.cancel()
 
@@ -235,8 +242,8 @@ class TrackerNode(AnserNode):
         except AnserError as error:
             self._refuse('setups_refused', error)
             return
-        self._setup_text, self._setup, self._tracker = message.data, setup, tracker
-        self._active = self._new_active(setup, settings)
+        self._setup_text, self._setup = message.data, setup
+        self._begin(setup, tracker)
         for topic in self._topics.values():
             topic.destroy(self)
         self._tips = {
@@ -259,13 +266,11 @@ class TrackerNode(AnserNode):
         """
         self._setup_text, self._setup = text, setup
         self._trouble.forget()
-        if self._tracker is not None:
-            same = replace(self._settings, volume=self._tracker.settings.volume)
-            self._tracker = self._tracker.with_settings(settings_for(setup, same))
+        if self._half is not None:
+            same = replace(self._settings, volume=self._half.tracker.settings.volume)
+            self._half.set_up(settings_for(setup, same))
 
-    def _take_model(
-        self, take: Callable[[Any], GivenModel | None], message: PointCloud2 | GivenModel
-    ) -> None:
+    def _take_model(self, take: Callable[[Any], GivenModel | None], message: PointCloud2) -> None:
         try:
             given = take(message)
         except AnserError as error:
@@ -275,69 +280,57 @@ class TrackerNode(AnserNode):
             self._frames.follows = given.follows
             self._frames.add_model(given.stamp_ns, given, time.monotonic())
 
-    def _activate(self, given: GivenModel) -> None:
-        """Track with another model from now on."""
-        self._given = given
-        self._use_model()
+    def _take_given(self, given: GivenModel, ahead: bool) -> None:
+        """Track with a model that another node of the process made."""
+        if self._models.accepts({}):
+            self._intake.newest = given
+            self._use_model(given, ahead)
 
-    def _new_active(self, setup: Setup, settings: TrackerSettings) -> ActiveModel:
-        allowed = self.parameters.allow_uncalibrated
-        return ActiveModel(setup, settings.box, self._file_model, allowed)
+    def _take_frame(self, stamp_ns: int, tools: FrameReadings) -> list[PoseEstimate]:
+        """Track a frame of another node of the process, and return what is found."""
+        if self._setup is None:
+            self.count('fluxes_before_setup')
+            return []
+        self._fluxes.accepts({})
+        return self._track((stamp_ns, tools))
 
-    def _use_model(self) -> None:
-        """Give the tracker the active model, once the setup is known too."""
-        given, active = self._given, self._active
-        if active is None:
+    def _begin(self, setup: Setup, tracker: Tracker) -> None:
+        """Track the tools of a setup with the tracker's own model, until another one is used."""
+        name, allowed = self.parameters.model_file, self.parameters.allow_uncalibrated
+        self._reader = ModelReader(setup, self._file_model, name, allowed)
+        self._half = TrackingHalf(tracker, setup.refit.references_age_s, self._reader.own)
+
+    def _use_model(self, given: GivenModel | None = None, ahead: bool = False) -> None:
+        """Use a model, else the last one or the tracker's own, once the setup is known too."""
+        half, reader = self._half, self._reader
+        self._given = given = given or self._given
+        if half is None or reader is None:
             return
+        before = half.answer.model if given is not None else None
         try:
-            field = active.field if given is None else active.field_of(given)
-            if field is not None:
-                new = field is not active.field or given is None
-                ages = given is not None and given.follows and self.hands_over
-                if not ages:
-                    self._track_with(field, given)
-                if given is not None:
-                    active.put(given, field)
-                if ages:  # frames that are handed over are younger than their model
-                    self._track_with(active.soon() or field, given)
-                self.count('models', new)
+            answer = reader.own if given is None else reader.answer(given)
+            if answer.model is not None:
+                half.use(answer, ahead)
+                self.count('models', answer.model is not before)
         except AnserError as error:
             self._refuse('models_refused', error)
 
-    def _track_with(self, field: FieldModel, given: GivenModel | None) -> None:
-        """Have the tracker use a model under the name of the published one, or the file's."""
-        name = self.parameters.model_file if given is None else str(given.stamp_ns)
-        if self._tracker is None:
-            return
-        if self._tracker.model is field:
-            self._tracker = self._tracker.renamed(name)
-        else:
-            self._tracker = self._tracker.with_model(field, name)
-
-    def _on_flux(self, message: PointCloud2 | HandedFlux) -> None:
-        """Track a frame when its model is there, or after so long.
-
-        One that was handed over doesn't wait: its model is made once its poses have gone out.
+    def _on_flux(self, message: PointCloud2, is_doubted: bool = False) -> None:
+        """Track a frame when its model is there, or after so long; say at once of one that may be
+        another sender's why it has no poses.
         """
         frame = self._read(message)
-        if frame is not None:
-            is_handed = isinstance(message, HandedFlux)
-            wait_s = 0.0 if is_handed else self.parameters.model_wait_s
+        if frame is not None and is_doubted:
+            self._track(frame)
+        elif frame is not None:
+            wait_s = self.parameters.model_wait_s
             self._frames.add_frame(frame[0], frame, time.monotonic(), wait_s)
             if self._frames.waiting:
                 self._wait.reset()
 
-    def _on_doubted(self, message: PointCloud2 | HandedFlux) -> None:
-        """Say of a frame that may be another sender's why it has no poses."""
-        frame = self._read(message)
-        if frame is not None:
-            self._track(frame)
-
-    def _lasting(self, message: PointCloud2 | GivenModel) -> bytes | None:
+    def _lasting(self, message: PointCloud2) -> bytes | None:
         """Return what a model says until there is another; None while each frame has its own."""
-        if self._frames.follows or isinstance(message, GivenModel):
-            return None
-        return bytes(message.data.tobytes())
+        return None if self._frames.follows else bytes(message.data.tobytes())
 
     def _on_wait(self) -> None:
         """Go on with frames whose model does not come."""
@@ -345,41 +338,34 @@ class TrackerNode(AnserNode):
         if not self._frames.waiting:
             self._wait.cancel()
 
-    def _read(self, message: PointCloud2 | HandedFlux) -> tuple[int, FluxPoints] | None:
-        """Stamp and points of a frame that can be tracked, or None for one that is refused."""
+    def _read(self, message: PointCloud2) -> tuple[int, FrameReadings] | None:
+        """Stamp and readings of a frame that can be tracked, or None for one that is refused."""
         setup = self._setup
         if setup is None:
             self.count('fluxes_before_setup')
             return None
         try:
-            return read_frame(message, setup.frame_id, self.count)
+            stamp_ns, points = read_frame(message, setup.frame_id, self.count)
+            return stamp_ns, readings_of(points)
         except AnserError as error:
             self._refuse('fluxes_refused', error)
             return None
 
-    def _track(self, frame: tuple[int, FluxPoints]) -> None:
-        """Track a frame with the active model, and publish what is good."""
-        if self._tracker is None or self._active is None:
-            return
-        begin_s = time.perf_counter()
-        stamp_ns, points = frame
+    def _track(self, frame: tuple[int, FrameReadings]) -> list[PoseEstimate]:
+        """Track a frame with the active model, publish what is good, and return what is found."""
+        half = self._half
+        if half is None:
+            return []
+        begin_s, (stamp_ns, readings) = time.perf_counter(), frame
         conflict = sender_words(self._sources)
-        if conflict:  # the frame may be another sender's: its stamp does not tell the model's age
-            standing = FrameModel(None, Withheld(TWO_SOURCES, conflict))
-        else:
-            standing = self._active.at(stamp_ns)
-        self._withheld = standing.withheld
-        if self._given is not None and self._given.follows:
-            self._model_age_ns = max(self._model_age_ns, stamp_ns - self._given.stamp_ns)
+        if half.answer.follows:
+            self._model_age_ns = max(self._model_age_ns, stamp_ns - half.answer.stamp_ns)
         try:
-            if standing.model is not None and standing.model is not self._tracker.model:
-                self._track_with(standing.model, self._given)
-            found = self._tracker.update(
-                stamp_ns, points.channel, points.flux, points.flags, standing.withheld
-            )
+            doubt = Withheld(TWO_SOURCES, conflict) if conflict else None
+            found = half.step(stamp_ns, readings, doubt)
         except AnserError as error:
             self._refuse('fluxes_refused', error)
-            return
+            return []
         now_ns = self.get_clock().now().nanoseconds
         found += [self._tips[e.name].of_body(e) for e in found if e.name in self._tips]
         changed = self._publish([(self._topics[e.name], e) for e in found], now_ns)
@@ -388,6 +374,7 @@ class TrackerNode(AnserNode):
         self._fluxes.backlog.worked(self._solve_s)
         if changed and time.monotonic() - self._diagnosed_s > EARLIEST_DIAGNOSTICS_S:
             self.publish_diagnostics()
+        return found
 
     def _publish(self, found: list[tuple[PoseTopic, PoseEstimate]], now_ns: int) -> bool:
         """Publish good poses first, then all else; return whether a state is another than before.
@@ -414,8 +401,8 @@ class TrackerNode(AnserNode):
         if old.model_file != new.model_file:
             self._exchange(model_of(new.model_file))
         self._settings = settings_of(new)
-        if self._tracker is not None and self._setup is not None:
-            self._tracker = self._tracker.with_settings(settings_for(self._setup, self._settings))
+        if self._half is not None and self._setup is not None:
+            self._half.set_up(settings_for(self._setup, self._settings))
 
     def _exchange(self, file_model: FieldModel | None) -> None:
         """Undo the effects of another model; until that is served too, state other_model."""
@@ -423,8 +410,8 @@ class TrackerNode(AnserNode):
         if setup is not None and file_model is not None:
             check_emitters(setup, file_model)
         self._file_model = file_model
-        if setup is not None:
-            self._active = self._new_active(setup, settings_for(setup, self._settings))
+        if setup is not None and self._half is not None:
+            self._begin(setup, self._half.tracker)
             self._use_model()
 
     def status(self) -> Status:
@@ -435,7 +422,8 @@ class TrackerNode(AnserNode):
         slow = too_slow(skipped - before[0], frames - before[1])
         if slow:
             self.warn('seconds_too_slow', slow)
-        tracker, newest = self._tracker, self._intake.newest
+        half, newest = self._half, self._intake.newest
+        tracker = None if half is None else half.tracker
         values: dict[str, object] = {
             'frame_time_s': self._solve_s,
             'model_age_s_max': self._model_age_ns / SECOND_NS,
@@ -467,8 +455,9 @@ class TrackerNode(AnserNode):
             'left_to_references': ', '.join(tracker.drifting_effects),
             'corrected': ', '.join(tracker.corrected_effects),
         }
-        if self._withheld is not None and self._withheld.state != TWO_SOURCES:
-            return Status('', Level.ERROR, ': '.join(self._withheld), values)
+        withheld = None if half is None else half.withheld
+        if withheld is not None and withheld.state != TWO_SOURCES:
+            return Status('', Level.ERROR, ': '.join(withheld), values)
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)
         trouble, gate = self._trouble.recent(time.monotonic()), tracker.settings.gate
@@ -486,10 +475,10 @@ class TrackerNode(AnserNode):
 
         A sender of fluxes (a replay) reads it in ``/diagnostics`` before it starts.
         """
-        tracker, intake = self._tracker, self._intake
+        half, intake = self._half, self._intake
         lacks_model = intake.newest is None and self.count_publishers('field_model')
         lacks_error = not intake.has_error and self.count_publishers('field_model_error')
-        if tracker is None or tracker.model is None or lacks_model or lacks_error:
+        if half is None or half.tracker.model is None or lacks_model or lacks_error:
             return ''
         is_matched = all(topic.is_matched(self) for topic in self._topics.values())
         return digest_of(self._setup_text) if is_matched else ''

@@ -19,14 +19,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array
 from anser_ros.errors import SetupError
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.physics.dipole import rows_of
-
-Array = NDArray[np.float64]
 
 
 @kernel
@@ -50,10 +48,7 @@ def _add_segments(starts, ends, points, factor, out):  # type: ignore[no-untyped
 
 
 def segment_field(
-    starts: NDArray[np.generic],
-    ends: NDArray[np.generic],
-    points: NDArray[np.generic],
-    current_a: float = 1.0,
+    starts: AnyArray, ends: AnyArray, points: AnyArray, current_a: float = 1.0
 ) -> Array:
     """Return the field (P, 3), T, of straight segments that all carry the same current.
 
@@ -71,9 +66,7 @@ def segment_field(
     return out
 
 
-def loop_field(
-    corners: NDArray[np.generic], points: NDArray[np.generic], current_a: float = 1.0
-) -> Array:
+def loop_field(corners: AnyArray, points: AnyArray, current_a: float = 1.0) -> Array:
     """Return the field (P, 3), T, of a closed path of straight segments.
 
     The current flows from each of the ``corners`` (M, 3), m, to the next, and from the last to the
@@ -84,18 +77,10 @@ def loop_field(
     return segment_field(path, np.roll(path, -1, axis=0), points, current_a)
 
 
-def loop_moment(corners: NDArray[np.generic], current_a: float = 1.0) -> Array:
-    """Return the magnetic moment (3,), A m^2, of a closed path: ``I/2`` times all ``r x dr``."""
-    path = rows_of(corners, 3, 'corners')
-    cross = np.cross(path, np.roll(path, -1, axis=0))
-    return np.asarray(0.5 * current_a * cross.sum(axis=0))
-
-
 MOST_TRACKS = 20_000
-"""Largest number of straight tracks of one coil. It only bounds the time that a mistyped setup
-can take: the Anser board's coil of 25 turns has 100 tracks."""
-_DIRECTIONS = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))
-"""Direction (x, y) of the four tracks of a turn; the first runs along +y on the right side."""
+"""Largest number of straight tracks of one coil, which bounds the time of a mistyped setup."""
+_CORNERS = ((1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0))
+"""Signs of x and y where a turn's four tracks begin; the first runs along +y on the right side."""
 
 
 @dataclass(frozen=True)
@@ -117,13 +102,9 @@ class Board:
         pairs = zip(self.rotations, self.centres, strict=True)
         return tuple(self.shape @ turn.T + centre for turn, centre in pairs)
 
-    def field(self, points: NDArray[np.generic]) -> Array:
+    def field(self, points: AnyArray) -> Array:
         """Return each coil's field (P, K, 3), T, at its nominal current; points (P, 3) in m."""
         return np.stack([loop_field(path, points, self.current_a) for path in self.paths], axis=1)
-
-    def moments(self) -> Array:
-        """Return the magnetic moment of every coil, shape (K, 3), A m^2, frame fg."""
-        return np.asarray(self.rotations @ loop_moment(self.shape, self.current_a))
 
 
 def _number(
@@ -183,16 +164,10 @@ def spiral_path(
 def _crossing(
     track: int, before: float, inset: float, side_x: float, side_y: float
 ) -> tuple[float, float]:
-    """Where the lines of two tracks cross, m, at these distances (m) from the outer sides."""
-    along_y = _DIRECTIONS[track % 4][0] == 0.0
-    right = _DIRECTIONS[track % 4][1] - _DIRECTIONS[(track - 1) % 4][1] > 0
-    if along_y:
-        x = 0.5 * side_x - inset
-        y = 0.5 * side_y - before
-        return (x, -y) if right else (-x, y)
-    x = 0.5 * side_x - before
-    y = 0.5 * side_y - inset
-    return (x, y) if _DIRECTIONS[track % 4][0] < 0 else (-x, -y)
+    """Where a track begins, m, by its distance and the one before's (m) from the outer sides."""
+    aside, along = (inset, before) if track % 2 == 0 else (before, inset)
+    x, y = _CORNERS[track % 4]
+    return x * (0.5 * side_x - aside), y * (0.5 * side_y - along)
 
 
 def _wound(path: Array, geometry: Mapping[str, Any], default: str) -> Array:
@@ -250,8 +225,8 @@ def build_board(
     kind: str,
     geometry: Mapping[str, Any],
     names: Sequence[str],
-    centres_m: NDArray[np.generic],
-    rotations_deg: NDArray[np.generic],
+    centres_m: AnyArray,
+    rotations_deg: AnyArray,
     frequencies_hz: Sequence[float],
 ) -> Board:
     """Draw all K coils of an emitter board as closed current paths.

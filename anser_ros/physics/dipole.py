@@ -8,22 +8,19 @@ with an error of order L^4.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array, ComplexArray
 from anser_ros.kernel_cache import kernel
 from anser_ros.parallel import in_order, slices, slices_of
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 GAUSS_OFFSET = 0.5 / math.sqrt(3.0)
 """Offset of the two Gauss-Legendre points from a coil's centre, as a fraction of its length."""
 AT_ONCE = 16
-"""Points whose couplings to all dipoles are kept at once: some hundred kilobytes, which stay in
-the processor's cache until they are used."""
+"""Points whose couplings to all dipoles are kept at once: what the processor's cache holds."""
 POINTS_A_THREAD = 512
 """Points that one thread works out, a millisecond's work."""
 
@@ -157,7 +154,7 @@ def fill_fields(points, dipoles, out):  # type: ignore[no-untyped-def]
                 place += 1
 
 
-def rows_of(values: NDArray[np.generic], width: int, what: str) -> Array:
+def rows_of(values: AnyArray, width: int, what: str) -> Array:
     """Return values as contiguous rows (n, width); raises `ValueError` for any other shape."""
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != width:
@@ -166,7 +163,7 @@ def rows_of(values: NDArray[np.generic], width: int, what: str) -> Array:
 
 
 def _sensors(
-    points: NDArray[np.generic], axes: NDArray[np.generic], lengths: NDArray[np.generic] | None
+    points: AnyArray, axes: AnyArray, lengths: AnyArray | None
 ) -> tuple[Array, Array, Array]:
     r, n = rows_of(points, 3, 'points'), rows_of(axes, 3, 'axes')
     if r.shape != n.shape:
@@ -177,12 +174,16 @@ def _sensors(
     return r, n, np.array(np.broadcast_to(lengths, r.shape[:1]), dtype=np.float64)
 
 
+def _dipoles(positions: AnyArray, directions: AnyArray) -> Array:
+    return dipole_rows(rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions'))
+
+
 def flux_basis(
-    points: NDArray[np.generic],
-    axes: NDArray[np.generic],
-    lengths: NDArray[np.generic] | None,
-    positions: NDArray[np.generic],
-    directions: NDArray[np.generic],
+    points: AnyArray,
+    axes: AnyArray,
+    lengths: AnyArray | None,
+    positions: AnyArray,
+    directions: AnyArray,
 ) -> Array:
     """Return the flux along each sensor's axis by dipoles of unit moment: M of the article.
 
@@ -191,87 +192,83 @@ def flux_basis(
     sensors. The result (P, N) is the flux density per moment, T / (A m^2). Raises `ValueError`
     when the shapes do not fit together.
     """
-    r, n, spans = _sensors(points, axes, lengths)
-    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
-    out = np.empty((r.shape[0], q.shape[0]))
-    fill_flux_basis(r, n, spans, dipole_rows(q, u), out)
+    (r, n, spans), dipoles = _sensors(points, axes, lengths), _dipoles(positions, directions)
+    out = np.empty((len(r), dipoles.shape[1]))
+    fill_flux_basis(r, n, spans, dipoles, out)
     return out
 
 
-def field_basis(
-    points: NDArray[np.generic], positions: NDArray[np.generic], directions: NDArray[np.generic]
-) -> Array:
+def field_basis(points: AnyArray, positions: AnyArray, directions: AnyArray) -> Array:
     """Return the field (P, N, 3), T / (A m^2), of dipoles of unit moment.
 
     ``points`` (P, 3) are in m; ``positions`` (m) and unit ``directions`` (N, 3) are the dipoles',
     all in the frame fg.
     """
-    r = rows_of(points, 3, 'points')
-    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
-    out = np.empty((r.shape[0], 3, q.shape[0]))
-    fill_fields(r, dipole_rows(q, u), out)
+    r, dipoles = rows_of(points, 3, 'points'), _dipoles(positions, directions)
+    out = np.empty((len(r), 3, dipoles.shape[1]))
+    fill_fields(r, dipoles, out)
     return np.moveaxis(out, 1, 2)
 
 
 def dipole_field(
-    points: NDArray[np.generic],
-    positions: NDArray[np.generic],
-    directions: NDArray[np.generic],
-    moments: NDArray[np.generic],
+    points: AnyArray, positions: AnyArray, directions: AnyArray, moments: AnyArray
 ) -> ComplexArray:
     """Return the field of dipoles, shape (P, 3, K), T; arguments as for `field_basis`.
 
     ``moments`` (N, K), complex, are the dipoles' magnitudes for each of the K emitters, A m^2.
     """
-    r = rows_of(points, 3, 'points')
-    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
+    r, dipoles = rows_of(points, 3, 'points'), _dipoles(positions, directions)
     m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)
-    out, dipoles = np.empty((r.shape[0], 3, m.shape[1])), dipole_rows(q, u)
+    return _made(lambda here, out: fill_fields(r[here], dipoles, out), len(r), 3, m).view(
+        np.complex128
+    )
+
+
+def _made(fill: Callable[[slice, Array], None], points: int, width: int, moments: Array) -> Array:
+    """Return what moments (N, C) make at P points, (P, width, C).
+
+    ``fill`` writes what unit dipoles make at a slice of the points, (p, width, N).
+    """
+    count, columns = moments.shape
+    out = np.empty((points, width, columns))
 
     def work(rows: slice) -> None:
-        basis = np.empty((AT_ONCE, 3, q.shape[0]))
+        basis = np.empty((AT_ONCE, width, count))
         for here in slices_of(rows, AT_ONCE):
             few = basis[: here.stop - here.start]
-            fill_fields(r[here], dipoles, few)
+            fill(here, few)
+            rows_made = width * len(few)
             np.matmul(
-                few.reshape(3 * len(few), len(m)), m, out=out[here].reshape(3 * len(few), -1)
+                few.reshape(rows_made, count), moments, out=out[here].reshape(rows_made, columns)
             )
 
-    in_order(work, slices(len(r), POINTS_A_THREAD))
-    return out.view(np.complex128)
-
-
-def flux_and_slopes(
-    points: NDArray[np.generic],
-    axes: NDArray[np.generic],
-    lengths: NDArray[np.generic] | None,
-    positions: NDArray[np.generic],
-    directions: NDArray[np.generic],
-    moments: Array,
-) -> Array:
-    """Return `flux_jacobian`'s results for real moments (N, C) side by side, shape (P, 7, C)."""
-    r, n, spans = _sensors(points, axes, lengths)
-    q, u = rows_of(positions, 3, 'positions'), rows_of(directions, 3, 'directions')
-    out, dipoles = np.empty((len(r), 7, moments.shape[1])), dipole_rows(q, u)
-
-    def work(rows: slice) -> None:
-        basis = np.empty((AT_ONCE, 7, len(q)))
-        for here in slices_of(rows, AT_ONCE):
-            few = basis[: here.stop - here.start]
-            fill_coil_basis(r[here], n[here], spans[here], dipoles, few)
-            np.matmul(few.reshape(-1, len(q)), moments, out=out[here].reshape(7 * len(few), -1))
-
-    in_order(work, slices(len(r), POINTS_A_THREAD))
+    in_order(work, slices(points, POINTS_A_THREAD))
     return out
 
 
+def flux_and_slopes(
+    points: AnyArray,
+    axes: AnyArray,
+    lengths: AnyArray | None,
+    positions: AnyArray,
+    directions: AnyArray,
+    moments: Array,
+) -> Array:
+    """Return `flux_jacobian`'s results for real moments (N, C) side by side, shape (P, 7, C)."""
+    (r, n, spans), dipoles = _sensors(points, axes, lengths), _dipoles(positions, directions)
+    return _made(
+        lambda here, out: fill_coil_basis(r[here], n[here], spans[here], dipoles, out),
+        len(r), 7, moments,
+    )  # fmt: skip
+
+
 def flux_jacobian(
-    points: NDArray[np.generic],
-    axes: NDArray[np.generic],
-    lengths: NDArray[np.generic] | None,
-    positions: NDArray[np.generic],
-    directions: NDArray[np.generic],
-    moments: NDArray[np.generic],
+    points: AnyArray,
+    axes: AnyArray,
+    lengths: AnyArray | None,
+    positions: AnyArray,
+    directions: AnyArray,
+    moments: AnyArray,
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return fluxes with their derivatives by the sensors' positions and axes.
 

@@ -8,25 +8,22 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from anser_ros.arrays import Array, Booleans, Integers
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
 
 LONGEST_GAP_S = 0.25
-"""Longest gap between two optical poses, s, over which a pose is interpolated: a tracker that is
-silent for longer did not see the tool, and a hand moves by centimetres in that time."""
+"""Longest gap, s, over which optical poses are interpolated: a hand moves centimetres in it."""
 
 VELOCITY_STEP_S = 0.02
-"""Half the time, s, over which a velocity is taken: much shorter multiplies the jitter of the
-poses, much longer smooths away how a hand accelerates."""
+"""Half the time, s, over which a velocity is taken, between jitter and a hand's acceleration."""
 
 REACH = (2, 3, 4)
-"""Poses before and after an interval by which its curvature is determined: three estimates, of
-which the middle one counts, since a reflected pose is in one of them only. Nearer ones jitter
-more, farther ones miss how the acceleration changes."""
+"""Poses before and after an interval by which its curvature is determined: of three estimates the
+middle one counts, since a reflected pose is in one of them only."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +49,7 @@ class PoseTrack:
         slerp: Callable[[Array], Rotation] = Slerp(self.time, Rotation.from_quat(self.quaternion))
         return slerp
 
-    def at(
-        self, time: Array, longest_gap: float = LONGEST_GAP_S
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def at(self, time: Array, longest_gap: float = LONGEST_GAP_S) -> tuple[Array, Array, Booleans]:
         """Interpolate the poses at other times.
 
         Positions are interpolated along the chord between two poses, rotations along the great
@@ -115,9 +110,7 @@ class _Bend:
     after each of the times ``at``.
     """
 
-    def __init__(
-        self, time: Array, left: NDArray[np.int64], right: NDArray[np.int64], at: Array
-    ) -> None:
+    def __init__(self, time: Array, left: Integers, right: Integers, at: Array) -> None:
         self.time, last = time, time.size - 1
         first, final = np.maximum(left - REACH[-1], 0), np.minimum(right + REACH[-1], last)
         is_whole = (left - first == REACH[-1]) & (final - right == REACH[-1]) & (left < right)

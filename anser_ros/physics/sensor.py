@@ -7,21 +7,18 @@ length.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array, Booleans, Integers
 from anser_ros.physics.dipole import flux_and_slopes, flux_basis
 
-Array = NDArray[np.float64]
-
 LARGEST_FLUX_T = 1.0
-"""A reading with a component beyond this, T, is taken for a fault of the electronics. The emitters
-make microtesla at most, so that any flux density that could be real is far smaller."""
+"""A component beyond this, T, is a fault of the electronics: emitters make microtesla at most."""
 
 SAME_CENTRE_M = 2e-3
-"""Sensors of a body closer together than this (m) are one cluster: coils of a triaxial sensor
-share a centre within winding tolerances of some 0.1 mm, separate sensors are centimetres apart."""
+"""Sensors of a body closer than this (m) are one cluster: windings are within some 0.1 mm."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,7 @@ class Windings:
         return Windings(table[:, :, :3], table[:, :, 3])
 
     @property
-    def is_sum(self) -> NDArray[np.bool_]:
+    def is_sum(self) -> Booleans:
         """Return which sensors (S,) are a sum of points."""
         return np.asarray((self.weight != 0.0).any(axis=1))
 
@@ -70,11 +67,15 @@ def joined_windings(tables: Sequence['SensorTable']) -> Windings | None:
     return Windings(np.concatenate(offset), np.concatenate(weight))
 
 
+ARRAYS, NAMES = ('channel', 'position', 'axis', 'length'), ('name', 'body')
+"""Columns of a `SensorTable`, beside the windings."""
+
+
 @dataclass(frozen=True)
 class SensorTable:
     """Holds a table of S pick-up coils with one row each."""
 
-    channel: NDArray[np.int64]  # (S,), channel of the control unit that each coil is connected to
+    channel: Integers  # (S,), channel of the control unit that each coil is connected to
     name: tuple[str, ...]  # length S
     body: tuple[str, ...]  # length S, that each is fixed to; ``fg`` for reference sensors
     position: Array  # (S, 3), centre in the frame of the sensor's body, m
@@ -84,7 +85,7 @@ class SensorTable:
     windings: Windings | None = None
 
     @property
-    def is_single(self) -> NDArray[np.bool_]:
+    def is_single(self) -> Booleans:
         """Return which sensors (S,) are single coils, not sums of points."""
         if self.windings is None:
             return np.ones(len(self), dtype=bool)
@@ -93,20 +94,13 @@ class SensorTable:
     def __len__(self) -> int:
         return len(self.name)
 
-    def select(self, rows: Sequence[int] | NDArray[np.generic]) -> 'SensorTable':
+    def select(self, rows: Sequence[int] | AnyArray) -> 'SensorTable':
         """Return the table of the rows given by index or mask, in that order."""
         index = np.arange(len(self))[np.asarray(rows)]
-        return SensorTable(
-            channel=self.channel[index],
-            name=tuple(self.name[i] for i in index),
-            body=tuple(self.body[i] for i in index),
-            position=self.position[index],
-            axis=self.axis[index],
-            length=self.length[index],
-            windings=None
-            if self.windings is None
-            else Windings(self.windings.offset[index], self.windings.weight[index]),
-        )
+        each: dict[str, Any] = {key: getattr(self, key)[index] for key in ARRAYS}
+        each |= {key: tuple(getattr(self, key)[i] for i in index) for key in NAMES}
+        own = self.windings
+        return SensorTable(**each, windings=own and Windings(own.offset[index], own.weight[index]))
 
     def of_body(self, body: str) -> 'SensorTable':
         """Return the table of the sensors on one body."""
@@ -115,15 +109,11 @@ class SensorTable:
     def joined(self, *others: 'SensorTable') -> 'SensorTable':
         """Return the table of these sensors followed by those of other tables."""
         tables = (self, *others)
-        return SensorTable(
-            channel=np.concatenate([table.channel for table in tables]),
-            name=tuple(name for table in tables for name in table.name),
-            body=tuple(body for table in tables for body in table.body),
-            position=np.concatenate([table.position for table in tables]),
-            axis=np.concatenate([table.axis for table in tables]),
-            length=np.concatenate([table.length for table in tables]),
-            windings=joined_windings(tables),
-        )
+        each: dict[str, Any] = {
+            key: np.concatenate([getattr(table, key) for table in tables]) for key in ARRAYS
+        }
+        each |= {key: tuple(n for table in tables for n in getattr(table, key)) for key in NAMES}
+        return SensorTable(**each, windings=joined_windings(tables))
 
     def placed(self, position: Array, rotation: Array) -> tuple[Array, Array]:
         """Return centres (m) and unit axes (..., S, 3) in fg at poses of the sensors' body.
@@ -134,7 +124,7 @@ class SensorTable:
         return turned + position[..., None, :], np.einsum('...ij,sj->...si', rotation, self.axis)
 
 
-def clusters_of(sensors: SensorTable) -> list[NDArray[np.int64]]:
+def clusters_of(sensors: SensorTable) -> list[Integers]:
     """Return the rows of the sensors of each body that share a centre; most often one, or three.
 
     The first remaining row of a table starts a cluster of those near it.
@@ -163,7 +153,7 @@ class PlacedPoints:
     lengths: Array  # (P,), m
     weights: Array  # (P,), factor of each point's flux density
     arms: Array  # (P, 3), from the sensor's place to the point, m, frame fg
-    first: NDArray[np.int64]  # (S,), the first point of each sensor
+    first: Integers  # (S,), the first point of each sensor
 
     @staticmethod
     def of(sensors: SensorTable, position: Array, rotation: Array) -> 'PlacedPoints':

@@ -7,20 +7,15 @@ The refit corrects the field in it, and the tracker gives poses in it. The setup
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import TrackingError
-
-Array = NDArray[np.float64]
 
 FLOOR, CEILING, REACH = 0.345, 2.3, 1.3225
 """The default volume, in halves of the board's larger side: heights over the board from which and
-up to which tools are tracked, and how far to the side of its middle. On the demo board that is 50
-to 350 mm high and 400 mm wide. A larger volume spreads the refit's samples over where no tool is;
-poses of tools outside a smaller one are withheld (`docs/refit.md`)."""
+up to which tools are tracked, and how far to the side of its middle (`docs/refit.md`)."""
 STEP_M = 0.01
-"""The default is rounded to whole centimetres, so that boards of about the same size have the same
-volume."""
+"""The default is rounded to whole centimetres, so that similar boards have the same volume."""
 
 
 @dataclass(frozen=True)

@@ -22,22 +22,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import field_basis
 from anser_ros.physics.volume import TrackedVolume
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 LAYER_RATIO = 1.45
-"""Ratio of the depths of neighbouring layers of sources: detail that sensors can tell grows with
-depth, so depths are even on a logarithmic scale."""
+"""Ratio of the depths of neighbouring layers of sources: detail to tell apart grows with depth."""
 SPACING_PER_DEPTH = 0.7
-"""Lateral spacing of a layer's sources over its depth: sensors as far away as the layer is deep
-can hardly tell its sources from a sheet."""
+"""Lateral spacing of a layer's sources over its depth: coils can hardly tell them from a sheet."""
 
 BODY_SPACING = 0.6
 """Distance of neighbouring compact bodies of the lattice, in halves of the board."""
@@ -199,7 +194,7 @@ def model_field(model: FieldModel, points: Array) -> ComplexArray:
     return np.asarray(np.einsum('pna,nk->pka', basis, model.moments, optimize=True))
 
 
-def region_of(field: Callable[[Array], NDArray[np.generic]]) -> Region:
+def region_of(field: Callable[[Array], AnyArray]) -> Region:
     """Return the board's extent: the square with 98 % of its field's power over the surface.
 
     Raises `FitError` when the field is zero or not finite.

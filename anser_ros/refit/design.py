@@ -11,22 +11,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.clouds import Cloud, Excitation, Region, below, overhead
-from anser_ros.refit.layer import bottom_layer_of_board, box_layer
+from anser_ros.refit.clouds import Excitation, Region, below, overhead
+from anser_ros.refit.layer import bottom_layer, box_layer
 from anser_ros.refit.prior import UPRIGHT, Response, build_prior, reduced
 from anser_ros.settings import RefitSettings
 
-Array = NDArray[np.float64]
-
 BELOW, AROUND = (0.2, 0.5, 1.1), (0.25, 0.6)
-"""Standoffs of the family's metals below the board and around the volume, in halves of the
-board."""
+"""Standoffs of the metals below the board and around the volume, in halves of the board."""
 GRADIENT = 3.0
-"""Field of a dipole over its gradient times the distance: an error of the field moves a pose by
-a third of the height times its share of the field."""
+"""Field of a dipole over its gradient times the distance: by it field errors move poses."""
 MOST_EXCHANGES = 3
 """Rounds of exchanging every coil; the second seldom finds more than a percent."""
 
@@ -62,16 +58,6 @@ class Design:
         return float(np.sqrt(np.mean(self.errors_m**2)))
 
 
-def clouds_of(region: Region, kinds: Sequence[str]) -> list[tuple[Cloud, Response]]:
-    """Return the family's metals of the kinds ``below`` and ``around``."""
-    out: list[tuple[Cloud, Response]] = []
-    if 'below' in kinds:
-        out += [(below(region, part * region.half), UPRIGHT) for part in BELOW]
-    if 'around' in kinds:
-        out += [(overhead(region, part * region.half), Response()) for part in AROUND]
-    return out
-
-
 def family(
     candidates: SensorTable,
     excitation: Excitation,
@@ -89,18 +75,17 @@ def family(
     noise = settings.accuracy.flux_noise_t
     clean = np.einsum('pa,pka->pk', candidates.axis, excitation.field(candidates.position))
     count, k = clean.shape
-    others = np.eye(count * k)
-    drift = np.zeros((count * k, k))
-    for emitter in range(k):
-        drift[emitter::k, emitter] = clean[:, emitter] * settings.emitter_drift / noise
-    others += drift @ drift.T
+    drift = ((clean * settings.emitter_drift / noise)[:, :, None] * np.eye(k)).reshape(-1, k)
+    others = np.eye(count * k) + drift @ drift.T
     points = region.volume.samples()
     size = np.linalg.norm(excitation.field(points), axis=(1, 2))
     per_field = float((points[:, 2] / size).mean()) / GRADIENT
-    bottom, box = bottom_layer_of_board(region, excitation), box_layer(region, excitation)
+    bottom, box = bottom_layer(region, excitation), box_layer(region, excitation)
+    clouds = [below(region, part * region.half) for part in BELOW if 'below' in kinds]
+    clouds += [overhead(region, part * region.half) for part in AROUND if 'around' in kinds]
     metals = []
-    for cloud, response in clouds_of(region, kinds):
-        layer = box if cloud.overhead else bottom
+    for cloud in clouds:
+        layer, response = (box, Response()) if cloud.overhead else (bottom, UPRIGHT)
         field = excitation.field(cloud.positions)
         rng = np.random.default_rng(settings.seed)
         prior = build_prior(
@@ -122,7 +107,7 @@ def family(
     return metals
 
 
-def _rows(coils: Sequence[int], k: int) -> NDArray[np.int64]:
+def _rows(coils: Sequence[int], k: int) -> Integers:
     return (np.asarray(coils, dtype=np.int64)[:, None] * k + np.arange(k)).ravel()
 
 

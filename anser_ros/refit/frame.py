@@ -10,8 +10,8 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames import faults
@@ -19,9 +19,6 @@ from anser_ros.frames.intake import Frame
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit import health
 from anser_ros.refit.posterior import median
-
-ComplexArray = NDArray[np.complex128]
-Array = NDArray[np.float64]
 
 FEWEST_BASELINE_FRAMES = 3
 """Frames that a baseline needs at least: their scatter is its noise."""
@@ -168,7 +165,7 @@ class BaselineCheck:
         lacks = np.isnan(self._least)
         self._lacks = lacks if lacks.any() else None
 
-    def read(self, frame: Frame) -> tuple[NDArray[np.bool_], list[str]]:
+    def read(self, frame: Frame) -> tuple[Booleans, list[str]]:
         """Return which readings (S,) of a frame can be used, and why not, if any cannot."""
         flux, codes = frame.flux, frame.codes
         is_silent = power_of(flux) < self._least
@@ -193,7 +190,7 @@ class NoiseUnits:
         power = float((np.abs(known) ** 2).mean()) if known.size else 0.0
         self.size = math.sqrt(0.5 * power) / noise_t
 
-    def of(self, change: ComplexArray) -> NDArray[np.float64]:
+    def of(self, change: ComplexArray) -> Array:
         """Return changes (S, K), T, as real and imaginary parts, shape (S, K, 2)."""
         scaled = change * self._scale
         return scaled.view(np.float64).reshape(*scaled.shape, 2)

@@ -13,15 +13,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.integrity.pose_checks import STREAM_GAP_S
 from anser_ros.refit.kernels import fill_without
 from anser_ros.refit.posterior import STRENGTHS, Bank, FrameEvidence, log_sum, median
 from anser_ros.stamps import NANO
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 RISE, REACH = 0.5, 1000.0
 """Rise of a log likelihood from one strength to the next below which its top has been reached, and
@@ -43,7 +40,7 @@ def left_out(bank: Bank, seen: FrameEvidence) -> tuple[Array, Array]:
 
 
 def evidence_without(
-    bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]
+    bank: Bank, seen: FrameEvidence, coils: Integers
 ) -> tuple[Array, list[Array]]:
     """Return the evidence without the first of some coils, the first two, and so on to all Q.
 
@@ -75,7 +72,7 @@ def evidence_without(
 
 
 def distance_of(
-    bank: Bank, seen: FrameEvidence, rows: NDArray[np.int64], readings: Array, noise: float
+    bank: Bank, seen: FrameEvidence, rows: Integers, readings: Array, noise: float
 ) -> float:
     """Return how far readings of an excluded coil are from what those in use predict.
 
@@ -128,11 +125,9 @@ AGREEMENT_CHI2 = 2.5
 RETRY_FRAMES = 25
 """Frames after which an excluded coil is looked at again."""
 HOLD_S = 0.5
-"""Time, s, of agreement after which an excluded coil is used again where that is sooner than its
-number of frames, as in slow streams: a loose plug comes and goes."""
+"""Agreement, s, that readmits an excluded coil where that is sooner than its number of frames."""
 FEWEST_HELD = 12
-"""Frames of agreement that are asked for at any rate, or the stated ones if these are fewer: noise
-that passes half of the time passes so many once in four thousand."""
+"""Fewest frames of agreement, unless fewer are stated: half-passing noise does it once in 4000."""
 OUTSTANDING = 8.0
 """A change this many times the median coil's is looked at as a possible fault."""
 MOST_AT_ONCE = 4
@@ -151,7 +146,7 @@ class ReferenceHealth(NamedTuple):
 
 
 def judge_references(
-    names: Sequence[str], reasons: Sequence[str], used: NDArray[np.bool_], chi2: Array,
+    names: Sequence[str], reasons: Sequence[str], used: Booleans, chi2: Array,
     residual: Array, flux_noise_t: float,
 ) -> tuple[ReferenceHealth, ...]:  # fmt: skip
     """Return the health of every reference in one frame.
@@ -166,7 +161,7 @@ def judge_references(
     return tuple(map(ReferenceHealth, names, reasons, size.tolist(), apart.tolist()))
 
 
-def fault_odds(bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]) -> list[float]:
+def fault_odds(bank: Bank, seen: FrameEvidence, coils: Integers) -> list[float]:
     """Return the log odds that the first of some coils in use is at fault, the first two, and on.
 
     Each coil is then at fault in a different way.
@@ -185,9 +180,7 @@ def fault_odds(bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]) -> lis
     return odds
 
 
-def find_faults(
-    bank: Bank, seen: FrameEvidence, suspects: list[NDArray[np.int64]]
-) -> NDArray[np.int64]:
+def find_faults(bank: Bank, seen: FrameEvidence, suspects: list[Integers]) -> Integers:
     """Return the suspects that are most probably at fault, or none.
 
     Of each array of suspects the first one may be at fault, the first two, and so on.
@@ -212,14 +205,12 @@ class ReferenceWatch:
         self.excluded = np.zeros(count, dtype=bool)
         self.reason = [OK] * count
         self._good = np.zeros(count, dtype=np.int64)
-        self._before: tuple[NDArray[np.bool_], list[str], NDArray[np.int64]] | None = None
+        self._before: tuple[Booleans, list[str], Integers] | None = None
         self._dismissed = 0.0, 0
         self._since = self._last_ns = 0
         self._gap_s = math.inf
 
-    def note(
-        self, readable: NDArray[np.bool_], reasons: list[str], least: int, stamp_ns: int
-    ) -> None:
+    def note(self, readable: Booleans, reasons: list[str], least: int, stamp_ns: int) -> None:
         """Exclude unreadable coils, whose waiting time starts again with every such frame.
 
         If fewer than `least` can be read, samples were lost and no coil is at fault: the next
@@ -287,13 +278,13 @@ class ReferenceWatch:
         for coil in np.flatnonzero(ready):
             self.excluded[coil], self.reason[coil], self._good[coil] = False, OK, 0
 
-    def wait(self, readable: NDArray[np.bool_]) -> None:
+    def wait(self, readable: Booleans) -> None:
         """Count a frame with too few coils to compare; coils once unreadable return in time."""
         for coil in np.flatnonzero(self.excluded & readable):
             self.agreed(int(coil), self.reason[coil] != DISAGREES)
         self.readmit()
 
-    def suspects(self, chi2: Array, power: Array, freedom: int) -> list[NDArray[np.int64]]:
+    def suspects(self, chi2: Array, power: Array, freedom: int) -> list[Integers]:
         """Return the coils in use whose fault is worth computing, often none; for `find_faults`.
 
         Coils that are far from what the others predict are suspected one by one; several that are

@@ -14,16 +14,14 @@ If the thread has not finished by then, the refit waits for it.
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray
 from anser_ros.refit.posterior import STRENGTHS, Bank, Eigenbasis, make_room
 from anser_ros.refit.tables import BodySearch, RefitTables
 from anser_ros.settings import RefitSettings
-
-Array = NDArray[np.float64]
 
 DELAY_NS = 80_000_000
 """Time from asking for a result to its use, ns: four frames at 50 Hz. The longest work takes 20 ms
@@ -35,11 +33,6 @@ Result = TypeVar('Result')
 @cache
 def _worker() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=1, thread_name_prefix='refit')
-
-
-def begin_in_background(work: Callable[[], None]) -> None:
-    """Start work in the thread that saves a later frame time and changes no result."""
-    _worker().submit(work)
 
 
 class BackgroundTask(Generic[Result]):
@@ -66,28 +59,17 @@ SLOTS = 3
 """Compact bodies that are full hypotheses at a time: two that explain the readings alike, and one
 more that may be better. Each costs the posterior of a source in every frame."""
 SLOT_EVIDENCE = 3.0
-"""Gain of approximate log evidence for which a body takes another's slot: odds of twenty to one,
-so that two that explain alike do not take turns."""
+"""Log evidence for which a body takes another's slot: odds of 20 to 1, so that none take turns."""
 EVERY = 4
-"""Frames from one look at all bodies to the next. In 80 ms at 50 Hz metal in a hand moves some 2
-cm, a third of the distance between neighbouring bodies (`clouds.BODY_SPACING`)."""
+"""Frames between looks at all bodies: a hand moves a third of `clouds.BODY_SPACING` meanwhile."""
 MOST_BODIES = 16
-"""Bodies whose hypotheses are kept once worked out, 3 MB and 17 ms each: of a disc that comes and
-goes, again and again, 16 answer two thirds of the requests, and 24 no more."""
+"""Bodies whose hypotheses are kept, 3 MB and 17 ms each; 24 would answer no more requests."""
 PRESENT = 1.15
-"""Ratio of the readings' power to that of the noise below which no body is looked for: noise of 32
-references and eight emitters exceeds it in one frame of 100."""
+"""Power of the readings over that of noise below which no body is looked for (1 frame in 100)."""
 
 
 Choice = tuple[int, int] | None
 """A slot and the body for it; None if there is no better one than those that have slots."""
-
-
-class _Look(NamedTuple):
-    """A look at all bodies, and the hypothesis of the body that it chooses, if any."""
-
-    choice: BackgroundTask[Choice]
-    eigenbasis: BackgroundTask[Eigenbasis | None]
 
 
 class BodySlots:
@@ -101,7 +83,8 @@ class BodySlots:
         self._first = len(bank.priors) - SLOTS + 1
         self._search = BodySearch(tables.factors, bank.rows, bank.whitening, STRENGTHS[::2])
         self._bodies: list[int] = []
-        self._look: _Look | None = None
+        # A look at all bodies, and the hypothesis of the one that it chooses, if any.
+        self._look: tuple[BackgroundTask[Choice], BackgroundTask[Eigenbasis | None]] | None = None
         self._wait = 0
         self._known: dict[int, Eigenbasis] = {}
 
@@ -125,20 +108,18 @@ class BodySlots:
         if float((readings**2).mean()) < PRESENT * noise**2:
             return
         self._wait -= 1
-        if self._wait > 0 or (self._look is not None and self._look.choice.result() is not None):
+        if self._wait > 0 or (self._look is not None and self._look[0].result() is not None):
             return
         self._wait = EVERY
         choice = BackgroundTask(partial(self._choose, readings, noise, (*self._bodies,)), stamp_ns)
-        self._look = _Look(choice, BackgroundTask(partial(self._eigenbasis_of, choice), stamp_ns))
+        self._look = choice, BackgroundTask(partial(self._eigenbasis_of, choice), stamp_ns)
 
     def _eigenbasis_of(self, choice: BackgroundTask[Choice]) -> Eigenbasis | None:
         """Return the hypothesis of the chosen body; the thread that has chosen it calls this."""
         chosen = choice.result()
-        return None if chosen is None else self._eigenbasis(chosen[1])
-
-    def _eigenbasis(self, body: int) -> Eigenbasis:
-        """Return the hypothesis of a body; one thread in the background calls it."""
-        known = self._known.pop(body, None)
+        if chosen is None:
+            return None
+        known = self._known.pop(body := chosen[1], None)
         if known is None:
             known = self._bank.eigenbasis(self._tables.body_prior(body))
             make_room(self._known, MOST_BODIES)
@@ -147,11 +128,10 @@ class BodySlots:
 
     def _put_in(self, stamp_ns: int) -> None:
         """Put a body into its slot whose time has come."""
-        look = self._look
-        if look is None or not look.eigenbasis.is_due(stamp_ns):
+        if self._look is None or not self._look[1].is_due(stamp_ns):
             return
+        choice, eigenbasis = self._look[0].result(), self._look[1].result()
         self._look = None
-        choice, eigenbasis = look.choice.result(), look.eigenbasis.result()
         if choice is not None and eigenbasis is not None:
             slot, body = choice
             self._bank.replace_prior(self._first + slot, eigenbasis)
@@ -169,8 +149,7 @@ class BodySlots:
 
 
 MOST_BANKS = 4
-"""Banks of hypotheses, one for each set of usable coils, that are kept; the oldest is dropped.
-Fewer, and coils that come and go cost a bank each time; more only cost memory."""
+"""Banks of hypotheses, one for each set of usable coils, that are kept; the oldest is dropped."""
 
 
 class Banks:
@@ -180,18 +159,16 @@ class Banks:
     """
 
     def __init__(
-        self, tables: RefitTables, baseline: NDArray[np.complex128], settings: RefitSettings
+        self, tables: RefitTables, baseline: ComplexArray, settings: RefitSettings
     ) -> None:
         self._tables = tables
         self._width = k = baseline.shape[1]
-        turned = baseline * tables.excitation.phase.conj()
+        turned = np.nan_to_num((baseline * tables.excitation.phase.conj()).real)
         scale = settings.emitter_drift / settings.accuracy.flux_noise_t
-        self._drift = np.zeros((baseline.size, k))
-        for emitter in range(k):
-            self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
+        self._drift = ((turned * scale)[:, :, None] * np.eye(k)).reshape(-1, k)
         self._known: dict[bytes, tuple[Bank, BodySlots]] = {}
 
-    def of(self, in_use: NDArray[np.bool_]) -> tuple[Bank, BodySlots]:
+    def of(self, in_use: Booleans) -> tuple[Bank, BodySlots]:
         """Return the hypotheses for the coils in use, bool (S,), and their slots."""
         key = in_use.tobytes()
         if key not in self._known:
@@ -201,7 +178,7 @@ class Banks:
             tables = self._tables
             bank = Bank(tables.priors, rows, self._drift, SLOTS, len(tables.bodies))
             self._known[key] = (bank, BodySlots(bank, tables))
-            begin_in_background(bank.make_ready)
+            _worker().submit(bank.make_ready)  # saves a later frame time, changes no result
         return self._known[key]
 
     def forget(self) -> None:

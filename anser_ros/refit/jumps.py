@@ -14,19 +14,15 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.refit.frame import NoiseUnits, power_of
 from anser_ros.refit.health import FAULT_ODDS, FAULT_SCALES, left_out
 from anser_ros.refit.posterior import STRENGTHS, Bank, FrameEvidence, log_sum, median
 from anser_ros.stamps import NANO
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 LEAST_JUMP_POWER = 5.0
-"""Power of a jump, in units of what noise makes, from which on jumps are judged: noise of sixteen
-components is that large once in a year."""
+"""Power of a jump, over noise's, from which on it is judged: noise reaches it once in a year."""
 FARTHEST = 3.0
 """Steps, in units of the last one, over which a course is carried on, and its noise with it."""
 LARGEST_RATE = 0.05
@@ -58,7 +54,7 @@ class Jumps(NamedTuple):
     since_s: float
 
 
-def _where(rows: NDArray[np.bool_], new: ComplexArray, old: ComplexArray) -> ComplexArray:
+def _where(rows: Booleans, new: ComplexArray, old: ComplexArray) -> ComplexArray:
     """Return new values (S, K) in some rows (S,), the old ones in the others."""
     return new if rows.all() else np.where(rows[:, None], new, old)
 
@@ -108,7 +104,7 @@ class Courses:
         self._last_ns = np.where(read, self._stamp_ns, self._last_ns)
         return Jumps(off, np.sqrt(variance), since_s)
 
-    def note(self, jumps: Jumps, coils: NDArray[np.int64]) -> None:
+    def note(self, jumps: Jumps, coils: Integers) -> None:
         """Remember which references have jumped: a jump is no part of a course."""
         if not self._is_away.any():
             self._sound = self._before[0]
@@ -121,15 +117,15 @@ class Courses:
         self._farthest[coils] = np.maximum(self._farthest[coils], size)
 
     @property
-    def _is_away(self) -> NDArray[np.bool_]:
+    def _is_away(self) -> Booleans:
         return np.asarray(self._farthest > 0.0)
 
-    def away(self) -> NDArray[np.int64]:
+    def away(self) -> Integers:
         """Return the references that are off by jumps."""
         return np.flatnonzero(self._is_away)
 
     @property
-    def readable(self) -> NDArray[np.bool_]:
+    def readable(self) -> Booleans:
         """Return which references (S,) have been read now, and twice before."""
         is_read = self._last_ns == self._stamp_ns
         return np.asarray(is_read & np.isfinite(self.bend()).all(axis=1))
@@ -142,13 +138,13 @@ class Courses:
         """Return the change (S, K), T, since before the first of the present jumps, and its s."""
         return self._last - self._sound, (self._stamp_ns - self._sound_ns) * NANO
 
-    def forget_jumps(self) -> NDArray[np.int64]:
+    def forget_jumps(self) -> Integers:
         """Take the readable references for back from jumps, and return which of them were off."""
         away = np.flatnonzero(self._is_away & self.readable)
         self._away[away], self._farthest[away] = 0.0, 0.0
         return away
 
-    def returned(self, noise_t: float) -> NDArray[np.int64]:
+    def returned(self, noise_t: float) -> Integers:
         """Return the references that are no longer off by jumps, which is then forgotten.
 
         One has jumped back when little of its jump is left. All have that jumped when all of them
@@ -192,7 +188,7 @@ def _is_predicted(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
 
 def jumped(
     bank: Bank, seen: FrameEvidence, jumps: Array, spread: float, drift: float, largest: float
-) -> NDArray[np.int64]:
+) -> Integers:
     """Return the coils that jumped by themselves, as numbers among those in use; often none.
 
     ``seen`` is the evidence of the ``jumps`` (U, K, 2), noise units over their ``spread``, as if
@@ -221,7 +217,7 @@ def jumped(
 
 def faults_have_ended(
     courses: Courses, units: NoiseUnits,
-    bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]], level: float, drift: float,
+    bank_of: Callable[[Booleans], tuple[Bank, object]], level: float, drift: float,
 ) -> bool:  # fmt: skip
     """Return whether jumps are over: metal alone explains how all has changed since before them.
 

@@ -120,10 +120,7 @@ def fill_scores(directions, white, inside, rest, log_det, scores):  # type: igno
 
 @inlined
 def _fill_block(rows, precision, weighted, block):  # type: ignore[no-untyped-def]
-    """Write ``rows diag(precision) rows^T`` of rows (m, n) into the lower half of (m, m).
-
-    Two rows by two at a time: fetching them takes longer than arithmetic.
-    """
+    """Write ``rows diag(precision) rows^T`` of rows (m, n), two by two, as a lower half."""
     count, n = rows.shape
     for r in range(0, count, 2):
         also = min(r + 1, count - 1)

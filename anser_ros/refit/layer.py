@@ -4,52 +4,38 @@ A *layer* is a regular grid of dipoles on or below the board, or on a box around
 takes the place of a cloud's many sources, whose field it reproduces where tools are. A field whose
 sources are all below a plane is also the field of dipoles on that plane (the equivalent layer of
 potential theory; Blakely, Potential Theory in Gravity and Magnetic Applications, chapter 3). So
-the refitted model keeps its size however fine the clouds are. If the calibrated model is such a
-layer itself, its own dipoles represent the change and the model does not grow at all. Metal beside
-or over the volume needs dipoles beside and over it.
+the refitted model keeps its size however fine the clouds are. Metal beside or over the volume
+needs dipoles beside and over it.
 """
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cholesky
 
-from anser_ros.field.model import FieldModel
+from anser_ros.arrays import Array, Integers
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.refit.clouds import Cloud, Excitation, Region
 from anser_ros.refit.kernels import fill_dipole_tensors
 
-Array = NDArray[np.float64]
-
 BELOW, AROUND = 'below', 'around'
 RIDGE = 1e-5
 """Damping of the layer's fit relative to its largest singular value."""
-MOST_OWN = 200
-"""A calibrated layer of more dipoles than this is not used as the equivalent layer."""
-GOOD_ENOUGH = 0.05
-"""Relative rms misfit of the nearest cloud, whose sources know nothing of each other, up to which
-the model's own dipoles are used: that of the layer that would be added."""
 SHALLOW = (12, 1.3, 0.15)
-"""Lattice near the board, as `DEEP` below describes it. The two have 193 dipoles, few enough for a
-tracker to sum in every solve."""
+"""Lattice near the board, as `DEEP` describes it; together 193 dipoles, few enough to track by."""
 DEEP = (7, 2.5, 1.0)
 """Dipoles along a side, half size and depth of a lattice, the last two in halves of the board."""
 SAMPLES = (12, 7)
-"""Samples across and up that a layer is fitted at. With half as many across it is right at the
-samples and, of metal that touches the board, 40 % wrong between them."""
+"""Samples across and up that a layer is fitted at; half as many leave 40 % between them."""
 AT_ONCE = 64
-"""Sources whose field at the samples is worked out at once, 5 MB: with many more, the time goes
-into waiting for memory, with many fewer, into starting again."""
+"""Sources whose field at the samples is worked out at once: 5 MB, which the cache still holds."""
 MOST_MIDDLE = 60
 """Samples in the middle that show what the uncertainty's modes leave."""
 LEAST_SAMPLE_DISTANCE = 0.35
 """Samples nearer to a body's sources than this part of its radius don't count."""
 INNER = 0.83
-"""Part of the tracked volume that the box is fitted in: near the faces, the field of what is just
-outside has more detail than the box can make."""
+"""Part of the volume that the box is fitted in: near the faces it cannot make all detail."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +43,6 @@ class Layer:
     """Holds the dipoles that represent the field of a cloud."""
 
     name: str  # the same for the same dipoles
-    # (Q,), or None, the calibrated model's own dipoles that take part of the change; they are the
-    # layer's first Q. None when all of the layer is added to the model
-    rows: NDArray[np.int64] | None
     # (N, 3)
     positions: Array
     directions: Array
@@ -83,32 +66,11 @@ class Layer:
         if key not in self._projected:
             # Clouds are asked for in turn, each for all of its responses.
             self._projected.clear()
+            parts = np.array_split(sources, -(-len(sources) // AT_ONCE) or 1)
             self._projected[key] = np.hstack(
-                [self.inverse @ _field_rows(self.points, part) for part in _parts(sources)]
+                [self.inverse @ _field_rows(self.points, part) for part in parts]
             )
         return self._projected[key]
-
-    def misfit(self, sources: Array, points: Array | None = None) -> float:
-        """Return the relative rms error of the layer's field compared with the sources'.
-
-        At the samples that it was fitted at, or at other points (P, 3).
-        """
-        at = self.points if points is None else points
-        rows = component_rows(at, self.positions, self.directions)
-        projected, done = self.project(sources), 0
-        off = size = 0.0
-        for part in _parts(sources):  # the field of all at once is hundreds of megabytes
-            wanted = _field_rows(at, part)
-            made = rows @ projected[:, done : done + wanted.shape[1]]
-            done += wanted.shape[1]
-            off += float(np.linalg.norm(made - wanted)) ** 2
-            size += float(np.linalg.norm(wanted)) ** 2
-        return math.sqrt(off / size)
-
-
-def _parts(sources: Array) -> list[Array]:
-    """Return sources (M, 3) in parts of at most `AT_ONCE`."""
-    return np.array_split(sources, -(-len(sources) // AT_ONCE) or 1)
 
 
 def _field_rows(points: Array, sources: Array) -> Array:
@@ -126,7 +88,6 @@ def component_rows(points: Array, positions: Array, directions: Array) -> Array:
 
 def _build(
     name: str,
-    rows: NDArray[np.int64] | None,
     positions: Array,
     directions: Array,
     points: Array,
@@ -139,7 +100,7 @@ def _build(
     inverse = (vt.T * (s / (s**2 + (RIDGE * s[0]) ** 2))) @ u.T / scale[:, None]
     metric = _metric(basis, pose_weight(points, excitation))
     middle = basis[_middle(points, half)]
-    return Layer(name, rows, positions, directions, inverse, points, metric, middle)
+    return Layer(name, positions, directions, inverse, points, metric, middle)
 
 
 def pose_weight(points: Array, excitation: Excitation) -> Array:
@@ -155,7 +116,7 @@ def _metric(basis: Array, weight: Array) -> Array:
     return np.asarray(cholesky(gram))
 
 
-def _middle(points: Array, half: float) -> NDArray[np.int64]:
+def _middle(points: Array, half: float) -> Integers:
     """Return the rows of some samples in the middle of the volume, three a sample."""
     there = np.flatnonzero((points[:, 2] > 0.5 * half) & (points[:, 2] < half))
     if not there.size:  # a stated volume may be all above or all below
@@ -177,7 +138,7 @@ def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
     basis = component_rows(points, positions, directions)
     metric = _metric(basis, weight[clear])
     middle = basis[_middle(points, region.half)]
-    return Layer(cloud.name, None, positions, directions, None, points, metric, middle)
+    return Layer(cloud.name, positions, directions, None, points, metric, middle)
 
 
 def _lattice(region: Region, across: int, extent: float, depth: float) -> Array:
@@ -190,31 +151,11 @@ def _upright(positions: Array) -> Array:
     return np.tile([0.0, 0.0, 1.0], (len(positions), 1))
 
 
-def bottom_layer(
-    model: FieldModel, region: Region, excitation: Excitation, sources: Array
-) -> Layer:
-    """Return the layer for clouds below the board.
-
-    The calibrated model's dipoles are used again where they can stand for the ``sources`` (M, 3)
-    of the cloud that is hardest to stand for, the nearest one.
-    """
-    points, deep = region.volume.samples(*SAMPLES), _lattice(region, *DEEP)
-    upright = np.abs(model.directions[:, 2]) > 0.999
-    low = np.abs(model.positions[:, 2]) < 0.5 * region.half
-    rows = np.flatnonzero(upright & low)
-    if 64 <= rows.size <= MOST_OWN:
-        own = np.concatenate([model.positions[rows], deep])
-        layer = _build(BELOW, rows, own, _upright(own), points, excitation, region.half)
-        if layer.misfit(sources) <= GOOD_ENOUGH:
-            return layer
-    return bottom_layer_of_board(region, excitation)
-
-
-def bottom_layer_of_board(region: Region, excitation: Excitation) -> Layer:
-    """Return the layer for clouds below the board, whatever model it is added to."""
+def bottom_layer(region: Region, excitation: Excitation) -> Layer:
+    """Return the layer for clouds below the board."""
     points = region.volume.samples(*SAMPLES)
     positions = np.concatenate([_lattice(region, *SHALLOW), _lattice(region, *DEEP)])
-    return _build(BELOW, None, positions, _upright(positions), points, excitation, region.half)
+    return _build(BELOW, positions, _upright(positions), points, excitation, region.half)
 
 
 def box_layer(region: Region, excitation: Excitation) -> Layer:
@@ -240,4 +181,4 @@ def box_layer(region: Region, excitation: Excitation) -> Layer:
     stacked[:, :2] += volume.middle
     points = region.volume.samples(*SAMPLES, part=INNER)
     axes = np.concatenate(directions)
-    return _build(AROUND, None, stacked, axes, points, excitation, region.half)
+    return _build(AROUND, stacked, axes, points, excitation, region.half)

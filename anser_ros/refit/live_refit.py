@@ -14,8 +14,8 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Freshness, Intake
@@ -54,9 +54,6 @@ from anser_ros.refit.model import (
 from anser_ros.refit.posterior import Bank, FrameEvidence, median
 from anser_ros.refit.witness import ToolReading, Witness
 from anser_ros.settings import RefitSettings
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 DRIFT_SIGMAS = 5.0
 """Standard deviations from which on a coil's drift counts as certain."""
@@ -141,8 +138,8 @@ class LiveRefit:
         self._last_ns = 0
 
     def update(
-        self, stamp_ns: int, channels: NDArray[np.generic], flux: NDArray[np.generic],
-        flags: NDArray[np.generic] | None = None,
+        self, stamp_ns: int, channels: AnyArray, flux: AnyArray,
+        flags: AnyArray | None = None,
     ) -> RefitResult:  # fmt: skip
         """Take in one frame of reference fluxes and return the result of the refit.
 
@@ -216,7 +213,7 @@ class LiveRefit:
             self._courses.note(jumps, found)
             self._average.forget()
 
-    def _in_use(self) -> NDArray[np.bool_]:
+    def _in_use(self) -> Booleans:
         return np.asarray(~self._watch.excluded)
 
     def _bank(self) -> tuple[Bank, BodySlots]:
@@ -243,7 +240,7 @@ class LiveRefit:
             self._average.forget()
 
     def _readmit(
-        self, bank: Bank, seen: FrameEvidence, values: Array, readable: NDArray[np.bool_],
+        self, bank: Bank, seen: FrameEvidence, values: Array, readable: Booleans,
         level: float,
     ) -> None:  # fmt: skip
         """Readmit excluded coils that agree with the others again."""

@@ -8,8 +8,8 @@ from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.field.model import FieldModel
 from anser_ros.pose_states import REFERENCES_DOUBTFUL, REFERENCES_LOST
 from anser_ros.refit import health
@@ -27,22 +27,15 @@ from anser_ros.refit.posterior import (
 )
 from anser_ros.refit.witness import FIRST_SAMPLE_STEP, Witness
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 NEGLIGIBLE = 0.01
 """Hypotheses less probable than this take no part in the mean."""
 INFLATION_STEP = 1.2
-"""Ratio of neighbouring factors by which modes are inflated. The steps keep modes, and what was
-computed for them, the same for many frames."""
-Rows = NDArray[np.int64] | slice
-"""Dipoles of a layer among those of a model."""
+"""Ratio of neighbouring factors by which modes are inflated: in steps, many frames share them."""
 Uncertainty = tuple[ComplexArray | None, float]
 """Modes and flux error of a model."""
 
 MOST_MODES = 16
-"""Sets of modes that are kept, which bounds the memory; the oldest is dropped, and is worked out
-again when its coils and hypothesis come back."""
+"""Sets of modes that are kept, which bounds the memory; the oldest is dropped."""
 KEEP_FRAMES = 25
 """Frames for which an inflation is kept at least before it may fall."""
 RIVAL = 0.05
@@ -101,18 +94,13 @@ class Assembly:
         if self._place is not None and [*self._place.rows] == [*layers]:
             return self._place
         positions, directions = [self.base.positions], [self.base.directions]
-        rows: dict[str, Rows] = {}
+        rows: dict[str, slice] = {}
         size = len(self.base.positions)
         for name, layer in layers.items():
-            # A layer that uses dipoles of the model adds only the others.
-            own = 0 if layer.rows is None else len(layer.rows)
-            end = size + len(layer.positions) - own
-            rows[name] = slice(size, end)
-            if layer.rows is not None:
-                rows[name] = np.concatenate([layer.rows, np.arange(size, end)])
-            positions.append(layer.positions[own:])
-            directions.append(layer.directions[own:])
-            size = end
+            rows[name] = slice(size, size + len(layer.positions))
+            positions.append(layer.positions)
+            directions.append(layer.directions)
+            size = rows[name].stop
         self._place = _Dipoles(np.concatenate(positions), np.concatenate(directions), rows)
         return self._place
 
@@ -189,9 +177,8 @@ class Assembly:
     ) -> tuple[ComplexArray, float]:
         """Return an error for as long as that of the best hypothesis is being worked out.
 
-        It is that of the hypothesis before, as large as the strength may be now, and the whole
-        difference between the two, in any direction. If there is no previous hypothesis, all of
-        the change may be wrong.
+        It is that of the one before, as large as the strength may be now, and the whole difference
+        between the two, in any direction; without one before, all of the change.
         """
         last = self._last
         if last is None or not last.holds(change):
@@ -211,7 +198,7 @@ class _Dipoles(NamedTuple):
 
     positions: Array
     directions: Array
-    rows: dict[str, Rows]
+    rows: dict[str, slice]
 
 
 @dataclass(frozen=True)
@@ -231,7 +218,7 @@ class _Change:
         """Dipoles N and emitters K of the model."""
         return len(self.place.positions), len(self.scale)
 
-    def rows(self, hypothesis: int) -> Rows:
+    def rows(self, hypothesis: int) -> slice:
         """Return the rows of the dipoles of a hypothesis' layer."""
         return self.place.rows[self.bank.prior(hypothesis).layer.name]
 
@@ -288,8 +275,7 @@ REFIT = 'refit'
 FEW_REFERENCES = 'few_references'
 POOR_FIT = 'poor_fit'
 STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT, REFERENCES_DOUBTFUL)
-"""No change; the model follows one; too few references to know; a change that
-nothing explains; references of which most jumped by themselves."""
+"""Nothing changed; followed; too few references; unexplained; most references jumped."""
 
 POOR = 4.0
 """Typical left-out distance from which on the state is `POOR_FIT`."""
@@ -312,7 +298,6 @@ class Metal:
     # (3,), mean of the space, weighted by the squared magnitude of the polarisability's density:
     # it leans towards the part of the metal that the emitters reach best
     centroid: Array
-    standoff_m: float  # the cloud's distance from the board
 
 
 def locate_metal(
@@ -331,7 +316,7 @@ def locate_metal(
     if not power.sum() > 0.0:
         return None
     centroid = (cloud.positions * power[:, None]).sum(axis=0) / power.sum()
-    return Metal(cloud.positions, polarisability, cloud.volumes, centroid, cloud.standoff_m)
+    return Metal(cloud.positions, polarisability, cloud.volumes, centroid)
 
 
 @dataclass(frozen=True)

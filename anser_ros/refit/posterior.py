@@ -6,10 +6,8 @@ strength ``a`` distributed as in the cloud, the survey's errors in proportion, a
 eigenvectors of C (whitened by N) all of it is diagonal, so the evidence of any strength costs a
 sum, and the strength is integrated over a grid instead of being chosen (MacKay, Neural Computation
 4 (1992) 415). In-phase and quadrature parts share the geometry and have a strength each.
-Hypothesis 0 is that nothing has changed. The *bank* holds all hypotheses with the matrices that
-are computed for them in advance, so that one pass over the readings of a frame gives the evidence
-of each. A *slot* of the bank is an empty place in which a compact body can be put later
-(`refit.hypotheses`). `refit.health` compares coils with each other by the same tables.
+Hypothesis 0 is that nothing has changed. One pass over the readings of a frame gives the evidence
+of all. A *slot* is an empty place for a compact body (`refit.hypotheses`).
 
 N is white noise plus the drift of the emitters: an error of an emitter's measured current changes
 all references in proportion to their baseline, which metal does not.
@@ -27,14 +25,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers, Single
 from anser_ros.refit.kernels import fill_evidence, fill_products
 from anser_ros.refit.prior import CloudPrior
-
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
-ComplexArray = NDArray[np.complex128]
 
 STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
 """Variances of a reading, in noise variances, that the evidence is summed over."""
@@ -108,7 +102,7 @@ class Bank:
     def __init__(
         self,
         priors: Sequence[CloudPrior],
-        rows: NDArray[np.int64],
+        rows: Integers,
         drift: Array,
         slots: int = 0,
         among: int = 0,
@@ -239,7 +233,7 @@ class Bank:
     def _to_moments(self, prior: CloudPrior, basis: Array) -> Single:
         return np.asarray(prior.transfer[:, self.rows] @ basis, dtype=np.float32)
 
-    def moments(self, seen: FrameEvidence, hypothesis: int) -> NDArray[np.complex128]:
+    def moments(self, seen: FrameEvidence, hypothesis: int) -> ComplexArray:
         """Return the posterior mean of the layer's moments (N, K) in units of the noise."""
         synthesis = self.to_moments(hypothesis)
         out = np.empty((len(synthesis), 2), dtype=np.float32)
@@ -283,20 +277,13 @@ def _rows(columns: Array) -> Single:
 
 
 def _whitening(drift: Array) -> Array:
-    """Return a matrix W with ``W^T (1 + drift drift^T) W = 1``.
-
-    The columns of ``drift`` are one emitter's readings each, so they are orthogonal.
-    """
+    """Return W with ``W^T (1 + drift drift^T) W = 1``; the columns of ``drift`` are orthogonal."""
     out = np.eye(len(drift))
     norm = np.linalg.norm(drift, axis=0)
     for column in np.flatnonzero(norm > 0.0):
         unit = drift[:, column] / norm[column]
         out -= np.outer(unit, unit) * (1.0 - 1.0 / np.sqrt(1.0 + norm[column] ** 2))
     return out
-
-
-MOST = len(STRENGTHS) - 1
-"""Index of the largest of the `STRENGTHS`."""
 
 
 @dataclass(frozen=True)
@@ -330,8 +317,8 @@ def error_level(seen: FrameEvidence, hypothesis: int) -> ErrorLevel:
     """Return the noise and strengths, rounded up, for which an uncertainty is computed."""
     noise = 2.0 ** math.ceil(math.log2(seen.noise) - 0.1)
     real, imaginary = (int(part.argmax()) for part in seen.strength[hypothesis])
-    strengths = min(real + real % 2, MOST), min(imaginary + imaginary % 2, MOST)
-    return ErrorLevel(noise, strengths)
+    most = len(STRENGTHS) - 1
+    return ErrorLevel(noise, (min(real + real % 2, most), min(imaginary + imaginary % 2, most)))
 
 
 def error_draws(

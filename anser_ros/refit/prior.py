@@ -25,18 +25,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Single
 from anser_ros.metal.body import FREQUENCY_SLOPE
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import tangents
-from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.sensor import SensorTable, along_each_axis
 from anser_ros.refit.clouds import Cloud
 from anser_ros.refit.layer import Layer
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 STEP_M = 1e-4
 """Step of the numerical derivative by a reference's position, m."""
@@ -44,11 +41,8 @@ STEP_M = 1e-4
 
 def vector_basis(points: Array, axes: Array, lengths: Array | None, sources: Array) -> Array:
     """Return each coil's flux per unit moment along x, y and z of each source, (S, M, 3)."""
-    out = np.empty((points.shape[0], sources.shape[0], 3))
-    for component, unit in enumerate(np.eye(3)):
-        directions = np.broadcast_to(unit, sources.shape)
-        out[:, :, component] = flux_basis(points, axes, lengths, sources, directions)
-    return out
+    basis = flux_basis(points, axes, lengths, *along_each_axis(sources))
+    return basis.reshape(len(points), len(sources), 3)
 
 
 def survey_variants(

@@ -8,7 +8,7 @@ Stored is what takes seconds; the emitters' field and the clouds are worked out 
 of that.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers, Single
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
@@ -42,9 +43,6 @@ from anser_ros.refit.prior import (
     vector_basis,
 )
 from anser_ros.settings import RefitSettings
-
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 DIRECTIONS = 16
 """Directions of the space of readings that are looked at for each body."""
@@ -82,7 +80,7 @@ class BodySearch:
     """Holds the directions of the bodies' readings for the coils in use."""
 
     factors: tuple[Single, ...]  # (all readings, c), from `body_factor`
-    rows: NDArray[np.int64]  # (n,), readings in use
+    rows: Integers  # (n,), readings in use
     whitening: Array  # (n, n), makes noise and drift of the readings white
     strengths: Array  # (A,), variances of a reading that the evidence is summed over
     _tables: dict[float, tuple[Single, Array, Array]] = field(default_factory=dict)
@@ -141,39 +139,53 @@ class RefitTables:
     """Holds the precomputed tables of a refit.
 
     ``layers`` are those below the board and around the volume; ``factors`` is what `BodySearch`
-    needs of each of the `bodies`; ``weight`` (P,) is the `pose_weight` of the region's samples.
+    needs of each of the `bodies`.
     """
 
     excitation: Excitation
     region: Region
-    layers: tuple[Layer, ...]
-    priors: tuple[CloudPrior, ...]
-    frequencies_hz: tuple[float, ...]
-    factors: tuple[NDArray[np.float32], ...]
+    frequencies_hz: Array
     references: SensorTable
     settings: RefitSettings
-    weight: Array
+    layers: tuple[Layer, Layer]
+    factors: tuple[Single, ...]
+    priors: tuple[CloudPrior, ...] = ()
 
     @cached_property
     def bodies(self) -> tuple[Cloud, ...]:
         """Return the compact bodies that may be put in as further hypotheses."""
         return bodies(self.region)
 
+    @cached_property
+    def _weight(self) -> Array:
+        """Return the `pose_weight` of the region's samples, (P,)."""
+        return pose_weight(self.region.volume.samples(), self.excitation)
+
     def body_prior(self, body: int) -> CloudPrior:
         """Return the full hypothesis of a compact body."""
         cloud = self.bodies[body]
         rng = np.random.default_rng([self.settings.seed, body])
-        return self._prior(cloud, BODY, body_layer(self.region, self.weight, cloud), rng)
+        return self._prior(cloud, BODY, body_layer(self.region, self._weight, cloud), rng)
 
     def reduced(self, prior: CloudPrior) -> ReducedPrior:
         """Return a hypothesis of these tables, or a body of theirs, in few numbers."""
         field = self.excitation.field(prior.cloud.positions)
         rng = np.random.default_rng(self.settings.seed)
-        return reduced(prior, field, np.array(self.frequencies_hz), rng)
+        return reduced(prior, field, self.frequencies_hz, rng)
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return every cloud with each response that is worth its time."""
+        out: list[Hypothesis] = []
+        for cloud in default_clouds(self.region):
+            layer = self.layers[int(cloud.overhead)]
+            out.append((cloud, Response() if cloud.overhead else UPRIGHT, layer))
+            if len(cloud.positions) <= MOST_ORIENTED:
+                out.append((cloud, ORIENTED, layer))
+        return out
 
     def with_priors(self, report: ReportShare) -> 'RefitTables':
         """Return the tables with the predictions of all clouds."""
-        hypotheses = hypotheses_of(default_clouds(self.region), *self.layers)
+        hypotheses = self.hypotheses()
         sizes = np.cumsum([0, *(len(cloud.positions) for cloud, _, _ in hypotheses)])
         rng, priors = np.random.default_rng(self.settings.seed), []
         for hypothesis, done in zip(hypotheses, sizes[:-1].tolist(), strict=True):
@@ -186,7 +198,7 @@ class RefitTables:
     ) -> CloudPrior:
         field = self.excitation.field(cloud.positions)
         return build_prior(
-            cloud, response, layer, self.references, field, np.array(self.frequencies_hz),
+            cloud, response, layer, self.references, field, self.frequencies_hz,
             self.settings.accuracy, rng,
         )  # fmt: skip
 
@@ -202,59 +214,29 @@ def build_tables(
     """Compute the tables; raises `FitError` as `excitation_for` does, and what ``report`` does."""
     excitation, region = excitation_for(model, drawing, volume)
     report(START)
-    nearest = default_clouds(region)[0]
-    layers = (
-        bottom_layer(model, region, excitation, nearest.positions),
-        box_layer(region, excitation),
-    )
-    tables = RefitTables(
-        excitation,
-        region,
-        layers,
-        (),
-        model.frequencies_hz,
-        _factors(bodies(region), references, excitation),
-        references,
-        settings,
-        pose_weight(region.volume.samples(), excitation),
-    )
-    return tables.with_priors(report)
-
-
-def _factors(
-    around: Sequence[Cloud], references: SensorTable, excitation: Excitation
-) -> tuple[NDArray[np.float32], ...]:
+    layers = bottom_layer(region, excitation), box_layer(region, excitation)
+    around = bodies(region)
     places = np.concatenate([cloud.positions[:COARSE] for cloud in around])
-    fields = excitation.field(places).reshape(len(around), COARSE, -1, 3)
-    return tuple(
-        body_factor(cloud, references, field) for cloud, field in zip(around, fields, strict=True)
-    )
-
-
-def hypotheses_of(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[Hypothesis, ...]:
-    """Return every cloud with each response that is worth its time."""
-    out: list[Hypothesis] = []
-    for cloud in clouds:
-        layer = box if cloud.overhead else bottom
-        plain = Response() if cloud.overhead else UPRIGHT
-        out.append((cloud, plain, layer))
-        if len(cloud.positions) <= MOST_ORIENTED:
-            out.append((cloud, ORIENTED, layer))
-    return tuple(out)
+    driving = excitation.field(places).reshape(len(around), COARSE, -1, 3)
+    pairs = zip(around, driving, strict=True)
+    factors = tuple(body_factor(cloud, references, field) for cloud, field in pairs)
+    frequencies_hz = np.array(model.frequencies_hz)
+    return RefitTables(
+        excitation, region, frequencies_hz, references, settings, layers, factors
+    ).with_priors(report)
 
 
 Arrays = Mapping[str, NDArray[Any]]
-"""Arrays by name; a number or a text is an array of no axes, and what is None is not there."""
+"""Arrays by name; a number or a text is an array of no axes."""
 
 
 def arrays_of(tables: RefitTables) -> dict[str, NDArray[Any]]:
     """Return what `tables_of` makes the tables from again."""
-    out: dict[str, NDArray[Any]] = {'weight': tables.weight}
-    out |= {f'factor{i}': factor for i, factor in enumerate(tables.factors)}
-    for i, layer in enumerate(tables.layers):
-        out |= _plain(f'layer{i}', layer)
-    for i, prior in enumerate(tables.priors):
-        out |= _plain(f'prior{i}', prior)
+    out = {f'factor{i}': factor for i, factor in enumerate(tables.factors)}
+    for kind, things in (('layer', tables.layers), ('prior', tables.priors)):
+        for i, thing in enumerate(things):
+            for name in _stored(type(thing)):
+                out[f'{kind}{i}.{name}'] = np.asarray(getattr(thing, name))
     return out
 
 
@@ -272,48 +254,29 @@ def tables_of(
     """
     excitation, region = excitation_for(model, drawing, volume)
     bottom, box = (Layer(**_given(f'layer{i}', Layer, arrays)) for i in range(2))
-    hypotheses = hypotheses_of(default_clouds(region), bottom, box)
+    factors = tuple(arrays[f'factor{i}'] for i in range(len(bodies(region))))
+    frequencies_hz = np.array(model.frequencies_hz)
+    tables = RefitTables(
+        excitation, region, frequencies_hz, references, settings, (bottom, box), factors
+    )
     priors = tuple(
         CloudPrior(
             cloud=cloud, response=response, layer=layer, **_given(f'prior{i}', CloudPrior, arrays)
         )
-        for i, (cloud, response, layer) in enumerate(hypotheses)
+        for i, (cloud, response, layer) in enumerate(tables.hypotheses())
     )
-    return RefitTables(
-        excitation,
-        region,
-        (bottom, box),
-        priors,
-        model.frequencies_hz,
-        tuple(arrays[f'factor{i}'] for i in range(len(bodies(region)))),
-        references,
-        settings,
-        arrays['weight'],
-    )
-
-
-def _plain(prefix: str, thing: Layer | CloudPrior) -> dict[str, NDArray[Any]]:
-    """Return the arrays, numbers and texts of a layer or hypothesis under their names."""
-    values = {f.name: getattr(thing, f.name) for f in fields(thing)}
-    return {
-        f'{prefix}.{name}': np.asarray(value)
-        for name, value in values.items()
-        if isinstance(value, np.ndarray | float | str)
-    }
-
-
-def _given(prefix: str, kind: type[Layer | CloudPrior], arrays: Arrays) -> dict[str, Any]:
-    """Return the values that `_plain` stored; None for what may be None and was."""
-    out: dict[str, Any] = {}
-    for name in (f.name for f in fields(kind) if f.name not in NOT_STORED):
-        stored = arrays.get(f'{prefix}.{name}')
-        if stored is None and name not in MAY_BE_NONE:
-            raise KeyError(f'{prefix}.{name}')
-        out[name] = stored.item() if stored is not None and stored.ndim == 0 else stored
-    return out
+    return replace(tables, priors=priors)
 
 
 NOT_STORED = 'cloud', 'response', 'layer', '_projected'
-"""Fields that are worked out anew."""
-MAY_BE_NONE = 'rows', 'inverse'
-"""Fields of a layer that only some have."""
+"""Fields of a layer or hypothesis that are worked out anew."""
+
+
+def _stored(kind: type[Any]) -> list[str]:
+    return [f.name for f in fields(kind) if f.name not in NOT_STORED]
+
+
+def _given(prefix: str, kind: type[Layer | CloudPrior], arrays: Arrays) -> dict[str, Any]:
+    """Return the stored values of a layer or hypothesis by the names of its fields."""
+    values = {name: arrays[f'{prefix}.{name}'] for name in _stored(kind)}
+    return {name: value if value.ndim else value.item() for name, value in values.items()}

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis, flux_jacobian
 from anser_ros.physics.rotations import tangents
@@ -36,8 +37,6 @@ from anser_ros.refit.tables import RefitTables
 from anser_ros.settings import ToolSettings
 from anser_ros.stamps import NANO
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 Floats = NDArray[np.floating[Any]]
 
 FREE_M, FREE_RAD = 0.02, 0.2
@@ -49,8 +48,7 @@ _AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]
 KEPT = 0.03
 """Share of a tool's stated errors that is never learnt away."""
 SHARE = 0.1
-"""Weight of a frame from which a tool's errors are learnt: the model's own error hardly changes
-from one frame to the next."""
+"""Weight of a frame by which a tool's errors are learnt: the model's own repeat in the next."""
 
 
 def coil_spread(count: int, tools: ToolSettings) -> Array:
@@ -154,22 +152,17 @@ def linearised(
 
 
 MEMORY_S = 2.0
-"""Time over which the references' error stays the same: with half a second errors are a tenth
-larger, with five no smaller (four references, the head at the board)."""
+"""Time over which the references' error stays the same: 0.5 s is a tenth worse, 5 s no better."""
 ODD = 1.5
-"""Squared misfit of a tool's readings, over what is expected of one frame, from which they count
-less."""
+"""Squared misfit of a tool's readings, over the expected one, from which they count less."""
 CONTRADICTION_S = 0.5
-"""Time over which a misfit that is odd stays the same: its correlation falls to 1/e in 0.4 to 0.6
-s (simulated scenes of seed 1 that metal passes, two references)."""
+"""Time over which an odd misfit stays the same: its correlation falls to 1/e in 0.4 to 0.6 s."""
 LEAST_PROBABILITY = 1e-3
-"""Probability from which on a hypothesis has a filter, which costs time. One that is less probable
-hardly changes the mean, whatever a tool says of it."""
+"""Probability from which on a hypothesis has a filter; others hardly change the mean."""
 ELSEWHERE = 0.1
 """Weight of the whole volume beside the surroundings of the tools, where modes are chosen."""
 FIRST_SAMPLE_STEP = 30
-"""Every so many of a layer's samples stand for the volume before a tool was seen, and give the
-size of an error until it is known: thirty points, a millisecond's work at the most."""
+"""Every so many of a layer's samples stand for the volume before a tool was seen: thirty."""
 
 
 @dataclass

@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import ComplexArray
 from anser_ros.effects.correction import needs_correction
 from anser_ros.errors import BagError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel, ReferenceReadings
@@ -17,8 +17,6 @@ from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import is_nominal
 from anser_ros.wire.setup import Setup
-
-ComplexArray = NDArray[np.complex128]
 
 SAME_PLACE_M = 0.005
 """Farthest that a sensor may be from where the session has it, m; a survey moves it by 1 mm."""

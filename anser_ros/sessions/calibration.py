@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anser_ros import extensions
+from anser_ros.arrays import Booleans, ComplexArray
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
 from anser_ros.calibration.disturbances import (
     at_strength,
@@ -26,12 +26,14 @@ from anser_ros.calibration.disturbances import (
 )
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.moments import Progress
-from anser_ros.calibration.readings import check_single_coils
+from anser_ros.calibration.readings import check_single_coils, with_pose
 from anser_ros.calibration.result import Calibration, Scan, drift_records
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS
 from anser_ros.diagnosis.departure import KNOWN, Departure, departure
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem
+from anser_ros.diagnosis.wiring import rightly_wired, scan_faults
 from anser_ros.effects.correction import tool_view
+from anser_ros.effects.effect import Remedy, Term, effect_named
 from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
@@ -41,15 +43,17 @@ from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
 from anser_ros.wire.setup import Setup
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 MOTION_MARGIN_S = 1.0
 """Time (s) before and after a motion that is looked at: it begins before it is seen."""
 FEWEST_STEADY = 10
 """Frames of the references at rest, of which their steady readings are the mean, at least."""
 FIELD_REACH_M = 0.015
 """Distance (m) of a coil from where the field was learnt, up to which that is predicted well."""
+ASIDE = 0.3
+"""Distance of a look's free dipoles at the wiring from each emitter's middle, in its sides."""
+MOST_UNEXPLAINED = 0.05
+"""Share of most readings that a calibration leaves at most: good ones leave a thousandth, those of
+a layout that is too coarse a hundredth, wrong signs or poses a tenth and more."""
 UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 
@@ -58,7 +62,7 @@ UNCERTAINTY_FRAMES = 60
 class RestingMetal:
     """Holds what metal at rest did to tools' fluxes, (F, S, K) each, T, its error and places."""
 
-    flux: tuple[NDArray[np.complex128], ...]
+    flux: tuple[ComplexArray, ...]
     sigma_t: float
     record: EffectRecord
 
@@ -269,22 +273,47 @@ def _fit_as_scan(
     sessions, drifts = at_constant_strength(sessions, options)
     measurements = [tool for session in sessions for tool in session.tools]
     check_single_coils(measurements)
-    names = [Path(session.path).name for session in sessions for _ in session.tools]
     setup = sessions[0].setup
     generator = replace(generator_of(setup), nominal=NominalBoard.of(setup).model)
+    around = ASIDE * generator.side_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    places = (generator.centres[:, None] + around).reshape(-1, 3)
+    wrong = scan_faults([with_pose(m) for m in measurements], places)
+    measurements = [rightly_wired(m, wrong) for m in measurements]
+    names = [Path(session.path).name for session in sessions for _ in session.tools]
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
     scan = correct_scan(measurements, generator, options, progress, steady)
+    scan = _with_faults(scan, wrong)
     calibration = fit_scan(scan, names, generator, options, progress)
     bare = without_resting_metal(sessions, calibration, progress)
     if bare is not None:
         same = replace(options, layout=calibration.layout)
         calibration = fit_scan(bare, names, generator, same, progress)
+    if options.layout is None:
+        check_explained(calibration)
     scan = calibration.scan
     scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
     return replace(calibration, scan=scan)
 
 
-def _steady(session: Session, tool: Measurements) -> NDArray[np.bool_]:
+def _with_faults(scan: Scan, faults: Sequence[Term]) -> Scan:
+    """The scan with what its wiring was found to be, in the order of the readings' way."""
+    records = [term.effect.record(term, np.zeros((0, 0))) for term in faults]
+    tables = [r for r in records if effect_named(r.name).remedy is Remedy.SENSORS]
+    signs = [r for r in records if r not in tables]
+    return replace(scan, corrections=(*tables, *scan.corrections, *signs))
+
+
+def check_explained(calibration: Calibration) -> None:
+    """Raise `FitError` where a model leaves so much of most readings that it is none."""
+    share = calibration.residuals.unexplained
+    if share > MOST_UNEXPLAINED:
+        raise FitError(
+            f'no field explains the scan: {100 * share:.0f} % of the signal is left. Are axes, '
+            'places or poses stated wrongly, or coils exchanged?'
+        )
+
+
+def _steady(session: Session, tool: Measurements) -> Booleans:
     """Which frames of a tool lie outside the times in which the session's references changed."""
     if session.reference is None:
         return np.ones(tool.time.size, dtype=bool)

@@ -10,9 +10,9 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import extensions
+from anser_ros.arrays import Array
 from anser_ros.diagnosis.diagnose import SCHEMA, Diagnosis, diagnose
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem, test_blocks
 from anser_ros.errors import DiagnosisError
@@ -25,8 +25,6 @@ from anser_ros.sessions.starting_model import date_drifts, made_for
 from anser_ros.sessions.tracked_session import track
 from anser_ros.tracking.estimate import TrackerSettings
 
-Array = NDArray[np.float64]
-
 ROOM = 2.0
 """Gate of the held-out part's tracking over its residual: less would refuse a wrong model's poses
 instead of counting them, much more would take wrong minima for poses."""
@@ -36,7 +34,8 @@ instead of counting them, much more would take wrong minima for poses."""
 class TrackingErrors:
     """Holds root mean square errors of all coils tracked singly in the held-out part.
 
-    They are of the source where only that was seen; None where no coil was tracked.
+    They are of the source where only that was seen, and of the bodies where no coil alone has a
+    pose; None where nothing was tracked.
     """
 
     position_rmse_m: float | None
@@ -152,18 +151,23 @@ def _errors(
     usual = TrackerSettings()
     settings = replace(usual, gate=usual.gate * max(1.0, ROOM * misfit))
     evaluation = track(prepared, settings, follower)
-    # Where no coil has a pose (a field that is the same all around an axis), the source has.
+    # Where no coil has a pose (a field that is the same all around an axis), the source has; where
+    # one coil alone cannot have one (over few emitters), its body has.
     further = [one for group in evaluation.further.values() for one in group.values()]
-    series = further or list(evaluation.sensors.values())
+    kinds = (further or list(evaluation.sensors.values())), list(evaluation.bodies.values())
     # The first frame of a held-out part is there for its stamp alone.
-    return TrackingErrors(
-        _rms([one.position_error[1:] for one in series]),
-        _rms([one.orientation_error[1:] for one in series]),
-    )
+    errors = [
+        TrackingErrors(
+            _rms([one.position_error[1:] for one in series]),
+            _rms([one.orientation_error[1:] for one in series]),
+        )
+        for series in kinds
+    ]
+    return next((e for e in errors if e.position_rmse_m is not None), errors[0])
 
 
 def _rms(errors: list[Array]) -> float | None:
-    values = np.concatenate(errors)
+    values = np.concatenate([np.zeros(0), *errors])
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 

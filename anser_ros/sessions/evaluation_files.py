@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import ParameterError
 from anser_ros.fingerprint import fingerprint_of
 from anser_ros.pose_states import OK
@@ -24,8 +24,6 @@ from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, metrics
 from anser_ros.wire.tables import read_table
 from anser_ros.wire.text_files import read_text
-
-Array = NDArray[np.float64]
 
 SCHEMA = 'anser_evaluation/1'
 """Name of the document's layout, which stands in every such document."""
@@ -259,7 +257,7 @@ def _names(first: dict[Key, float], second: dict[Key, float]) -> list[str]:
 
 def _paired(
     first: dict[Key, float], second: dict[Key, float], name: str
-) -> tuple[NDArray[np.int64], Array]:
+) -> tuple[Integers, Array]:
     """Stamps (n,) that both have of a name, and their values (2, n)."""
     both = sorted(stamp for stamp, other in first if other == name and (stamp, name) in second)
     pairs = [[values[stamp, name] for stamp in both] for values in (first, second)]
@@ -267,10 +265,7 @@ def _paired(
 
 
 def _interval(
-    stamps: NDArray[np.int64],
-    values: Array,
-    rng: np.random.Generator,
-    shown: Callable[[Array], Array],
+    stamps: Integers, values: Array, rng: np.random.Generator, shown: Callable[[Array], Array]
 ) -> tuple[float, float]:
     """The interval of the difference of two means, as they are shown, by resampled stretches."""
     if not stamps.size:

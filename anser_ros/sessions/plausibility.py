@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.pose_track import PoseTrack
@@ -21,8 +21,6 @@ from anser_ros.refit.clouds import FieldFunction
 from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.wire.recorded import optical_stem
 from anser_ros.wire.setup import Setup, topic_of
-
-Array = NDArray[np.float64]
 
 LENGTH_UNITS: Mapping[str, float] = {'millimetres': 1e3, 'centimetres': 1e2, 'inches': 1 / 0.0254}
 """Units of length that stand where metres belong: how many there are in a metre."""
@@ -145,7 +143,7 @@ def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Meas
     _check_size(path, setup, field, tool)
 
 
-def _chosen(tool: Measurements) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _chosen(tool: Measurements) -> tuple[Integers, Integers]:
     """Frames and columns of readings with a pose, of some frames over the whole recording."""
     # Fluxes in a small unit are beyond what counts as valid: only flags and NaN exclude one.
     whole = np.isfinite(tool.flux).all(axis=2) & (tool.flags == 0) & tool.has_pose[:, None]
@@ -158,11 +156,7 @@ def _chosen(tool: Measurements) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _fit(
-    drawn: FieldFunction,
-    tool: Measurements,
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
-    reading: Reading,
+    drawn: FieldFunction, tool: Measurements, rows: Integers, columns: Integers, reading: Reading
 ) -> tuple[float, float]:
     """Share of readings (P,) that fit when poses are read so, and the fluxes' common factor."""
     flux = tool.flux[rows, columns]

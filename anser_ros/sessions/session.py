@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
 from anser_ros.frames.faults import GOOD, reading_codes
@@ -187,29 +188,7 @@ def empty_session(setup: Setup, path: str) -> Session:
     return session_of(Bag(path, setup, '', tool, reference, {}))
 
 
-@dataclass(frozen=True)
-class FrameReadings:
-    """Holds what S sensors read in one frame: channels, fluxes (S, K), T, and flag bits."""
-
-    channels: NDArray[np.int64]
-    flux: ComplexArray
-    flags: NDArray[np.int64]
-
-    def in_phase(self) -> 'FrameReadings':
-        """Return the readings without the fluxes' quadrature parts."""
-        return replace(self, flux=self.flux.real.astype(complex))
-
-
-@dataclass(frozen=True)
-class SessionFrame:
-    """Holds all that tools or references, or both, measured under one stamp."""
-
-    stamp_ns: int
-    tools: FrameReadings | None
-    reference: FrameReadings | None
-
-
-def frames_of(session: Session) -> Iterator[SessionFrame]:
+def frames_of(session: Session) -> Iterator[ChainFrame]:
     """Yield every stamp of a session in order, with what was measured under it."""
     rows: dict[float, tuple[list[tuple[Measurements, int]], list[int]]] = {}
     for tool in session.tools:
@@ -223,7 +202,7 @@ def frames_of(session: Session) -> Iterator[SessionFrame]:
         reference = None
         if session.reference is not None and references:
             reference = _readings([(session.reference, references[0])])
-        yield SessionFrame(
+        yield ChainFrame(
             session.start_ns + round(time / NANO), _readings(tools) if tools else None, reference
         )
 

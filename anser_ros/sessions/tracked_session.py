@@ -6,12 +6,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import extensions
+from anser_ros.arrays import Array, Booleans
+from anser_ros.chain.chain import Chain
+from anser_ros.chain.tracking_half import TrackingHalf
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.model_age import UNCHANGED_MODEL
 from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.pose_states import OK
 from anser_ros.sessions.baseline import check_place
@@ -71,21 +72,14 @@ def track(
     tracker = Tracker(prepared.model, prepared.sensors, settings, observers)
     estimates: dict[str, list[PoseEstimate]] = {}
     further: dict[str, dict[str, list[PoseEstimate]]] = {one.KIND: {} for one in observers}
+    age_s = prepared.session.setup.refit.references_age_s
+    chain = Chain(follower, TrackingHalf(tracker, age_s))
     frames = list(frames_of(prepared.session))
     start = time.perf_counter()
     for count, frame in enumerate(frames, start=1):
-        standing = UNCHANGED_MODEL if follower is None else follower.at(frame)
-        if standing.model is not None and standing.model is not tracker.model:
-            tracker = tracker.with_model(standing.model)
+        for estimate in chain.step(frame.in_phase() if in_phase else frame):
+            estimates.setdefault(estimate.name, []).append(estimate)
         if frame.tools is not None:
-            tools = frame.tools.in_phase() if in_phase else frame.tools
-            found = tracker.update(
-                frame.stamp_ns, tools.channels, tools.flux, tools.flags, standing.withheld
-            )
-            if follower is not None:
-                follower.witnessed(tools, found)
-            for estimate in found:
-                estimates.setdefault(estimate.name, []).append(estimate)
             for observer in observers:
                 for body, estimate in observer.found.items():
                     further[observer.KIND].setdefault(body, []).append(estimate)
@@ -100,9 +94,6 @@ def track(
     return Evaluation(sensors, bodies, seconds, summary, others)
 
 
-Array = NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class PoseSeries:
     """Holds the estimates of one sensor or body, one a frame, and their errors where known."""
@@ -113,7 +104,7 @@ class PoseSeries:
     orientation_error: Array
 
     @property
-    def ok(self) -> NDArray[np.bool_]:
+    def ok(self) -> Booleans:
         """Return the mask (F,) of the frames in which a pose was given."""
         return np.array([estimate.state == OK for estimate in self.estimates], dtype=bool)
 

@@ -9,8 +9,7 @@ from enum import Enum
 from itertools import pairwise
 
 FOLLOWED_SHARE = 1e-4
-"""Largest relative rate difference at which a device's clock is followed. Two quartz clocks differ
-by less; a larger value would follow slow changes of the host's load."""
+"""Largest relative difference of rates that is followed: two quartz clocks differ by less."""
 _STRETCH_NS = 500_000_000
 """Length (0.5 s) of a stretch of which only the earliest arrival is kept."""
 _MEMORY = 120
@@ -67,10 +66,8 @@ class Envelope:
 
 
 def _slope_below(points: Sequence[tuple[float, float]]) -> float:
-    """Return the most probable slope of the line below points, with `_TYPICAL_SHARE` as prior.
-
-    Two points determine a line; the distances of the next ones above it show how certain it is.
-    """
+    """Return the most probable slope of the line below points, with `_TYPICAL_SHARE` as prior."""
+    # Two points determine a line; how far the next ones are above it shows how certain it is.
     slope = _hull_slope(points)
     above = sorted(y - slope * x for x, y in points)
     sigma = 2.0 * (above[3] - above[0]) / (points[-1][0] - points[0][0])
@@ -99,26 +96,21 @@ LARGEST_LATENESS_S = 4e-3
 """Lateness, s, up to which an arrival confirms the line; one that is so much too early refutes it.
 It is the 5 ms that a stamp may be wrong by, less what the line itself is uncertain by."""
 _SETTLE_NS = 200_000_000
-"""Time (0.2 s) that a new line must stand where the device never answers. Bytes that had piled up
-are worked off faster than new ones come, and push the line down meanwhile."""
+"""Time (0.2 s) that a new line must stand: bytes that had piled up push it down meanwhile."""
 _SETTLE_UNPROVEN_NS = 3_000_000_000
-"""The same (3 s) where answers bound it only loosely, or are still awaited: if everything is late,
-so is its answer. All of the time arrivals must be in time."""
+"""The same (3 s) where answers bound it loosely or are awaited: a late line's answers are late."""
 _REFUTED_NS = 1_000_000.0
 """By how much (1 ms) an answer must show a line to be too early to refute it."""
 _SETTLED_NS = 1_000_000.0
 """Fall of a new line (1 ms) that begins the time again; less is how arrivals scatter."""
 _ANSWER_S = 0.15
-"""Longest time, s, that an answer of the device may take to bound nothing: it has 100 ms for it,
-and the line the rest. If it takes longer, the line itself is late."""
+"""Longest time, s, that an answer may take to bound nothing: the device has 100 ms for it."""
 _ANSWER_HOLDS_NS = 60e9
 """Device time (60 s) after which two clocks may have drifted apart by more than an answer says."""
 _FALSE_ANSWERS = 3
-"""Answers that arrivals have contradicted, after which none is asked for any more: the device
-answers before it has sent the samples that it has."""
+"""Answers contradicted by arrivals after which none is asked for: the device answers too early."""
 _DOUBT_NS = 30_000_000
-"""Time (30 ms) without a confirmation, while blocks arrive, from which on the device is asked. A
-stall of the host ends with a burst that confirms the line at once."""
+"""Time (30 ms) of blocks without a confirmation from which on the device is asked."""
 _GIVE_UP_NS = 10_000_000_000
 """Time (10 s) of unchanged lateness after which a silent device is believed to have lost time."""
 _BUCKET_NS = 50_000_000

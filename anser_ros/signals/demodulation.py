@@ -16,15 +16,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray
 from anser_ros.errors import FitError, ParameterError
 
 SHORTEST_WINDOW_S = 0.005
 """Shortest window, s. Tones 170 Hz apart need about 1/170 s to be separated."""
 LONGEST_WINDOW_S = 0.05
-"""Longest window, s. A tool at 0.2 m/s moves 1 cm meanwhile, and its phasors no longer change
-linearly."""
+"""Longest window, s: a tool at 0.2 m/s moves 1 cm, and its phasors change no longer linearly."""
 MAINS_HARMONICS = 5
 """Harmonics of the mains that are fitted in addition to the tones; higher ones are weaker."""
 _RANK_TOLERANCE = 1e-6
@@ -32,34 +31,32 @@ _RANK_TOLERANCE = 1e-6
 _LARGEST_LOSS = 1e-3
 """Largest part of a wanted coefficient that may lie in the singular vectors that are left out."""
 _WORST_VARIANCE_RATIO = 30.0
-"""Variance of a phasor, relative to that of a single tone in the same window, beyond which the
-tones count as not separable: the noise would then be 5.5 times larger."""
+"""Variance of a phasor, over that of a single tone, beyond which tones are not separable."""
 _AFFORDABLE_VARIANCE_RATIO = 2.0
-"""The same ratio up to which rates of change are fitted unless asked otherwise. They cost that
-much noise and save the error of a moving tool."""
+"""The same up to which rates of change are fitted: noise for the error of a moving tool."""
 
 
 @dataclass(frozen=True)
 class ToneFit:
     """Holds fitted phasors of one window, in the unit of the samples."""
 
-    phasors: NDArray[np.complex128]  # (C, K), peak amplitude and phase in the middle of the window
-    sigma: NDArray[np.float64]  # (C, K), standard deviation of the real and of the imaginary part
-    noise: NDArray[np.float64]  # (C,), root mean square of the residual of a sample
+    phasors: ComplexArray  # (C, K), peak amplitude and phase in the middle of the window
+    sigma: Array  # (C, K), standard deviation of the real and of the imaginary part
+    noise: Array  # (C,), root mean square of the residual of a sample
     # (C, K), change of the phasors per second; zero where it is not fitted
-    rates: NDArray[np.complex128]
+    rates: ComplexArray
     # (2K, 2K), bias of the phasors [Re, Im] by rates [Re, Im] that the fit leaves out, s; None
     # where the rates are fitted
-    motion_bias: NDArray[np.float64] | None = None
+    motion_bias: Array | None = None
 
 
 @dataclass(frozen=True)
 class _Solution:
     """A solved design: orthonormal basis, map to coefficients, and their variance factors."""
 
-    basis: NDArray[np.float64]
-    to_coefficients: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    basis: Array
+    to_coefficients: Array
+    variance: Array
 
 
 class Demodulator:
@@ -74,7 +71,7 @@ class Demodulator:
     def __init__(
         self,
         sample_rate_hz: float,
-        frequencies_hz: NDArray[np.float64],
+        frequencies_hz: Array,
         window_samples: int,
         *,
         mains_hz: float | None = None,
@@ -109,9 +106,7 @@ class Demodulator:
             ) from failure
         self._bias = self._motion_bias(self._solution, self._design, self._times_s)
 
-    def demodulate(
-        self, samples: NDArray[np.generic], present: NDArray[np.bool_] | None = None
-    ) -> ToneFit:
+    def demodulate(self, samples: AnyArray, present: Booleans | None = None) -> ToneFit:
         """Fit the phasors of all tones of all channels to a window's samples (N, C).
 
         Samples that are not ``present`` (N,) were lost, and their values are ignored. Raises
@@ -140,9 +135,7 @@ class Demodulator:
         variance = (solution.variance[:count] + solution.variance[count : 2 * count]) / 2
         return ToneFit(phasors, noise[:, None] * np.sqrt(variance), noise, rates, bias)
 
-    def _motion_bias(
-        self, solution: _Solution, design: NDArray[np.float64], times_s: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
+    def _motion_bias(self, solution: _Solution, design: Array, times_s: Array) -> Array | None:
         """Return the phasors that a fit without motion finds in tones times t, (2K, 2K), s."""
         if self.follows_motion:
             return None
@@ -152,23 +145,19 @@ class Demodulator:
 
 
 def _kept_harmonics(
-    mains_hz: float | None, tones: NDArray[np.float64], sample_rate_hz: float, length_s: float
-) -> NDArray[np.float64]:
+    mains_hz: float | None, tones: Array, sample_rate_hz: float, length_s: float
+) -> Array:
     if mains_hz is None:
         return np.empty(0)
     harmonics = mains_hz * np.arange(1, MAINS_HARMONICS + 1)
     apart = np.abs(harmonics[:, None] - tones).min(axis=1) > 1 / length_s
-    kept: NDArray[np.float64] = harmonics[apart & (harmonics < sample_rate_hz / 2)]
+    kept: Array = harmonics[apart & (harmonics < sample_rate_hz / 2)]
     return kept
 
 
 def _design_matrix(
-    times_s: NDArray[np.float64],
-    length_s: float,
-    tones: NDArray[np.float64],
-    harmonics: NDArray[np.float64],
-    follow_motion: bool,
-) -> NDArray[np.float64]:
+    times_s: Array, length_s: float, tones: Array, harmonics: Array, follow_motion: bool
+) -> Array:
     """Return the columns: cos and -sin of the tones, the same times t, offset, slope, mains."""
     unit = times_s / (length_s / 2)
     angle = 2 * np.pi * times_s[:, None] * tones
@@ -182,9 +171,7 @@ def _design_matrix(
     return np.hstack(columns)
 
 
-def _solve(
-    design: NDArray[np.float64], wanted: int, worst_ratio: float = _WORST_VARIANCE_RATIO
-) -> _Solution:
+def _solve(design: Array, wanted: int, worst_ratio: float = _WORST_VARIANCE_RATIO) -> _Solution:
     """Solve the design by singular value decomposition.
 
     Raises `FitError` when the first `wanted` coefficients are not determined, or with more than

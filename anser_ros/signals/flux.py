@@ -22,12 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray
 from anser_ros.errors import ParameterError
 from anser_ros.signals.demodulation import ToneFit
 
 LEAST_CURRENT = 0.05
-"""Fraction of the nominal current below which an emitter counts as not driven; its fluxes would be
-divided by a current of noise."""
+"""Fraction of the nominal current below which an emitter is not driven: the rest is noise."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class FluxWindow:
     """Holds fluxes and currents of one window."""
 
     # (S, K), flux density at nominal current, T; NaN for an emitter without current
-    flux: NDArray[np.complex128]
+    flux: ComplexArray
     # (S, K), standard deviation of each component from the residual noise, T
-    sigma: NDArray[np.float64]
+    sigma: Array
     # (K,), measured currents, A, with their phase in the middle of the window
-    current: NDArray[np.complex128]
+    current: ComplexArray
     # (K,), standard deviation of each component of the currents, A
-    current_sigma: NDArray[np.float64]
-    driven: NDArray[np.bool_]  # (K,), whether the emitter carries current
+    current_sigma: Array
+    driven: Booleans  # (K,), whether the emitter carries current
 
 
 class FluxConverter:
@@ -57,15 +57,15 @@ class FluxConverter:
 
     def __init__(
         self,
-        frequencies_hz: NDArray[np.float64],
+        frequencies_hz: Array,
         sensor_columns: NDArray[np.intp],
-        volts_per_code: NDArray[np.float64],
-        area_m2: NDArray[np.float64],
-        delay_s: NDArray[np.float64],
+        volts_per_code: Array,
+        area_m2: Array,
+        delay_s: Array,
         *,
         current_column: int,
         amperes_per_code: float,
-        nominal_currents_a: NDArray[np.float64],
+        nominal_currents_a: Array,
         current_delay_s: float = 0.0,
     ) -> None:
         if not np.all(np.isfinite(area_m2) & (area_m2 != 0)):
@@ -80,9 +80,7 @@ class FluxConverter:
         self._amperes_per_code = amperes_per_code * np.exp(1j * omega * current_delay_s)
         self._nominal_a = nominal_currents_a
 
-    def convert(
-        self, fit: ToneFit, flux_rates: NDArray[np.complex128] | None = None
-    ) -> FluxWindow:
+    def convert(self, fit: ToneFit, flux_rates: ComplexArray | None = None) -> FluxWindow:
         """Convert the phasors of one window to fluxes.
 
         Windows that are too short to fit ``flux_rates`` (S, K), T/s, are given these, and the bias
@@ -111,8 +109,7 @@ class FluxConverter:
 REACH_S = 0.03
 """Time over which the straight line is fitted, s: a tool's velocity hardly changes meanwhile."""
 LONGEST_WINDOW_GAP_S = 0.05
-"""Longest time from one window to the next, s; after a longer gap the windows before it say
-nothing about the present motion."""
+"""Longest time from one window to the next, s: earlier ones say nothing of the motion."""
 FEWEST_WINDOWS = 3
 """Windows that a slope needs at least, so that the noise of a single one does not make it."""
 
@@ -125,9 +122,9 @@ class FluxRates:
     """
 
     def __init__(self) -> None:
-        self._past: deque[tuple[float, NDArray[np.complex128]]] = deque()
+        self._past: deque[tuple[float, ComplexArray]] = deque()
 
-    def add(self, time_s: float, flux: NDArray[np.complex128]) -> None:
+    def add(self, time_s: float, flux: ComplexArray) -> None:
         """Take in the fluxes (S, K), T, of a window at the time of its middle.
 
         A gap or a step back in time discards the windows before.
@@ -139,7 +136,7 @@ class FluxRates:
         while len(past) > FEWEST_WINDOWS and time_s - past[0][0] > REACH_S:
             past.popleft()
 
-    def at(self, time_s: float) -> NDArray[np.complex128] | None:
+    def at(self, time_s: float) -> ComplexArray | None:
         """Return the rates (S, K), T/s, at a time, or None without enough recent windows."""
         past = self._past
         if len(past) < FEWEST_WINDOWS or not 0 < time_s - past[-1][0] <= LONGEST_WINDOW_GAP_S:

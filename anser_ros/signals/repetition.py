@@ -17,23 +17,20 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.errors import ParameterError
 from anser_ros.kernel_cache import kernel
 
 FINGERPRINT_SAMPLES = 32
-"""Samples that a fingerprint depends on. The factor of its recursion holds the number 2 once, so
-that after 32 steps a sample has left its 32 bits. It is the shortest run that can be found."""
+"""Samples that a fingerprint depends on, the shortest run found: 32 factors of 2 fill its bits."""
 FACTOR = np.uint32(0x9E3779B2)
-"""Factor of the recursion h <- h * FACTOR + sample modulo 2^32: twice an odd number, the golden
-ratio's 32 bits, which spreads neighbouring codes over the whole range."""
+"""Factor of h <- h * FACTOR + sample modulo 2^32: twice an odd number, the golden ratio's bits."""
 ANCHOR_SHARE = 64
-"""One fingerprint in so many, by its own value, is remembered and looked up: where it lies depends
-on the samples alone, so a run that comes again has its anchors at the same samples."""
+"""One fingerprint in so many, by its own value, is looked up: a repeated run has the same ones."""
 _ANCHOR_BELOW = np.uint32(2**32 // ANCHOR_SHARE)
 """Fingerprints below this are anchors."""
 SLOTS = 2048
-"""Remembered anchors of a column, a power of 2: at 40 kS/s they are those of 3 s. With more of
-them, which leave the processor's cache, the search takes twice the time."""
+"""Remembered anchors of a column, a power of 2: 3 s at 40 kS/s, and in the processor's cache."""
 _SLOT_SHIFT = np.uint32(15)
 """Shift of an anchor, which is below 2^26, that leaves the number of its slot."""
 _ROW_BITS = np.uint32(20)
@@ -41,12 +38,10 @@ _ROW_BITS = np.uint32(20)
 them are the lowest bits of its fingerprint, which let one in 4096 pass that is another."""
 MOST_ROWS = 2**20
 """Longest history, samples, that these bits allow: 2.6 s at 400 kS/s."""
-_ROW_MASK = np.uint32(MOST_ROWS - 1)
-"""Mask of the row in a slot."""
+_ROW_MASK = np.uint32(MOST_ROWS - 1)  # of the row in a slot
 PROBE_SAMPLES = (128, 512, 2048)
-"""Samples after which each of the fingerprints that all others are compared with is taken anew. In
-a ring that is shorter than one of these numbers such a probe comes again for certain, at the
-latest after twice the number; that a longer one has no anchor has a probability of 1e-14."""
+"""Samples after which each fingerprint that all others are compared with is taken anew: in a ring
+shorter than one of these it comes again for certain; longer ones have anchors (all but 1e-14)."""
 
 
 @kernel
@@ -139,9 +134,8 @@ def search(  # type: ignore[no-untyped-def]
 
 
 EVIDENCE_BITS = 80.0
-"""Bits of surprise that a run must hold to count as repeated. A unit of 42 columns at 40 kS/s with
-two seconds of history compares 2^65 pairs of runs in ten years, so that one false alarm in them
-has a probability of 2^-15."""
+"""Bits of surprise that a run must hold to count as repeated: 42 columns at 40 kS/s compare 2^65
+pairs of runs in ten years, with one false alarm at a probability of 2^-15."""
 LONGEST_RUN_S = 0.025
 """Longest run, s, that a column may need. One that needs more (0.08 bits per sample at 40 kS/s,
 0.06 codes rms) is noiseless: whole windows would pass before a repetition is found."""
@@ -154,11 +148,9 @@ _LONGEST_STEP = 2048
 _JUDGED_SAMPLES = 2 * _LONGEST_STEP
 """Samples after which it is worked out again how long runs must be: every 0.1 s at 40 kS/s."""
 SHORTEST_LAG_S = 1e-3
-"""Shortest lag, s, at which fresh samples are compared: over a shorter one a tone at 1 kHz or less
-is no other than it was."""
+"""Shortest lag, s, at which fresh samples are compared: over less, slow tones are as they were."""
 SAMPLED_ROWS = 64
-"""Length, samples, of the stretches on which the column is compared with itself at the worst lag;
-long enough for what follows on what."""
+"""Length, samples, of the stretches on which a column is compared with itself."""
 SAMPLED_SHARE = 16
 """One such stretch in so many is compared. All of them would cost as much as the search."""
 MEMORY_S = 1.0
@@ -166,8 +158,7 @@ MEMORY_S = 1.0
 _PRIOR = 32.0
 """Samples that the prior of the coincidences counts for, half of which coincide (one bit each)."""
 _PRIOR_RUNS = 4.0
-"""Coincidences that the prior of what follows one counts for: that noise is so correlated that
-every further sample is worth half of its own surprise."""
+"""Coincidences that the prior of what follows one counts for: half of a sample's own surprise."""
 RAILS = np.array([np.iinfo(np.int16).min, np.iinfo(np.int16).max], np.int16)
 """Ends of the range of the 16-bit converter; a code at either end counts as saturated."""
 
@@ -181,9 +172,7 @@ class RepetitionWatch:
     `ParameterError` when there is no column, or the rate is not positive.
     """
 
-    def __init__(
-        self, columns: int, sample_rate_hz: float, tones_hz: NDArray[np.float64] | None = None
-    ) -> None:
+    def __init__(self, columns: int, sample_rate_hz: float, tones_hz: Array | None = None) -> None:
         if columns < 1 or not sample_rate_hz > 0:
             raise ParameterError(
                 f'repetitions need columns and a rate, not {columns} at {sample_rate_hz:g} S/s'
@@ -209,7 +198,7 @@ class RepetitionWatch:
         self._judge()
 
     @property
-    def noiseless(self) -> NDArray[np.bool_]:
+    def noiseless(self) -> Booleans:
         """Return the columns with too little noise in their samples to distinguish new from old,
         (C,)."""
         return self.needed > self._longest
@@ -242,7 +231,7 @@ class RepetitionWatch:
         self._searched = self._contiguous_from = self.position
         self._run[:] = self._lag[:] = 0
 
-    def ages(self, first: int) -> NDArray[np.int64]:
+    def ages(self, first: int) -> Integers:
         """Return how old the samples from a position on are, shape (C,), samples.
 
         It is 0 for a column whose samples are all new, otherwise the time since it had the same
@@ -312,11 +301,8 @@ class RepetitionWatch:
         self._tally *= math.exp(-_JUDGED_SAMPLES / (MEMORY_S * self._rate_hz))
 
 
-def _worst_lag(rows: int, sample_rate_hz: float, tones_hz: NDArray[np.float64] | None) -> int:
-    """Return the lag, samples, at which all tones are most nearly where they were.
-
-    The shortest of equally good ones is taken: the less time passes, the less has moved.
-    """
+def _worst_lag(rows: int, sample_rate_hz: float, tones_hz: Array | None) -> int:
+    """Return the shortest lag, samples, at which all tones are most nearly where they were."""
     shortest = max(int(SHORTEST_LAG_S * sample_rate_hz), 1)
     lags = np.arange(shortest, max(rows - _LONGEST_STEP, shortest + 1))
     if tones_hz is None or not len(tones_hz):

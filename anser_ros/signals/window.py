@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Booleans, Integers
 from anser_ros.errors import ParameterError
 from anser_ros.signals.repetition import RAILS, RepetitionWatch
 
@@ -116,16 +117,16 @@ class Window:
     """Holds one window of samples of all channels."""
 
     codes: NDArray[np.int16]  # (N, C), converter codes
-    present: NDArray[np.bool_]  # (N,), false where a sample was lost
+    present: Booleans  # (N,), false where a sample was lost
     # Number of the sample in the middle of the window, since the stream began
     middle_sample: float
-    saturated: NDArray[np.bool_]  # (C,), whether a sample lies at an end of the converter's range
-    stuck: NDArray[np.bool_]  # (C,), whether all samples are the same
+    saturated: Booleans  # (C,), whether a sample lies at an end of the converter's range
+    stuck: Booleans  # (C,), whether all samples are the same
     # (C,), how long before, samples, a column said what it says in the window, or a part of it; 0
     # where all of it is new
-    ages: NDArray[np.int64]
+    ages: Integers
     # (C,), whether a column holds too little noise to distinguish new samples from old ones
-    noiseless: NDArray[np.bool_]
+    noiseless: Booleans
     repeats: bool  # Whether no column says anything new
 
     @property
@@ -217,8 +218,11 @@ class WindowCutter:
             self.counters.missing_samples += missing
             self._watch.skip(missing)
             self._ticks.begin(first, ticks[0])
-            skipped = self._skip_whole_windows(missing)
-            windows += self._advance(None, missing - skipped, first - missing + skipped)
+            # Windows that lie inside a long hole are not cut.
+            hops = max((missing - 2 * self._window) // self._hop, 0)
+            self.counters.windows_lost += hops
+            left = missing - hops * self._hop
+            windows += self._advance(None, left, first - left)
         else:
             for rank, each in enumerate(ticks):
                 self._ticks.take(first + rank * block, each)
@@ -227,12 +231,7 @@ class WindowCutter:
         return windows + self._advance(codes, len(codes), first)
 
     def _missing_blocks(self, sequence: int, ticks: int, codes: NDArray[np.int16]) -> int:
-        """Return the number of blocks lost before this one; -1 for a block that came before.
-
-        Sequence number and ticks must agree on the size of a hole; otherwise the device has
-        started a new stream, and its first blocks were lost. A repeated block has the same samples
-        as before, or fills a hole too late.
-        """
+        """Return the number of blocks lost before this one; -1 for a block that came before."""
         if self.expected is None or sequence == self.expected:
             return 0
         ahead, block = (sequence - self.expected) % _SEQUENCES, len(codes)
@@ -245,14 +244,6 @@ class WindowCutter:
         self.counters.restarts += 1
         self.reset()
         return 0
-
-    def _skip_whole_windows(self, missing: int) -> int:
-        """Skip the windows that lie inside a long hole and return the samples skipped."""
-        hops = (missing - 2 * self._window) // self._hop
-        if hops <= 0:
-            return 0
-        self.counters.windows_lost += hops
-        return hops * self._hop
 
     def _advance(self, codes: NDArray[np.int16] | None, count: int, first: int) -> list[Window]:
         """Append samples, or a hole where `codes` is None, and return the completed windows."""

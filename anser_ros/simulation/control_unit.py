@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.simulation.effects import RawEffect
 from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import ChannelCalibration
@@ -37,10 +38,6 @@ from anser_ros.wire.frames import (
     encode,
 )
 from anser_ros.wire.protocols import FrameReader
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 
 OVERLOAD_GAIN = 1e4
 """Gain of an amplifier under overload: so large that any signal reaches the converter's limits."""
@@ -186,7 +183,10 @@ class Piece:
 
 
 class ControlUnit:
-    """Speaks the protocol of `docs/cu_protocol.md`, by its channels' true ``calibration``."""
+    """Speaks the protocol of `docs/cu_protocol.md`, by its channels' true ``calibration``.
+
+    ``samples`` is the number of samples since power-up.
+    """
 
     def __init__(
         self,
@@ -203,7 +203,7 @@ class ControlUnit:
         self._sampler = Sampler(world, calibration, front, nominal_a, effects=effects, seed=seed)
         self._hello = _hello(world, front, block_samples, nominal_a)
         self._reader = FrameReader()
-        self._sample = 0
+        self.samples = 0
         self._stream_begin = 0
         self._sequence = 0
         self._state = DeviceState.IDLE
@@ -215,11 +215,6 @@ class ControlUnit:
     def sample_rate_hz(self) -> float:
         """Return the number of samples a second and channel."""
         return self._hello.sample_rate_hz
-
-    @property
-    def samples(self) -> int:
-        """Return the number of samples since power-up."""
-        return self._sample
 
     @property
     def streaming(self) -> bool:
@@ -243,12 +238,12 @@ class ControlUnit:
         """Let time pass in which the device could not send and whole blocks are lost."""
         block = self._hello.block_samples
         if self.streaming:
-            end = self._sample + samples - self._stream_begin
+            end = self.samples + samples - self._stream_begin
             lost = max(0, end // block - self._sequence)
             self._sequence += lost
             self._dropped += lost
             self._lost_before = self._lost_before or lost > 0
-        self._sample += samples
+        self.samples += samples
 
     def advance(self, samples: int) -> list[Piece]:
         """Let time pass and return the records of that time, in order.
@@ -256,18 +251,18 @@ class ControlUnit:
         ``samples``: time in sampling instants; a block is sent once its last sample is taken.
         """
         pieces: list[Piece] = []
-        if self._sample >= self._next_hello:
-            self._next_hello = self._sample + int(self.sample_rate_hz)
+        if self.samples >= self._next_hello:
+            self._next_hello = self.samples + int(self.sample_rate_hz)
             pieces += [Piece(encode(self._hello)), Piece(encode(self._status()))]
         if self.streaming:
             pieces += self._blocks(samples)
-        self._sample += samples
+        self.samples += samples
         return pieces
 
     def _blocks(self, samples: int) -> list[Piece]:
         block = self._hello.block_samples
         begin = self._stream_begin + self._sequence * block
-        count = (self._sample + samples - begin) // block
+        count = (self.samples + samples - begin) // block
         if count <= 0:
             return []
         codes = self._sampler.codes(begin, count * block)
@@ -291,9 +286,9 @@ class ControlUnit:
         code, text, more = ReplyCode.OK, '', []
         if isinstance(command, Start):
             self._state = DeviceState.STREAMING
-            self._stream_begin, self._sequence = self._sample, 0
+            self._stream_begin, self._sequence = self.samples, 0
             self._dropped, self._lost_before = 0, False
-            self._sampler.drive(self._sample / self.sample_rate_hz)
+            self._sampler.drive(self.samples / self.sample_rate_hz)
         elif isinstance(command, Stop):
             self._state = DeviceState.IDLE
         elif isinstance(command, Identify):
@@ -320,7 +315,7 @@ class ControlUnit:
         return DeviceStatus(
             self._state,
             StatusFlag.OVERRUN if self._dropped else StatusFlag(0),
-            self._ticks(self._sample),
+            self._ticks(self.samples),
             self._dropped,
             refused.bad_header + refused.bad_crc + refused.bad_payload + refused.unknown_type,
             31.5,

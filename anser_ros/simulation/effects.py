@@ -1,151 +1,128 @@
 """Puts simulated faults of sensors, coils, amplifiers and clocks into a control unit's signals.
 
-An effect overrides the stage at which it acts. The stages run in the order of the methods. Times
-count from the first drive of the coils, s, except for the device's clock. `draw` draws an effect
-and its parameters at random, for tests that do not know the answer.
+Times count from the first drive of the coils, s, except for the optical clock. `draw` draws an
+effect and its parameters at random, for tests that do not know the answer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import ParameterError
 from anser_ros.simulation.world import MetalBody, at_rest
 from anser_ros.wire.channel_calibration import ChannelCalibration
 from anser_ros.wire.setup import SensorSpec, Setup
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
-
+@dataclass(frozen=True)
 class RawEffect:
-    """Changes nothing at any stage; it is the base of all effects."""
+    """Changes the signals at some stages, at the others nothing.
 
-    def setup(self, setup: Setup) -> Setup:
-        """Return the true setup, which the effect may make differ from its document."""
-        return setup
+    ``setup`` makes the true setup of the document's. ``flux`` takes a time, s, and the fluxes
+    (S, K), T at nominal current, in the order of the setup's sensors, and returns the latter;
+    ``volts`` the times (n,), s, of n sampling instants and the voltages (n, S), V, before noise
+    and converter. ``optical_time`` is what the optical tracker's clock says at a true time, s.
+    """
 
-    def flux(self, time_s: float, flux: ComplexArray) -> ComplexArray:
-        """Return the fluxes (S, K), T at nominal current, in the order of the setup's sensors."""
-        return flux
-
-    def volts(self, time_s: Array, volts: Array) -> Array:
-        """Return the voltages (n, S), V, at n sampling instants before noise and converter."""
-        return volts
-
-    def optical_time(self, time_s: float) -> float:
-        """Return the time that the optical tracker's clock stamps with at a true time, s."""
-        return time_s
+    setup: Callable[[Setup], Setup] = lambda setup: setup
+    flux: Callable[[float, ComplexArray], ComplexArray] = lambda time_s, flux: flux
+    volts: Callable[[Array, Array], Array] = lambda time_s, volts: volts
+    optical_time: Callable[[float], float] = lambda time_s: time_s
 
 
-@dataclass(frozen=True)
-class RawChannelCrosstalk(RawEffect):
-    """Makes crosstalk between the sensors of one cluster."""
+def channel_crosstalk(columns: Sequence[int], matrix: Array) -> RawEffect:
+    """Return crosstalk between the sensors of one cluster, in these columns of the setup's order.
 
-    columns: tuple[int, ...]  # of the cluster's sensors in the order of the setup
-    # gain from each sensor (column) to each channel (row), with ones on the diagonal
-    matrix: tuple[tuple[float, ...], ...]
+    ``matrix`` is the gain from each sensor (column) to each channel (row), with ones on the
+    diagonal.
+    """
 
-    def volts(self, time_s: Array, volts: Array) -> Array:
-        mixed = volts.copy()
-        mixed[:, list(self.columns)] = volts[:, list(self.columns)] @ np.array(self.matrix).T
-        return mixed
+    def mixed(time_s: Array, volts: Array) -> Array:
+        out = volts.copy()
+        out[:, columns] = volts[:, columns] @ matrix.T
+        return out
+
+    return RawEffect(volts=mixed)
 
 
-@dataclass(frozen=True)
-class OneSensor(RawEffect):
-    """Changes the voltages of one sensor, at its column in the order of the setup.
+def one_sensor(column: int, changed: Callable[[Array, Array], Array]) -> RawEffect:
+    """Return a change of the voltages of one sensor, at its column in the order of the setup.
 
     ``changed`` takes times (n,), s, and the sensor's voltages (n,), V, and returns the latter.
     """
 
-    column: int
-    changed: Callable[[Array, Array], Array]
-
-    def volts(self, time_s: Array, volts: Array) -> Array:
+    def volts(time_s: Array, volts: Array) -> Array:
         out = volts.copy()
-        out[:, self.column] = self.changed(time_s, volts[:, self.column])
+        out[:, column] = changed(time_s, volts[:, column])
         return out
 
+    return RawEffect(volts=volts)
 
-def compressing(column: int, limit_v: float) -> OneSensor:
+
+def compressing(column: int, limit_v: float) -> RawEffect:
     """Return an amplifier that saturates: v becomes ``limit * tanh(v / limit)``."""
-    return OneSensor(column, lambda _, volts: limit_v * np.tanh(volts / limit_v))
+    return one_sensor(column, lambda _, volts: limit_v * np.tanh(volts / limit_v))
 
 
-def crossing_over(column: int, dead_v: float) -> OneSensor:
+def crossing_over(column: int, dead_v: float) -> RawEffect:
     """Return crossover distortion, which no diagnosis knows: ``v - dead * tanh(v / dead)``."""
-    return OneSensor(column, lambda _, volts: volts - dead_v * np.tanh(volts / dead_v))
+    return one_sensor(column, lambda _, volts: volts - dead_v * np.tanh(volts / dead_v))
 
 
-def loose(column: int, share: float, period_s: float, rest: float = 0.02) -> OneSensor:
+def loose(column: int, share: float, period_s: float, rest: float = 0.02) -> RawEffect:
     """Return a contact that is open for a share of each period; a rest of the voltage stays."""
 
     def changed(time_s: Array, volts: Array) -> Array:
         return np.where((time_s / period_s) % 1.0 < share, volts * rest, volts)
 
-    return OneSensor(column, changed)
+    return one_sensor(column, changed)
 
 
-def with_gain(column: int, gain: float) -> OneSensor:
+def with_gain(column: int, gain: float) -> RawEffect:
     """Return a channel whose gain is wrong."""
-    return OneSensor(column, lambda _, volts: volts * gain)
+    return one_sensor(column, lambda _, volts: volts * gain)
 
 
-@dataclass(frozen=True)
-class OpticalClock(RawEffect):
-    """Makes the optical tracker's clock early by a constant, and fast."""
-
-    early_s: float = 0.0
-    fast_ppm: float = 0.0
-
-    def optical_time(self, time_s: float) -> float:
-        return time_s * (1.0 + 1e-6 * self.fast_ppm) - self.early_s
+def optical_clock(early_s: float = 0.0, fast_ppm: float = 0.0) -> RawEffect:
+    """Return an optical tracker's clock that is early by a constant, and fast."""
+    return RawEffect(optical_time=lambda time_s: time_s * (1.0 + 1e-6 * fast_ppm) - early_s)
 
 
-@dataclass(frozen=True)
-class TiltedSensor(RawEffect):
-    """Tilts a sensor that has come loose: its axis is not the setup document's."""
+def tilted(column: int, axis: tuple[float, float, float]) -> RawEffect:
+    """Return a sensor that has come loose: its axis is not the setup document's."""
 
-    column: int
-    axis: tuple[float, float, float]
+    def setup(stated: Setup) -> Setup:
+        sensors = list(stated.sensors)
+        sensors[column] = replace(sensors[column], axis=axis)
+        return replace(stated, sensors=tuple(sensors))
 
-    def setup(self, setup: Setup) -> Setup:
-        sensors = list(setup.sensors)
-        sensors[self.column] = replace(sensors[self.column], axis=self.axis)
-        return replace(setup, sensors=tuple(sensors))
+    return RawEffect(setup)
 
 
-@dataclass(frozen=True)
-class GainRipple(RawEffect):
-    """Makes all gains oscillate, as by a bad supply; the diagnosis has no such effect."""
+def gain_ripple(depth: float, period_s: float) -> RawEffect:
+    """Return gains that all oscillate, as by a bad supply; the diagnosis has no such effect."""
 
-    depth: float
-    period_s: float
+    def volts(time_s: Array, volts: Array) -> Array:
+        return np.asarray(volts * (1 + depth * np.sin(2 * np.pi * time_s / period_s))[:, None])
 
-    def volts(self, time_s: Array, volts: Array) -> Array:
-        swing = 1 + self.depth * np.sin(2 * np.pi * time_s / self.period_s)
-        return np.asarray(volts * swing[:, None])
+    return RawEffect(volts=volts)
 
 
-@dataclass(frozen=True)
-class CoilWeakens(RawEffect):
-    """Changes a coil's field at constant current, as by a turn that heats up and shorts."""
+def weakening(coil: int, amount: float, tau_s: float) -> RawEffect:
+    """Return a change of a coil's field at constant current, as by a turn that shorts."""
 
-    coil: int
-    amount: float
-    tau_s: float
+    def flux(time_s: float, flux: ComplexArray) -> ComplexArray:
+        out = flux.copy()
+        out[:, coil] *= 1 + amount * (1 - np.exp(-time_s / tau_s))
+        return out
 
-    def flux(self, time_s: float, flux: ComplexArray) -> ComplexArray:
-        drifted = flux.copy()
-        drifted[:, self.coil] *= 1 + self.amount * (1 - np.exp(-time_s / self.tau_s))
-        return drifted
+    return RawEffect(flux=flux)
 
 
 NONE = 'none'
@@ -218,20 +195,19 @@ def _channel_crosstalk(unit: Unit, rng: np.random.Generator) -> Drawn:
     count = len(columns)
     matrix = np.eye(count) + rng.uniform(0.01, 0.04, (count, count)) * (1 - np.eye(count))
     matrix[~np.eye(count, dtype=bool)] *= rng.choice([-1.0, 1.0], count * (count - 1))
-    rows = tuple(tuple(float(v) for v in row) for row in matrix)
     channels = [unit.setup.sensors[c].channel for c in columns]
-    parameters = {'channels': channels, 'matrix': [list(row) for row in rows]}
-    return _known('channel_crosstalk', parameters, RawChannelCrosstalk(tuple(columns), rows))
+    parameters = {'channels': channels, 'matrix': matrix.tolist()}
+    return _known('channel_crosstalk', parameters, channel_crosstalk(columns, matrix))
 
 
 def _time_offset(unit: Unit, rng: np.random.Generator) -> Drawn:
     early = float(rng.uniform(0.015, 0.04))
-    return _known('time_offset', {'offset_s': early}, OpticalClock(early_s=early))
+    return _known('time_offset', {'offset_s': early}, optical_clock(early_s=early))
 
 
 def _clock_rate(unit: Unit, rng: np.random.Generator) -> Drawn:
     fast_ppm = float(rng.uniform(2500.0, 6000.0))
-    return _known('clock_rate', {'rate_ppm': -fast_ppm}, OpticalClock(fast_ppm=fast_ppm))
+    return _known('clock_rate', {'rate_ppm': -fast_ppm}, optical_clock(fast_ppm=fast_ppm))
 
 
 def _sensor_axis(unit: Unit, rng: np.random.Generator) -> Drawn:
@@ -241,7 +217,7 @@ def _sensor_axis(unit: Unit, rng: np.random.Generator) -> Drawn:
     turn = Rotation.from_rotvec(np.radians(tilt_deg) * across / np.linalg.norm(across))
     x, y, z = (float(v) for v in turn.apply(sensor.axis))
     parameters = {'channel': sensor.channel, 'tilt_deg': tilt_deg, 'axis': [x, y, z]}
-    return _known('sensor_axis', parameters, TiltedSensor(column, (x, y, z)))
+    return _known('sensor_axis', parameters, tilted(column, (x, y, z)))
 
 
 def _sensor_gain(unit: Unit, rng: np.random.Generator) -> Drawn:
@@ -267,7 +243,7 @@ def _coil_drift(unit: Unit, rng: np.random.Generator) -> Drawn:
     amount = float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.03))
     tau_s = float(rng.uniform(5.0, 20.0))
     parameters = {'coil': coil, 'amount': amount, 'tau_s': tau_s}
-    return _known('coil_drift', parameters, CoilWeakens(coil, amount, tau_s))
+    return _known('coil_drift', parameters, weakening(coil, amount, tau_s))
 
 
 def _loose_contact(unit: Unit, rng: np.random.Generator) -> Drawn:
@@ -283,7 +259,7 @@ def _gain_ripple(unit: Unit, rng: np.random.Generator) -> Drawn:
     parameters = {'depth': depth, 'period_s': period_s}
     # The diagnosis has no oscillating gain, but one that varies over time.
     answers = ('tool_gain_drift', 'sensor_gain_drift')
-    return Drawn('gain_ripple', parameters, (GainRipple(depth, period_s),), answers=answers)
+    return Drawn('gain_ripple', parameters, (gain_ripple(depth, period_s),), answers=answers)
 
 
 def _crossover(unit: Unit, rng: np.random.Generator) -> Drawn:

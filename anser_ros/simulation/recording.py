@@ -7,9 +7,9 @@ called simulated.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.world import Pose, World
 from anser_ros.stamps import SECOND_NS
@@ -17,10 +17,8 @@ from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import dump_setup
 
-Array = NDArray[np.float64]
 START_NS = 1_700_000_000 * SECOND_NS
-"""First stamp of every recording, ns since 1970: a fixed date in 2023, so that the same seed makes
-the same bag."""
+"""First stamp of every recording, ns since 1970: fixed, so that a seed makes one bag."""
 OPTICAL_MARGIN_S = 0.2
 """Time by which the optical poses begin before the fluxes and end after them, s."""
 STATIC_NOISE_T = 30e-12

@@ -13,14 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.metal.body import sphere_polarisability
 from anser_ros.physics.dipole import GAUSS_OFFSET, flux_basis
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, Setup
 
-ComplexArray = NDArray[np.complex128]
-
-Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
 """A position (3,), m, and a rotation matrix (3, 3) from the body's frame to fg."""
 
@@ -227,15 +225,14 @@ def board_source(setup: Setup) -> FieldSource:
     """
     board = board_of(setup)
 
-    def field(points: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def field(points: Array) -> ComplexArray:
         return np.asarray(board.field(points).transpose(0, 2, 1), complex)
 
     return field
 
 
 SHIFT_M = 0.2e-3
-"""Standard deviation of a coil's position along each axis, m: an assumption about printed boards,
-smaller than the tolerances of the nominal model (0.5 mm)."""
+"""Standard deviation of a coil's position along each axis, m: an assumption on printed boards."""
 TURN_DEG = 0.1
 """Standard deviation of a coil's rotation about z, degrees, an assumption as well."""
 CURRENT_SHARE = 0.01

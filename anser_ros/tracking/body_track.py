@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import Array, Integers
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.stamps import NANO
 from anser_ros.tracking.coil_step import MOST_STEPS, SUSPICIOUS_JUMP_M
@@ -25,8 +25,6 @@ from anser_ros.tracking.rigid import (
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import bounded_inverse
 from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
-
-Array = NDArray[np.float64]
 
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""
@@ -110,7 +108,7 @@ class BodyFit:
     """Holds a body's solution, the coils (indices) that took part, and the degrees of freedom."""
 
     solution: BodySolution
-    used: NDArray[np.int64]
+    used: Integers
     freedom: int
 
     @property
@@ -139,11 +137,11 @@ class BodyFrame(SolveFrame):
 
     coils: BodyCoils
     single: list[CoilResult]
-    rows: NDArray[np.int64]
+    rows: Integers
     tracks: CoilTracks
 
     @property
-    def usable(self) -> NDArray[np.int64]:
+    def usable(self) -> Integers:
         """Return the indices of the coils that the body may use."""
         return np.flatnonzero([coil.usable for coil in self.single])
 
@@ -152,7 +150,7 @@ class BodyFrame(SolveFrame):
         """Return the inverse of each sigma, 1/T, shape (2K,)."""
         return 1.0 / self.context.sigma
 
-    def common(self, used: NDArray[np.int64], start: Start) -> Array:
+    def common(self, used: Integers, start: Start) -> Array:
         """Errors that some coils share, see `common_factor`.
 
         They are those that the coils' own solves reckoned with, where these were near.
@@ -167,7 +165,7 @@ class BodyFrame(SolveFrame):
         modes = np.concatenate([shared, gains], axis=1) if gains.shape[1] else shared
         return common_factor(modes, weights)
 
-    def nearer(self, start: Start, used: NDArray[np.int64]) -> Start:
+    def nearer(self, start: Start, used: Integers) -> Start:
         """Return a start moved to where the coils' own good poses agree best."""
         rows = [i for i in used.tolist() if self.single[i].estimate.state == states.OK]
         coils = self.coils.subset(np.array(rows, dtype=np.int64))
@@ -182,7 +180,7 @@ class BodyFrame(SolveFrame):
         return nearer
 
 
-def _solve(frame: BodyFrame, used: NDArray[np.int64], start: Start) -> BodyFit:
+def _solve(frame: BodyFrame, used: Integers, start: Start) -> BodyFit:
     part, context = frame.coils.subset(used), frame.context
     weights = np.tile(frame.inverse_sigma, (len(used), 1))
     solution = solve_body(
@@ -209,7 +207,7 @@ def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit
     return fit
 
 
-def _cold_starts(frame: BodyFrame, used: NDArray[np.int64]) -> list[Start]:
+def _cold_starts(frame: BodyFrame, used: Integers) -> list[Start]:
     context, coils, single = frame.context, frame.coils, frame.single
     for wanted in (states.OK, states.RESIDUAL):
         rows = [i for i in used if single[i].estimate.state == wanted]
@@ -245,6 +243,8 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     if not fits:
         reason = 'no coil of this body has a pose to start from'
         return BodyResult(frame.no_pose(states.RESIDUAL, reason))
+    fits += _on_other_sides(frame, fits[0])
+    fits.sort(key=lambda candidate: candidate.ratio)
     fit = fits[0]
     result = _judge(track, frame, fit, fits[1:])
     if result.state == states.OK:
@@ -256,7 +256,28 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     return BodyResult(result, fit)
 
 
-def _from_good(track: BodyTrack, frame: BodyFrame, used: NDArray[np.int64]) -> list[BodyFit]:
+OTHER_SIDES = -np.ones(3), np.array([1.0, 1.0, -1.0])
+"""What takes a place to the other side of a source, and to that of a board (its plane is z)."""
+
+
+def _on_other_sides(frame: BodyFrame, fit: BodyFit) -> list[BodyFit]:
+    """Fits across the source and the board, where the volume reaches there.
+
+    A dipole has the same field at opposite places, and upright dipoles in a plane have on its
+    other side the field that half a turn about z makes of it: what is read cannot tell them apart.
+    """
+    solution, middle = fit.solution, frame.context.middle
+    lever = frame.coils.offsets[fit.used].mean(axis=0)
+    place, found = solution.position + solution.rotation @ lever - middle, []
+    for signs in OTHER_SIDES:
+        across, away = middle + signs * place, (signs - 1.0) * place
+        if np.linalg.norm(away) > SAME_PLACE_M and frame.settings.box.contains(across):
+            rotation = -signs[:, None] * solution.rotation
+            found.append(_solve(frame, fit.used, (across - rotation @ lever, rotation)))
+    return found
+
+
+def _from_good(track: BodyTrack, frame: BodyFrame, used: Integers) -> list[BodyFit]:
     """The fit near the last good pose, when there is one that passes the gate."""
     stamp_ns, gate = frame.stamp_ns, frame.settings.gate
     good = track.fresh(stamp_ns, frame.settings)

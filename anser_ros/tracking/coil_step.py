@@ -9,8 +9,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.stamps import NANO
 from anser_ros.tracking.descent import descend
@@ -19,17 +19,12 @@ from anser_ros.tracking.solve import MAX_EVALUATIONS, CoilSolution, coil_covaria
 from anser_ros.tracking.solve_context import fill_model_errors
 from anser_ros.tracking.solve_verdict import SOUND, SYSTEMATIC, fault_of, usual_and_most
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
 SUSPICIOUS_JUMP_M = 0.02
 """A pose that moved further from one frame to the next, m, is confirmed by a scan, for it may be
 another solution of the same fluxes. Smaller, and fast tools are scanned for in every frame;
 larger, and a wrong solution near by is followed."""
 MOST_STEPS = 2.5
 """Motion is carried on for so many of the last step's durations."""
-
-
 UNKNOWNS = 5
 """Numbers that a coil's pose has."""
 SELDOM = 0.1

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.errors import TrackingError
 from anser_ros.stamps import NANO
 from anser_ros.tracking.coil_step import (
@@ -21,10 +21,8 @@ from anser_ros.tracking.coil_step import (
     SELDOM,
     UNKNOWN,
     UNKNOWNS,
-    Array,
     CoilMemory,
     Followed,
-    Integers,
     follow_coils,
     freedom_of,
     remember,
@@ -112,7 +110,7 @@ class CoilTracks:
         self,
         stamp_ns: int,
         values: Array,
-        sound: NDArray[np.bool_],
+        sound: Booleans,
         lengths: Array,
         context: SolveContext,
         settings: TrackerSettings,

@@ -4,15 +4,13 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import inlined
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.settings import Accuracy, ToolSettings
 from anser_ros.tracking.solve import ROLL_VARIANCE
-
-Array = NDArray[np.float64]
 
 USUAL_GATE = 4.0
 """Largest residual of a pose in units of the expected one, unless a setting says another. Smaller,
@@ -27,18 +25,14 @@ MEMORY_FRAMES = 100.0
 """Good frames over which the noise is averaged, 2 s at 50 Hz: it is then known to a tenth with one
 coil of eight emitters. Fewer follow the noise of single frames; more are late when it changes."""
 PRIOR_FRAMES = 8.0
-"""Frames for which the stated noise counts at the start. Fewer let the first frame decide; more
-keep a wrong statement for longer."""
+"""Frames for which the stated noise counts at the start, so that the first one does not decide."""
 HIDDEN = 20.0 / 11.0
-"""Power of a distortion that goes into the pose over the power that stays in the residual. A
-smooth distortion looks more like a pose than like anything else: of a coil with eight emitters the
-five dimensions of the pose get four times what each of the eleven others gets. Smaller, and
-distorted poses say that they are certain; larger, and slight misfits widen poses that are
-right."""
+"""Power of a distortion that goes into the pose over the power that stays in the residual: of a
+coil with eight emitters the five dimensions of the pose get four times what each of the eleven
+others gets, as a smooth distortion looks more like a pose than like anything else."""
 SLIGHT = 0.1
 """Residual power that lasts from frame to frame, in units of the expected power, up to which it is
-no misfit. Of noise alone, a coil with eight emitters has 0 +- 0.02. Smaller, and chance widens
-poses; larger, and a coil that is a little wrong all the time counts as one with more noise."""
+no misfit: of noise alone, a coil with eight emitters has 0 +- 0.02."""
 
 
 @inlined
@@ -96,7 +90,6 @@ class TrackerSettings:
 
     @property
     def box(self) -> TrackedVolume:
-        """Return the volume where tools may be."""
         return self.volume or DEFAULT_VOLUME
 
     def margin(self, ratio: float) -> float:
@@ -200,7 +193,6 @@ class NoiseScale:
 
     @property
     def value(self) -> float:
-        """Return residual power over its expectation."""
         return float(self._state[1] / self._state[0])
 
     def add(self, ratio: float, whitened: Array | None = None, freedom: int = 1) -> None:
@@ -247,11 +239,7 @@ class Tip:
         the arm ``a`` in fg, ``d_tip = d_body - [a]x d_turn + R d_arm``, and turns are the body's.
         """
         if body.rotation is None:
-            nothing = np.full(3, np.nan)
-            return replace(
-                body, name=self.name, position=nothing, axis=nothing,
-                covariance=np.full((6, 6), np.nan), sigma_position_m=math.nan,
-            )  # fmt: skip
+            return no_pose(self.name, body.stamp_ns, body.state, body.model_id, body.reason)
         arm = body.rotation @ self.position
         x, y, z = arm
         carry = np.eye(6)

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import Integers
 from anser_ros.integrity import pose_checks
 from anser_ros.integrity.pose_checks import (
     STREAM_GAP_S,
@@ -29,7 +29,6 @@ from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils
 from anser_ros.tracking.solve import add_motion
 
-Array = NDArray[np.float64]
 Estimates = list[PoseEstimate]
 
 CONTRADICTS = (states.RESIDUAL, states.INCONSISTENT)
@@ -45,8 +44,7 @@ a model that is a little wrong."""
 FEWEST_JUDGED_READINGS = 6
 """Readings that a share is made of at least: a single bad coil is not the whole chain."""
 GOOD_SHARE = 0.2
-"""Share (0 to 1) of refused readings up to which a frame speaks for the model: one bad coil of
-five."""
+"""Share of refused readings up to which a frame speaks for the model: one bad coil of five."""
 RECOVERY_S = 0.5
 """For so long, s, all frames must speak for a doubtful model before it gives poses again: where it
 happens to fit, it is not yet right."""
@@ -59,7 +57,6 @@ class ModelRecord:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all frames that were judged so far."""
         self._frames: deque[tuple[int, int, int, float]] = deque()
         self._refused = self._total = self._sound_since_ns = self._last_ns = 0
         self.is_doubtful = False
@@ -107,7 +104,7 @@ class ModelRecord:
 class RigidBody:
     """Holds a body's coils: their rows among the sensors, their places, and what was found."""
 
-    rows: NDArray[np.int64]
+    rows: Integers
     coils: BodyCoils
     result: BodyResult
 
@@ -121,7 +118,6 @@ class Judgement:
         self.record = ModelRecord()
 
     def forget(self) -> None:
-        """Forget all frames that were judged so far."""
         self._continuity.clear()
         self._last.clear()
         self.record.forget()

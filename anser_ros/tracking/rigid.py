@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import dipole_field, fill_coil_basis
@@ -27,7 +28,7 @@ from anser_ros.tracking.descent import (
     limit_step,
 )
 from anser_ros.tracking.seed import SeedGrid
-from anser_ros.tracking.solve import Array, RealField
+from anser_ros.tracking.solve import RealField
 
 
 @inlined
@@ -200,11 +201,9 @@ def step_to_coils(  # type: ignore[no-untyped-def]
 
 
 MAX_EVALUATIONS = 30
-"""Evaluations of the residuals after which a descent is given up as not converged. Good starts
-need a few; the bound keeps the time of a frame limited when the fluxes fit no pose."""
+"""Evaluations after which a descent is given up: good starts need a few, and a frame is short."""
 GRID_STARTS = 12
-"""Starts from the grid of a body whose coils have no poses of their own. Fewer miss the right
-valley more often; each more costs a descent of all coils."""
+"""Starts from the grid of a body whose coils have no poses; fewer miss the right valley more."""
 PARALLEL = 0.05
 """Sine of the angle between axes below which all coils of a tool count as parallel."""
 

@@ -16,15 +16,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import dipole_field, fill_fields
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.descent import damped_step
-from anser_ros.tracking.solve import Array, CoilSolution, RealField, solve_coil
+from anser_ros.tracking.solve import CoilSolution, RealField, solve_coil
 
 LARGEST_MOVE_M = 0.05
 """Longest step of the position, m; beyond it the linearised field is no guide any more."""
@@ -260,6 +260,10 @@ def _pick(points, linear, triangles, power, apart, chosen, cost, axes):  # type:
     return chosen.shape[0]
 
 
+CLOSEST_M = 5e-3
+"""Distance (m) from the field's dipoles within which no start pose is: nothing fits between."""
+
+
 def grid_points(volume: TrackedVolume, spacing_m: float) -> Array:
     """Return points of a grid that covers a volume, shape (G, 3), m.
 
@@ -295,6 +299,9 @@ def build_grid(
     Raises `TrackingError` when the spacing doesn't suit the volume, see `grid_points`.
     """
     points = grid_points(volume, spacing_m)
+    if volume.low[2] <= field.positions[:, 2].max():  # it reaches around the dipoles
+        apart = np.linalg.norm(points[:, None] - field.positions, axis=2).min(axis=1)
+        points = np.ascontiguousarray(points[apart > CLOSEST_M])
     moments = field.moments.view(np.complex128)
     fields = dipole_field(points, field.positions, field.directions, moments)
     white = np.ascontiguousarray(fields).view(np.float64) / sigma
@@ -304,7 +311,7 @@ def build_grid(
     return SeedGrid(points, triangles @ white, triangles, np.array(sigma), spacing_m)
 
 
-def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[NDArray[np.int64], Array, Array]:
+def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[Integers, Array, Array]:
     """Return the cheapest distinct grid points for fluxes (2K,), T, ``count`` of them at most.
 
     They are indices, best first; with them come the best unit axis (G, 3) at every grid point, and
@@ -337,7 +344,7 @@ def _polish(
     high: Array,
     length_m: float,
     gate: float,
-    starts: NDArray[np.int64],
+    starts: Integers,
     axes: Array,
 ) -> list[CoilSolution]:
     """Distinct solutions that these grid points lead to."""

@@ -1,10 +1,8 @@
 """Solves for a coil's pose from complex fluxes, and computes how well the pose is known.
 
-Damped least squares with the dipoles' own gradient: the unknowns are the position and the unit
-axis; the axis moves by a two-parameter step in its tangent plane, so that no direction is
-singular. In-phase and quadrature parts are fitted together, each divided by its standard
-deviation: the residual has no unit, and a step is small when it is small against the pose's own
-uncertainty. The damping is Marquardt's (Nocedal and Wright, Numerical Optimization, section 10.3).
+Damped least squares with the dipoles' own gradient (`descent`). In-phase and quadrature parts are
+fitted together, each divided by its standard deviation: the residual has no unit, and a step is
+small when it is small against the pose's own uncertainty.
 
 The error of a pose comes from the flux noise and from the error of the field model. Both enter the
 whitening, so the inverse of the whitened normal matrix is the covariance. Roll about a coil's axis
@@ -17,21 +15,17 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from anser_ros.arrays import AnyArray, Array
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.dipole import dipole_rows
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.tracking.descent import damped_step, descend
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 MAX_EVALUATIONS = 40
-"""Evaluations of the residuals after which a descent is given up as not converged. Good starts
-need a few; the bound keeps the time of a frame limited when the fluxes fit no pose."""
+"""Evaluations after which a descent is given up: good starts need a few, and a frame is short."""
 
 
 @dataclass(frozen=True)
@@ -44,26 +38,14 @@ class RealField:
     moments: Array  # (N, 2K), A m^2; for every emitter its real part, then its imaginary part
 
     @classmethod
-    def of(
-        cls,
-        positions: NDArray[np.generic],
-        directions: NDArray[np.generic],
-        moments: NDArray[np.generic],
-    ) -> 'RealField':
+    def of(cls, positions: AnyArray, directions: AnyArray, moments: AnyArray) -> 'RealField':
         """Lay out dipoles with complex magnitudes, shape (N, K).
 
-        Raises `TrackingError` when the shapes don't fit or a value is not finite.
+        Raises `TrackingError` when a value is not finite.
         """
         r = np.ascontiguousarray(positions, dtype=np.float64)
         u = np.ascontiguousarray(directions, dtype=np.float64)
         m = np.ascontiguousarray(moments, dtype=np.complex128)
-        if r.ndim != 2 or r.shape[1:] != (3,) or r.shape != u.shape or m.ndim != 2:
-            raise TrackingError(
-                f'a field model needs positions and directions (n, 3) and moments (n, k), '
-                f'got {r.shape}, {u.shape} and {m.shape}'
-            )
-        if m.shape[0] != r.shape[0] or m.shape[0] == 0 or m.shape[1] == 0:
-            raise TrackingError(f'{r.shape[0]} dipoles cannot have moments of shape {m.shape}')
         if not (np.isfinite(r).all() and np.isfinite(u).all() and np.isfinite(m).all()):
             raise TrackingError('a field model must be finite')
         return cls(r, u, m.view(np.float64))
@@ -108,8 +90,8 @@ def solve_coil(
     field: RealField,
     flux: Array,
     whitening: Array,
-    position: NDArray[np.generic],
-    axis: NDArray[np.generic],
+    position: AnyArray,
+    axis: AnyArray,
     low: Array,
     high: Array,
     length_m: float = 0.0,

@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import FieldModel, SymmetryAxis, symmetry_axis
 from anser_ros.kernel_cache import kernel
@@ -23,8 +23,6 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.seed import SeedGrid, build_grid
 from anser_ros.tracking.solve import RealField
-
-Array = NDArray[np.float64]
 
 SAME_PLACE_M = 1e-6
 """Dipoles nearer to each other than this, m, are components of one: rounding moves them apart by
@@ -109,8 +107,6 @@ def source_spacing(positions: Array, floor_m: float) -> Array:
     return np.where((nearest < np.inf) & (positions[:, 2] >= floor_m), nearest, 0.0)
 
 
-ComplexArray = NDArray[np.complex128]
-
 BOX_MARGIN_M = 0.1
 """How far beyond the volume the solver may go, so that a tool there counts as there."""
 GRID_TOLERANCE = 0.05
@@ -175,7 +171,7 @@ class ErrorModes:
     # (R, N, K), the model's own array that the rest was made from: a model that has the same array
     # has the same modes, and all that sensors derived from them stays good
     given: ComplexArray
-    rows: NDArray[np.int64]  # (M,), the dipoles whose moments are uncertain
+    rows: Integers  # (M,), the dipoles whose moments are uncertain
     moments: Array  # (M, R' 2K), of the modes that are not zero, A m^2
     places: Array  # (M, 3), m
     spacing: Array  # (M,), see `source_spacing`, m
@@ -210,7 +206,7 @@ class ErrorModes:
             spacing = source_spacing(places, floor_m)
         return cls(given, rows, moments.reshape(rows.size, -1), places, spacing)
 
-    def of_components(self, kept: NDArray[np.bool_]) -> 'ErrorModes':
+    def of_components(self, kept: Booleans) -> 'ErrorModes':
         """Return the modes' part in some of the 2K flux components."""
         parts = self.moments.reshape(len(self.rows), -1, kept.size)[:, :, kept]
         return replace(self, moments=np.ascontiguousarray(parts.reshape(len(self.rows), -1)))
@@ -250,6 +246,12 @@ class SolveContext:
     def grid(self) -> SeedGrid:
         """Return the grid of start poses for a cold start."""
         return self.starts.grid(self.field, self.sigma)
+
+    @cached_property
+    def middle(self) -> Array:
+        """Return the middle of the field's dipoles, weighted by their strength, (3,), m."""
+        weight = np.abs(self.field.moments).sum(axis=1)
+        return np.asarray(weight @ self.field.positions / max(float(weight.sum()), 1e-300))
 
     @cached_property
     def readings(self) -> int:
@@ -359,12 +361,12 @@ class ReducedScene:
     """Holds a context without its dead emitters, and what it was made from."""
 
     whole: SolveContext
-    living: NDArray[np.bool_]
+    living: Booleans
     context: SolveContext
 
 
 def without_dead(
-    context: SolveContext, living: NDArray[np.bool_], previous: ReducedScene | None = None
+    context: SolveContext, living: Booleans, previous: ReducedScene | None = None
 ) -> ReducedScene:
     """Return the context of the living emitters; what has not changed since ``previous`` is
     kept.

@@ -11,10 +11,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from anser_ros import pose_states as states
+from anser_ros.arrays import Array
 from anser_ros.kernel_cache import inlined
 from anser_ros.tracking.estimate import (
     USUAL_GATE,
@@ -25,8 +23,6 @@ from anser_ros.tracking.estimate import (
 )
 from anser_ros.tracking.solve import chi2_limit
 from anser_ros.tracking.solve_context import SolveContext
-
-Array = NDArray[np.float64]
 
 RARE = 0.01
 """Probability of the residual of many sensors together beyond which it counts as more than noise.
@@ -147,10 +143,6 @@ def millimetres(place: Array) -> str:
 
 class Solution(Protocol):
     """States where the solve of any tracked thing ended."""
-
-    @property
-    def position(self) -> Array:
-        """Return the position, m, frame fg."""
 
     @property
     def chi2(self) -> float:

@@ -16,14 +16,15 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE, value_codes
 from anser_ros.frames.intake import Frame, Freshness, Intake
+from anser_ros.integrity.pose_checks import SurveyErrors, distances
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import Withheld
@@ -32,7 +33,13 @@ from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, trac
 from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTracks, track_coil
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
-from anser_ros.tracking.rigid import BodyCoils
+from anser_ros.tracking.rigid import (
+    BodyCoils,
+    common_factor,
+    solve_body,
+    start_from_grid,
+    step_to_coils,
+)
 from anser_ros.tracking.solve_context import (
     FEWEST_EMITTERS,
     ReducedScene,
@@ -41,11 +48,6 @@ from anser_ros.tracking.solve_context import (
     depends_on,
     without_dead,
 )
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
-__all__ = ['PoseEstimate', 'Tracker', 'TrackerSettings']
 
 
 def _add(counters: Counter[str], name: str, by: int) -> None:
@@ -79,7 +81,6 @@ class Past:
         self.first_ns = 0
 
     def forget(self) -> None:
-        """Forget all warm starts, and what was seen of the sensors and bodies."""
         self.judgement.forget()
         self.coils.forget()
         for body in self.bodies.values():
@@ -98,7 +99,7 @@ class TrackedScene:
     correction: Correction | None = None  # Of the model's effects
     table: SensorTable = field(init=False)  # The sensors as the model's effects have them
     # Rows and coils of the bodies whose six degrees of freedom their coils see
-    bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = field(init=False)
+    bodies: dict[str, tuple[Integers, BodyCoils]] = field(init=False)
     # The context of the last frame in which emitters were dead
     reduced: ReducedScene | None = None
 
@@ -170,12 +171,10 @@ class Tracker:
 
     @property
     def counters(self) -> Counter[str]:
-        """Return how often what was seen, by name."""
         return self._past.counters
 
     @property
     def model(self) -> FieldModel | None:
-        """Return the active field model, or None."""
         return self._scene.model
 
     @property
@@ -237,9 +236,9 @@ class Tracker:
     def update(
         self,
         stamp_ns: int,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
-        flags: NDArray[np.generic] | None = None,
+        channels: AnyArray,
+        flux: AnyArray,
+        flags: AnyArray | None = None,
         withheld: Withheld | None = None,
     ) -> list[PoseEstimate]:
         """Estimate the poses of one frame: one a sensor, then one a rigid body.
@@ -258,7 +257,6 @@ class Tracker:
         return [] if frame is None else self._track(frame, withheld)
 
     def _track(self, frame: Frame, withheld: Withheld | None) -> list[PoseEstimate]:
-        """Estimate the poses of a frame that has been judged."""
         past, context = self._past, self._scene.context
         if frame.goes_back:
             self.reset()
@@ -279,8 +277,7 @@ class Tracker:
             flux, context = flux[:, frame.living], self._scene.reduced.context
         return self._solved(frame.stamp_ns, np.ascontiguousarray(flux), codes, context)
 
-    def _few_emitters(self, living: NDArray[np.bool_]) -> str:
-        """Why a frame with so few emitters has no poses."""
+    def _few_emitters(self, living: Booleans) -> str:
         emitters = () if self.model is None else self.model.emitters
         silent = [name for name, lives in zip(emitters, living, strict=True) if not lives]
         return (
@@ -288,7 +285,7 @@ class Tracker:
             f'{FEWEST_EMITTERS} needed'
         )
 
-    def _corrected(self, frame: Frame) -> tuple[ComplexArray, NDArray[np.int64]]:
+    def _corrected(self, frame: Frame) -> tuple[ComplexArray, Integers]:
         """Fluxes (S, K) without what the model's effects did to them, and the readings' codes."""
         correction = self._scene.correction
         if correction is None or not correction.changes_flux:
@@ -302,7 +299,7 @@ class Tracker:
         return flux, codes
 
     def _solved(
-        self, stamp_ns: int, flux: ComplexArray, codes: NDArray[np.int64], context: SolveContext
+        self, stamp_ns: int, flux: ComplexArray, codes: Integers, context: SolveContext
     ) -> list[PoseEstimate]:
         """Return the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,)."""
         values = flux.view(np.float64)
@@ -330,9 +327,8 @@ class Tracker:
         return [estimate.with_shift(context.shift_sigma_m) for estimate in judged]
 
     def _solved_coils(
-        self, stamp_ns: int, values: Array, codes: NDArray[np.int64], context: SolveContext
+        self, stamp_ns: int, values: Array, codes: Integers, context: SolveContext
     ) -> list[CoilResult]:
-        """Solve each sensor by itself, from flux components (S, 2K)."""
         table, past, settings, results = self._scene.table, self._past, self.settings, []
         tracks, lengths = past.coils, table.length.tolist()
         followed = tracks.follow(stamp_ns, values, codes == GOOD, table.length, context, settings)
@@ -352,7 +348,6 @@ class Tracker:
     def _without_poses(
         self, frame: Frame, state: str, model_id: str, reason: str
     ) -> list[PoseEstimate]:
-        """Return an estimate without a pose for every sensor and body."""
         names = (*self._scene.table.name, *self._scene.bodies)
         return [no_pose(name, frame.stamp_ns, state, model_id, reason) for name in names]
 
@@ -403,3 +398,24 @@ def warm_up() -> None:
         if uncertainty is not None:  # what a coil needs that is far from where it was expected
             context = build_context(model, settings)
             context.errors_at(places, sensors.axis, sensors.length)
+
+
+def warm_up_bodies(model: FieldModel) -> None:
+    """Solve a small made-up body alone, which `warm_up` comes to last."""
+    context = build_context(model, TrackerSettings())
+    coils = BodyCoils(np.zeros((3, 3)), np.eye(3), np.zeros(3))
+    flux = model.flux(coils.offsets + [0.0, 0.0, 0.15], coils.axes, coils.lengths).view(np.float64)
+    weights = np.tile(1.0 / context.sigma, (3, 1))
+    common = common_factor(np.zeros((3, 0, context.sigma.size)), weights)
+    normals, took_part = np.tile(np.eye(6), (3, 1, 1)), np.ones(3, dtype=bool)
+    for start in start_from_grid(context.grid, context.field, coils, flux):
+        found = solve_body(
+            context.field, coils, flux, weights, common, *start, context.low, context.high
+        )
+        body = found.position, found.rotation
+        own = coils.offsets + found.position, coils.axes @ found.rotation.T
+        step_to_coils(*body, coils.offsets, coils.axes, *own, normals, context.low, context.high)
+        distances(
+            (*body, np.eye(6)), coils.offsets, coils.axes, (*own, normals), took_part,
+            SurveyErrors(1e-4, 1e-3, 1e-3),
+        )  # fmt: skip

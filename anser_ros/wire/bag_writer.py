@@ -19,8 +19,8 @@ import numpy as np
 import yaml
 from mcap.well_known import Profile, SchemaEncoding
 from mcap.writer import Writer
-from numpy.typing import NDArray
 
+from anser_ros.arrays import ComplexArray
 from anser_ros.errors import BagError
 from anser_ros.wire import cdr
 from anser_ros.wire.points import STALE, FluxPoints, PointFieldTuple, encode_flux
@@ -357,7 +357,7 @@ class SessionWriter(BagWriter):
         self.write(channel, stamp_ns, cdr.string_bytes(text))
 
     def write_readings(
-        self, sensors: Sequence[SensorSpec], stamp_ns: int, flux: NDArray[np.complex128]
+        self, sensors: Sequence[SensorSpec], stamp_ns: int, flux: ComplexArray
     ) -> None:
         """Write one window, stamped with its middle: a message of tools, and one of references.
 
@@ -411,7 +411,7 @@ class SessionWriter(BagWriter):
         return self._channels[topic]
 
 
-def _points(sensors: Sequence[SensorSpec], flux: NDArray[np.complex128]) -> FluxPoints:
+def _points(sensors: Sequence[SensorSpec], flux: ComplexArray) -> FluxPoints:
     """One window's cloud; a sensor lacks its reading where it has none of a driven emitter."""
     known, rows = np.isfinite(flux), SensorRows.of(sensors, fixed_only=True)
     lacks = (known != known.any(axis=0)).any(axis=1) | ~known.any()

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import SetupError
 from anser_ros.wire.text_files import read_own_yaml
 
@@ -37,11 +37,11 @@ class ChannelCalibration:
     channels: Mapping[int, ChannelResponse] = field(default_factory=dict)
     current_delay_s: float = 0.0
 
-    def areas_m2(self, channels: Iterable[int]) -> NDArray[np.float64]:
+    def areas_m2(self, channels: Iterable[int]) -> Array:
         """Return the effective area of each channel, m^2."""
         return np.array([self.channels.get(c, self.default).area_m2 for c in channels], float)
 
-    def delays_s(self, channels: Iterable[int]) -> NDArray[np.float64]:
+    def delays_s(self, channels: Iterable[int]) -> Array:
         """Return the delay of each channel, s."""
         return np.array([self.channels.get(c, self.default).delay_s for c in channels], float)
 

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.errors import LayoutError
 from anser_ros.fingerprint import DIGITS
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 PointFieldTuple = tuple[str, int, int, int]
 
 SATURATED = 1
@@ -38,8 +37,8 @@ _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'
 class FluxPoints:
     """Holds the fluxes of one demodulation window with a row for each sensor."""
 
-    channel: NDArray[np.int64]  # (S,)
-    flags: NDArray[np.int64]  # (S,), bits (`SATURATED`, `STALE`, `DROPPED`)
+    channel: Integers  # (S,)
+    flags: Integers  # (S,), bits (`SATURATED`, `STALE`, `DROPPED`)
     flux: ComplexArray  # (S, K), complex, T, a column per emitter
     position: Array  # (S, 3), m, frame fg; NaN for sensors that move
     axis: Array  # (S, 3), unit vector, frame fg; NaN for sensors that move
@@ -108,7 +107,7 @@ def _columns(records: NDArray[np.void], names: Sequence[str]) -> Array:
     return out
 
 
-def _integers(records: NDArray[np.void], name: str) -> NDArray[np.int64]:
+def _integers(records: NDArray[np.void], name: str) -> Integers:
     values = _columns(records, (name,))[:, 0]
     if not (np.abs(values) < 2.0**31).all():
         raise LayoutError(f'the field {name!r} holds values that are not small integers')

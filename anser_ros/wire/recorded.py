@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.setup import Setup, topic_of
 
@@ -17,7 +18,7 @@ LENGTH_TOLERANCE = 1e-2
 angles, or other columns, are farther off."""
 
 
-def unit_quaternions(given: ArrayLike) -> NDArray[np.float64]:
+def unit_quaternions(given: ArrayLike) -> Array:
     """Return quaternions (..., 4) of unit length, and NaN in place of what is none."""
     quaternions = np.asarray(given, dtype=np.float64)
     length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
@@ -95,19 +96,19 @@ def pose_setup(sensors: Iterable[str], body: str) -> str:
 class RecordedFluxes:
     """Holds the fluxes (F, S, K) of one topic, T, with flags (F, S), by ascending stamps (F,)."""
 
-    stamp_ns: NDArray[np.int64]
-    channel: NDArray[np.int64]
-    flags: NDArray[np.int64]
-    flux: NDArray[np.complex128]
+    stamp_ns: Integers
+    channel: Integers
+    flags: Integers
+    flux: ComplexArray
 
 
 @dataclass(frozen=True)
 class PoseStream:
     """Holds poses of one topic: stamps (M,), positions (M, 3) in m, quaternions x y z w (M, 4)."""
 
-    stamp_ns: NDArray[np.int64]
-    position: NDArray[np.float64]
-    quaternion: NDArray[np.float64]
+    stamp_ns: Integers
+    position: Array
+    quaternion: Array
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, sections_of, settings_from
@@ -41,8 +41,6 @@ KEYS = (
     'volume', 'tips', *SECTIONS,
 )  # fmt: skip
 FIELD_GENERATOR = 'fg'
-LOWEST_VOLUME_M = 1e-3
-"""Least height of a tracked volume over the copper (z = 0), m: no model holds nearer."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +85,9 @@ class SensorSpec:
 class SensorRows(NamedTuple):
     """Holds channels (S,), positions, m, and unit axes (S, 3), in the frames of bodies."""
 
-    channel: NDArray[np.int64]
-    position: NDArray[np.float64]
-    axis: NDArray[np.float64]
+    channel: Integers
+    position: Array
+    axis: Array
 
     @staticmethod
     def of(sensors: Sequence[SensorSpec], fixed_only: bool = False) -> 'SensorRows':
@@ -265,11 +263,6 @@ def _parse_volume(item: Any) -> tuple[Vector, Vector]:
     )
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise SetupError(f'setup: volume.low_m must be below volume.high_m, got {low} and {high}')
-    if low[2] < LOWEST_VOLUME_M:
-        raise SetupError(
-            f'setup: volume.low_m[2] must be at least {LOWEST_VOLUME_M:g} m over the board, '
-            f'got {low[2]:g}'
-        )
     return low, high
 
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import SetupError
 from anser_ros.wire.text_files import read_own_yaml, read_yaml
 
@@ -135,7 +135,7 @@ class TipSpec:
     covariance_m2: tuple[float, ...] = (0.0,) * 6
 
     @property
-    def covariance(self) -> NDArray[np.float64]:
+    def covariance(self) -> Array:
         """Return the covariance as a matrix, shape (3, 3), m^2, body's frame."""
         matrix = np.zeros((3, 3))
         for (i, j), value in zip(UPPER, self.covariance_m2, strict=True):

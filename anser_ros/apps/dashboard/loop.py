@@ -31,12 +31,8 @@ if TYPE_CHECKING:  # the loop itself needs no ROS
 RESULTS = 'results'
 """Folder inside it, in which every calibration and diagnosis gets a folder of its own."""
 SHOWN_FILES = (
-    'report.html',
-    'choice.png',
-    'populations.png',
-    'calibration.json',
-    'diagnosis.json',
-)
+    'report.html', 'choice.png', 'populations.png', 'calibration.json', 'diagnosis.json',
+)  # fmt: skip
 """Files of a result that a browser may ask for."""
 MOST = 100
 """Recordings that are offered, the newest: more is no list to choose from."""
@@ -79,7 +75,6 @@ class RecordingFolder:
         return path
 
     def new_result(self, kind: str, recording: str) -> Path:
-        """Make the folder of a result and return it."""
         return make_new_folder(self.path / RESULTS, f'{Path(recording).stem}_{kind}')
 
     def shown(self, result: str, name: str) -> Path | None:
@@ -102,10 +97,6 @@ def _is_bag(path: Path) -> bool:
 NICE = 10
 """Niceness of commands: poses go before a diagnosis."""
 PERCENT = re.compile(r'(\d+)%')
-KEPT_LINES = 20
-"""Lines of what a command says that are kept, for the last ones say why it failed."""
-LONGEST_LINE = 65_536
-"""Bytes of a line that are taken as one, which bounds the memory of a line without an end."""
 
 
 class Job:
@@ -120,14 +111,13 @@ class Job:
         self._arguments = [str(argument) for argument in arguments]
         self.exit_code: int | None = None
         self.share, self.stage = math.nan, ''
-        self._lines: list[str] = []
+        self._last_line = ''
         self._began_s, self._took_s = time.monotonic(), math.nan
         self._process: asyncio.subprocess.Process | None = None
         self._is_ended = False
 
     @property
     def seconds(self) -> float:
-        """Return how long it has run, or took, s."""
         return time.monotonic() - self._began_s if math.isnan(self._took_s) else self._took_s
 
     @property
@@ -137,16 +127,14 @@ class Job:
             return ''
         if self._is_ended:
             return f'{self.kind} was cancelled'
-        return self._lines[-1] if self._lines else f'{self.kind} ended with {self.exit_code}'
+        return self._last_line or f'{self.kind} ended with {self.exit_code}'
 
     async def run(self) -> None:
-        """Run it to its end."""
         command = [sys.executable, '-P', '-m', 'anser_ros.cli.main', self.kind, *self._arguments]
         with (self.folder / 'output.txt').open('wb') as output:
             self._process = await asyncio.create_subprocess_exec(
                 'nice', '-n', str(NICE), *command, stdin=asyncio.subprocess.DEVNULL,
                 stdout=output, stderr=asyncio.subprocess.PIPE, start_new_session=True,
-                limit=LONGEST_LINE,
             )  # fmt: skip
         try:
             await self._listen(self._process.stderr)
@@ -170,18 +158,16 @@ class Job:
         """Take a line of progress, ``what: stage, 43%, about 5 s left``, or of complaint."""
         if not line:
             return
-        self._lines = [*self._lines[-KEPT_LINES + 1 :], line]
+        self._last_line = line
         words, found = line.partition(': ')[2], PERCENT.search(line)
         self.share = int(found[1]) / 100 if found else math.nan
         self.stage = words or line
 
     def cancel(self) -> None:
-        """End it before its time."""
         self._is_ended = self._is_ended or self.exit_code is None
         self.end()
 
     def end(self) -> None:
-        """Ask its processes to end."""
         process = self._process
         if process is not None and process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
@@ -192,8 +178,6 @@ CALIBRATE, DIAGNOSE = 'calibrate', 'diagnose'
 SETTLING_S = 2.0
 """Time, s, after a change of the model that the figures after it leave out: warm starts and
 averages of before have their end in it."""
-MOST_UNDONE = 20
-"""Changes of the model that can be undone, which bounds what is kept of a long day."""
 
 
 class Found(NamedTuple):
@@ -210,7 +194,6 @@ class Found(NamedTuple):
 
     @property
     def model(self) -> Path:
-        """Return the path of the model that it wrote."""
         return self.folder / 'model.yaml'
 
 
@@ -259,7 +242,6 @@ class CorrectionLoop:
 
     @property
     def is_running(self) -> bool:
-        """Return whether a command runs."""
         return self.job is not None and self.job.exit_code is None
 
     @property
@@ -269,7 +251,6 @@ class CorrectionLoop:
 
     @property
     def can_undo(self) -> bool:
-        """Return whether a model was loaded here."""
         return bool(self._loaded)
 
     @property
@@ -281,7 +262,6 @@ class CorrectionLoop:
 
     @_step
     async def record(self) -> str:
-        """Begin to record another bag."""
         return f'recording to {Path(await self._chain.trigger("recorder/start")).name}'
 
     @_step
@@ -304,7 +284,6 @@ class CorrectionLoop:
 
     @_step
     async def calibrate(self) -> str:
-        """Fit a model to the chosen recording."""
         return await self._start(CALIBRATE)
 
     @_step
@@ -314,19 +293,17 @@ class CorrectionLoop:
 
     @_step
     async def load(self) -> str:
-        """Activate the model that was found."""
         if self.found is None:
             raise ParameterError('there is no model to load yet')
         before = await self._chain.model_files()
         figures = self._live.figures(0.0)
         await self._exchange(before, dict.fromkeys(before, str(self.found.model)))
-        self._loaded = [*self._loaded[-MOST_UNDONE + 1 :], Loaded(before, figures, time.time())]
+        self._loaded.append(Loaded(before, figures, time.time()))
         self._live.mark('model loaded')
         return 'the new model is active'
 
     @_step
     async def undo(self) -> str:
-        """Activate the model that was there before."""
         if not self._loaded:
             raise ParameterError('no model was loaded from this page')
         await self._exchange(await self._chain.model_files(), self._loaded[-1].before)
@@ -335,18 +312,15 @@ class CorrectionLoop:
         return 'the previous model is active again'
 
     def refresh_names(self) -> None:
-        """See which recordings there are."""
         self.names = tuple(self.folder.recordings())
         if self.chosen not in self.names:
             self.chosen = self.names[0] if self.names else ''
 
     def cancel(self) -> None:
-        """End the command that runs."""
         if self.job is not None:
             self.job.cancel()
 
     async def look(self) -> None:
-        """Ask which model is active."""
         self.model = (await self._chain.model_files()).get('field_model', '')
 
     # How it is done -----------------------------------------------------------------------

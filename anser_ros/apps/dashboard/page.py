@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,7 @@ class Screen:
             self._diagnose = _button('Diagnose', loop.diagnose, 'search').tooltip(
                 'Find what the active model lacks on this recording'
             )
-            self._cancel = _button('Cancel', self._end, 'close', flat=True)
+            self._cancel = _button('Cancel', loop.cancel, 'close', flat=True)
         self._progress = ui.linear_progress(0.0, show_value=False).classes('progress')
         self._message = ui.label().classes('words').mark('said')
         self._verdict = ui.label().classes('verdict').mark('verdict')
@@ -104,9 +104,6 @@ class Screen:
     def _choose(self, event: Any) -> None:
         self._loop.chosen = event.value or ''
 
-    async def _end(self) -> None:
-        self._loop.cancel()
-
     async def _open_report(self) -> None:
         found = self._loop.found
         if found is not None:
@@ -117,11 +114,9 @@ class Screen:
 
     @property
     def is_seen(self) -> bool:
-        """Return whether the browser is connected."""
         return bool(self._client.has_socket_connection)
 
     def show_frame(self, rows: list[Any]) -> None:
-        """Move what has moved since the last frame."""
         if self.is_seen and self._is_ready and self._version == self._source.version:
             self._instrument.run_method('frame', rows)
 
@@ -134,7 +129,7 @@ class Screen:
                 self._version = source.version
                 self._instrument.run_method('setup', world)
         elif self._is_ready:
-            self._instrument.run_method('table', source.table(), source.metal())
+            self._instrument.run_method('table', source.table(), source.metal)
             self._instrument.run_method('point', source.point())
             self._once('marks', source.marks(),
                        lambda marks: self._instrument.run_method('marks', marks))  # fmt: skip
@@ -236,9 +231,7 @@ def _heading(text: str) -> None:
     ui.html(f'<h2>{text}</h2>', sanitize=False)
 
 
-def _button(
-    text: str, action: Callable[[], Awaitable[None]], icon: str, flat: bool = False
-) -> Any:
+def _button(text: str, action: Callable[[], Any], icon: str, flat: bool = False) -> Any:
     style = 'flat' if flat else 'outline'
     return ui.button(text, on_click=action, icon=icon).props(f'{style} dense no-caps')
 
@@ -268,7 +261,6 @@ class Pages:
         self._tick = guarded(self._move)
 
     def register(self) -> None:
-        """Serve the page at ``/``."""
 
         @ui.page('/', title='anser_ros live view')
         def _page() -> None:
@@ -281,11 +273,9 @@ class Pages:
 
     @property
     def count(self) -> int:
-        """Return how many pages are open."""
         return len(self._screens)
 
     async def _drive(self) -> None:
-        """Move the pages for ever."""
         clock = asyncio.get_running_loop()
         due_s = clock.time()
         while True:

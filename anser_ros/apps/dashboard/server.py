@@ -9,14 +9,14 @@ import secrets
 import socket
 import threading
 from collections.abc import Awaitable, Callable, MutableMapping
-from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 import uvicorn
 from fastapi import FastAPI, HTTPException
-from fastapi.responses import FileResponse
+from fastapi.requests import HTTPConnection
+from fastapi.responses import FileResponse, PlainTextResponse, RedirectResponse
 from nicegui import ui
 
 from anser_ros.apps.dashboard.loop import RecordingFolder
@@ -38,11 +38,6 @@ FULL = (1013, 'too many pages')
 """The same where as many pages are open as may be."""
 
 
-def is_local(host: str) -> bool:
-    """Return whether an address can be reached from this machine alone."""
-    return host in LOOPBACK
-
-
 class Guard:
     """Stands before another ASGI application, and refuses who may not come in.
 
@@ -56,80 +51,53 @@ class Guard:
         self.pages = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, or refuse it."""
         if scope['type'] not in ('http', 'websocket'):
             await self._inner(scope, receive, send)
             return
-        headers = {name.decode('latin-1'): value.decode('latin-1')
-                   for name, value in scope['headers']}  # fmt: skip
-        query = parse_qs(scope['query_string'].decode('latin-1'))
-        given = query.get('token', [''])[0]
-        refused = self._refusal(scope, headers, query, given)
+        request = HTTPConnection(scope)
+        given = request.query_params.get('token', '')
+        refused = self._refusal(request, given)
         if refused:
             await _refuse(scope, receive, send, *refused)
         elif scope['type'] == 'websocket':
-            await self._connect(scope, receive, send)
+            self.pages += 1
+            try:
+                await self._inner(scope, receive, send)
+            finally:
+                self.pages -= 1
         elif given and self._token:
-            await _keep_token(scope, send, given)
+            # The browser keeps the token, and takes it out of the address line.
+            answer = RedirectResponse(scope['path'], 303)
+            answer.set_cookie(COOKIE, given, httponly=True, samesite='strict')
+            await answer(scope, receive, send)
         else:
             await self._inner(scope, receive, send)
 
-    def _refusal(
-        self, scope: Scope, headers: dict[str, str], query: dict[str, list[str]], given: str
-    ) -> tuple[int, str] | None:
-        host, origin = headers.get('host', ''), headers.get('origin', '')
-        if not self._token and not is_local(urlsplit(f'//{host}').hostname or ''):
+    def _refusal(self, request: HTTPConnection, given: str) -> tuple[int, str] | None:
+        host, origin = request.headers.get('host', ''), request.headers.get('origin', '')
+        if not self._token and urlsplit(f'//{host}').hostname not in LOOPBACK:
             return 403, 'The live view answers to localhost only.'
         if origin and urlsplit(origin).netloc != host:
             return 403, 'The request comes from another page.'
-        if self._token and not hmac.compare_digest(
-            (given or _token_of(headers)).encode(), self._token.encode()
-        ):
+        token = given or request.cookies.get(COOKIE, '')
+        if self._token and not hmac.compare_digest(token.encode(), self._token.encode()):
             return 401, 'Open the address with ?token=..., as the live view has printed it.'
         # A page that is connected can be counted; one that asks over and over can not.
-        if query.get('transport') == ['polling']:
+        if request.query_params.get('transport') == 'polling':
             return 403, 'WebSockets are needed.'
-        is_new = scope['type'] == 'websocket' or scope['path'] == '/'
+        is_new = request.scope['type'] == 'websocket' or request.scope['path'] == '/'
         if is_new and self.pages >= MOST_PAGES:
             return 503, f'{MOST_PAGES} pages are open, which is the most; close one of them.'
         return None
 
-    async def _connect(self, scope: Scope, receive: Receive, send: Send) -> None:
-        self.pages += 1
-        try:
-            await self._inner(scope, receive, send)
-        finally:
-            self.pages -= 1
-
-
-def _token_of(headers: dict[str, str]) -> str:
-    try:
-        cookies = SimpleCookie(headers.get('cookie', ''))
-    except CookieError:
-        return ''
-    return cookies[COOKIE].value if COOKIE in cookies else ''
-
-
-async def _keep_token(scope: Scope, send: Send, token: str) -> None:
-    """Let the browser keep the token, and take it out of the address line."""
-    cookie = f'{COOKIE}={token}; HttpOnly; SameSite=Strict; Path=/'
-    headers = [('location', scope['path']), ('set-cookie', cookie)]
-    await _answer(send, 303, headers, '')
-
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, code: int, words: str) -> None:
     if scope['type'] == 'http':
-        await _answer(send, code, [('content-type', 'text/plain')], words + '\n')
+        await PlainTextResponse(f'{words}\n', code)(scope, receive, send)
         return
     await receive()
     number, reason = FULL if code == 503 else POLICY
     await send({'type': 'websocket.close', 'code': number, 'reason': reason})
-
-
-async def _answer(send: Send, code: int, headers: list[tuple[str, str]], text: str) -> None:
-    coded = [(name.encode(), value.encode('latin-1')) for name, value in headers]
-    await send({'type': 'http.response.start', 'status': code, 'headers': coded})
-    await send({'type': 'http.response.body', 'body': text.encode()})
 
 
 EVERYWHERE = ('0.0.0.0', '::')
@@ -155,7 +123,7 @@ def token_for(host: str, token_file: str) -> str:
     Raises `ParameterError` when the file holds none, or a short one.
     """
     if not token_file:
-        return '' if is_local(host) else secrets.token_urlsafe(LEAST_TOKEN)
+        return '' if host in LOOPBACK else secrets.token_urlsafe(LEAST_TOKEN)
     try:
         token = Path(token_file).expanduser().read_text(encoding='utf-8').strip()
     except (OSError, UnicodeDecodeError) as error:
@@ -219,11 +187,9 @@ class PageServer:
         return f'http://{host}:{self.port}/' + (f'?token={self._token}' if self._token else '')
 
     def start(self) -> None:
-        """Begin to serve pages to browsers."""
         self._thread.start()
 
     def end(self) -> None:
-        """End it, and the connections with it."""
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(2 * END_S)

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import ComplexArray, Integers
 from anser_ros.diagnosis.diagnose import diagnose
 from anser_ros.diagnosis.problem import FEWEST_POSED_FRAMES, Problem, State, evaluate, rms
 from anser_ros.diagnosis.search import SearchSettings
@@ -26,8 +26,6 @@ from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes, unit_quaternions
 from anser_ros.wire.setup import Setup
-
-Array = NDArray[np.float64]
 
 OPTICAL, RIGID = 'optical poses', 'rigidity of the tools'
 LIGHT_SEARCH = SearchSettings(most_effects=1, finalists=4, iterations=6)
@@ -65,7 +63,6 @@ class Sighting:
 
     @property
     def is_clear(self) -> bool:
-        """Return whether all is as the model says."""
         return self.excess < EXCESS and not self.findings
 
 
@@ -202,15 +199,14 @@ MARGIN_NS = 1_000_000_000
 
 
 @dataclass
-class _Fluxes:
-    """Readings of one topic: stamp, fluxes (S, K) and flags (S,), all of the same channels."""
+class FluxRows:
+    """Holds readings of one topic: stamp, fluxes (S, K) and flags (S,), of the same channels."""
 
-    channel: NDArray[np.int64] | None = None
-    rows: deque[tuple[int, NDArray[np.complex128], NDArray[np.int64]]] = field(
-        default_factory=deque
-    )
+    channel: Integers | None = None
+    rows: deque[tuple[int, ComplexArray, Integers]] = field(default_factory=deque)
 
     def stream(self) -> RecordedFluxes | None:
+        """Return them as if they had been recorded; None without any."""
         if not self.rows or self.channel is None:
             return None
         stamps, flux, flags = zip(*self.rows, strict=True)
@@ -220,7 +216,8 @@ class _Fluxes:
 class SlidingWindow:
     """Keeps what came in the last seconds by the stamps, thinned to a number of frames.
 
-    ``frames`` is the most readings of a topic that are kept, spread evenly over the window;
+    ``tool`` and ``reference`` are the readings of the two topics, of which at most so many
+    ``frames`` are kept, spread evenly over the window;
     ``first_ns`` the stamp of the first reading of all, 0 before; ``restarts`` how often time ran
     backwards, and all was forgotten.
     """
@@ -230,16 +227,8 @@ class SlidingWindow:
         self._length_ns = round(length_s / NANO)
         self._step_ns = self._length_ns // frames
         self.first_ns, self.restarts = 0, 0
-        self._tool, self._reference = _Fluxes(), _Fluxes()
+        self.tool, self.reference = FluxRows(), FluxRows()
         self._poses: dict[str, deque[tuple[int, tuple[float, ...]]]] = {}
-
-    def take_tool(self, stamp_ns: int, points: FluxPoints) -> None:
-        """Keep the tools' fluxes of one stamp, unless they are late or too close to the last."""
-        self._take(self._tool, stamp_ns, points)
-
-    def take_reference(self, stamp_ns: int, points: FluxPoints) -> None:
-        """Keep the references' fluxes of one stamp, under the same rule."""
-        self._take(self._reference, stamp_ns, points)
 
     def take_pose(self, body: str, stamp_ns: int, pose: Sequence[float]) -> None:
         """Keep an optical pose (x y z in m, quaternion x y z w), unless it is late or no pose."""
@@ -257,7 +246,8 @@ class SlidingWindow:
         while rows[0][0] < stamp_ns - self._length_ns - MARGIN_NS:
             rows.popleft()
 
-    def _take(self, fluxes: _Fluxes, stamp_ns: int, points: FluxPoints) -> None:
+    def take(self, fluxes: FluxRows, stamp_ns: int, points: FluxPoints) -> None:
+        """Keep one topic's fluxes of a stamp, unless they are late or too close to the last."""
         channel = np.asarray(points.channel, dtype=np.int64)
         rows = fluxes.rows
         if order_of(stamp_ns, rows[-1][0] if rows else 0) is Order.BACK:
@@ -276,18 +266,18 @@ class SlidingWindow:
         """Start again: a replay has begun again, or the clock was set."""
         self.restarts += 1
         self.first_ns = 0
-        self._tool.rows.clear()
-        self._reference.rows.clear()
+        self.tool.rows.clear()
+        self.reference.rows.clear()
 
     @property
     def span_s(self) -> float:
         """Return the time between the oldest and the newest reading that is kept, s."""
-        spans = [f.rows[-1][0] - f.rows[0][0] for f in (self._tool, self._reference) if f.rows]
+        spans = [f.rows[-1][0] - f.rows[0][0] for f in (self.tool, self.reference) if f.rows]
         return max(spans, default=0) * NANO
 
     def session(self) -> Session | None:
         """Return what is in the window, None without fluxes; raises `BagError` as `session_of`."""
-        tool, reference = self._tool.stream(), self._reference.stream()
+        tool, reference = self.tool.stream(), self.reference.stream()
         if tool is None and reference is None:
             return None
         optical = {}

@@ -13,10 +13,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.one_place import calibrate_at_one_place
 from anser_ros.apps.lab.still import STILL_ONLY, calibrate_still
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import PoseWhitener, Progress, pose_precision, pose_terms
@@ -42,16 +42,12 @@ from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session
 from anser_ros.settings import Accuracy
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 POINT, SIZED = COAXIAL[:2]
 """Layouts of emitters without a size, and of those that have no more than a size."""
 STILL = 5.0
 """Standard deviations of the optical jitter within which all poses are one place."""
 LEAST_SIGMAS = 5.0
-"""Standard deviations, of five blocks, at which a size is reported: chance in one emitter of
-130."""
+"""Standard deviations, of five blocks, at which a size is reported: chance in one of 130."""
 STEPS = 4
 """Steps of the fit, each of which leaves a small part of the error before it."""
 WAYS = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-4, 1e-7])
@@ -134,10 +130,7 @@ def _solved(normal: Array, right: Array) -> Array:
 
 
 def _sums(
-    sources: _SizedSources,
-    calibration: Calibration,
-    folds: Sequence[NDArray[np.int64]],
-    blocks: NDArray[np.int64],
+    sources: _SizedSources, calibration: Calibration, folds: Sequence[Integers], blocks: Integers
 ) -> tuple[Array, Array]:
     """Normal equations of each block, (B, 8K, 8K) and (B, 8K)."""
     ways = np.diag(np.tile(WAYS, len(sources.sizes_m2)))

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.calibration_engines import is_estimated_jointly
 from anser_ros.apps.lab.still import AS_STATED, BEND, PLACEMENT, STILL_ONLY
+from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.result import SPREADS, Calibration
@@ -130,7 +130,7 @@ def _described(record: EffectRecord) -> EffectRecord:
     return replace(record, evidence={**words, **record.evidence})
 
 
-def residual_power(calibration: Calibration) -> NDArray[np.float64]:
+def residual_power(calibration: Calibration) -> Array:
     """Return the squared magnitude (F, S, K), T^2, of the held-out residual of each reading.
 
     Of a body at one place its mean reading is predicted, F = 1. NaN where nothing was measured.
@@ -144,7 +144,7 @@ def residual_power(calibration: Calibration) -> NDArray[np.float64]:
     return power
 
 
-def _differs(power: NDArray[np.float64], axis: int) -> bool:
+def _differs(power: Array, axis: int) -> bool:
     """Whether the logarithm of the power differs along an axis beyond chance."""
     from scipy.stats import f_oneway  # loads slowly, and other diagnoses do without
 

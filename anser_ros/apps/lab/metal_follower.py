@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from anser_ros.apps.lab.metal_lattice import Coils, KnownMetal, load_known_metal
@@ -23,30 +22,29 @@ from anser_ros.apps.lab.metal_track import (
     predicted,
     updated,
 )
+from anser_ros.arrays import Array
+from anser_ros.chain.frame import Answer, ChainFrame
+from anser_ros.chain.model_half import poses_of, tool_readings
 from anser_ros.errors import BagError, ModelFileError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.model_age import FrameModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.pose_states import MODEL_DOUBTFUL, OK, Withheld
+from anser_ros.pose_states import MODEL_DOUBTFUL, Withheld
 from anser_ros.refit.clouds import Excitation, excitation_for
 from anser_ros.refit.witness import ToolReading, coil_spread, linearised
-from anser_ros.sessions.follower import FrameModels, RefitSummary, tool_readings
+from anser_ros.sessions.follower import FrameModels, RefitSummary
 from anser_ros.sessions.nominal_board import stated_volume
 from anser_ros.sessions.prepared import PreparedSession, settings_for
-from anser_ros.sessions.session import FrameReadings, SessionFrame, tracking_noise
+from anser_ros.sessions.session import tracking_noise
 from anser_ros.settings import ToolSettings
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import NO_GATE, PoseEstimate, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
-Array = NDArray[np.float64]
-
 SPACING_M = 0.08
 """Of the places that are tried: about what a track finds back from."""
 APART_M = 0.15
-"""Distance of starts from each other, m: two that are nearer lead to the same place, and show
-nothing of whether another place explains the readings as well."""
+"""Distance of starts from each other, m: two that are nearer lead to the same place."""
 AT_ONCE = 64
 """Places that are worked out at once."""
 BEYOND_M = 0.4
@@ -112,13 +110,11 @@ TRIAL_S, SEARCH_AGAIN_S = 1.0, 1.0
 """How long they are followed, which is also the longest time without readings for which metal is
 still known to be there, and how long a search that found nothing is not repeated."""
 CERTAIN = 10.0
-"""Logarithm of how much more likely the chosen one must make the readings than no metal, or metal
-`ELSEWHERE_M` away."""
+"""Log likelihood of the chosen one over that of no metal, or of metal `ELSEWHERE_M` away."""
 ELSEWHERE_M = 0.04
 """Distance from which on two tracks are of different places, m."""
 DOUBTFUL, HOPELESS = 3.0, 9.0
-"""Squared misfit, over what is expected, from which on no pose is given, and the track is given
-up."""
+"""Squared misfit, over the expected one, at which no pose is given, and the track is given up."""
 MISFIT_MEMORY_S = 0.5
 """Time over which the misfit is averaged."""
 STRONGER, NEARER = 1.25, 0.8
@@ -308,26 +304,24 @@ class KnownMetalModels(FrameModels):
         self._stamp_ns = 0
         self.summary = RefitSummary()
 
-    def at(self, frame: SessionFrame) -> FrameModel:
+    def step(self, frame: ChainFrame) -> Answer:
         """Return what a frame is tracked with."""
         self._stamp_ns = frame.stamp_ns
         model, withheld = self._follower.at(frame.stamp_ns)
         self.summary.states[FOLLOWED if self._follower.is_followed else SEARCHED] += 1
         if model is not self._rough.model:
             self._rough = self._rough.with_model(model)
-        return FrameModel(model, withheld)
+        return Answer(frame.stamp_ns, model, withheld=withheld)
 
-    def witnessed(self, tools: FrameReadings, found: Sequence[PoseEstimate]) -> None:
+    def witnessed(self, frame: ChainFrame, found: Sequence[PoseEstimate]) -> None:
         """Take in what a frame's tools read, at poses near theirs."""
+        if (tools := frame.tools) is None:
+            return
         rough = self._rough.update(self._stamp_ns, tools.channels, tools.flux, tools.flags)
-        poses = {
-            one.name: (one.position, one.rotation)
-            for one in (*rough, *(one for one in found if one.state == OK))
-            if one.state == OK and one.rotation is not None
-        }
+        poses = poses_of((*rough, *found))
         at = [one.position for one in rough if np.isfinite(one.position).all()]
         self._follower.take(
             self._stamp_ns,
-            tool_readings(self._correction, tools.channels, tools.flux, tools.flags, poses),
+            tool_readings(self._correction, tools, poses),
             np.array(at) if at else None,
         )

@@ -14,9 +14,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DIPOLE_CONSTANT, MU_0
@@ -25,9 +25,6 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import Excitation
 from anser_ros.refit.prior import vector_basis
 from anser_ros.wire.text_files import read_document, write_document
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 STEPS = np.array([1e-3] * 3 + [5e-3] * 3)
 """Steps of the central differences by place (m) and turn (rad); their relative error is the square
@@ -243,8 +240,7 @@ lattice is not the metal's true shape."""
 SAMPLES = 3, 3
 """Samples across and up the volume where the effect of answers on the field is compared."""
 LARGEST_M, FARTHEST_M = 2.0, 3.0
-"""Largest body, and farthest place, that a file may state: more is a file in millimetres, and the
-search for the metal would not end."""
+"""Largest body, and farthest place, m, that a file may state: more is a file in millimetres."""
 EVERY = 8
 """Of the poses of the fit, for the same."""
 

@@ -23,6 +23,7 @@ from anser_ros.apps.lab.metal_lattice import (
     lattice_points,
     moved,
 )
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import BagError, FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.volume import TrackedVolume
@@ -34,9 +35,6 @@ from anser_ros.sessions.nominal_board import stated_volume
 from anser_ros.sessions.prepared import PreparedSession, correct
 from anser_ros.settings import Accuracy, ToolSettings
 from anser_ros.stamps import NANO
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 class CoilReadings(NamedTuple):

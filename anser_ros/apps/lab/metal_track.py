@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
@@ -27,6 +26,7 @@ from anser_ros.apps.lab.metal_lattice import (
     step_between,
 )
 from anser_ros.apps.lab.metal_learning import real_parts
+from anser_ros.arrays import Array, Integers
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable, along_each_axis
 from anser_ros.refit.clouds import Excitation
@@ -40,8 +40,6 @@ from anser_ros.refit.witness import (
     surroundings,
 )
 from anser_ros.settings import ToolSettings
-
-Array = NDArray[np.float64]
 
 MEMORY_S = 2.0
 """Time over which a lattice's misfit stays the same: it counts once in it, not in every frame."""
@@ -138,7 +136,7 @@ class Scene:
             self._lattice = known.lattice.with_parameters(whole)
         return self._lattice.near(known.directions @ off)
 
-    def own_columns(self, table: SensorTable) -> NDArray[np.int64]:
+    def own_columns(self, table: SensorTable) -> Integers:
         """Return which of the state's own errors are those of some coils."""
         first = [7 * self._own_row[name] for name in table.name]
         return (np.array(first)[:, None] + np.arange(7)).ravel()
@@ -200,7 +198,7 @@ def updated(scene: Scene, state: MetalState, reading: ToolReading, step_s: float
 
 
 def _posed(
-    scene: Scene, state: MetalState, reading: ToolReading, columns: NDArray[np.int64]
+    scene: Scene, state: MetalState, reading: ToolReading, columns: Integers
 ) -> ToolReading:
     """Return a reading at the pose that fits with the metal of a state."""
     lattice = scene.lattice(state.answers)

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.source_calibration import KINDS, SourceReadings, SourcesFit, SourcesFitter
 from anser_ros.apps.lab.still_fit import figures_of
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.calibration.held_out import HeldOut, rms
 from anser_ros.calibration.layouts import Generator, Layout
 from anser_ros.calibration.least_squares import as_real
@@ -29,12 +29,8 @@ from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import PlacedPoints
 from anser_ros.settings import Accuracy
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 NOISY = 5.0
-"""Times the median noise from which on a sensor is called noisy: two frames of four emitters make
-such a ratio by chance in no sensor of a thousand."""
+"""Times the median noise to be called noisy: chance in no sensor of a thousand with two frames."""
 FEWEST_SCATTERS = 4
 """Degrees of freedom of a sensor's scatter from which on it is called noisy."""
 WORDS = 'a three-component dipole for every emitter, place free, and {} of their stray fields'
@@ -93,9 +89,7 @@ def calibrate_at_one_place(
         layout=Layout('sources', strays, 1.0, 0.0, words=WORDS.format(strays)),
         damping=0.0,
         n_measurements=int(posed.usable.sum()),
-        residuals=Residuals(
-            np.sqrt((np.abs(left) ** 2).mean(axis=0)), float(flux.real.max() - flux.real.min())
-        ),
+        residuals=Residuals.of(left, flux),
         scan=Scan((right,), accuracy, effects, _noisy(posed.sensors.channel, noise_ratio)),
         undetermined=_unclear(posed, fit, readings.used & ~turned) if looked_for else (),
         more={'sources': _places(emitters, fit), 'sensor_widths': dict(fit.widths)},
@@ -118,7 +112,7 @@ def _mean(measured: Measurements, accuracy: Accuracy) -> tuple[SourceReadings, A
 
 
 def _noise(
-    measured: Measurements, mean: NDArray[np.complex128], parts: int, accuracy: Accuracy
+    measured: Measurements, mean: ComplexArray, parts: int, accuracy: Accuracy
 ) -> tuple[Array, Array]:
     """Noise of a part of each sensor's reading, T, and its ratio to the median sensor's.
 
@@ -164,7 +158,7 @@ def _fitted(readings: SourceReadings, kinds: Sequence[str]) -> SourcesFit:
     return SourcesFitter(readings, (low - margin, high + margin), kinds).fit()
 
 
-def _dipoles(fit: SourcesFit) -> tuple[Array, Array, NDArray[np.complex128]]:
+def _dipoles(fit: SourcesFit) -> tuple[Array, Array, ComplexArray]:
     """Positions, directions and moments (N, K): each source's own dipoles drive it alone."""
     sites = [one.sites for one in fit.sources]
     moments = scipy.linalg.block_diag(*(_phasors(one.moments)[:, None] for one in fit.sources))
@@ -175,7 +169,7 @@ def _dipoles(fit: SourcesFit) -> tuple[Array, Array, NDArray[np.complex128]]:
     return positions, directions, moments.astype(complex)
 
 
-def _phasors(parts: Array) -> NDArray[np.complex128]:
+def _phasors(parts: Array) -> ComplexArray:
     """Complex numbers (...) of their parts (..., C)."""
     return np.asarray(parts[..., 0] + (1j * parts[..., 1] if parts.shape[-1] == 2 else 0.0))
 
@@ -200,9 +194,7 @@ def _held_out(
     )
 
 
-def _reversed(
-    channels: NDArray[np.int64], evidence: Array, held_out: Array
-) -> tuple[EffectRecord, ...]:
+def _reversed(channels: Integers, evidence: Array, held_out: Array) -> tuple[EffectRecord, ...]:
     """A record of the channels that are the wrong way round, with the least evidence of one."""
     if not channels.size:
         return ()
@@ -211,7 +203,7 @@ def _reversed(
     return (EffectRecord('sensor_polarity', {'channels': channels.tolist()}, {}, found),)
 
 
-def _noisy(channels: NDArray[np.int64], ratio: Array) -> tuple[EffectRecord, ...]:
+def _noisy(channels: Integers, ratio: Array) -> tuple[EffectRecord, ...]:
     """A record of each channel with more noise than the median one."""
     return tuple(
         EffectRecord('excess_noise', {'factor': float(ratio[k]), 'channels': [int(channels[k])]})
@@ -219,7 +211,7 @@ def _noisy(channels: NDArray[np.int64], ratio: Array) -> tuple[EffectRecord, ...
     )
 
 
-def _unclear(posed: Measurements, fit: SourcesFit, others: Mask) -> tuple[str, ...]:
+def _unclear(posed: Measurements, fit: SourcesFit, others: Booleans) -> tuple[str, ...]:
     """A line for the sensors whose polarity the readings do not determine."""
     rows = np.flatnonzero(others & (fit.sign_evidence >= -LEAST_EVIDENCE))
     if not rows.size:

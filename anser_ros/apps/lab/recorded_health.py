@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.rotations import axis_angles, rotation_angles
@@ -19,8 +19,6 @@ from anser_ros.stamps import NANO
 from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages, published_poses
 from anser_ros.wire.recorded import PoseStream
 from anser_ros.wire.setup import topic_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.still_fit import DIPOLE_PAYS, FREEDOM, LEAST_CLEARANCE, student_weight
+from anser_ros.arrays import Array, Booleans
 from anser_ros.calibration.readings import DipoleSites
 from anser_ros.errors import FitError
 from anser_ros.physics.sensor import PlacedPoints
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 KINDS = ('places', 'axes', 'gains')
 """Kinds of sensors' errors whose widths are found where they are asked for: m, rad, relative."""
@@ -60,7 +57,7 @@ class SourceReadings:
     points: PlacedPoints  # of the sensors
     flux: Array  # (S, K, C): the C real parts of each source's flux, T
     noise_t: Array  # (S,): noise of a part, T
-    used: Mask  # (S,)
+    used: Booleans  # (S,)
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,7 @@ class _OneEmitter:
     points: PlacedPoints
     flux: Array  # (S, C), T
     noise_t: Array
-    used: Mask
+    used: Booleans
     widths: dict[str, float] | None
 
     def left(self, source: LocatedSource) -> Array:

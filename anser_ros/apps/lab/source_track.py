@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
+from anser_ros.arrays import Array, Booleans
 from anser_ros.field.model import SymmetryAxis, symmetry_axis
 from anser_ros.physics.dipole import field_basis
 from anser_ros.physics.rotations import nearest_rotation, rotation_of_vector
@@ -27,8 +27,6 @@ from anser_ros.tracking.rigid import BodyCoils, BodySolution, common_factor, sol
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import ROLL_VARIANCE, RealField, bounded_inverse
 from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
-
-Array = NDArray[np.float64]
 
 DIRECTIONS, RATIO = 400, 1.15
 """Directions of the scan's places, and the ratio of neighbouring distances: both leave about a
@@ -133,7 +131,7 @@ class _SourceFrame(SolveFrame):
         self.coils, self.used, self.axis = body.coils, body.usable, axis
 
     @cached_property
-    def live(self) -> NDArray[np.bool_]:
+    def live(self) -> Booleans:
         """Return which flux components (2K,) carry anything: a constant one has no quadrature."""
         return np.asarray((self.flux != 0.0).any(axis=0))
 

@@ -13,10 +13,10 @@ import pickle
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.still_fit import STILL_STEPS, StillFit, StillFitter, figures_of
 from anser_ros.apps.lab.still_model import POSE
+from anser_ros.arrays import Array, Booleans
 from anser_ros.calibration.held_out import HeldOut, HeldOutTally, rms
 from anser_ros.calibration.layouts import Generator, Layout
 from anser_ros.calibration.moments import (
@@ -41,8 +41,6 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import clusters_of
 from anser_ros.settings import Accuracy
-
-Array = NDArray[np.float64]
 
 STILL_KINDS = ('gains', 'axes', 'bend', 'poses')
 """Kinds of errors that few poses of many sensors show. The poses' errors are part of every fit;
@@ -203,7 +201,7 @@ def _where_the_other_half_finds_it(
 
 
 def _at_best_pose(
-    sound: Measurements, fit: StillFit, accuracy: Accuracy, seen: NDArray[np.bool_]
+    sound: Measurements, fit: StillFit, accuracy: Accuracy, seen: Booleans
 ) -> Measurements:
     """The frame at the pose that the readings of these sensors make most probable."""
     weights, precision = usable_weights(sound) * seen, pose_precision(accuracy)

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anser_ros.apps.lab.still_model import POSE, Columns, StillModel, StillUnknowns
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.layouts import SPREAD, UNIT_Z, coaxial, fit_coaxial
 from anser_ros.calibration.moments import FitFigures
 from anser_ros.calibration.population import LEAST_EVIDENCE
@@ -28,14 +28,10 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.settings import Accuracy
 
-Array = NDArray[np.float64]
-
 FREEDOM = 4.0
-"""Degrees of freedom of Student's t, the distribution of a channel's readings in a frame: a few
-wild ones lose weight, and the others hardly any."""
+"""Degrees of freedom of Student's t: a few wild readings lose weight, the others hardly any."""
 SHARED = 100.0
-"""How many times tighter an error's sum over all frames is held than the error: what all frames
-share moves the field or turns the sensors."""
+"""How many times tighter errors' sum is held: what all frames share moves the field instead."""
 AT_ONCE = 64
 """Places of a dipole that are judged at a time; each takes three columns for each part."""
 
@@ -166,16 +162,16 @@ class StillSystem:
         left = rest - np.einsum('sra,sa->sr', columns.own, own)
         self.residual = left.reshape(self.sensors, parts, self.frames).transpose(2, 0, 1)
 
-    def student_weights(self, usable: NDArray[np.bool_]) -> Array:
+    def student_weights(self) -> Array:
         """Return weights (F, S) of the readings by what is left of them; 0 where unusable."""
         parts = self.model.parts
         size = (self.residual**2).sum(axis=2) / self.widths.noise_t**2
-        return np.where(usable, student_weight(size, parts), 0.0)
+        return np.where(self.model.usable, student_weight(size, parts), 0.0)
 
-    def log_evidence(self, usable: NDArray[np.bool_]) -> float:
+    def log_evidence(self) -> float:
         """Return Laplace's approximation of the log evidence, up to a constant of the readings."""
         parts, noise = self.model.parts, self.widths.noise_t
-        size = (self.residual**2).sum(axis=2)[usable] / noise**2
+        size = (self.residual**2).sum(axis=2)[self.model.usable] / noise**2
         fit = -0.5 * (FREEDOM + parts) * float(np.log1p(size / FREEDOM).sum())
         fit -= parts * size.size * np.log(noise)
         penalty = float(self.values @ self.prior @ self.values)
@@ -218,8 +214,7 @@ NOISE_STEP = 2.0
 MOST_NOISE_STEPS = 20
 """Variations of the noise at most: from any that may be stated to any that is real."""
 DIPOLE_PAYS = 20.0
-"""Log evidence that a free dipole must add: many places were tried, of which the best is always
-better than none."""
+"""Log evidence that a free dipole must add: the best of many places always adds some."""
 MOST_FREE_DIPOLES = 6
 """Free dipoles in addition to the emitters at most; each further one costs a search."""
 REACH = 0.7
@@ -229,8 +224,7 @@ GRID = 0.25
 HALVINGS = 3
 """Refinements of a place, each by half the distance."""
 LEAST_CLEARANCE = 0.05
-"""Least distance of a dipole from every sensor, as a fraction of the sensors' extent: a nearer one
-is felt by one sensor alone, and is that sensor's."""
+"""Least distance of a dipole from sensors, in their extent: a nearer one is one sensor's error."""
 SIZES = (1e-3, 1e-2, 1e-1, 1.0)
 """Expected sizes of a free dipole's field at the nearest sensor, relative to the fluxes."""
 
@@ -253,7 +247,7 @@ class StillFit:
     evidence: dict[str, float]  # log evidence that each kind of error added to those before it
 
     @property
-    def moments(self) -> NDArray[np.complex128]:
+    def moments(self) -> ComplexArray:
         """Return the moments (N, K), A m^2."""
         return self.model.phasors(self.unknowns.moments)
 
@@ -278,11 +272,10 @@ class StillFitter:
         self.with_beside = functools.cache(self._with_beside)
 
     def _around(self, centres: Array) -> tuple[DipoleSites, Array]:
-        """Return dipoles about each emitter, and how large their moments may be.
+        """Dipoles about each emitter, and how large their moments may be.
 
-        One dipole finds an emitter's place. Six more about it, at a distance that is small
-        compared with that of the sensors, make the multipoles of its size. All serve all emitters,
-        as the iron of one carries the fields of the others.
+        Six about the one that finds its place make the multipoles of its size. All serve all
+        emitters, as the iron of one carries the fields of the others.
         """
         start = coaxial(centres, np.tile(UNIT_Z, (len(centres), 1)), 1, np.ones(len(centres)))
         weights = [usable_weights(self.measurements)]
@@ -360,14 +353,14 @@ class StillFitter:
             now = system.solution
             sites = self._moved(sites, system.steps)
             if step < STILL_STEPS - 1:
-                weights = system.student_weights(model.usable)
+                weights = system.student_weights()
             if 2 <= step < STILL_STEPS - 2:
                 widths = self._learnt(system, beside)
         determined = 1.0 - system.moment_variance / widths.moments[:, None] ** 2
         return StillFit(
             model, sites, beside, now, np.sqrt(system.sensor_variance),
             np.sqrt(system.frame_variance), widths, weights,
-            float(determined.sum(axis=0).mean()), system.log_evidence(model.usable), {},
+            float(determined.sum(axis=0).mean()), system.log_evidence(), {},
         )  # fmt: skip
 
     def _moved(self, sites: DipoleSites, steps: Array) -> DipoleSites:

@@ -11,9 +11,9 @@ Theory of Plates and Shells, chapter 2).
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.least_squares import as_complex, as_real
 from anser_ros.calibration.moments import pose_slopes
 from anser_ros.calibration.readings import DipoleSites
@@ -22,13 +22,10 @@ from anser_ros.physics.dipole import flux_basis, flux_jacobian
 from anser_ros.physics.rotations import tangents, tilted
 from anser_ros.physics.sensor import SensorTable
 
-Array = NDArray[np.float64]
-
 DEGREE = 4
 """Degree of the polynomial: that of a plate under an even load, whose bend has fourth powers."""
 FLAT = 0.02
-"""Thickness (rms) of a body's cloud of sensors, as a fraction of its extent (rms), up to which it
-is a plate. A thicker body has no one surface whose lift would move all of its sensors."""
+"""Thickness (rms) of a body's cloud of sensors, over its extent (rms), of a plate at most."""
 
 
 @dataclass(frozen=True)
@@ -127,11 +124,11 @@ class StillModel:
         """Return whether any usable reading has an imaginary part."""
         return bool((measurements.flux[measurements.usable].imag != 0.0).any())
 
-    def phasors(self, parts: Array) -> NDArray[np.complex128]:
+    def phasors(self, parts: Array) -> ComplexArray:
         """Return the phasors (..., K) of their parts (..., C)."""
         return as_complex(parts) if self.is_complex else parts.astype(complex)
 
-    def _parts(self, flux: NDArray[np.complex128]) -> Array:
+    def _parts(self, flux: ComplexArray) -> Array:
         """Real parts (..., K) of phasors, or real and imaginary ones by turns (..., 2K)."""
         return as_real(flux) if self.is_complex else np.ascontiguousarray(flux.real)
 
@@ -231,7 +228,7 @@ class StillModel:
         return Columns(target, basis, by_frame, own, places)
 
     def _by_dipole_place(
-        self, now: StillUnknowns, flat: tuple[Array, ...], moments: NDArray[np.complex128],
+        self, now: StillUnknowns, flat: tuple[Array, ...], moments: ComplexArray,
         movable: int,
     ) -> Array:  # fmt: skip
         """A dipole that moves does what all sensors that move the other way would feel of it."""

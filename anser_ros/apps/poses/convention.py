@@ -5,25 +5,25 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import Role, effect_with
+from anser_ros.apps.poses.problem import PoseProblem
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession
 from anser_ros.apps.poses.start import (
     coarse_offset,
     first_cost,
     first_fit,
     is_at_rest,
+    longest_recording,
     pose_problem,
     turn_misfit,
 )
+from anser_ros.arrays import Array
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.plausibility import check_positions
 from anser_ros.wire.table_names import LENGTH_M
-
-Array = NDArray[np.float64]
 
 POOR_M = 8e-3
 """Median misfit of hand-eye, m and tenths of rad together, from which other readings are tried:
@@ -36,8 +36,7 @@ TURNS_SHARE, TURNED_SHARE = 0.8, 0.7
 order although places fit: recordings that were read wrongly left 0.57 to 0.69 and 0.43 to 0.51."""
 FEW_POSES = 150  # poses of a sensor that a reading is judged by, a fit each: a median needs few
 HOPELESS_M = 25e-3
-"""Median misfit, m, with which no reading fits and a session is refused: as much as a wrong
-reading makes at least (`POOR_M`)."""
+"""Median misfit, m, at which a session is refused: a wrong reading makes as much (`POOR_M`)."""
 CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])  # of x y z w: the inverse turn
 UNITS = {
     **LENGTH_M, 'km': 1e3, 'inch taken for mm': 25.4, 'mm taken for inch': 1 / 25.4,
@@ -112,15 +111,21 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     is_turned = cost < POOR_M and _is_turned(as_written)
     if cost < POOR_M and not is_turned:
         return as_written, record
-    trials = [(_cost(reading.applied(session)), reading) for reading in _readings(unit)]
+    offset = coarse_offset(_few(as_written))  # which no reading of the tracked poses changes
+    trials = [
+        (_cost(reading.applied(session), None if reading.stream == REFERENCE else offset), reading)
+        for reading in _readings(unit)
+    ]
     best, reading = min(trials, key=lambda pair: pair[0])
     if best < (TURNED_SHARE if is_turned else RIGHT_MISFIT_SHARE) * cost:
         return reading.applied(session), reading.record(cost, best, ratio)
     if cost > HOPELESS_M:
+        reach = longest_recording(pose_problem(session))
         raise PlausibilityError(
             f'{session.path}: tracked and optical poses do not belong together: hand-eye is off '
-            f'by {1e3 * cost:.0f} mm in the median, and by {1e3 * best:.0f} mm when quaternions '
-            f'are read in another order or sense'
+            f'by {1e3 * cost:.0f} mm in the median at the best offset of their clocks, up to '
+            f'{reach:.0f} s, and by {1e3 * best:.0f} mm when quaternions are read in another '
+            'order or sense; are they of one body at the same time?'
         )
     return as_written, record
 
@@ -157,11 +162,16 @@ def _readings(unit: str) -> Iterator[PoseReading]:
             yield PoseReading(stream, quaternion, handedness, unit)
 
 
-def _cost(session: PoseSession) -> float:
+def _few(session: PoseSession) -> PoseProblem:
     problem = pose_problem(session)
     step = max(1, max(poses.size for poses in problem.sensors) // FEW_POSES)
-    problem = problem.rows([np.arange(0, poses.size, step) for poses in problem.sensors])
-    return first_cost(first_fit(problem, coarse_offset(problem), False))
+    return problem.rows([np.arange(0, poses.size, step) for poses in problem.sensors])
+
+
+def _cost(session: PoseSession, offset: float | None = None) -> float:
+    problem = _few(session)
+    offset = coarse_offset(problem) if offset is None else offset
+    return first_cost(first_fit(problem, offset, False))
 
 
 def _is_turned(session: PoseSession) -> bool:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.convention import PoseReading
@@ -13,12 +12,11 @@ from anser_ros.apps.poses.diagnosis import PoseDiagnosis
 from anser_ros.apps.poses.effect import SMOOTH, PoseMap, Role, effect_of_record, effect_with
 from anser_ros.apps.poses.hand_eye import PoseClock
 from anser_ros.apps.poses.sequence import FARTHEST, NO_TURN, PoseSequence
+from anser_ros.arrays import Array
 from anser_ros.calibration.error_map import ErrorMap
 from anser_ros.diagnosis.diagnose import SCHEMA
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord, plain
-
-Array = NDArray[np.float64]
 
 MODEL_SCHEMA = 'anser_pose_model/1'
 """Name of the layout of a model of poses."""

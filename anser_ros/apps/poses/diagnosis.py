@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.convention import read_rightly
@@ -45,15 +44,13 @@ from anser_ros.apps.poses.start import (
     train_blocks,
     untangled,
 )
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.diagnosis.problem import TEST_EVERY
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 
-Array = NDArray[np.float64]
-
 FEWEST_RECORDINGS = 8
-"""Recordings at rest from which each is judged by a fit of others: of fewer the rest does not
-determine all frames."""
+"""Recordings at rest from which each is judged by a fit of others: fewer leave frames open."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ def errors_of(state: PoseState) -> HeldOutErrors:
 
 
 def held_out(
-    problem: PoseProblem, found: PoseFit, test: NDArray[np.int64]
+    problem: PoseProblem, found: PoseFit, test: Integers
 ) -> tuple[PoseState, PoseState, HeldOutErrors]:
     """Return held-out poses before and after, and what registration alone leaves of them."""
     folds = [(found, test)]
@@ -198,7 +195,7 @@ def _share(part: PosePart, name: str) -> float:
     return explained / max(total, 1e-18) - len(numbers) / max(len(residual), 1)
 
 
-def _groups(part: PosePart, used: NDArray[np.bool_], name: str) -> NDArray[np.int64]:
+def _groups(part: PosePart, used: Booleans, name: str) -> Integers:
     if name == 'time':
         time = part.view.time[used]
         return np.asarray(np.argsort(np.argsort(time)) * GROUPS**2 // time.size, dtype=np.int64)
@@ -215,8 +212,7 @@ def _groups(part: PosePart, used: NDArray[np.bool_], name: str) -> NDArray[np.in
 
 
 ABOVE_FLOOR = 1.3
-"""Factor of the held-out error over the jitter from which something stays unexplained. What is no
-jitter is then 0.8 of it (the root of 1.3 squared less one)."""
+"""Factor of the held-out error over the jitter from which something stays unexplained."""
 
 LEAST_REPORTED_M = 0.3e-3
 """Held-out error, m, below which nothing is said to be unexplained: no tracker promises less. Of
@@ -325,7 +321,7 @@ def diagnose_poses(
     )
 
 
-def _confirmed(search: PoseSearch, problem: PoseProblem, test: NDArray[np.int64]) -> PoseSearch:
+def _confirmed(search: PoseSearch, problem: PoseProblem, test: Integers) -> PoseSearch:
     """The search without effects of place that positions do not confirm."""
     fit = search.fit
     for index, term in enumerate(fit.terms):

@@ -11,10 +11,10 @@ from functools import cache
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
 
 import anser_ros.apps.poses.effects as package
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSession
+from anser_ros.arrays import Array
 from anser_ros.effects.base import BaseEffect, BaseTerm
 from anser_ros.effects.effect import effects_in, sigmas
 from anser_ros.field.model import EffectRecord
@@ -22,7 +22,6 @@ from anser_ros.field.model import EffectRecord
 if TYPE_CHECKING:
     from anser_ros.apps.poses.problem import PoseResiduals
 
-Array = NDArray[np.float64]
 
 SMOOTH = 'smooth'
 """The kind of a map of places that is determined by the points that it was learnt from."""
@@ -213,10 +212,6 @@ class PoseEffect(BaseEffect[PoseTerm]):
     def beside_scale(self, term: PoseTerm) -> PoseTerm | None:
         """Return what is left of a term beside one scale of all sensors; None where nothing is."""
         return term
-
-    def whole(self, term: PoseTerm) -> PoseTerm | None:
-        """Return a map with what it lacks beside a scale, of zeros; None where nothing lacks."""
-        return None
 
     def is_scale(self, term: PoseTerm) -> bool:
         """Return whether a term is one scale, of a sensor or of all."""

@@ -9,7 +9,6 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv, ndtri
@@ -17,37 +16,29 @@ from scipy.special import gammaincinv, ndtri
 from anser_ros.apps.poses.effect import PoseTerm, Role
 from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState, stamp_step
 from anser_ros.apps.poses.sequence import PoseSequence, PoseSession
+from anser_ros.arrays import Array, Booleans
 from anser_ros.diagnosis.engine import JointFit, descended, stepped
 from anser_ros.effects.effect import sigmas
 
-Array = NDArray[np.float64]
-
 STUDENT_FREEDOM = 4.0
-"""Degrees of freedom of Student's distribution by which poses are weighted in a robust fit: the
-usual compromise between the mean (infinite) and a distribution without one (1)."""
+"""Degrees of freedom of Student's t in robust fits: between the mean (infinite) and Cauchy (1)."""
 REWEIGHTINGS = 5
-"""Fits of a robust fit after the first, each with the weights of the one before. Fewer leave bad
-poses some of their first weight; more cost a fit each and change weights by little."""
+"""Fits of a robust fit after the first: fewer leave bad poses some of their first weight."""
 STANDS_OUT, FAR_OUT = 7.0, 25.0
-"""Distances of a pose from its prediction, in robust spreads of a coordinate, from which it stands
-out: where few do (normal ones once in 1e10), and where many do, as what an effect makes."""
+"""Distances of a pose from its prediction, in spreads, to stand out: where few do, and many."""
 FEW_SHARE = 0.03
 """Share of a sensor's poses up to which those that stand out are few: between one window and the
 two that metal must be near to be named (`episodes.WINDOWS`)."""
 SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
 FEWEST_BLOCKS = 10
-"""Blocks by whose scores the variance of a time beside a poll is judged. Fewer have no slow
-course; more take errors of stamps as random that are not."""
+"""Blocks by whose scores the variance of a time beside a poll is judged; fewer show no course."""
 SLOW = 6
-"""Tapers of a slow course. Fewer take chance for accuracy; more are as quick as the teeth that end
-in blocks."""
+"""Tapers of a slow course: fewer take chance for accuracy, more are as quick as a poll's teeth."""
 CHANCE = 0.01
-"""Chance that the poses' own noise makes a slow course that is believed. Larger widens sigmas for
-noise; smaller leaves out a slow beat of poll and tracker."""
+"""Chance that the poses' own noise makes a slow course: smaller leaves out beats of a poll."""
 FILTER_STEPS = 3  # Newton's, to a time constant that is known to some percent
 NEAR_TAU = 1.25
-"""Factor by which positions alone may move a time constant. Smaller keeps one that orientations
-have moved; larger follows steps where no filter is, which lead anywhere."""
+"""Factor by which positions alone may move a time constant; without a filter it leads anywhere."""
 LARGEST_STAMP_S = 0.1
 """Spread of stamps, s, beyond which a time makes no pose of a hand's motion."""
 
@@ -165,7 +156,7 @@ def _spread(part: PosePart) -> PoseNoise:
     )
 
 
-def unexplained_poses(state: PoseState) -> tuple[NDArray[np.bool_], ...]:
+def unexplained_poses(state: PoseState) -> tuple[Booleans, ...]:
     """Return the poses that nothing explains: far beyond the spread of their sensor's others."""
     found = []
     for part in state.parts:
@@ -218,11 +209,9 @@ LEAST_JITTER_RAD = 1e-5  # no reference measures turns better; none at all has n
 FEWEST_TURNS = 20  # poses that tell a reference's jitter, to 16 %
 MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
 LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
-"""Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given:
-the motion does not determine it."""
+"""Standard deviation of a lever arm's component, m, or turn, rad, beyond which it is not given."""
 MUCH_TILT = 0.15
-"""Turns of the body, rad rms, that move a lever arm of 5 cm by 8 mm, as much as a slow filter
-moves a hand."""
+"""Turns, rad rms, that move a lever arm of 5 cm by 8 mm, as much as a slow filter does a hand."""
 HARDLY_DETERMINED_M = 0.022
 """Lever arm, m, that would make the median error by turns alone, from which the motion does not
 determine it: beyond this levers of recordings were off by 9 mm and more, below by 4 and less."""
@@ -234,7 +223,7 @@ leaves less, as the frames take up what goes with its turns, and with it wrong l
 
 def is_lever_determined(
     part: PosePart, jitter_rad: float, error_m: float = OWN_ERROR_M
-) -> NDArray[np.bool_]:
+) -> Booleans:
     """Return the mask (3,) of the components of a lever arm that the motion determines.
 
     Errors of the measured rotations make a lever arm too small by their share of the rotations'
@@ -299,8 +288,7 @@ def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
 
 
 SAME_SCALE = 1 / 370
-"""Chance that noise makes the scales of any two sensors of one reference differ so much: of one
-pair, three standard deviations. Larger takes noise for a difference; smaller misses some."""
+"""Chance that noise makes any two sensors' scales differ so much: three sigmas of one pair."""
 SCALE_DIFFERS = 0.003  # difference of scales that matters: 1 mm in a tracked volume
 
 

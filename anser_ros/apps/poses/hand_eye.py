@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.convention import read_rightly
@@ -23,11 +22,10 @@ from anser_ros.apps.poses.problem import PoseProblem
 from anser_ros.apps.poses.search import PoseEvidence, frame_terms, with_noise
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, train_blocks
+from anser_ros.arrays import Array
 from anser_ros.effects.effect import needed, sigmas
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
-
-Array = NDArray[np.float64]
 
 AGREE_S = 3.0
 """Time about a session's start or middle, s, at which clocks count as agreeing: programs set

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.sequence import (
@@ -21,6 +20,7 @@ from anser_ros.apps.poses.sequence import (
     sequence_of,
     stamp_words,
 )
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.physics.rotations import nearest_rotation
 from anser_ros.sessions.table_import import SCHEMA
@@ -39,8 +39,6 @@ from anser_ros.wire.recorded import (
 )
 from anser_ros.wire.table_names import LENGTH_M, TIME_NS, UNITS, meaning_of, pose_columns
 from anser_ros.wire.tables import Table, decode_text, read_table
-
-Array = NDArray[np.float64]
 
 ORDERS = {
     'xyzw': ((0, 1, 2, 3), 1.0),
@@ -313,13 +311,13 @@ def _advice(table: Table, error: ParameterError) -> str:
 Piece = tuple[str, Array, Array, Array]
 """Name of a stream, and of one of its recordings times, s, positions, m, and quaternions."""
 BETWEEN_FILES_S = 10.0
-"""Pause, s, between recordings without a host's time that are put one after the other. A pose is
-not interpolated over a tenth of it."""
+"""Pause, s, between recordings without a host's time; nothing interpolates over a tenth of it."""
+SET_S, CLOCKS_APART = 0.3, 3e-3
+"""Time, s, and share of the time passed, by which clocks that nobody sets may move against each
+other between recordings: these start late by some 40 ms, and quartz errs by a thousandth."""
 MOST_RESTARTS = 5
-"""Falls of a device's counter in one recording up to which they are restarts; of more, rows are in
-another order."""
-STAMPS = ('host', 'device')
-"""Which of a file's times become stamps; the other is taken where a file lacks the one."""
+"""Falls of a counter in a recording that may be restarts; with more, rows are in no order."""
+STAMPS = ('host', 'device')  # which time becomes the stamp; the other where a file lacks the one
 
 
 def import_poses(
@@ -351,9 +349,8 @@ def import_poses(
             f'{len(tracked)} files of tracked poses and {len(reference)} of the reference; '
             'they belong together one by one'
         )
-    pieces: list[Piece] = []
+    recordings: list[dict[str, Array]] = []
     lost: list[str] = []
-    free = 0.0  # where the next recording without a host's time begins, s
     for number, path in enumerate(tracked):
         rows, unread = read_form(path)
         groups, files = _named(path, rows, None, unit, quaternion), [(path, unread)]
@@ -363,16 +360,11 @@ def import_poses(
             files.append((reference[number], unread))
         words = 'lines of {} that are no poses, and are left out: {}'
         lost += [words.format(*one) for one in files if one[1]]
-        times = {label: _times(table, stamps) for label, table in groups.items()}
-        for label, (time, _) in times.items():
-            if not np.isfinite(time).any():
-                raise ParameterError(f'{path}: {label}: no pose has a time')
         for label, table in groups.items():
-            time, is_host = times[label]
-            begin = -shift_s[label == REFERENCE] if is_host else _begin(label, times) - free
-            pieces.append((label, time - begin, table[:, 2:5], table[:, 5:]))
-        if not all(is_host for _, is_host in times.values()):
-            free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
+            if not np.isfinite(table[:, :2]).any():
+                raise ParameterError(f'{path}: {label}: no pose has a time')
+        recordings.append(groups)
+    pieces = _placed(recordings, stamps, shift_s)
     called = _called([piece[0] for piece in pieces], names or {})
     lost += [
         f'{old} is called {new}'
@@ -397,10 +389,47 @@ def _called(found: Sequence[str], names: Mapping[str, str]) -> dict[str, str]:
     return {**called, REFERENCE: REFERENCE}
 
 
-def _begin(label: str, times: Mapping[str, tuple[Array, bool]]) -> float:
-    """Where a device's own time begins: two devices that count for themselves start together."""
-    same = [t for key, (t, _) in times.items() if (key == REFERENCE) == (label == REFERENCE)]
-    return min(float(np.nanmin(t)) for t in same)
+def _placed(
+    recordings: Sequence[Mapping[str, Array]], stamps: str, shift_s: tuple[float, float]
+) -> list[Piece]:
+    """All recordings on one axis of time. Two devices that count for themselves start together,
+    and their counters go on in the next recording if both have moved on alike since the last.
+    """
+    times: list[dict[str, tuple[Array, bool]]] = [{} for _ in recordings]
+    for label in dict.fromkeys(label for groups in recordings for label in groups):
+        own = [k for k, groups in enumerate(recordings) if label in groups]
+        found = _times([recordings[k][label] for k in own], stamps)
+        for k, one in zip(own, found, strict=True):
+            times[k][label] = one
+    pieces: list[Piece] = []
+    free = 0.0  # where the next recording without a host's time begins, s
+    zero: dict[bool, float] = {}
+    last: dict[bool, float] = {}
+    for groups, known in zip(recordings, times, strict=True):
+        begin: dict[bool, float] = {}  # by whether it is the reference
+        for label, (time, is_host) in known.items():
+            if not is_host:
+                key = label == REFERENCE
+                begin[key] = min(begin.get(key, np.inf), float(np.nanmin(time)))
+        runs_on = len(begin) == len(last) == 2 and _runs_on(
+            last[False] - last[True], begin[False] - begin[True], begin[True] - last[True]
+        )
+        if not runs_on:
+            zero = {key: value - free for key, value in begin.items()}
+        last = begin
+        for label, table in groups.items():
+            time, is_host = known[label]
+            is_reference = label == REFERENCE
+            shift = -shift_s[is_reference] if is_host else zero[is_reference]
+            pieces.append((label, time - shift, table[:, 2:5], table[:, 5:]))
+        if begin:
+            free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
+    return pieces
+
+
+def _runs_on(before: float, after: float, elapsed: float) -> bool:
+    """Whether two counters, apart so much before and after a time, s, have not been set since."""
+    return elapsed > 0 and abs(after - before) < SET_S + CLOCKS_APART * elapsed
 
 
 def _named(
@@ -433,28 +462,41 @@ def _named(
     return found
 
 
-def _times(table: Array, stamps: str) -> tuple[Array, bool]:
-    """Times of a group of rows, s, and whether they are on the host's axis."""
-    host, device = table[:, 0], table[:, 1].copy()
-    if not np.isfinite(host).any():
-        return _continued(device), False
-    if stamps == 'host' or not np.isfinite(device).any():
-        return host, True
-    order = np.argsort(host, kind='stable')  # lines may be in another order than they came
-    count = _restarts(device[order])
-    for number in np.unique(count):
-        rows_of_it = order[count == number]
-        late = host[rows_of_it] - device[rows_of_it]
-        if np.isfinite(late).any():
-            device[rows_of_it] += np.nanmin(late)
-    return device, True
+def _times(tables: Sequence[Array], stamps: str) -> list[tuple[Array, bool]]:
+    """Times of a stream's recordings, s, and whether they are on the host's axis.
 
-
-def _restarts(counter: Array) -> NDArray[np.int64]:
-    """How often a counter has restarted before each of its values: it falls by more than a second.
-
-    Where there are many falls, rows are in no order, and no counter restarts.
+    A device's counter that runs on has one zero on that axis, whose drift is its clock's rate.
     """
+    out, pieces = [], []
+    for table in tables:
+        host, device = table[:, 0], table[:, 1].copy()
+        if not np.isfinite(host).any():
+            out.append((_continued(device), False))
+            continue
+        if stamps == 'host' or not np.isfinite(device).any():
+            out.append((host, True))
+            continue
+        out.append((device, True))
+        order = np.argsort(host, kind='stable')  # lines may be in another order than they came
+        count = _restarts(device[order])
+        for number in np.unique(count):
+            rows = order[count == number]
+            late = host[rows] - device[rows]
+            if np.isfinite(late).any():
+                pieces.append(
+                    (device, rows, float(np.nanmin(late)), float(np.nanmin(device[rows])))
+                )
+    zero, last = 0.0, None
+    for device, rows, late, begin in pieces:
+        if last is None or not _runs_on(last[0], late, begin - last[1]):
+            zero = late
+        last = late, begin
+        device[rows] += zero
+    return out
+
+
+def _restarts(counter: Array) -> Integers:
+    """How often a counter has fallen by more than a second before each of its values."""
     known = np.flatnonzero(np.isfinite(counter))
     falls = np.zeros(counter.size, dtype=np.int64)
     falls[known[1:]] = np.diff(counter[known]) < -1.0
@@ -523,7 +565,10 @@ def read_pose_session(
         for topic in sorted(streams)
         if topic.startswith(TRACKED) and topic.endswith(ENDING)
     }
-    reference = optical or _only_optical(name, list(streams))
+    optics = [t for t in streams if t.startswith(OPTICAL) and t.endswith(ENDING)]
+    if not optical and len(optics) > 1:
+        raise BagError(f'{name}: several references, name one: {", ".join(sorted(optics))}')
+    reference = optical or next(iter(optics), None)
     topics = [*chosen.values(), *([reference] if reference else [])]
     for topic in topics:
         if topic not in streams:
@@ -543,13 +588,6 @@ def read_pose_session(
     sensors = {label: sequence(label, topic) for label, topic in chosen.items()}
     found = sequence(REFERENCE, reference) if reference else None
     return _judged(PoseSession(name, start, sensors, found, salvage.lost))
-
-
-def _only_optical(path: str, topics: list[str]) -> str | None:
-    found = [t for t in topics if t.startswith(OPTICAL) and t.endswith(ENDING)]
-    if len(found) > 1:
-        raise BagError(f'{path}: several references, name one: {", ".join(sorted(found))}')
-    return found[0] if found else None
 
 
 def write_pose_session(path: Path, session: PoseSession) -> None:

@@ -26,8 +26,7 @@ CHANGED, CHANGED_M = 2.5, 1.5e-3
 """Factor of the median misfit over the one that was there when the frames were learnt, and its
 growth (m), from which something has changed."""
 EXPLAINED = 0.4
-"""Share of the misfit that may be left when one frame is fitted again for that one to have
-changed."""
+"""Share of the misfit that may be left by fitting one frame again, if that one has changed."""
 FRAME_STEPS = 12  # Gauss-Newton steps for one frame; a turn of 30 deg takes six
 FEWEST_POSES_OF_CHANGE = 20  # poses of the later half of a window by which a change is judged
 

@@ -9,22 +9,16 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import PoseSetting, PoseTerm, PoseView, Role, frames_of
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSequence, PoseSession
+from anser_ros.arrays import AnyArray, Array, Booleans, Integers
 from anser_ros.calibration.readings import FOLDS
 from anser_ros.diagnosis.engine import BlockSums, JointState, block_sums, joined
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-Ints = NDArray[np.int64]
-
 FILTER_STEP = 0.05
-"""Share of a filter's time constant by which it is changed for differences. Smaller meets the
-filter's grid; larger, its curvature."""
+"""Share of a filter's time constant by which it is changed for differences, above its grid."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +55,12 @@ class PoseProblem:
     sensors: tuple[PoseSequence, ...]  # poses in the order of time; repeats are left out
     path: OpticalPath  # of the reference
     setting: PoseSetting
-    blocks: tuple[Ints, ...]  # (n,), number of the time block that each pose is in
-    places: tuple[Ints, ...]  # (n,), number of the block of space
+    blocks: tuple[Integers, ...]  # (n,), number of the time block that each pose is in
+    places: tuple[Integers, ...]  # (n,), number of the block of space
     weight: tuple[Array, ...]  # (n,), square root of what a pose counts; zero leaves it out
     noise: tuple[PoseNoise, ...]
 
-    def rows(self, keep: Sequence[NDArray[np.generic]]) -> 'PoseProblem':
+    def rows(self, keep: Sequence[AnyArray]) -> 'PoseProblem':
         """Return the poses of each sensor that are named by index or mask."""
         rows: dict[str, Any] = {
             key: tuple(v[k] for v, k in zip(getattr(self, key), keep, strict=True))
@@ -81,7 +75,7 @@ class PoseProblem:
         one: dict[str, Any] = {key: getattr(self, key)[index : index + 1] for key in keys}
         return replace(self, **one)
 
-    def in_blocks(self, wanted: Ints) -> 'PoseProblem':
+    def in_blocks(self, wanted: Integers) -> 'PoseProblem':
         """Return the problem with only the poses in some blocks of time."""
         return self.rows([np.isin(blocks, wanted) for blocks in self.blocks])
 
@@ -98,7 +92,7 @@ class PoseProblem:
 
 def predicted(
     path: OpticalPath, sensor: PoseSequence, terms: Sequence[PoseTerm]
-) -> tuple[PoseView, Array, Mask]:
+) -> tuple[PoseView, Array, Booleans]:
     """Return view, residual (n, 6) measured less predicted, and where the reference is known."""
     time, position, rotation = sensor.time, sensor.position, sensor.rotation
     frames = frames_of(terms, sensor.name)
@@ -137,8 +131,8 @@ class PosePart:
     residual: Array  # (n, 6), measured less predicted: m, and rad along the tracker's axes
     weight: Array  # (n,), square root of what a pose counts
     noise: PoseNoise
-    blocks: Ints  # (n,)
-    places: Ints  # (n,)
+    blocks: Integers  # (n,)
+    places: Integers  # (n,)
 
     @cached_property
     def white(self) -> Array:
@@ -146,7 +140,7 @@ class PosePart:
         return self.weight[:, None] * self.noise.whitened(self.residual, self.view.velocity)
 
     @property
-    def used(self) -> Mask:
+    def used(self) -> Booleans:
         """Return a mask (n,) of the poses that have a weight."""
         return self.weight > 0
 
@@ -160,7 +154,7 @@ class PosePart:
 class Sensing(PosePart):
     """Holds what one sensor shows once the frames and effects are fitted."""
 
-    out: Mask  # (n,), poses that have a reference and stand out
+    out: Booleans  # (n,), poses that have a reference and stand out
     stamp_gain: float  # minus twice the log likelihood that an error of the stamps takes off
 
 
@@ -181,7 +175,7 @@ class PoseState(JointState[PoseTerm, PosePart]):
     folds: ClassVar[int] = FOLDS
 
     @property
-    def numbers(self) -> Ints:
+    def numbers(self) -> Integers:
         """Return the numbers of the blocks."""
         return np.unique(np.concatenate([part.blocks for part in self.parts]))
 
@@ -265,15 +259,13 @@ class PoseState(JointState[PoseTerm, PosePart]):
 FINEST_S = 2e-3  # finest step of a poll, s: at 0.5 m/s a finer one moves poses by 0.3 mm rms
 ON_STEP = 0.95  # share of the stamps that lie on a grid for it to be one
 RATE_SHARE = 0.9
-"""Share of the intervals that are one step from which the step may be the tracker's own rate, with
-some poses lost, and no poll's: another clock falls into step for less."""
+"""Share of the intervals of one step from which it may be the tracker's own rate and no poll's."""
 FEWEST_BEATS, ON_BEAT = 4, 0.7
 """Distances between the intervals that are not one step, and the share of them that differ by one
 interval at most, from which they are two clocks' beat; poses lost at random make it once in
 1000."""
 SHARED = 0.05
-"""Share of poses under the stamp of the pose before them from which a grid is a poll's, whatever
-its intervals: a tracker gives each pose a time of its own."""
+"""Share of poses under the stamp before from which a grid is a poll's: a tracker repeats none."""
 
 
 def stamp_step(time: Array) -> float:
@@ -323,7 +315,7 @@ NEAR_S, NEAR_STEPS = 0.3, 3.0
 """Poses that are nearer in time, s or usual intervals, differ by noise and not by place."""
 
 
-def jitter(part: PosePart, used: Mask, is_stamped: bool) -> tuple[Array, Array]:
+def jitter(part: PosePart, used: Booleans, is_stamped: bool) -> tuple[Array, Array]:
     """Return squared noise (n,) of used poses beside near neighbours, and distances (n, 3).
 
     Squares are m^2, a coordinate; the distances, m, are those of the pose before, of the pose and

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.effect import PoseTerm, Role, pose_effects
 from anser_ros.apps.poses.fit import (
@@ -27,35 +26,27 @@ from anser_ros.apps.poses.fit import (
 from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseState, stamp_step
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.apps.poses.start import FEWEST_HAND_EYE_POSES
+from anser_ros.arrays import Array
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN, PER_PARAMETER
 from anser_ros.diagnosis.engine import ForwardSelection, Scorer, is_covered
 from anser_ros.errors import DiagnosisError
 
-Array = NDArray[np.float64]
-
 LEAST_EXPLAINED = 0.015
-"""Share of the sum of squares that an effect must explain on unseen blocks: errors of trackers are
-alike over seconds and centimetres, and any smooth course takes a trace of them."""
+"""Share of the squares to explain on unseen blocks: any smooth course takes a trace of errors."""
 MAP_SHARE, LARGE_SHARE = 0.55, 0.3
-"""Share of the squared error of positions that a map must explain, since it follows whatever is
-smooth: most, or less where it moves poses by `LARGE_M`. Chosen on recordings with and without
-metal."""
+"""Share of the squared error of positions that a map must explain: most, or less where it moves
+poses by `LARGE_M`. Chosen on recordings with and without metal."""
 LARGE_M = 1.5e-3
-"""Error, m, that no tracker has of itself: data sheets say 0.5 to 1.4 mm. What a map takes off is
-larger then, and something is there that bends the field."""
+"""Error, m, that no tracker has of itself: data sheets say 0.5 to 1.4 mm."""
 SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
-"""The same of a scale of one sensor alone, which is few numbers and follows hardly anything: this
-share, or more where that is less than `SCALE_M`."""
+"""The same of a scale of one sensor, which follows hardly anything: more below `SCALE_M`."""
 LEAST_MAP_M = 0.5e-3
-"""How far a map must move poses, and what it must take off their errors, m rms: no tracker claims
-less of itself. Smaller names what is within its accuracy."""
+"""Least that a map moves poses and takes off their errors, m rms: no tracker claims less."""
 
 LEAST_SCALE_SIGMAS = 5.0
-"""Standard deviations by which a scale must differ from one, or a sensor's clock from the others':
-of six recordings at rest, each a block, 1 in 250 such is chance."""
+"""Sigmas by which a scale differs from one, or a sensor's clock from others: chance, 1 in 250."""
 LEAST_CLOCK_SIGMAS = 3.0
-"""The same of a clock that all sensors share: 1 in 370. Smaller names an offset that is less than
-what is known of it; larger misses slight ones of a slow tracker."""
+"""The same of a clock that all sensors share: chance, 1 in 370."""
 
 
 def gain_of(before: PoseFit, after: PoseFit, term: PoseTerm) -> float:
@@ -168,9 +159,7 @@ def with_lag(
 def _is_smoothing(before: PoseFit, after: PoseFit) -> bool:
     """Whether a filter takes off no more than a smoother reference can.
 
-    That is the noise of its poses, and what errors of its stamps make of its velocity where those
-    of the tracker have errors: one host stamps both. Errors of the tracker that happen to go with
-    this noise are taken off with it, or stay.
+    That is the noise of its poses, and of its stamps where those of the tracker have errors.
     """
     path, taken, noise, left, count = before.state.problem.path, 0.0, 0.0, 0.0, 0
     for old, new in zip(before.state.parts, after.state.parts, strict=True):
@@ -210,16 +199,13 @@ def _slower(fit: PoseFit, factor: float) -> PoseFit:
 
 
 POSES_A_PARAMETER = 6
-"""Poses that a parameter needs: neighbours in time are hardly new. More leave metal unnamed on a
-hundred poses that a slow tracker gives in a minute; blocks judge what fewer would do."""
+"""Poses that a parameter needs: more leave metal unnamed in a minute of a slow tracker."""
 FULL_FITS = 3  # candidates fitted in full in each round, which takes most of the time
 NOISE_ROUNDS = 3  # times that noise and what stands out, which depend on each other, are found
 STAMP_GAIN = 25.0
-"""Minus twice the log likelihood that an error of the stamps must take off, a sensor, to be
-believed; chance takes off one."""
+"""Minus twice the log likelihood that an error of a sensor's stamps takes off; chance: one."""
 PART_OF_MAP = 2 / 3
-"""Share of what a map gains below which a scale is a part of it: a map contains the scale, and
-gains as much where there is nothing else."""
+"""Share of what a map gains below which a scale is only a part of it."""
 
 
 class PoseEvidence(NamedTuple):
@@ -290,7 +276,7 @@ def search_effects(
     if not is_known:
         fit = with_noise(start, False)
     how = _PoseSelection(is_known, say or (lambda text: None))
-    fit = how.thinned(_one_map(how.grown(fit)))
+    fit = how.thinned(how.grown(fit))
     return PoseSearch(fit, tuple(how.evidence), tuple(how.refused), is_known)
 
 
@@ -429,15 +415,3 @@ def _simplest(accepted: list[tuple[float, PoseFit]]) -> PoseFit:
         and (gain >= least or fit.terms[-1].role is not Role.SCALE)
     ]
     return max(plain or accepted, key=lambda pair: pair[0])[1]
-
-
-def _one_map(fit: PoseFit) -> PoseFit:
-    """A whole map instead of a scale and what is bent besides, where it explains as much."""
-    pairs = [(t, whole) for t in fit.terms if (whole := t.effect.whole(t)) is not None]
-    bent = [t for t, _ in pairs]
-    rest = [t for t in fit.terms if t not in bent and t.role is not Role.SCALE]
-    if not bent or len(rest) + len(bent) == len(fit.terms):
-        return fit
-    problem = fit.state.problem
-    trial = fit_poses(problem, [*rest, pairs[0][1]])
-    return trial if trial.held_out(True) < (1 + LEAST_EXPLAINED) * fit.held_out(True) else fit

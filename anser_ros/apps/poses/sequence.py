@@ -7,22 +7,18 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
+from anser_ros.arrays import AnyArray, Array, Booleans
 from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.stamps import NANO, Order, order_of
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 REFERENCE = 'optical'
 """Name of the reference among a session's streams."""
 FARTHEST = 1e6
-"""Coordinate, m, from which on it is a device's marker for no pose and no position: no tracker
-sees a thousand kilometres, NDI's marker is 3.7e28."""
+"""Coordinate, m, from which it is a marker for no pose and no position; NDI's is 3.7e28."""
 NO_TURN = 0.1
 """Norm of a quaternion below which it is a marker for no pose; a rounded one has a norm near 1."""
 LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
@@ -37,8 +33,7 @@ STRETCH, FEWEST_POSES, LEAST_WAY_M = 5, 50, 3e-3
 way, m, that a body would have to go within a leap."""
 LONGEST_JUMP = 3  # rounds; each takes out one pose of a run, or two from its ends
 NOT_UNIT = 0.05
-"""How far the norm of a quaternion may be from one: four digits are given by the coarsest form.
-Smaller refuses rounded files; larger takes other numbers for quaternions."""
+"""How far the norm of a quaternion may be from one: smaller refuses rounded files."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +60,7 @@ class PoseSequence:
         """Return rotation matrices, shape (n, 3, 3), from the sensor's frame to the tracker's."""
         return np.asarray(Rotation.from_quat(self.quaternion).as_matrix()).reshape(-1, 3, 3)
 
-    def rows(self, keep: NDArray[np.generic] | slice) -> 'PoseSequence':
+    def rows(self, keep: AnyArray | slice) -> 'PoseSequence':
         """Return the poses that are named by index, mask or slice."""
         return replace(
             self,
@@ -75,7 +70,7 @@ class PoseSequence:
         )
 
     @property
-    def repeated(self) -> Mask:
+    def repeated(self) -> Booleans:
         """Return the mask (n,) of poses that are those before them, number for number."""
         same = (np.diff(self.position, axis=0) == 0).all(axis=1)
         same &= (np.diff(self.quaternion, axis=0) == 0).all(axis=1)
@@ -116,7 +111,7 @@ class PoseSession:
         return {**self.sensors, **({} if reference is None else {REFERENCE: reference})}
 
 
-def jumping_poses(poses: PoseSequence) -> Mask:
+def jumping_poses(poses: PoseSequence) -> Booleans:
     """Return the mask (n,) of poses, at most a few in a row, that leap away from their neighbours.
 
     A marker found in its second solution does this: it is far away between two poses that agree.
@@ -286,8 +281,7 @@ FEWEST_PATH_POSES = 4
 MEDIAN_GAPS = 2.5
 """Gap in median intervals over which a slow reference is interpolated: one pose may be lost."""
 STEPS_A_TAU = 20
-"""Steps of a filter's grid in its time constant. Straight lines between them round off motions;
-eight make the time constant too short by three of its standard deviations."""
+"""Steps of a filter's grid in its time constant: eight make it too short by three sigmas."""
 SMALLEST_STEP_S = 0.002  # grid of a filter, s: a hand moves by 0.2 mm in it
 
 
@@ -326,7 +320,7 @@ class OpticalPath:
                 slopes[a:b] = np.gradient(values[a:b], time[a:b], axis=0)
         return cls(time, gap, is_at_rest, CubicHermiteSpline(time, values, slopes))
 
-    def at(self, time: Array) -> tuple[Array, Array, Array, Mask]:
+    def at(self, time: Array) -> tuple[Array, Array, Array, Booleans]:
         """Return positions (n, 3), rotations (n, 3, 3), velocities (n, 6) in the optical frame,
         validity.
 
@@ -346,7 +340,7 @@ class OpticalPath:
             valid = valid & self.source._valid(time)
         return values[:, :3], matrices, velocity, valid
 
-    def _valid(self, time: Array) -> Mask:
+    def _valid(self, time: Array) -> Booleans:
         """Where it is interpolated: between poses that are near each other."""
         right = np.clip(np.searchsorted(self.knots, time, side='left'), 1, self.knots.size - 1)
         inside = (time >= self.knots[0]) & (time <= self.knots[-1])

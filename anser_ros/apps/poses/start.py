@@ -1,18 +1,18 @@
 """Starts a fit from a session: blocks, a coarse time offset, two frames, swapped sensors."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import PoseSetting, PoseSite, PoseTerm, Role, effect_with
 from anser_ros.apps.poses.fit import PoseFit, robust_fit
 from anser_ros.apps.poses.problem import PoseNoise, PoseProblem, predicted
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSequence, PoseSession, jumping_poses
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.calibration.readings import fold_of_frames
 from anser_ros.diagnosis.problem import BLOCKS, TEST_EVERY
 from anser_ros.errors import DiagnosisError, FitError
@@ -21,33 +21,29 @@ from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.physics.rotations import nearest_rotation
 from anser_ros.stamps import NANO
 
-Mask = NDArray[np.bool_]
-
-Array = NDArray[np.float64]
-
 PAUSE_S = 2.0
 """Pause, s, that parts static recordings; where there are several, each is a block."""
 AT_REST_M, POSES_AT_REST = 2e-3, 4
 """Extent of a recording at rest, m, and the poses of it that are kept."""
 HAND_M = 0.1  # a hand's breadth, m: distance at which an angle counts as the displacement it makes
-AT_REST_SHARE = 0.3  # share of poses kept below which all is recordings at rest
+AT_REST_SHARE = 0.7  # share of poses in recordings at rest from which all is such
 FEWEST_PARTS = 5  # recordings that make blocks of their own; fewer leave too few to hold out
-FEWEST_HAND_EYE_POSES = 8
-"""Poses with a reference that hand-eye needs: it has twelve unknowns, a pose gives six, and as
-many again have to judge it."""
+FEWEST_HAND_EYE_POSES = 8  # poses with a reference: hand-eye has twelve unknowns, a pose gives six
 MOST_POSES = 900
-"""Poses of a sensor that are fitted at most, evenly over the session: more add nothing of errors
-that are alike for seconds, and a session has to be done within seconds."""
+"""Poses of a sensor that are fitted at most: more add nothing of errors alike for seconds."""
 GOLDEN = (5**0.5 - 1) / 2
-"""Squares of whole numbers times it, less whole numbers, are spread evenly and fall into step with
-nothing. Its multiples fall into step with a poll that goes on by as much from pose to pose."""
+"""Its multiples by squares, less whole numbers, are spread evenly, in step with no poll."""
 COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
 COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
+FAR_STEP_S, FASTEST = 0.1, 3e-3
+"""Step, s, of looks beyond that range and at clocks that run apart, by this share at most."""
+LEAST_OVERLAP = 0.25  # share of the poses that must have a reference at an offset
+ALIKE, UNLIKE = 0.8, 0.2
+"""Correlation of one body's motions at the right time (chance: 0.5), and how much it must gain."""
+HAND_S = 0.3  # time, s, in which a hand turns and moves by what it is told by
 COARSE_OFFSET_MISFIT = 0.8
-"""Share of the misfit at no offset below which a coarse offset is taken. Chance takes off 6 % (the
-least of 61 mean distances of 300 poses); an offset of a step moves a hand many times the
-misfit."""
+"""Share of the misfit at no offset below which a coarse offset is taken; chance takes off 6 %."""
 START_NOISE = PoseNoise(2e-3, 0.02)  # m, rad: of the first fit, which then finds its own
 
 
@@ -67,17 +63,16 @@ def pose_problem(session: PoseSession) -> PoseProblem:
             )
     reference = reference.rows(~jumping_poses(reference))
     path = OpticalPath.through(reference.track(), is_at_rest=is_at_rest(reference))
-    kept = {name: _thinned(poses) for name, poses in sensors.items()}
-    starts = _pauses(list(kept.values()))
+    sensors = {name: poses.rows(~poses.repeated) for name, poses in sensors.items()}
+    starts = _pauses(list(sensors.values()))
     if starts.size + 1 >= FEWEST_PARTS:
-        every = sum(p.size for p in kept.values())
-        kept = {name: _still_ones(poses) for name, poses in kept.items()}
-        if sum(p.size for p in kept.values()) < AT_REST_SHARE * every:
-            track = _resting(reference, list(sensors.values()))
+        track, sensors, share = _recordings(reference, sensors, starts)
+        if share > AT_REST_SHARE:
             path = OpticalPath.through(track, is_at_rest=True)
+    thin = {name: _thinned(poses) for name, poses in sensors.items()}
     kept = {
         name: poses
-        for name, poses in kept.items()
+        for name, poses in thin.items()
         if np.count_nonzero(path.at(poses.time)[3]) >= FEWEST_HAND_EYE_POSES
     }
     if not kept:
@@ -122,6 +117,8 @@ def _apart(session: PoseSession) -> str:
 
 def is_at_rest(poses: PoseSequence) -> bool:
     """Return whether a body stays where it is: what differs between its poses is noise."""
+    if not poses.size:
+        return False
     turns = Rotation.from_quat(poses.quaternion)
     turned = HAND_M * (turns.mean().inv() * turns).as_rotvec()
     return _extent(np.concatenate([poses.position, turned], axis=1)) < AT_REST_M
@@ -132,15 +129,10 @@ def _extent(values: Array) -> float:
 
 
 def _thinned(poses: PoseSequence) -> PoseSequence:
-    """The poses that are no repeats, not more than `MOST_POSES`: one of each few neighbours.
-
-    Which of them changes from group to group: every third pose, say, falls into step with a poll,
-    and the mean error of its stamps is then not that of all.
-    """
-    fresh = poses.rows(~poses.repeated)
-    step = max(1, -(-fresh.size // MOST_POSES))
-    groups = np.arange(fresh.size // step)
-    return fresh.rows(step * groups + (step * (GOLDEN * groups**2 % 1)).astype(np.int64))
+    """At most `MOST_POSES` poses, one of a few neighbours, in no rhythm that a poll may have."""
+    step = max(1, -(-poses.size // MOST_POSES))
+    groups = np.arange(poses.size // step)
+    return poses.rows(step * groups + (step * (GOLDEN * groups**2 % 1)).astype(np.int64))
 
 
 def _pauses(sensors: Sequence[PoseSequence]) -> Array:
@@ -149,44 +141,49 @@ def _pauses(sensors: Sequence[PoseSequence]) -> Array:
     return np.asarray(every[1:][np.diff(every) > PAUSE_S])
 
 
-def _still_ones(poses: PoseSequence) -> PoseSequence:
-    """A few poses of each recording at rest: its errors are alike, however many there are."""
-    number = np.searchsorted(_pauses([poses]), poses.time, side='right')
-    keep = []
-    for one in np.unique(number):
-        rows = np.flatnonzero(number == one)
-        if _extent(poses.position[rows]) < AT_REST_M and rows.size > POSES_AT_REST:
-            rows = rows[np.linspace(0, rows.size - 1, POSES_AT_REST).astype(int)]
-        keep.append(rows)
-    return poses.rows(np.concatenate(keep))
-
-
-def _resting(reference: PoseSequence, sensors: Sequence[PoseSequence]) -> PoseTrack:
-    """The reference's track, over the whole of each recording in which it is at rest.
+def _recordings(
+    reference: PoseSequence, sensors: Mapping[str, PoseSequence], starts: Array
+) -> tuple[PoseTrack, dict[str, PoseSequence], float]:
+    """The reference's track, throughout each recording at rest; a few poses of these; their share.
 
     Two programs that record one after the other share no time, and still the place.
     """
-    streams = [reference, *sensors]
-    number = [np.searchsorted(_pauses(streams), p.time, side='right') for p in streams]
-    pieces = []
+    streams = [reference, *sensors.values()]
+    common = _pauses(streams)
+    starts = common if common.size + 1 >= FEWEST_PARTS else starts
+    number = [np.searchsorted(starts, p.time, side='right') for p in streams]
+    pieces, resting = [], set()
     for one in np.unique(number[0]):
         rows = reference.rows(number[0] == one)
-        spans = [p.time[n == one] for p, n in zip(streams, number, strict=True)]
         if is_at_rest(rows):
-            every = np.concatenate(spans)
+            resting.add(one)
+            every = np.concatenate(
+                [p.time[n == one] for p, n in zip(streams, number, strict=True)]
+            )
             steps = int(np.ptp(every) / (LONGEST_GAP_S / 2)) + 2
             time = np.linspace(every.min(), every.max() + 1e-6, steps)
-            middle = _middle(Rotation.from_quat(rows.quaternion))
-            turn = Rotation.from_matrix(middle).as_quat()
+            turn = Rotation.from_matrix(_middle(Rotation.from_quat(rows.quaternion))).as_quat()
             place = np.median(rows.position, axis=0)
             pieces.append((time, np.tile(place, (steps, 1)), np.tile(turn, (steps, 1))))
         else:
             track = rows.track()
             pieces.append((track.time, track.position, track.quaternion))
-    return PoseTrack(*(np.concatenate(values) for values in zip(*pieces, strict=True)))
+    kept, still = {}, 0
+    for (name, poses), numbers in zip(sensors.items(), number[1:], strict=True):
+        keep = [np.zeros(0, dtype=np.int64)]
+        for one in np.unique(numbers):
+            rest = np.flatnonzero(numbers == one)
+            is_still = one in resting or _extent(poses.position[rest]) < AT_REST_M
+            if is_still and rest.size > POSES_AT_REST:
+                still += rest.size
+                rest = rest[np.linspace(0, rest.size - 1, POSES_AT_REST).astype(int)]
+            keep.append(rest)
+        kept[name] = poses.rows(np.concatenate(keep))
+    track = PoseTrack(*(np.concatenate(values) for values in zip(*pieces, strict=True)))
+    return track, kept, still / max(sum(p.size for p in sensors.values()), 1)
 
 
-def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArray[np.int64], ...]:
+def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[Integers, ...]:
     """Equal stretches of time, or the recordings where there are several."""
     if starts.size + 1 >= FEWEST_PARTS:
         return tuple(np.searchsorted(starts, p.time, side='right') for p in sensors)
@@ -198,7 +195,7 @@ def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArra
     )
 
 
-def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArray[np.int64], ...]:
+def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[Integers, ...]:
     """Cells of space dealt to folds; blocks of time where all is at one place."""
     places = [poses.position for poses in sensors]
     every = np.concatenate(places)
@@ -209,7 +206,7 @@ def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArr
         return _time_blocks(sensors, starts)
 
 
-def train_blocks(problem: PoseProblem) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def train_blocks(problem: PoseProblem) -> tuple[Integers, Integers]:
     """Return blocks of time to choose and fit on, and those that are held out."""
     every = np.unique(np.concatenate(problem.blocks))
     held = np.arange(every.size) % TEST_EVERY == TEST_EVERY - 2
@@ -217,7 +214,10 @@ def train_blocks(problem: PoseProblem) -> tuple[NDArray[np.int64], NDArray[np.in
 
 
 def coarse_offset(problem: PoseProblem) -> float:
-    """Return the offset, s, at which tracked places are most nearly linear in the optical pose."""
+    """Return the offset, s, at which tracked places are most nearly linear in the optical pose.
+
+    Where the motion is not alike then, it is that within the length of a recording at which it is.
+    """
     if problem.path.is_at_rest:
         return 0.0
     chosen = [p.rows(slice(None, None, max(1, p.size // COARSE_POSES))) for p in problem.sensors]
@@ -225,7 +225,73 @@ def coarse_offset(problem: PoseProblem) -> float:
     misfits = np.array([_misfit(problem.path, chosen, float(trial)) for trial in trials])
     still = float(misfits[np.argmin(np.abs(trials))])
     best = int(np.argmin(misfits))
-    return float(trials[best]) if misfits[best] < COARSE_OFFSET_MISFIT * still else 0.0
+    near = float(trials[best]) if misfits[best] < COARSE_OFFSET_MISFIT * still else 0.0
+    far = np.arange(COARSE_S, longest_recording(problem), FAR_STEP_S)
+    return _most_alike(problem, near, [(float(o), 0.0) for o in (*-far, *far)])[0]
+
+
+def coarse_rate(problem: PoseProblem, offset: float) -> tuple[float, float]:
+    """Return offset, s, and rate (parts of one) of clocks that run apart by far in a session."""
+    moved = 0.5 * problem.setting.duration  # by a rate of one, at the session's ends
+    if problem.path.is_at_rest or FASTEST * moved < FAR_STEP_S:
+        return offset, 0.0
+    rates = np.arange(-FASTEST, FASTEST, FAR_STEP_S / moved)
+    near = offset + np.arange(-COARSE_S, COARSE_S, FAR_STEP_S)
+    return _most_alike(problem, offset, [(float(o), float(r)) for r in rates for o in near])
+
+
+def longest_recording(problem: PoseProblem) -> float:
+    """Return the length, s, of the longest recording of the reference that no pause interrupts."""
+    knots = problem.path.knots
+    ends = np.flatnonzero(np.diff(knots) > PAUSE_S)
+    return float(np.max(knots[np.r_[ends, -1]] - knots[np.r_[0, ends + 1]]))
+
+
+def _most_alike(
+    problem: PoseProblem, offset: float, trials: Sequence[tuple[float, float]]
+) -> tuple[float, float]:
+    """The offset, s, and rate, of some, at which motions are alike, if they are not as it is.
+
+    Ways and angles between two times are the same in all frames, but for lever arms.
+    """
+    pairs = []
+    for poses in problem.sensors:
+        later = np.searchsorted(poses.time, poses.time + HAND_S)
+        rows = np.flatnonzero(later < poses.size)
+        rows = rows[poses.time[later[rows]] - poses.time[rows] < 10 * HAND_S]
+        rows = rows[:: max(1, rows.size // COARSE_POSES)]
+        ends = poses.time[rows], poses.time[later[rows]]
+        turns = Rotation.from_quat(poses.quaternion)
+        turned = (turns[rows].inv() * turns[later[rows]]).magnitude()
+        moved = np.linalg.norm(poses.position[later[rows]] - poses.position[rows], axis=1)
+        pairs.append((ends, turned, moved))
+    middle = problem.setting.start + 0.5 * problem.setting.duration
+
+    def alike(trial: tuple[float, float]) -> float:
+        return float(np.mean([_alike(problem.path, *pair, trial, middle) for pair in pairs]))
+
+    here = alike((offset, 0.0))
+    if here > ALIKE or not trials:
+        return offset, 0.0
+    best = max(trials, key=alike)
+    return best if alike(best) > max(ALIKE, here + UNLIKE) else (offset, 0.0)
+
+
+def _alike(
+    path: OpticalPath, ends: tuple[Array, Array], turned: Array, moved: Array,
+    clock: tuple[float, float], middle: float,
+) -> float:  # fmt: skip
+    """The larger correlation of ways and of angles between two times with the reference's."""
+    offset, rate = clock
+    one, other = (path.at(time - offset - rate * (time - middle)) for time in ends)
+    known = one[3] & other[3]
+    if np.count_nonzero(known) < max(FEWEST_HAND_EYE_POSES + 13, LEAST_OVERLAP * known.size):
+        return 0.0
+    way = np.linalg.norm(one[0] - other[0], axis=1)[known]
+    cosine = (np.einsum('nij,nij->n', one[1][known], other[1][known]) - 1) / 2
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    return max(float(np.corrcoef(a, b)[0, 1]) if np.ptp(a) > 0 and np.ptp(b) > 0 else 0.0
+               for a, b in ((way, moved[known]), (angle, turned[known])))  # fmt: skip
 
 
 def _misfit(path: OpticalPath, sensors: Sequence[PoseSequence], offset: float) -> float:
@@ -298,11 +364,20 @@ def _turn_of_turns(tracked: Array, optical: Array) -> Array:
     return np.asarray(solution)
 
 
-def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[PoseTerm]:
-    """Return both frames and an offset to start from; a known registration is the identity."""
+def started(
+    problem: PoseProblem, offset: float, frame: Array | None = None, rate: float = 0.0
+) -> list[PoseTerm]:
+    """Return both frames and a clock to start from; a known registration is the identity."""
     pairs = []
+    clock = [PoseTerm(effect_with(Role.OFFSET), {}, np.array([offset]))]
+    if rate:
+        clock += [t.with_theta(np.array([1e3 * rate]))
+                  for t in effect_with(Role.RATE).sites(problem.setting)]  # fmt: skip
     for poses in problem.sensors:
-        place, turn, _, known = problem.path.at(poses.time - offset)
+        time = poses.time
+        for term in clock:
+            time = term.effect.clock(term, poses.name, time)
+        place, turn, _, known = problem.path.at(time)
         pairs.append((poses.position[known], poses.rotation[known], place[known], turn[known]))
     terms: list[PoseTerm] = []
     rotation = np.eye(3) if frame is None else frame
@@ -314,7 +389,7 @@ def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> 
         mounts = Rotation.from_matrix(turn.transpose(0, 2, 1) @ (rotation.T @ turned))
         site: PoseSite = {'sensor': poses.name}
         terms.append(effect_with(Role.MOUNT).at_frame(site, np.zeros(3), _middle(mounts)))
-    return [*terms, PoseTerm(effect_with(Role.OFFSET), {}, np.array([offset]))]
+    return [*terms, *clock]
 
 
 def _middle(turns: Rotation) -> Array:
@@ -329,14 +404,14 @@ def _middle(turns: Rotation) -> Array:
 
 def first_fit(problem: PoseProblem, offset: float, is_one_frame: bool) -> PoseFit:
     """Return the best robust fit of the two frames from several starts."""
-    starts = [started(problem, offset, frame) for frame in _frames(problem, offset, is_one_frame)]
-    fits = [robust_fit(problem, terms) for terms in starts]
+    offset, rate = coarse_rate(problem, offset)
+    frames = [None] if is_one_frame else _frames(problem, offset)
+    fits = [robust_fit(problem, started(problem, offset, frame, rate)) for frame in frames]
     return min(fits, key=first_cost)
 
 
-def _frames(problem: PoseProblem, offset: float, is_one_frame: bool) -> list[Array | None]:
-    if is_one_frame:
-        return [None]
+def _frames(problem: PoseProblem, offset: float) -> list[Array]:
+    """The rotations to start from, by places and by turns."""
     poses = max(problem.sensors, key=lambda p: p.size)
     place, turn, _, known = problem.path.at(poses.time - offset)
     turned = Rotation.from_matrix(turn[known]).as_quat()
@@ -363,8 +438,7 @@ FAR, FITS = 8.0, 0.25
 """Distance of a pose from its own prediction, in spreads, from which it may be another sensor's,
 and the share of it that is left from the other's prediction."""
 EARLY = 0.4
-"""Share of a session by which the sensors' names are meant, where they are exchanged for half of
-it. Smaller determines no lever arms; larger meets the exchange itself."""
+"""Share of a session that says whose names are meant: smaller determines no lever arms."""
 NEAR_S = 1.0  # s; nearer spans are one: nobody swaps two plugs and back in a second
 FEWEST, LEAST_SHARE = 5, 0.01  # poses in a span, and share of a sensor's poses, that are a swap
 
@@ -398,7 +472,7 @@ def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
     return put_back(session, swapped_spans(problem, fit))
 
 
-def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Mask, Mask]:
+def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Booleans, Booleans]:
     """Masks of the poses of sensor i that fit where j should be, and that rather fit there."""
     own = replace(problem, noise=fit.state.problem.noise).state(fit.terms).parts[i]
     renamed = replace(problem.sensors[i], name=problem.sensors[j].name)
@@ -411,13 +485,11 @@ def _look_like(problem: PoseProblem, fit: PoseFit, i: int, j: int) -> tuple[Mask
     return (here > FAR) & (there < FITS * here) & (own.weight > 0), there < here
 
 
-def _runs(time: Array, mask: Mask, rather: Mask) -> list[tuple[float, float]]:
+def _runs(time: Array, mask: Booleans, rather: Booleans) -> list[tuple[float, float]]:
     """Spans in which a mask holds, as far as poses rather fit the other sensor."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    runs = zip(edges[::2], edges[1::2], strict=True)
     spans: list[tuple[float, float]] = []
-    for first, last in runs:
-        a, b = int(first), int(last)
+    for a, b in edges.reshape(-1, 2).tolist():
         while a > 0 and rather[a - 1]:
             a -= 1
         while b < time.size and rather[b]:
@@ -452,12 +524,14 @@ def put_back(
     return replace(session, sensors=sensors), records
 
 
-def _merged(own: PoseSequence, keep: Mask, other: PoseSequence, take: Mask) -> PoseSequence:
-    time = np.concatenate([own.time[keep], other.time[take]])
-    order = np.argsort(time, kind='stable')
-    return replace(
+def _merged(
+    own: PoseSequence, keep: Booleans, other: PoseSequence, take: Booleans
+) -> PoseSequence:
+    left, right = own.rows(keep), other.rows(take)
+    both = replace(
         own,
-        time=time[order],
-        position=np.concatenate([own.position[keep], other.position[take]])[order],
-        quaternion=np.concatenate([own.quaternion[keep], other.quaternion[take]])[order],
+        time=np.concatenate([left.time, right.time]),
+        position=np.concatenate([left.position, right.position]),
+        quaternion=np.concatenate([left.quaternion, right.quaternion]),
     )
+    return both.rows(np.argsort(both.time, kind='stable'))

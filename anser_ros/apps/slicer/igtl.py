@@ -65,7 +65,6 @@ class Tracked(NamedTuple):
 
 
 def crc64(data: bytes) -> int:
-    """Return the check sum of a message's body."""
     value = 0
     for byte in data:
         value = _TABLE[(value >> 56) ^ byte] ^ ((value << 8) & _MASK)
@@ -163,7 +162,6 @@ def transform(
 
 
 def string(device: str, stamp_s: float, text: str) -> bytes:
-    """Pack a device's text into a STRING message."""
     words = text.encode('ascii', 'replace')
     return message('STRING', device, stamp_s, struct.pack('>HH', ASCII, len(words)) + words)
 
@@ -176,7 +174,6 @@ def status(device: str, stamp_s: float, code: int, name: str, text: str) -> byte
 
 
 def capability(stamp_s: float) -> bytes:
-    """Pack the list of messages that the server sends."""
     return message(
         'CAPABILITY', '', stamp_s, b''.join(struct.pack('12s', k.encode()) for k in CAPABILITIES)
     )
@@ -188,7 +185,6 @@ def tracking_reply(stamp_s: float) -> bytes:
 
 
 def tracking(stamp_s: float, instruments: Sequence[Tracked]) -> bytes:
-    """Pack the poses of all instruments as one TDATA."""
     content = b''.join(
         struct.pack('>20sBB', one.name.encode('ascii', 'replace')[:NAME_BYTES], SIX_DOF, 0)
         + _matrix(one.position_m, one.quaternion_xyzw)

@@ -1,1 +1,1 @@
-"""Holds what every node runs in: its life, its process, parameters, diagnostics and handover."""
+"""Holds what every node runs in: its life, its process, parameters and diagnostics."""

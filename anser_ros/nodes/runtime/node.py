@@ -23,7 +23,6 @@ from rclpy.parameter import Parameter
 from anser_ros.errors import AnserError
 from anser_ros.nodes.runtime import incoming, parameters, qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status, Throttle, diagnostic_array
-from anser_ros.nodes.runtime.handover import DirectSubscription, Handover, NewestWorker
 
 Callback = Callable[..., Any]
 
@@ -35,6 +34,9 @@ WARNING_PERIOD_S = 10.0
 LONGEST_TURN_S = 0.05
 """Time, s, that a timer waits while another thread works in its node, before it is left out until
 the next time: other nodes of the process wait meanwhile."""
+GIVEN = 'tool/flux', 'reference/flux', 'field_model', 'field_model_error'
+"""Topics that nodes of one process pass on as objects: these are published for others only, as who
+subscribed would process everything twice."""
 LONGEST_END_S = 0.2
 """Time, s, that the end of a process waits for what its nodes work on aside: longer than a frame
 takes, less than the start of a refit."""
@@ -48,7 +50,7 @@ class NoParameters:
 class AnserNode(Node):
     """Gives all nodes their parameters, diagnostics and guarded callbacks.
 
-    ``beside`` are the other nodes of the process: values that are given to all of them may be
+    ``beside`` are all nodes of a process of several: values that are given to all of them may be
     meant for one. ``parameters`` is a frozen instance of ``PARAMETERS``; an allowed change swaps
     it. ``counters`` are shown in ``/diagnostics``. The process ends with ``exit_code`` once that
     is not None.
@@ -61,26 +63,14 @@ class AnserNode(Node):
     HAS_KERNELS: ClassVar[bool] = False
     """Whether the node calculates with compiled kernels, and waits until all are there."""
 
-    WORKS_ASIDE: ClassVar[bool] = False
-    """Whether what is handed over is worked on in a thread of its own, the newest first."""
-
-    def __init__(
-        self,
-        handover: Handover | None = None,
-        beside: Sequence[type['AnserNode']] = (),
-        **options: Any,
-    ) -> None:
+    def __init__(self, beside: Sequence[type['AnserNode']] = (), **options: Any) -> None:
         # The base class already creates services, so what guards them must be there first.
-        self.hands_over = handover is not None  # what it publishes, to nodes of this process
-        self._handover, self._beside = handover or Handover(), tuple(beside)
-        # Where frames are handed over, they come in another thread than the executor's.
-        self._aside: NewestWorker | None = None
+        self._beside = tuple(beside)
         self._turn = threading.RLock()
         self.counters: Counter[str] = Counter()
         self.exit_code: int | None = None
         self._throttle = Throttle(WARNING_PERIOD_S)
         self._fault: str | None = None
-        self._is_ending = False
         self._faults_reported = 0
         self.started_s = time.monotonic()
         options.setdefault('namespace', NAMESPACE)
@@ -123,13 +113,11 @@ class AnserNode(Node):
 
     # What a node uses ---------------------------------------------------------------------
 
-    def offer(self, publisher: Any, *, lasts: bool = False) -> None:
-        """Hand over what is published, too, to the nodes of this process that want it."""
-        self._handover.offer(publisher.topic_name, lasts=lasts)
-
-    def hand_over(self, publisher: Any, what: Any) -> None:
-        """Give something that is published to the nodes of this process."""
-        self._handover.give(publisher.topic_name, what)
+    def given(self, callback: Callback, longest_s: float = -1.0) -> Callback:
+        """Return a callback as another thread of the process may call it: guarded, in turn, and
+        left out where that would take longer.
+        """
+        return self._guard(self._in_turn(callback, longest_s))
 
     def count(self, name: str, by: int = 1) -> None:
         """Count an event for ``/diagnostics``."""
@@ -177,21 +165,14 @@ class AnserNode(Node):
     # Guarded callbacks --------------------------------------------------------------------
 
     def create_subscription(
-        self, msg_type: Any, topic: str, callback: Callback, qos_profile: Any, *,
-        handed: Callback | None = None, **options: Any,
-    ) -> Any:  # fmt: skip
+        self, msg_type: Any, topic: str, callback: Callback, qos_profile: Any, **options: Any
+    ) -> Any:
         """Subscribe as rclpy does, with the callback guarded, and what is too large refused.
 
-        An object handed over by a node of this process goes to ``handed``, by default to the
-        callback.
+        Return None for what nodes of this process give each other as objects.
         """
-        name = self.resolve_topic_name(topic)
-        if self._handover.offers(name):
-            taker = self._guard(self._in_turn(handed or callback))
-            if self.WORKS_ASIDE:
-                self._aside = self._aside or NewestWorker(lambda: self.count('frames_skipped'))
-                taker = functools.partial(self._aside.put, name, taker)
-            return self._handover.take(name, taker)
+        if self._beside and topic in GIVEN:
+            return None
         bounded = msg_type in incoming.MOST_BYTES and not options.get('raw', False)
 
         @functools.wraps(callback)
@@ -219,17 +200,9 @@ class AnserNode(Node):
         guarded = self._guard(self._in_turn(callback), is_service=True)
         return super().create_service(srv_type, srv_name, guarded, **options)
 
-    def destroy_subscription(self, subscription: Any) -> bool:
-        """Destroy a subscription as rclpy does, or take no longer what is handed over."""
-        if isinstance(subscription, DirectSubscription):
-            self._handover.drop(subscription)
-            return True
-        return super().destroy_subscription(subscription)
-
     def stop_working(self) -> bool:
         """End what is worked on aside; False where that still goes on after a while."""
-        self._is_ending = True
-        return self._aside is None or self._aside.end(LONGEST_END_S)
+        return True
 
     def destroy_node(self) -> None:
         """Destroy the node as rclpy does; nothing is worked on aside for it afterwards."""
@@ -263,7 +236,7 @@ class AnserNode(Node):
                 reason = ' '.join(str(error).split())
                 self.warn(f'refused_{type(error).__name__}', reason)
             except Exception as error:  # noqa: BLE001 - the node must outlive any callback
-                if self.context.ok() and not self._is_ending:
+                if self.context.ok():
                     reason = f'{type(error).__name__}: {error}'
                     self._report_fault(reason)
             response: Any = args[1] if is_service else None

@@ -9,7 +9,7 @@ import socket
 import sys
 import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any
 
@@ -21,7 +21,6 @@ from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, OneLineParser, ParameterError
 from anser_ros.nodes.runtime import parameters
-from anser_ros.nodes.runtime.handover import Handover
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.runtime.parameters import complaints, names_for
 from anser_ros.wire.text_files import config_path
@@ -64,10 +63,11 @@ def main(
     node_class: type[AnserNode] | Sequence[type[AnserNode]],
     argv: Sequence[str] | None = None,
     name: str = '',
+    join: Callable[..., None] | None = None,
 ) -> int:
     """Run nodes until one of them ends, or until SIGINT or SIGTERM; return the exit code.
 
-    Several classes, in the order of the chain, hand their frames over to each other; the process
+    Nodes of several classes are connected by ``join``, which takes them in this order; the process
     then needs a name of its own. The code is 0 where it ended as asked, 2 for a wrong argument or
     parameter, reported in one line, and 1 for a defect.
     """
@@ -83,7 +83,7 @@ def main(
         _choose_profile()
         common, meant = _meant_for(classes, arguments)
         rclpy.init(args=common, signal_handler_options=SignalHandlerOptions.NO)
-        return _run(classes, own, arguments, meant, signals)
+        return _run(classes, own, arguments, meant, signals, join)
     except AnserError as error:
         print(f'{name}: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
@@ -239,17 +239,19 @@ def _run(
     arguments: Sequence[str],
     meant: dict[str, list[str]],
     signals: _Signals,
+    join: Callable[..., None] | None,
 ) -> int:
     nodes, code = signals.nodes, 0
     keep_in_one_piece()
     executor = make_executor()
-    shared: dict[str, Any] = {'handover': Handover(), 'beside': classes}
     try:
         for node_class in classes:
             if len(classes) > 1:
-                own |= {**shared, 'cli_args': meant[node_class.NAME]}
+                own |= {'beside': classes, 'cli_args': meant[node_class.NAME]}
             nodes.append(node_class(**own))
         _complain(nodes, arguments)
+        if join is not None:
+            join(*nodes)
         for node in nodes:
             executor.add_node(node)
         # What is there now stays: looking through all of it for garbage takes up to 0.1 s.

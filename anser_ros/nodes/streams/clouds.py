@@ -12,11 +12,11 @@ import numpy as np
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 
+from anser_ros.chain.frame import FrameReadings
 from anser_ros.effects.correction import needs_correction
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Count
-from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.pose_states import state_of
 from anser_ros.stamps import SECOND_NS, pack_stamp, set_stamp, stamp_of
 from anser_ros.wire.points import (
@@ -31,7 +31,6 @@ from anser_ros.wire.points import (
     encode_flux,
     encode_model_error,
 )
-from anser_ros.wire.setup import Setup
 
 FLUX_NOISE, STAMP_SIGMA, FLUX_RATE = 'flux_noise_t', 'stamp_sigma_s', 'flux_rate_hz'
 """Keys of the setup document that acquisition measures: by what the components of fluxes scatter,
@@ -116,20 +115,16 @@ def layout_of(message: PointCloud2) -> tuple[list[PointFieldTuple], int, int, An
     return fields, message.point_step, int(message.width), message.data
 
 
-def read_frame(
-    message: PointCloud2 | HandedFlux, frame_id: str, count: Count
-) -> tuple[int, FluxPoints]:
+def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, FluxPoints]:
     """Read a flux message that must be in a frame; its peculiarities are counted.
 
     The counters are ``fluxes_big_endian``, ``fluxes_other_frame_id``, ``fluxes_without_stamp``.
     Raises `LayoutError` when it is in another frame, has no stamp, or is no flux cloud.
     """
-    given_id = message.frame_id if isinstance(message, HandedFlux) else message.header.frame_id
+    given_id = message.header.frame_id
     if given_id != frame_id:
         count('fluxes_other_frame_id', 1)
         raise LayoutError(f'fluxes in the frame {given_id!r}, the setup is in {frame_id!r}')
-    if isinstance(message, HandedFlux):
-        return message.stamp_ns, message.points
     if message.is_bigendian:
         count('fluxes_big_endian', 1)
     stamp_ns, nanosec = stamp_of(message), message.header.stamp.nanosec
@@ -140,6 +135,11 @@ def read_frame(
     if stamp_ns <= 0:
         raise LayoutError('the flux message has no stamp')
     return stamp_ns, decode_flux(*layout_of(message), bool(message.is_bigendian))
+
+
+def readings_of(points: FluxPoints) -> FrameReadings:
+    """Return what the chain takes of a frame's points."""
+    return FrameReadings(points.channel, points.flux, points.flags)
 
 
 @dataclass(frozen=True)
@@ -160,32 +160,6 @@ class GivenModel:
         """Return the state for which the server wants no pose to be given; empty where none is."""
         code = 0 if self.error is None else self.error.withheld
         return state_of(code)
-
-    def is_same_as(self, other: 'GivenModel | None') -> bool:
-        """Return whether only the stamp differs."""
-        return other is not None and self.points is other.points and self.error is other.error
-
-    def field_model(self, setup: Setup, file_model: FieldModel | None) -> FieldModel:
-        """Return the model for a setup, with the effects of the model file.
-
-        Raises `LayoutError` when it has other emitters than the setup.
-        """
-        points, count = self.points, len(setup.emitter_names)
-        if points.moments.shape[1] != count:
-            raise LayoutError(
-                f'the field model has {points.moments.shape[1]} emitters, the setup {count}'
-            )
-        own: dict[str, Any] = {}
-        if file_model is not None:
-            names = 'flux_error_t', 'shift_sigma_m', 'effects'
-            own = {name: getattr(file_model, name) for name in names}
-        if self.error is not None:
-            modes = self.error.modes if len(self.error.modes) else None
-            own |= {'flux_error_t': self.error.flux_error_t, 'modes': modes}
-        return FieldModel(
-            points.positions, points.directions, points.moments, setup.emitter_names,
-            setup.frequencies_hz, **own,
-        )  # fmt: skip
 
 
 class ModelWriter:

@@ -17,7 +17,6 @@ from std_msgs.msg import String
 
 from anser_ros.integrity.streams import Senders
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.handover import HandedFlux
 from anser_ros.nodes.runtime.incoming import opened
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.streams.clouds import without_measured
@@ -37,8 +36,7 @@ def too_slow(skipped: int, worked: int) -> str:
 
 
 LATE_WINDOWS = 3.0
-"""Age of a message, in the spacing of messages, from which it may be late: more than the jitter of
-a loaded machine."""
+"""Age, in spacings of messages, from which one may be late, more than a busy machine's jitter."""
 SHORTEST_LATE_S = 0.05
 """Age, s, below which no message is late, however fast messages come: the executor has delays."""
 CATCH_UP_S = 1.0
@@ -47,9 +45,9 @@ MEMORY = 25
 """Messages that typical figures are taken of, so that a few slow ones say nothing."""
 FEWEST_MESSAGES = 10
 """Messages that must have been worked on before a backlog is judged: the first ones are slow."""
+
 MOST_LEFT_OUT = 2
-"""Frames in a row that may be left out: more, and the model is older than metal in a hand
-allows."""
+"""Frames in a row that may be left out: no model may be older than metal in a hand allows."""
 
 
 class Backlog:
@@ -86,8 +84,10 @@ class Backlog:
         return share >= 1.0 or age_s * share / (1.0 - share) > CATCH_UP_S
 
     def gives_way(self, age_s: float) -> bool:
-        """Return whether to leave out, of a frame so old, work that can wait for newer ones."""
-        behind = bool(self._spacing_s) and age_s > median(self._spacing_s)
+        """Return whether to leave out, of a frame so old, work that can wait for newer ones: once
+        half of the time until the next one is over.
+        """
+        behind = bool(self._spacing_s) and age_s > 0.5 * median(self._spacing_s)
         is_left_out = behind and self._left_out < MOST_LEFT_OUT
         self._left_out = self._left_out + 1 if is_left_out else 0
         return is_left_out
@@ -162,7 +162,9 @@ class OneSource:
         return bytes(known[0].endpoint_gid).hex() if len(known) == 1 else ''
 
     def accepts(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:
-        """Take a message's information; return whether the message may be used."""
+        """Take a message's information, empty where a node of this process gave it as an object;
+        return whether the message may be used.
+        """
         now_s, number = time.monotonic(), info.get(NUMBER)
         if number is not None and not self._sources.continues(number):
             self._looked_s = 0.0  # the graph as it is at this moment is needed
@@ -176,11 +178,7 @@ class OneSource:
 
     def _subscribed(self) -> Any:
         message_type, profile = self._arguments
-        # Of what is handed over within the process nothing more is known: its sender is ours.
-        handed = partial(self._take, info={})
-        return self._node.create_subscription(
-            message_type, self._topic, self._take, profile, handed=handed
-        )
+        return self._node.create_subscription(message_type, self._topic, self._take, profile)
 
     def _take(self, message: Any, info: Mapping[str, Any]) -> None:
         lasting = None if self._lasting is None else self._lasting(message)
@@ -224,10 +222,8 @@ class NewestSource(OneSource):
         self._works_later, self.backlog = works_later, Backlog()
         super().__init__(node, PointCloud2, topic, callback, qos.STREAM, doubted)
 
-    def _deliver(self, message: PointCloud2 | HandedFlux, info: Mapping[str, Any]) -> None:
-        # What is handed over has no queue.
-        is_handed = isinstance(message, HandedFlux)
-        newest = message if is_handed else self._newest(message, info)
+    def _deliver(self, message: PointCloud2, info: Mapping[str, Any]) -> None:
+        newest = self._newest(message, info)
         begin_s = time.perf_counter()
         if newest is not None:
             self._callback(newest)

@@ -71,7 +71,6 @@ class Readiness:
         )
 
     def close(self) -> None:
-        """Stop watching the listeners."""
         self._node.destroy_subscription(self._subscription)
 
     def missing(self) -> str:

@@ -41,9 +41,9 @@ def filled(bag, *, gain=1.0, optical=True, length_s=20.0, frames=100, shift_ns=0
     """A window into which a bag was played."""
     window = window or SlidingWindow(bag.setup, length_s, frames)
     for row, stamp in enumerate(bag.tool.stamp_ns.tolist()):
-        window.take_tool(stamp + shift_ns, points(bag.tool, row, gain))
+        window.take(window.tool, stamp + shift_ns, points(bag.tool, row, gain))
     for row, stamp in enumerate(bag.reference.stamp_ns.tolist()):
-        window.take_reference(stamp + shift_ns, points(bag.reference, row))
+        window.take(window.reference, stamp + shift_ns, points(bag.reference, row))
     if optical:
         for body, track in bag.optical.items():
             rows = zip(track.stamp_ns.tolist(), track.position, track.quaternion, strict=True)
@@ -86,7 +86,7 @@ class TestWindow:
         window = filled(moving)
         size = window.session().tools[0].time.size
         stamp = int(moving.tool.stamp_ns[-1])
-        window.take_tool(stamp - SECOND_NS // 2, points(moving.tool, 0))
+        window.take(window.tool, stamp - SECOND_NS // 2, points(moving.tool, 0))
         window.take_pose('tool_a', stamp + SECOND_NS, (np.nan, 0, 0, 0, 0, 0, 1))
         window.take_pose('tool_a', stamp + SECOND_NS, (0, 0, 0, 0, 0, 0, 0.5))
         session = window.session()
@@ -99,7 +99,7 @@ class TestWindow:
             points(moving.tool, 0), channel=moving.tool.channel[:4],
             flux=moving.tool.flux[0][:4], flags=moving.tool.flags[0][:4],
         )  # fmt: skip
-        window.take_tool(int(moving.tool.stamp_ns[-1]) + SECOND_NS, fewer)
+        window.take(window.tool, int(moving.tool.stamp_ns[-1]) + SECOND_NS, fewer)
         assert window.session().tools[0].time.size == 1
         assert SlidingWindow(moving.setup, 5.0, 50).session() is None
 

@@ -10,7 +10,7 @@ from conftest import SHARED, needs
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.lab.cli import measured
-from anser_ros.apps.lab.measured import hpi_coils, navion, transformer
+from anser_ros.apps.lab.measured import hpi_coils, ilemt, navion, transformer
 from anser_ros.cli.main import main
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.field.model import FieldModel
@@ -247,3 +247,22 @@ def test_rows_compare_the_model_with_an_interpolation_on_the_plane_left_out(tmp_
 def test_the_published_file_has_the_planes(tmp_path):
     place, field = transformer.read(FOLDER)
     assert len(place) == 3 * 231 + 66 and np.abs(field).max() < 1e-3
+
+
+class TestIlemt:
+    def test_a_pole_that_turns_keeps_its_end_on_the_axis(self):
+        stage = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 90], [10, 0, 0, 0, 0, 0.0]])
+        place, turn = ilemt.poses(stage, 'YoutZup')
+        np.testing.assert_allclose(place[0], [0.012, 0.0, 0.243], atol=1e-12)
+        np.testing.assert_allclose(place[1], place[0], atol=1e-12)
+        np.testing.assert_allclose(place[2] - place[0], [0.0, 0.01, 0.0], atol=1e-4)
+        away = Rotation.from_quat(turn).apply([[0.0, 1.0, 0.0]] * 3)
+        np.testing.assert_allclose(away[:2], [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], atol=1e-12)
+
+    @needs('measured', 'ilemt')
+    def test_the_real_data(self, tmp_path):
+        bags = ilemt.write_sessions(SHARED / 'measured' / 'ilemt', tmp_path)
+        assert [path.stem for path in bags[:2]] == ['ilemt_dipole_md', 'ilemt_dipole_ld']
+        (tool,) = load_session(bags[0]).tools
+        assert tool.flux.shape == (426, 3, 3) and tool.has_pose.all()
+        assert len(ilemt.commands(bags, tmp_path)) == 8

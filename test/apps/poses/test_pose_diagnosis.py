@@ -1,6 +1,7 @@
 """Sessions of poses with one thing wrong: it is named, with its size, and nothing else is."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +20,7 @@ from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
 from anser_ros.apps.poses.fit import fit_poses
 from anser_ros.apps.poses.importing import write_pose_session
 from anser_ros.apps.poses.search import with_noise
+from anser_ros.apps.poses.sequence import PoseSession, sequence_of
 from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem
 from anser_ros.cli.main import run_verb
 from anser_ros.errors import DiagnosisError, PlausibilityError
@@ -364,3 +366,132 @@ def test_a_map_has_to_take_its_size_off_the_errors_of_positions(size):
     bent = fit_poses(rest.state.problem, [*rest.terms, term])
     why = unconfirmed(rest, bent, bent.terms[-1], bent.state.problem)
     assert why == ('' if size else 'takes less than 0.5 mm off the errors of positions')
+
+
+def test_an_offset_of_seconds_is_found_by_the_shape_of_the_motion():
+    world = World(2, duration=20.0, sensors=1)
+    world.offset = 3.076
+    found = named(diagnose_poses(world.session()))
+    assert set(found) == {'time_offset'}
+    assert found['time_offset'].parameters['offset_s'] == pytest.approx(3.076, abs=5e-4)
+
+
+def test_what_fits_at_no_offset_is_refused_in_words_of_time():
+    one, other = (World(seed, duration=15.0, sensors=1).session() for seed in (2, 3))
+    with pytest.raises(PlausibilityError, match='best offset of their clocks, up to 16 s'):
+        diagnose_poses(replace(one, reference=other.reference))
+
+
+def only_when(session, keep):
+    """The poses of all streams at some times."""
+    sensors = {name: poses.rows(keep(poses.time)) for name, poses in session.sensors.items()}
+    reference = session.reference.rows(keep(session.reference.time))
+    return replace(session, sensors=sensors, reference=reference)
+
+
+def test_a_pause_of_all_streams_lies_between_recordings():
+    session = World(2, duration=60.0).session()
+    paused = only_when(session, lambda time: (time < 16) | (time > 40))
+    assert not named(diagnose_poses(paused))
+    lost = replace(session, reference=paused.reference)
+    assert set(named(diagnose_poses(lost))) == {'missing_poses'}
+
+
+def test_clocks_that_run_apart_by_a_second_over_several_recordings_have_a_rate():
+    world = World(4, duration=3000.0, sensors=1, rate=8.0)
+    world.rate_ppm = 300.0
+    session = only_when(world.session(), lambda time: time % 300 < 25)
+    found = named(diagnose_poses(session))
+    assert set(found) == {'clock_rate'}
+    assert found['clock_rate'].parameters['rate_ppm'] == pytest.approx(300, abs=1)
+
+
+def at_rest(seed, count, length=5.0):
+    """Recordings at rest with an error of their own each, and noise that grows with distance."""
+    rng, streams = np.random.default_rng(seed), {}
+    places = rng.normal(0, 0.08, (count, 3)) + [0.05, 0.02, -0.25]
+    turns = Rotation.from_rotvec(rng.normal(0, 0.35, (count, 3)))
+    for name, rate in (('sensor_0', 40), ('sensor_1', 40), ('optical', 20)):
+        one = np.repeat(np.arange(count), int(rate * length))
+        time = 15.0 * one + np.tile(np.arange(int(rate * length)), count) / rate
+        place, turn = places[one], turns[one]
+        if name == 'optical':
+            place, turn, noise = FRAME.inv().apply(place - SHIFT), FRAME.inv() * turn, 3e-5
+        else:
+            place = place + turn.apply([0.03, -0.02, 0.05]) + rng.normal(0, 9e-4, (count, 3))[one]
+            turn = Rotation.from_rotvec(rng.normal(0, 3e-3, (count, 3))[one]) * turn
+            noise = 2e-4 * (np.linalg.norm(place, axis=1, keepdims=True) / 0.3) ** 5
+        place = place + noise * rng.normal(size=place.shape)
+        turn = Rotation.from_rotvec(1e-3 * rng.normal(size=place.shape)) * turn
+        streams[name] = sequence_of(name, time + 1.0, place, turn.as_quat())
+    reference = streams.pop('optical')
+    return PoseSession('simulated', 10**9, streams, reference)
+
+
+def test_bodies_at_rest_have_no_clock_however_many_and_noisy_they_are():
+    for count in (6, 91):
+        assert pose_problem(at_rest(5, count)).path.is_at_rest
+    names = named(diagnose_poses(at_rest(5, 20)))
+    assert not set(names) & {'time_offset', 'clock_rate', 'stamp_jitter', 'tracker_lag'}
+
+
+def test_turns_that_change_at_a_time_are_an_episode_of_the_sensor_that_turns_most():
+    world = World(1, duration=86.0, sensors=2, rate=5.0)
+    world.jitter = 0.017
+
+    def after(streams):
+        for name, degrees in (('sensor_0', 3.0), ('sensor_1', 0.5)):
+            rows = streams[name]
+            late = rows[0][:, None] > 68
+            turn = Rotation.from_rotvec(late * np.deg2rad(degrees) * [0.6, -0.5, 0.62])
+            rows[1] = rows[1] + 1e-3 * late * [0.6, 0.5, -0.6]
+            rows[2] = (turn * Rotation.from_quat(rows[2])).as_quat()
+        return streams
+
+    world.after = after
+    records = diagnose_poses(world.session()).records
+    (metal,) = (r.parameters for r in records if r.name == 'moving_metal')
+    assert metal['sensors'] == ['sensor_0']
+    assert metal['t_start_s'] == pytest.approx(69, abs=2)
+    assert metal['t_end_s'] == pytest.approx(87, abs=2)
+
+
+def test_metal_at_a_place_is_named_at_every_visit_and_neither_as_noise_nor_as_a_map():
+    world, middles = World(1, duration=90.0, sensors=2, rate=5.0), (15.0, 34.0, 55.0, 76.0)
+    plain, spot = world._place, np.array([0.12, -0.02, 0.03])
+
+    def place(time):
+        away = np.min(np.abs(np.subtract.outer(time, middles)), axis=1)
+        there = 1 / (1 + np.exp((away - 1.6) / 0.2))
+        return plain(time) * (1 - there)[:, None] + there[:, None] * (spot + 0.2 * plain(time))
+
+    def after(streams):
+        for name, share in (('sensor_0', 1.0), ('sensor_1', 0.6)):
+            rows = streams[name]
+            body = world.body(rows[0])[0] - [0.05, 0.02, -0.3]
+            near = share * np.exp(-(((body - spot) / 0.03) ** 2).sum(axis=1))[:, None]
+            rows[1] = rows[1] + 0.015 * near * [0.7, 0.5, -0.5]
+            turn = Rotation.from_rotvec(0.14 * near * [0.5, 0.5, 0.7])
+            rows[2] = (turn * Rotation.from_quat(rows[2])).as_quat()
+        return streams
+
+    world.follow(place, world._turn)
+    world.after = after
+    records = [r for r in diagnose_poses(world.session()).records if r.name != 'hand_eye']
+    assert {r.name for r in records} == {'moving_metal'}
+    found = [(r.parameters['t_start_s'] + r.parameters['t_end_s']) / 2 - 1 for r in records]
+    np.testing.assert_allclose(found, middles, atol=1)
+
+
+def test_a_scale_of_all_sensors_is_named_as_such_beside_a_bend():
+    world = World(1, duration=30.0, sensors=3, rate=20.0)
+    world.scale = 1.012
+
+    def bend(sensor, place):
+        x, y, z = ((place - MIDDLE) / 0.08).T
+        return place + 8e-4 * np.stack([x * y, z**2 - 0.5, x * z], axis=1)
+
+    world.bend = bend
+    found = named(diagnose_poses(world.session()))
+    assert found['optical_scale'].parameters['scale'] == pytest.approx(1.012, abs=2e-3)
+    assert set(found) <= {'optical_scale', 'field_distortion'}

@@ -176,9 +176,12 @@ def episodes_of(spans, *, returns=False, shared_m=0.0):
         residual = 3e-4 * rng.normal(size=(time.size, 6)) + shared
         for first, last, pulls in spans:
             residual[(time > first) & (time < last), 0] += pulls[k]
-        view = SimpleNamespace(sensor=f'sensor_{k}', time=time, measured=place)
+        still, noise = np.zeros((time.size, 6)), PoseNoise(3e-4, 3e-4)
+        view = SimpleNamespace(sensor=f'sensor_{k}', time=time, measured=place, velocity=still)
         every = np.ones(time.size, dtype=bool)
-        sensors.append(SimpleNamespace(view=view, residual=residual, used=every, out=~every))
+        sensors.append(
+            SimpleNamespace(view=view, residual=residual, noise=noise, used=every, out=~every)
+        )
     setting = PoseSetting(('sensor_0', 'sensor_1', 'sensor_2'), 0.0, 40.0, np.zeros(3), 0.1)
     return PoseMovingMetal().observed(SimpleNamespace(sensors=sensors, setting=setting))
 

@@ -297,3 +297,40 @@ def test_names_of_files_become_names_of_topics_and_are_told(tmp_path, name, call
     assert run_verb('import_poses', [str(path), '--out', str(tmp_path / 'o.mcap')]) == 0
     assert f'{name} is called {called}' in capsys.readouterr().out
     assert set(read_pose_session(tmp_path / 'o.mcap').sensors) == {called}
+
+
+def test_counters_that_run_through_several_files_are_one_clock(tmp_path):
+    """Two devices of their own clocks, one 250 ppm fast; the programs start 40 ms apart."""
+    files = {'EM': [], 'OT': []}
+    for number, late in enumerate((0.0, 0.04, -0.03)):
+        start = 240.0 * number
+        for name, ppm, first in (('EM', 250, 5000.0), ('OT', 0, 900.0)):
+            true = start + (late if name == 'EM' else 0.0) + np.arange(20) / 20
+            hz = 320 if name == 'EM' else 60
+            frames = np.round(hz * (first + true * (1 + 1e-6 * ppm))).astype(int)
+            rows = [(cell(frame),) for frame in frames]
+            path = tmp_path / f'{name}{number}.tsv'
+            files[name].append(tool_tracker(path, rows, (f'Port {name}',)))
+    session = import_poses(files['EM'], files['OT'])
+    tracked, reference = one_of(session).time[::20], session.reference.time[::20]
+    np.testing.assert_allclose(np.diff(reference), 240, atol=0.02)
+    apart = np.diff(tracked) - np.diff(reference)
+    np.testing.assert_allclose(apart, [0.06 + 0.04, 0.06 - 0.07], atol=0.02)
+
+
+def test_counters_that_start_anew_in_every_file_are_put_one_after_the_other(tmp_path):
+    rows = [(cell(16 * k),) for k in range(20)]
+    files = [tool_tracker(tmp_path / f'{n}.tsv', rows, ('Port EM',)) for n in range(4)]
+    session = import_poses(files[:2], files[2:])
+    assert session.reference.time[20] - session.reference.time[19] == pytest.approx(10.0)
+
+
+def test_a_devices_counter_has_one_zero_on_the_hosts_axis_in_all_files(tmp_path):
+    def rows(start, late):
+        return [
+            device_line(start + 0.05 * k + late, 1000 + 320 * start + 16 * k) for k in range(9)
+        ]
+
+    files = [write(tmp_path / f'{n}.txt', *rows(100 + 60 * n, 0.04 * (n % 2))) for n in range(3)]
+    time = one_of(import_poses(files, stamps='device')).time
+    np.testing.assert_allclose(time[9::9] - time[:-9:9], 60, atol=1e-9)

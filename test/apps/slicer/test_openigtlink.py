@@ -228,7 +228,7 @@ def test_replies_of_the_node(ros, tracker):
     values = {'port': 0, 'coil_name': '{sensor}Of{body}'}
     node = OpenIGTLink(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()])
     try:
-        with socket.create_connection(('127.0.0.1', node.port)) as client:
+        with socket.create_connection(('127.0.0.1', node._server.port)) as client:
             client.settimeout(60.0)
             for kind in ('GET_CAPABIL', 'GET_STATUS', 'STT_TDATA'):
                 client.sendall(igtl.message(kind, '', 1.0, b''))

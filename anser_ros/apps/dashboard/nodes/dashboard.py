@@ -11,10 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -56,7 +55,6 @@ class ChainClient:
         }
 
     def is_there(self, service: str) -> bool:
-        """Return whether somebody offers a service."""
         return bool(self._triggers[service].service_is_ready())
 
     async def trigger(self, service: str) -> str:
@@ -83,13 +81,11 @@ class ChainClient:
         Raises `ChainError` when one refuses; those before it have theirs already.
         """
         for name, path in files.items():
-            value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=path)
-            wanted = ParameterMessage(name=MODEL_FILE, value=value)
+            wanted = Parameter(MODEL_FILE, value=path).to_parameter_msg()
             request = SetParameters.Request(parameters=[wanted])
-            answer = await _ask(self._setters[name], request, LOADING_S)
-            if not answer.results or not answer.results[0].successful:
-                reason = answer.results[0].reason if answer.results else 'refused'
-                raise ChainError(f'{name}: {reason}')
+            (result,) = (await _ask(self._setters[name], request, LOADING_S)).results
+            if not result.successful:
+                raise ChainError(f'{name}: {result.reason}')
 
     async def baseline_file(self) -> str:
         """Return the recording without metal that ``field_model`` was started with."""
@@ -120,8 +116,6 @@ async def _ask(client: Any, request: Any, longest_s: float) -> Any:
 
 @dataclass(frozen=True)
 class DashboardParameters:
-    """Holds the parameters of the live view."""
-
     host: str = parameter(
         '127.0.0.1',
         "address that the page is served on; any other than this machine's own needs a token",
@@ -178,7 +172,6 @@ class Dashboard(AnserNode):
         self._source.setup_text = message.data
 
     def status(self) -> Status:
-        """Return how many pages look on."""
         job = self._loop.job
         values = {
             'pages': self._server.guard.pages,
@@ -188,7 +181,6 @@ class Dashboard(AnserNode):
         return Status('', Level.OK, f'{self._pages.count} pages open', values)
 
     def close(self) -> None:
-        """End the page, and a command that runs."""
         self._loop.cancel()
         self._server.end()
         self._streams.destroy_node()

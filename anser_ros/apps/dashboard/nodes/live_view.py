@@ -8,14 +8,13 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.nodes import traces
 from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime.diagnostics import LastStatus
 from anser_ros.wire.setup import Setup
 
-Array = NDArray[np.float64]
 HISTORY = 240
 """Points of the curves over time: two minutes at half a second per point."""
 FRESH_S = 0.6
@@ -95,7 +94,6 @@ class LiveView:
         self._recent[number].position.append(tuple(values[:3]))
 
     def take_optical(self, body: str, received: Iterable[tuple[bytes, Mapping[str, int]]]) -> None:
-        """Take a body's optical poses."""
         trace = self._optical[body]
         for data, _ in received:
             stamp_s, values = read_pose(data)
@@ -148,7 +146,6 @@ class LiveView:
         return shares
 
     def reasons(self) -> list[str]:
-        """Return the causes of what the statuses report."""
         return causes(self.statuses, self.namespace, self.setup.flux_rate_hz)
 
     def add_point(self) -> None:
@@ -164,7 +161,6 @@ class LiveView:
         self.points.append((time.time(), self.error_m, self.residual_t(), self.tracked()))
 
     def _errors(self) -> Array:
-        """Root mean square distance of the last poses from the optical ones, m."""
         optical = {body: trace.track() for body, trace in self._optical.items()}
         found = np.full(len(self.targets), np.nan)
         for number, recent in enumerate(self._recent):

@@ -100,7 +100,6 @@ class Polled:
         return found
 
     def close(self) -> None:
-        """End the subscription and forget what came by it."""
         self._node.destroy_subscription(self._subscription)
 
 
@@ -151,12 +150,11 @@ class ViewSource:
         self._optical: dict[str, Polled] = {}
         self._statuses: dict[str, LastStatus] = {}
         self._status_s: dict[str, float] = {}
-        self._balls: list[list[float]] = []
+        self.metal: list[list[float]] = []  # balls where metal seems to be: place and radius, m
         self._marks: deque[tuple[float, str]] = deque(maxlen=MOST_MARKS)
         self._processor = Processor()
 
     def mark(self, words: str) -> None:
-        """Mark this moment in the curves."""
         self._marks.append((time.time(), words))
 
     def figures(self, since_s: float) -> dict[str, float | None]:
@@ -166,7 +164,6 @@ class ViewSource:
     # What comes in ------------------------------------------------------------------------
 
     def look(self) -> None:
-        """Take in what has come since the last time."""
         self._take_setup(self.setup_text)
         for message in self._diagnostics.messages(self._refused):
             self._take_statuses(message)
@@ -223,7 +220,7 @@ class ViewSource:
         if self.view is not None:
             self.view.add_point()
         for data, _ in self._metals.take()[-1:]:
-            self._balls = _balls(deserialize_message(data, MarkerArray))
+            self.metal = _balls(deserialize_message(data, MarkerArray))
 
     # What is shown ------------------------------------------------------------------------
 
@@ -254,7 +251,6 @@ class ViewSource:
         }
 
     def frame(self) -> list[Any]:
-        """Return the places of all targets that the view shows."""
         return [] if self.view is None else self.view.frame()
 
     def table(self) -> list[list[Any]]:
@@ -272,12 +268,7 @@ class ViewSource:
             for one, *figures in columns
         ]
 
-    def metal(self) -> list[list[float]]:
-        """Return balls where metal seems to be."""
-        return self._balls
-
     def point(self) -> list[Any]:
-        """Return the newest point of the curves."""
         view = self.view
         return [] if view is None or not view.points else _point(view.points[-1])
 
@@ -286,7 +277,6 @@ class ViewSource:
         return [list(mark) for mark in self._marks]
 
     def status(self) -> dict[str, Any]:
-        """Return what the page's header and lists say."""
         view, space = self.view, self.namespace
         own, busy = self._processor.shares()
         status: dict[str, Any] = {
@@ -301,8 +291,10 @@ class ViewSource:
         tracker = self._statuses.get(f'{space}/tracker', LastStatus(1, 'no tracker', {}))
         good = sum(view.last_status(target.name).level == 0 for target in view.targets)
         rates = view.rate_hz[view.rate_hz > 0]
-        recorder = self._statuses.get(f'{space}/recorder')
-        is_recording = recorder is not None and recorder.message == 'recording'
+        recorder, recording = self._statuses.get(f'{space}/recorder'), ''
+        if recorder is not None and recorder.message == 'recording':
+            name = recorder.values.get('bag', '').rpartition('/')[2]
+            recording = f'{name} {float(recorder.values.get("duration_s", 0.0)):.0f} s'
         return status | {
             'tracked': f'{good} of {len(view.targets)} tracked',
             'level': tracker.level if good == len(view.targets) else max(1, tracker.level),
@@ -311,7 +303,7 @@ class ViewSource:
             'why': view.reasons(),
             'nodes': self._nodes(),
             'findings': self._findings(),
-            'recording': _recording(recorder) if recorder and is_recording else '',
+            'recording': recording,
         }
 
     def _nodes(self) -> list[tuple[str, int, str]]:
@@ -335,11 +327,6 @@ class ViewSource:
         ]
         own = self._statuses[name]
         return [(own.level, own.message), *parts]
-
-
-def _recording(recorder: LastStatus) -> str:
-    name = recorder.values.get('bag', '').rpartition('/')[2]
-    return f'{name} {float(recorder.values.get("duration_s", 0.0)):.0f} s'
 
 
 def _point(point: Any) -> list[Any]:

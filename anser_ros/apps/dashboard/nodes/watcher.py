@@ -48,8 +48,6 @@ SILENCE_S = 2.0
 
 @dataclass(frozen=True)
 class WatcherParameters:
-    """Holds the parameters of the watcher."""
-
     model_file: str = parameter(
         NOMINAL,
         "the tracker's model: a file, or nominal for that of the setup's own geometry",
@@ -93,7 +91,7 @@ class WatcherParameters:
 class Streams(Protocol):
     """States what a watcher looks at: streams into a window, and who looks at the window.
 
-    `FluxStreams` are those of this package's own fluxes; others come by `streams_of`.
+    `FluxStreams` are those of this package's own fluxes; others are an application's.
     """
 
     WHAT: str  # what comes, in a word
@@ -132,7 +130,6 @@ class FluxStreams:
         ]
 
     def on_setup(self, message: String) -> None:
-        """Take a setup document."""
         if message.data == self._setup_text:
             return
         self._offered = message.data
@@ -142,7 +139,6 @@ class FluxStreams:
             self._node.refuse('setups_refused', error)
 
     def on_parameters(self, old: WatcherParameters, new: WatcherParameters) -> None:
-        """Start again with another model."""
         if old.model_file != new.model_file and self._offered:
             self._begin(self._offered)
 
@@ -171,13 +167,12 @@ class FluxStreams:
             self.window.take_pose(body, stamp_of(message), pose_numbers(message.pose))
 
     def on_fluxes(self, topic: str, message: PointCloud2) -> None:
-        """Take a frame of one of the two topics."""
         window = self.window
         if window is None:
             return
-        take = window.take_tool if topic == 'tool/flux' else window.take_reference
+        fluxes = window.tool if topic == 'tool/flux' else window.reference
         try:
-            take(*read_frame(message, window.setup.frame_id, self._node.count))
+            window.take(fluxes, *read_frame(message, window.setup.frame_id, self._node.count))
             self.received_s = time.monotonic()
             self._node.count('frames')
         except AnserError as error:
@@ -188,14 +183,12 @@ class FluxStreams:
         return ()
 
     def look(self) -> Callable[[], Sighting] | None:
-        """Return what looks at the window as it is now; None where that has too little."""
         session = None if self.window is None else self.window.session()
         if session is None or self.watch is None or self.window is None:
             return None
         return partial(self.watch.look, session, self.window.first_ns)
 
     def words(self, seen: Sighting) -> str:
-        """Return what was seen as one line for an operator."""
         size = (
             f'residual {1e12 * seen.flux_rms_t:.0f} pT, {seen.excess**0.5:.1f} x the expected one'
         )
@@ -209,7 +202,6 @@ class FluxStreams:
         return f'{size}; {cause}{depends}'
 
     def values(self, seen: Sighting) -> dict[str, object]:
-        """Return the figures of what was seen, by name."""
         return {
             'compared_with': seen.truth,
             'frames_compared': seen.frames,
@@ -219,12 +211,6 @@ class FluxStreams:
             'findings': titles_of(seen.findings),
             'depends_on': ', '.join(seen.depends_on),
         }
-
-
-def streams_of(node: 'Watcher', table: WatcherParameters) -> Streams:
-    """Return what the parameters ask for: streams of an application, or fluxes."""
-    asked = extensions.loaded('STREAMS', lambda name: getattr(table, name))
-    return next((make(node, table) for make in asked), None) or FluxStreams(node, table)
 
 
 class Watcher(AnserNode):
@@ -249,14 +235,17 @@ class Watcher(AnserNode):
         self._busy = False
         # What looks, and by whose watch; None at the end.
         self._tasks: queue.SimpleQueue[tuple[Any, Callable[[], Any]] | None] = queue.SimpleQueue()
-        self._streams = streams_of(self, self.parameters)
+        table = self.parameters
+        asked = extensions.loaded('STREAMS', lambda name: getattr(table, name))
+        self._streams: Streams = next((make(self, table) for make in asked), None) or FluxStreams(
+            self, table
+        )
         self.create_timer(POLL_S, self._begin_look, clock=self.steady_clock)
         work = self._guard(self._take_look)
         self._thread = threading.Thread(target=self._work, args=(work,), daemon=True)
         self._thread.start()
 
     def refuse(self, counter: str, error: AnserError) -> None:
-        """Count and report what can't be used."""
         self._trouble = str(error)
         self.warn(counter, str(error))
 
@@ -265,7 +254,6 @@ class Watcher(AnserNode):
         self._trouble, self._seen, self._known = '', None, {}
 
     def on_parameters(self, old: WatcherParameters, new: WatcherParameters) -> None:
-        """Start again with another model."""
         self._streams.on_parameters(old, new)
 
     # Looking ------------------------------------------------------------------------------
@@ -305,7 +293,6 @@ class Watcher(AnserNode):
             self._known |= {title_of(record): record for record in seen.findings}
 
     def close(self) -> None:
-        """End the thread after the look that it is at."""
         self._tasks.put(None)
 
     # What is reported ---------------------------------------------------------------------
@@ -314,7 +301,6 @@ class Watcher(AnserNode):
         return now_s - self._streams.received_s > SILENCE_S
 
     def status(self) -> Status:
-        """Return what is there, in one line, with its figures."""
         streams, seen = self._streams, self._seen
         values: dict[str, object] = {'look_cpu_s': self._look_s, 'last_refusal': self._trouble}
         conflict = sender_words(streams.sources)

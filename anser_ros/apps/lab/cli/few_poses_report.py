@@ -24,8 +24,7 @@ from anser_ros.cli.page import (
 )
 
 FAR = 3.0
-"""Times the residual of the median channel from which on a channel is named: noise alone does not
-make it, even where a channel has a dozen readings."""
+"""Times the median channel's residual to be named: noise of a dozen readings does not make it."""
 
 
 def render(

@@ -334,8 +334,7 @@ SECOND_SHARE = 0.6
 OTHER_PATH_RAD = 2.0
 """Phase of the second run's path, rad, so that the correction is tested at other poses."""
 LEAST_KEPT = 0.85
-"""Fraction of whole frames below which a recording shows the load of the machine rather than the
-effect."""
+"""Fraction of whole frames below which a recording shows the load of the machine instead."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -14,7 +14,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.apps.lab.measured import anser_board, hpi_coils, magnet_patch, navion, transformer
+from anser_ros.apps.lab.measured import (
+    anser_board,
+    hpi_coils,
+    ilemt,
+    magnet_patch,
+    navion,
+    transformer,
+)
 from anser_ros.apps.lab.measured import recipe as shared_data
 from anser_ros.apps.lab.measured.recipe import SHARED, Recipe, ReportRow
 from anser_ros.cli import main
@@ -25,7 +32,7 @@ RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
         navion.RECIPE, magnet_patch.RECIPE, magnet_patch.STEP_RECIPE, hpi_coils.RECIPE,
-        anser_board.RECIPE, transformer.RECIPE,
+        anser_board.RECIPE, transformer.RECIPE, ilemt.RECIPE,
     )
 }  # fmt: skip
 """Data sets that the shipped commands are run on."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.lab.measured.recipe import shared_folder
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import BagError
 from anser_ros.physics.dipole import field_basis
 from anser_ros.sessions.session import Session, load_session
@@ -30,8 +30,6 @@ from anser_ros.simulation.world import (
 )
 from anser_ros.wire.setup import SensorSpec, Setup, parse_setup
 from anser_ros.wire.text_files import config_path
-
-Array = NDArray[np.float64]
 
 STATISTICS = ('RMSE', 'ME', 'PRC50', 'PRC95')
 SENSORS = ('Y', 'Z')
@@ -238,7 +236,7 @@ def with_metal(source: FieldSource, metal: Sequence[MetalBody], setup: Setup) ->
         [source(body.centres(0.0)) * body.polarisability(tones) for body in metal]
     )
 
-    def field(points: Array) -> NDArray[np.complex128]:
+    def field(points: Array) -> ComplexArray:
         out = np.array(source(points), dtype=complex)
         for component, unit in enumerate(np.eye(3)):
             basis = field_basis(points, where, np.broadcast_to(unit, where.shape))

@@ -8,12 +8,12 @@ poses count as such.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anser_ros.arrays import ComplexArray, Integers
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import FieldFunction, default_clouds, excitation_for
@@ -27,9 +27,6 @@ from anser_ros.sessions.session import Session
 from anser_ros.settings import Accuracy
 from anser_ros.stamps import NANO
 from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 class FreeDipoles:
@@ -49,7 +46,7 @@ class FreeDipoles:
         excitation, region = excitation_for(model, drawing)
         clouds = [cloud for cloud in default_clouds(region) if not cloud.overhead]
         self.model, self.baseline, self._noise = model, baseline, accuracy.flux_noise_t
-        self._layer = bottom_layer(model, region, excitation, clouds[0].positions)
+        self._layer = bottom_layer(region, excitation)
         self._spectra, self._bases, self._transfers = [], [], []
         for cloud in clouds:
             root = np.repeat(np.sqrt(cloud.volumes), 3)
@@ -89,18 +86,11 @@ class FreeDipoles:
                 best, kept = evidence, transfer @ (shrink * projected)
         k, layer = flux.shape[1], self._layer
         moments = (self._noise * (kept[:, :k] + 1j * kept[:, k:])).astype(np.complex128)
-        rows = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
-        base = self.model.moments.copy()
-        base[rows] += moments[: rows.size]
-        model = replace(self.model, moments=base)
-        return model.with_dipoles(
-            layer.positions[rows.size :], layer.directions[rows.size :], moments[rows.size :]
-        )
+        return self.model.with_dipoles(layer.positions, layer.directions, moments)
 
 
 REACH_M = 0.15
-"""Largest distance of a solution from the optical position, m; a wrong model may not lead a pose
-farther astray."""
+"""Largest distance of a solution from the optical position, m, however wrong the model."""
 COUNTS = (4, 8, 16, 32)
 """Numbers of reference coils that are compared; the demo's board has 32."""
 FROZEN, FREE, SHARED = 'frozen model', 'free dipoles', 'shared polarisability'
@@ -116,7 +106,7 @@ class AblationRow:
     rmse_m: float  # of all tool coils tracked singly, against the optical pose
 
 
-def spread_out(references: SensorTable, count: int) -> NDArray[np.int64]:
+def spread_out(references: SensorTable, count: int) -> Integers:
     """Return the rows of some references, each as far as possible from those before it.
 
     Coils at the place of another one come last, in the order of how different their axes are.
@@ -162,8 +152,8 @@ def ablate(
 def _models(
     session: Session,
     model: FieldModel,
-    clean: NDArray[np.complex128],
-    chosen: NDArray[np.int64],
+    clean: ComplexArray,
+    chosen: Integers,
     method: str,
     every: int,
 ) -> list[FieldModel]:

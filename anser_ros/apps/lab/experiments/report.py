@@ -7,16 +7,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib import pyplot as plt
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.experiments import recordings
 from anser_ros.apps.lab.experiments.recordings import HEAD_DISTANCES_CM, MATERIALS, checkerboard
 from anser_ros.apps.lab.experiments.study import SensorErrors, Study
+from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.cli.page import legend_below, save
 from anser_ros.field.model import FieldModel
 from anser_ros.sessions.session import Session
-
-Array = NDArray[np.float64]
 
 SIMULATED = 'simulated data'
 SENSOR_WORDS = {'Y': 'Y sensor (horizontal)', 'Z': 'Z sensor (vertical)'}
@@ -139,9 +137,7 @@ def _profiles(study: Study, folder: Path) -> Path:
     return _save(figure, folder / 'fig_6.png', title)
 
 
-def _readings_near(
-    session: Session, component: int, emitter: int
-) -> tuple[Array, NDArray[np.complex128]]:
+def _readings_near(session: Session, component: int, emitter: int) -> tuple[Array, ComplexArray]:
     """Return x (m) and flux (T) of the readings near the line by sensors along a component."""
     tool = session.tools[0]
     points, axes = tool.placed()
@@ -169,7 +165,7 @@ def _lattices(errors: Mapping[str, SensorErrors], folder: Path) -> Path:
     return _save(figure, folder / 'fig_8.png', title)
 
 
-def _lattice_lines(places: Array) -> Sequence[NDArray[np.int64]]:
+def _lattice_lines(places: Array) -> Sequence[Integers]:
     """Return the rows and columns of a square lattice as indices in order."""
     side = max(round(np.sqrt(len(places))) - 1, 1)
     low, high = np.nanmin(places, axis=0)[:2], np.nanmax(places, axis=0)[:2]

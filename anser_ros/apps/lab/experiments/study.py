@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.experiments.recordings import (
     HEAD_DISTANCES_CM,
@@ -19,6 +18,7 @@ from anser_ros.apps.lab.experiments.recordings import (
 )
 from anser_ros.apps.lab.measured import anser_board
 from anser_ros.apps.lab.measured.recipe import shared_folder
+from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.error_map import learn_error_map
 from anser_ros.calibration.layout_fit import emitter_gains
@@ -42,8 +42,6 @@ from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 from anser_ros.sessions.tracked_session import error_statistics, track_session
 from anser_ros.simulation.recording import STATIC_NOISE_T
-
-Array = NDArray[np.float64]
 
 
 def position_bound(measurements: Measurements, model: FieldModel, noise_t: float) -> Array:

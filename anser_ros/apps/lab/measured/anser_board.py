@@ -8,13 +8,11 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.lab.measured.recipe import Recipe, ReportRow, figure, ran
+from anser_ros.arrays import Array
 from anser_ros.errors import FitError
 from anser_ros.wire.tables import read_points
-
-Array = NDArray[np.float64]
 
 NAME = 'anser_board'
 PITCH_M = 31.75e-3

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.lab.measured.recipe import (
@@ -26,10 +25,9 @@ from anser_ros.apps.lab.measured.recipe import (
     vector,
     write_frames,
 )
+from anser_ros.arrays import Array, Booleans, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
-
-Array = NDArray[np.float64]
 
 NAME, BODY = 'hpi_coils', 'helmet'
 TONES_HZ = (70.0, 72.0, 74.0, 76.0)
@@ -55,7 +53,7 @@ class Epoch:
     """Holds the file in SI units: S channels, Q points each, T samples, 4 coils."""
 
     names: tuple[str, ...]  # length S
-    is_magnetometer: NDArray[np.bool_]  # (S,)
+    is_magnetometer: Booleans  # (S,)
     # (S, Q, 3), (S, Q, 3), (S, Q)
     points_m: Array
     normals: Array
@@ -89,7 +87,7 @@ def load(folder: Path) -> Epoch:
             raise FitError(f'{path.name} is not the expected set of arrays: {error}') from error
 
 
-def demodulated(samples: Array, rate_hz: float, reference: NDArray[np.bool_]) -> Array:
+def demodulated(samples: Array, rate_hz: float, reference: Booleans) -> Array:
     """Return phasors (S, 4), complex, of a stretch of samples, in their unit.
 
     Tones and drift are fitted together; a tone's phase is that of the reference channels, since
@@ -107,7 +105,7 @@ def demodulated(samples: Array, rate_hz: float, reference: NDArray[np.bool_]) ->
     return np.asarray((phasor * np.exp(-1j * phase)[:, None]).T)
 
 
-def fluxes(epoch: Epoch) -> NDArray[np.complex128]:
+def fluxes(epoch: Epoch) -> ComplexArray:
     """Return fluxes (FRAMES, S, 4), T; those of a gradiometer are differences of its coils'."""
     kinds = epoch.is_magnetometer, ~epoch.is_magnetometer
     frames = np.stack(
@@ -168,7 +166,7 @@ def distance_mm(found: Array, digitised: Array) -> float:
     return float(1e3 * least / len(found) ** 0.5)
 
 
-def inverted(epoch: Epoch) -> NDArray[np.bool_]:
+def inverted(epoch: Epoch) -> Booleans:
     """Return which channels (S,) have the other sign than their stored amplitudes, by all tones.
 
     Tones are matched with stored coils by the sizes of their amplitudes.

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.lab.measured.recipe import (
@@ -33,13 +32,12 @@ from anser_ros.apps.lab.measured.recipe import (
     vector,
     write_frames,
 )
+from anser_ros.arrays import Array
 from anser_ros.errors import FitError
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 from anser_ros.wire.setup_values import Vector
 from anser_ros.wire.tables import read_table
-
-Array = NDArray[np.float64]
 
 NAME, BODY, AXES = 'magnet_patch', 'patch', 'xyz'
 SENSORS = 16

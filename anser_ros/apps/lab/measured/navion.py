@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.lab.measured.recipe import (
@@ -25,11 +24,10 @@ from anser_ros.apps.lab.measured.recipe import (
     vector,
     write_frames,
 )
+from anser_ros.arrays import Array
 from anser_ros.errors import FitError
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 from anser_ros.wire.tables import read_table
-
-Array = NDArray[np.float64]
 
 NAME, PLATE, AXES = 'navion', 'plate', 'xyz'
 TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

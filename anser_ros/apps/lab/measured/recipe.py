@@ -7,17 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import Setup, dump_setup
 from anser_ros.wire.setup_values import Vector
-
-Array = NDArray[np.float64]
 
 SHARED = 'ANSER_SHARED'
 """Environment variable with the folder of other people's data and shared recordings."""
@@ -44,7 +40,7 @@ def vector(values: Array) -> Vector:
 def write_frames(
     path: Path,
     setup: Setup,
-    flux: NDArray[np.complex128],
+    flux: ComplexArray,
     poses: Mapping[str, tuple[Array, Array]] | None = None,
     stamp_ns: Sequence[int] | None = None,
 ) -> None:

@@ -10,7 +10,6 @@ One plane takes no part in the calibration and judges it.
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
 from anser_ros.apps.lab.measured.recipe import (
@@ -21,13 +20,12 @@ from anser_ros.apps.lab.measured.recipe import (
     vector,
     write_frames,
 )
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 from anser_ros.wire.tables import read_table
-
-Array = NDArray[np.float64]
 
 NAME, PROBE = 'transformer', 'probe'
 COLUMNS = 9
@@ -47,7 +45,7 @@ STATED = {'flux_noise_t': 2e-7, 'optical_position_m': 3e-3, 'optical_rotation_ra
 """Resolution of the meter, and what a wooden frame may be off by."""
 
 
-def read(folder: Path) -> tuple[Array, NDArray[np.complex128]]:
+def read(folder: Path) -> tuple[Array, ComplexArray]:
     """Return places (P, 3), m, fg, and fields (P, 3), T, complex, along the axes of fg.
 
     Raises `FitError` when the file is missing, or is no table of nine columns.
@@ -104,7 +102,7 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     axes = np.tile(judge.sensors.axis, (count, 1))
     predicted = model.flux(np.repeat(judge.position, channels, axis=0), axes)
 
-    def rmse_ut(flux: NDArray[np.complex128]) -> float:
+    def rmse_ut(flux: ComplexArray) -> float:
         error = (flux.reshape(count, channels) - judge.flux[:, :, 0]).view(float)
         return float(1e6 * np.sqrt(np.mean(error**2)))
 

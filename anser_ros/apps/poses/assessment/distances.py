@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.assessment.intervals import (
@@ -29,10 +28,9 @@ from anser_ros.apps.poses.assessment.intervals import (
 )
 from anser_ros.apps.poses.assessment.rest import StillPoint
 from anser_ros.apps.poses.sequence import PoseSequence
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.physics.rotations import axis_angles
-
-Array = NDArray[np.float64]
 
 SPACING_M = 0.05
 """Distance of neighbouring holes of the protocol's board, m."""
@@ -52,8 +50,7 @@ COMMON_ERROR_SIGMAS = 1.0
 """Correlation of the errors of parallel neighbouring distances, in its standard errors, from which
 on they count as alike: in doubt the interval is the wider one. Chosen on simulated boards."""
 PARTS = 3
-"""Strips of a board, along and across, that are drawn again where lines are alike: with fewer
-nothing can be drawn, and more are alike themselves."""
+"""Strips of a board, along and across, that are drawn again where lines are alike."""
 ROTATION = 'Rotation error statistics'
 ORDERS = ('rows', 'serpentine')
 
@@ -214,7 +211,7 @@ def _group(
 
 
 def grouped(
-    unit: str, words: Sequence[str], signed: Array, clusters: Sequence[NDArray[np.int64]],
+    unit: str, words: Sequence[str], signed: Array, clusters: Sequence[Integers],
     rng: np.random.Generator,
 ) -> ErrorGroup:  # fmt: skip
     """Return errors with intervals from resamples of clusters, the widest of several ways."""

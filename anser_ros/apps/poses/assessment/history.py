@@ -34,8 +34,7 @@ RUN = 8
 DIFFERENCE = 1.128
 """Mean of the difference of two normal values over their deviation."""
 SMALLEST_SHARE = 0.02
-"""Least standard deviation that limits are made with, as a share of the mean: sessions that happen
-to be alike do not make limits that the next one must break."""
+"""Least standard deviation of limits, as a share of the mean: sessions may happen to be alike."""
 
 
 class ControlLimits(NamedTuple):

@@ -9,10 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-Array = NDArray[np.float64]
+from anser_ros.arrays import Array, Integers
 
 LEVEL = 0.95
 """Probability with which an interval holds what it is an interval of."""
@@ -56,14 +55,14 @@ def mitk_statistics(values: Array) -> dict[str, float]:
     }  # fmt: skip
 
 
-def cluster_weights(clusters: NDArray[np.int64], rng: np.random.Generator) -> Array:
+def cluster_weights(clusters: Integers, rng: np.random.Generator) -> Array:
     """Return how often each error is in each resample of whole clusters, shape (`DRAWS`, n)."""
     names, index = np.unique(clusters, return_inverse=True)
     counts = rng.multinomial(names.size, np.full(names.size, 1 / names.size), size=DRAWS)
     return np.asarray(counts[:, index], dtype=np.float64)
 
 
-def vertex_weights(pairs: NDArray[np.int64], rng: np.random.Generator) -> Array:
+def vertex_weights(pairs: Integers, rng: np.random.Generator) -> Array:
     """Return how often each pair (n, 2) of points is in each resample of points, (`DRAWS`, n)."""
     count = int(pairs.max()) + 1
     counts = rng.multinomial(count, np.full(count, 1 / count), size=DRAWS)
@@ -163,12 +162,12 @@ def deviation_interval(value: float, freedoms: float) -> IntervalEstimate:
     return IntervalEstimate(value, value * low, value * high)
 
 
-def blocks_of_time(time: Array) -> NDArray[np.int64]:
+def blocks_of_time(time: Array) -> Integers:
     """Return the number of the equal stretch of time, of `BLOCKS`, that each moment (n,) is in."""
     return equal_parts(time, BLOCKS)
 
 
-def equal_parts(values: Array, count: int) -> NDArray[np.int64]:
+def equal_parts(values: Array, count: int) -> Integers:
     """Return which of so many parts of equal extent each value (n,) is in."""
     extent = max(float(np.ptp(values)), 1e-9)
     numbers = (count * (values - values.min()) / extent).astype(np.int64)

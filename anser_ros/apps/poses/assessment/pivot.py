@@ -9,16 +9,15 @@ what noise of the rotations takes off the arm.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.assessment.intervals import blocks_of_time
 from anser_ros.apps.poses.fit import turn_jitter
 from anser_ros.apps.poses.sequence import PoseSequence
+from anser_ros.arrays import Array, Booleans
 from anser_ros.errors import FitError
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Booleans
 
 FEWEST_PIVOT_POSES = 30  # poses without which nothing is said; at 20 Hz a second and a half
 MOST_POSES = 3000  # poses that take part, evenly over the recording; more add nothing new

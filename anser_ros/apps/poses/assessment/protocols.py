@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.assessment.distances import (
     ORDERS,
@@ -44,16 +43,14 @@ from anser_ros.apps.poses.assessment.source import AssessedPoses
 from anser_ros.apps.poses.hand_eye import HandEye, fit_hand_eye
 from anser_ros.apps.poses.problem import predicted
 from anser_ros.apps.poses.sequence import PoseSequence
+from anser_ros.arrays import Array
 from anser_ros.errors import FitError, ParameterError
-
-Array = NDArray[np.float64]
 
 GROUPS = 5  # groups of speeds, with equal numbers of poses: a row of the table each
 FEWEST_MOVING_POSES = 100
 """Fewer leave a group less than 20, whose 95th percentile would be one pose."""
 SLOWEST_M_S = 0.02
-"""Median speed below which a recording is of a rest, where a jitter of 0.1 mm is 5 ms of
-latency."""
+"""Median speed of a rest at most, where a jitter of 0.1 mm is 5 ms of latency."""
 
 
 @dataclass(frozen=True)

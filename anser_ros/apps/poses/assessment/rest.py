@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -16,9 +15,8 @@ from anser_ros.apps.poses.assessment.intervals import (
     independent_for_variance,
 )
 from anser_ros.apps.poses.sequence import PoseSequence
+from anser_ros.arrays import Array
 from anser_ros.errors import FitError
-
-Array = NDArray[np.float64]
 
 WINDOW_S, WINDOW_POSES = 0.25, 3.0
 """Window whose middle pose is compared with its neighbours', s and poses: noise has fallen in it,
@@ -27,8 +25,7 @@ FEWEST_WINDOWS = 4
 """Windows of a pause, each half over the one before: fewer don't show whether the tool moved."""
 NOISE_TIMES = 5.0  # windows' own scatter by which their middle may differ in a pause
 LEAST_MOVE_M, LEAST_MOVE_RAD = 0.7e-3, 0.012
-"""Difference that is a move whatever the noise: m, rad. A hand that holds a tool on a divot moves
-it by less."""
+"""Difference that is a move whatever the noise, m, rad: a hand on a divot moves a tool less."""
 MOST_MOVE_M, MOST_MOVE_RAD = 2.5e-3, 0.05
 """Difference that is a move however noisy: m, rad. A scan that steps on with every pose is noise
 by its differences, and no rest."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.importing import import_poses, read_pose_session
 from anser_ros.apps.poses.sequence import PoseSequence, PoseSession, sequence_of
+from anser_ros.arrays import Array
 from anser_ros.errors import AnserError, BagError
 from anser_ros.pose_states import OK
 from anser_ros.sessions.plausibility import check_positions
@@ -21,8 +21,6 @@ from anser_ros.stamps import NANO
 from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
 from anser_ros.wire.recorded import ENDING, OPTICAL, POSE_TYPE, POSE_TYPES, optical_topic, poses_in
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
-
-Array = NDArray[np.float64]
 
 BAGS = ('.mcap', '.db3', '.zstd', '.bag')  # endings; a folder is a bag too
 TOOL = 'tool'

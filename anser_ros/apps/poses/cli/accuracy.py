@@ -11,7 +11,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.assessment.distances import ORDERS, RING_STEP_DEG, SPACING_M, ErrorGroup
@@ -63,8 +62,6 @@ from anser_ros.cli.page import (
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.wire.tables import read_table
-
-Array = NDArray[np.float64]
 
 SEED = 1
 """Seed of the resamples, so that the same recordings give the same intervals."""

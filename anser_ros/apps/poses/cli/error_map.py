@@ -5,18 +5,15 @@ import csv
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.corrector import to_point_model
+from anser_ros.arrays import Array
 from anser_ros.calibration.error_map import ErrorMap, HeldOutError, learn_error_map
 from anser_ros.cli.output import Result, Tell, add_json, add_out, make_folder, write_files
 from anser_ros.errors import ParameterError, PlausibilityError
 from anser_ros.sessions.plausibility import check_points
 from anser_ros.wire.tables import MARKUPS, Table, read_points, read_table
-
-Array = NDArray[np.float64]
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')

@@ -14,7 +14,6 @@ import numpy as np
 import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.corrector import to_document, to_model
@@ -23,6 +22,7 @@ from anser_ros.apps.poses.effect import Role, effect_with
 from anser_ros.apps.poses.importing import read_pose_session
 from anser_ros.apps.poses.problem import PosePart, PoseState
 from anser_ros.apps.poses.sequence import PoseSession
+from anser_ros.arrays import Array
 from anser_ros.cli.diagnosis_words import short_ones, value_text
 from anser_ros.cli.output import (
     Result,
@@ -51,8 +51,6 @@ from anser_ros.cli.page import (
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.tracked_session import error_statistics
-
-Array = NDArray[np.float64]
 
 UNSHOWN = ('centre_m', 'size_m', 'lowest', 'middle_s', 'degree', 'strain')
 """Parameters that tell how a map or a course is written, and not what it does."""

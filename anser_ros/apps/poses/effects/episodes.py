@@ -1,41 +1,38 @@
 """Something comes and goes, or shifts, in a session: metal that moves, a mount that is loose."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anser_ros.apps.poses.effect import PoseEffect
 from anser_ros.apps.poses.problem import PoseResiduals, Sensing
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.field.model import EffectRecord
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-WINDOWS, FEWEST_WINDOWS = 40, 15
-"""Windows of time that a session is cut into: an episode of a twentieth is seen in two. A slow
-tracker has fewer; of fewer yet an episode is too large a part."""
+WINDOWS, FEWEST_WINDOWS, WINDOW_S = 40, 15, 1.0
+"""Windows of time of a session, and fewest of a slow tracker: an episode of a twentieth is seen in
+two. A long session has more, of a second, which a hand takes to pass a thing."""
 FEWEST_POSES_OF_WINDOW = 4  # poses that a window needs to be judged: fewer may be outliers
 POSES_OF_WINDOW = 4.5  # on average, so that most windows can be judged
 TIMES = 9.0
-"""Squared error over the median window's from which a window belongs to an episode: three times
-the error, which the range of places in a session hardly makes."""
-LOUD = 3.0
-"""The same of a window in which a sensor leaves the others on its body by `TIMES`: stamps that
-jitter make every window loud."""
+"""Squared error of an episode over the median window's: the range of places hardly makes it."""
 LONGEST = 0.4
-"""Share (0 to 1) of the windows that episodes may be: the median window must be a quiet one, and a
-tenth is left for what else is loud."""
+"""Share (0 to 1) of the windows that episodes may be: the median window must be a quiet one."""
 ALIKE = 0.4  # share of a window's squared error that its mean must be; noise has a small one
 NEAR_M = 0.03
-"""Distance within which a place outside the episode is the same place: metal changes over its own
-size, centimetres."""
+"""Distance, m, of places that are the same: metal changes over its own size, centimetres."""
 REVISITED_SHARE = 0.5  # share of the episode's places that must have been visited outside it
 STRETCH, FILLED = 0.15, 0.8
 """Share of the windows that an episode of one sensor alone must span where its places were visited
 at no other time, and the share of these that are in it: no hand stays so long in a distortion."""
+FEWEST_VISITS, ALWAYS, SELDOM, FARTHER = 2, 0.6, 0.1, 90
+"""Visits to a place that makes the episodes; shares of these there, and of the poses there that
+are off; share of those elsewhere that may be; percentile of the right poses' distances that it
+must be nearer than: the edge of the volume errs without metal."""
+NEIGHBOURS = 3  # windows by which those of one episode are apart at most
+PASSED = 'metal stands at one place, and the sensors are off whenever they pass it'
 LOOSE, FAST = 0.5, 0.25
 """Share of a sensor's squared error that shifts in the body's frame explain if its mount is loose,
 and up to which the others' must be lower."""
@@ -44,10 +41,11 @@ and up to which the others' must be lower."""
 def window_count(residuals: PoseResiduals) -> int:
     """Return how many windows a session is cut into, by the poses of its median sensor."""
     poses = np.median([np.count_nonzero(s.used | s.out) for s in residuals.sensors])
-    return int(np.clip(poses // POSES_OF_WINDOW, FEWEST_WINDOWS, WINDOWS))
+    most = max(WINDOWS, int(residuals.setting.duration / WINDOW_S))
+    return int(np.clip(poses // POSES_OF_WINDOW, FEWEST_WINDOWS, most))
 
 
-def windows_of(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.int64]:
+def windows_of(sensing: Sensing, residuals: PoseResiduals) -> Integers:
     """Return the window of each pose of a sensor that counts; -1 for the others."""
     share = (sensing.view.time - residuals.setting.start) / max(residuals.setting.duration, 1e-9)
     count = window_count(residuals)
@@ -61,42 +59,121 @@ class Episode:
 
     windows: tuple[int, ...] = ()  # of time; none where it never is
     is_alone: bool = False  # whether the others on its body are right meanwhile
+    place: Array | None = None  # (3,), where it is off whenever it passes, m; None where it moved
+
+
+def _sizes(
+    sensing: Sensing, residuals: PoseResiduals, is_beside: bool
+) -> tuple[Array, dict[int, Array]]:
+    """Squared errors of places and of turns over those of the median window: of poses (n, 2), and
+    of the means of windows (2,), in which jitter cancels.
+
+    Errors count from the middle of the windows, as frames go a little way with an episode; or
+    beside the other sensors, which have the same clock and reference.
+    """
+    window, errors = windows_of(sensing, residuals), sensing.residual
+    if not is_beside:  # without what errors of the stamps make
+        errors = sensing.noise.whitened(errors, sensing.view.velocity)
+    middles = _middles(sensing, residuals, errors)
+    if is_beside:
+        others = [_middles(one, residuals) for one in residuals.sensors if one is not sensing]
+        middles = {
+            w: middle - np.median([one[w] for one in others], axis=0)
+            for w, middle in middles.items()
+            if others and all(w in one for one in others)
+        }
+    if not middles:
+        return np.zeros((window.size, 2)), {}
+    centre = np.median(list(middles.values()), axis=0)
+    square = _halves(errors - centre)
+    usual = np.median([np.median(square[window == w], axis=0) for w in middles], axis=0)
+    means = _halves(np.array(list(middles.values())) - centre)
+    means /= np.maximum(np.median(means, axis=0), 1e-18)
+    return square / np.maximum(usual, 1e-18), dict(zip(middles, means, strict=True))
+
+
+def _halves(errors: Array) -> Array:
+    """Squares of errors (n, 6) of places and of turns, (n, 2)."""
+    return np.asarray(np.sum(errors.reshape(-1, 2, 3) ** 2, axis=2))
 
 
 def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
     """Return when a sensor is off that was right at other times at the same places.
 
-    Where it was there at no other time, the body shows it: all others on it are right meanwhile.
+    Where it was there at no other time, the body shows it, if all others on it are right
+    meanwhile; or the place does, if the sensor is off in the same way whenever it comes back.
     """
-    window = windows_of(sensing, residuals)
-    square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
-    count = window_count(residuals)
-    judged = [w for w in range(count) if np.count_nonzero(window == w) >= FEWEST_POSES_OF_WINDOW]
-    if len(judged) < count // 3:
+    own = _episode(sensing, residuals, False)
+    return own if own.windows else _episode(sensing, residuals, True)
+
+
+def _episode(sensing: Sensing, residuals: PoseResiduals, is_beside: bool) -> Episode:
+    window, count = windows_of(sensing, residuals), window_count(residuals)
+    poses, sizes = _sizes(sensing, residuals, is_beside)
+    is_off, place = poses.max(axis=1) > TIMES, sensing.view.measured
+    loud = [w for w, size in sizes.items() if size.max() > TIMES]
+    high = [w for w in loud if is_beside or _is_shift(sensing, window == w)]
+    if len(sizes) < count // 3 or len(high) > LONGEST * len(sizes):
         return Episode()
-    size = {w: float(np.median(square[window == w])) for w in judged}
-    high = {w for w in _loud(size) if _is_shift(sensing, window == w)}
-    runs = [w for w in judged if w in high and (w - 1 in high or w + 1 in high)]
-    if runs and len(runs) <= LONGEST * len(judged):
-        inside = np.isin(window, runs)
-        outside = (window >= 0) & ~inside & (square < TIMES * np.median(list(size.values())))
-        place = sensing.view.measured
-        is_alone = _is_alone(sensing, residuals, runs)
-        if is_alone or (outside.any() and _is_revisited(place[inside], place[outside])):
-            return Episode(tuple(runs), is_alone)
-    return _by_the_body(sensing, residuals, size)
+    passed = _place_of(sensing, window, high, is_off)
+    if passed is not None and not is_beside:
+        return Episode(tuple(high), place=passed)
+    runs = [w for w in high if w - 1 in high or w + 1 in high]
+    if not runs:
+        return Episode()
+    inside = np.isin(window, runs)
+    is_alone = _is_alone(sensing, residuals, runs)
+    if is_alone or is_beside:
+        return Episode(tuple(runs), True) if is_alone else Episode()
+    if not any(sizes[w][0] > TIMES for w in runs):
+        # Turns err with orientation as well as place, but not for so long.
+        is_other = _lasts(runs, count) and _spread(place[inside]) > 0.5 * _spread(place)
+    else:
+        outside = (window >= 0) & ~inside & ~is_off
+        is_other = bool(outside.any()) and _is_revisited(place[inside], place[outside])
+    return Episode(tuple(runs)) if is_other else Episode()
 
 
-def in_episode(sensing: Sensing, residuals: PoseResiduals) -> Mask:
+def _spread(place: Array) -> float:
+    """Mean distance, m, of places (n, 3) from their middle."""
+    return float(np.mean(np.linalg.norm(place - place.mean(axis=0), axis=1)))
+
+
+def _lasts(runs: Sequence[int], count: int) -> bool:
+    """Whether windows are a long stretch of all with hardly a break."""
+    span = runs[-1] - runs[0] + 1
+    return span >= round(STRETCH * count) and len(runs) >= FILLED * span
+
+
+def _place_of(
+    sensing: Sensing, window: Integers, high: Sequence[int], is_off: Booleans
+) -> Array | None:
+    """The place (3,), m, of what a sensor passes, and is off whenever it does; None for none.
+
+    It is passed twice at least, and poses farther from the field generator are right.
+    """
+    place, judged = sensing.view.measured, window >= 0
+    means = [place[np.isin(window, visit)].mean(axis=0) for visit in _stretches(high)]
+    if len(means) < FEWEST_VISITS:
+        return None
+    middle = np.asarray(np.median(means, axis=0))
+    away = np.linalg.norm(place - middle, axis=1)
+    near = [mean for mean in means if np.linalg.norm(mean - middle) < NEAR_M]
+    is_there = len(near) >= max(FEWEST_VISITS, ALWAYS * len(means))
+    there, elsewhere = judged & (away < NEAR_M), judged & (away > 2 * NEAR_M)
+    right = np.linalg.norm(place[judged & ~is_off], axis=1)
+    if not (is_there and there.any() and elsewhere.any() and right.size):
+        return None
+    is_off_there = np.mean(is_off[there]) > ALWAYS
+    is_right_elsewhere = np.mean(is_off[elsewhere]) < SELDOM
+    is_inside = np.linalg.norm(middle) < np.percentile(right, FARTHER)
+    return middle if is_off_there and is_right_elsewhere and is_inside else None
+
+
+def in_episode(sensing: Sensing, residuals: PoseResiduals) -> Booleans:
     """Return the mask (n,) of a sensor's poses that are in one of its episodes."""
     inside = episode(sensing, residuals).windows
     return np.asarray(np.isin(windows_of(sensing, residuals), inside))
-
-
-def _loud(size: Mapping[int, float]) -> list[int]:
-    """The windows whose squared error is so many times that of the median window."""
-    usual = float(np.median(list(size.values())))
-    return [w for w, square in size.items() if square > TIMES * usual]
 
 
 def _is_revisited(inside: Array, outside: Array) -> bool:
@@ -105,32 +182,14 @@ def _is_revisited(inside: Array, outside: Array) -> bool:
     return bool(np.mean(distance < NEAR_M) > REVISITED_SHARE)
 
 
-def _by_the_body(sensing: Sensing, residuals: PoseResiduals, size: Mapping[int, float]) -> Episode:
-    """When a sensor leaves the others on its body, whose clock and reference are the same.
-
-    What all of them share, errors of the stamps before all, is in no difference of two.
-    """
-    own = _middles(sensing, residuals)
-    others = [_middles(one, residuals) for one in residuals.sensors if one is not sensing]
-    usual = float(np.median(list(size.values())))
-    apart = {
-        w: float(np.sum((own[w] - np.median([one[w] for one in others], axis=0)) ** 2))
-        for w in size
-        if others and all(w in one for one in others)
-    }
-    if not apart:
-        return Episode()
-    high = [w for w in _loud(apart) if size[w] > LOUD * usual]
-    runs = [w for w in high if w - 1 in high or w + 1 in high]
-    is_alone = 0 < len(runs) <= LONGEST * len(apart) and _is_alone(sensing, residuals, runs)
-    return Episode(tuple(runs), True) if is_alone else Episode()
-
-
-def _middles(sensing: Sensing, residuals: PoseResiduals) -> dict[int, Array]:
-    """The median residual (3,), m, of each window that can be judged."""
+def _middles(
+    sensing: Sensing, residuals: PoseResiduals, errors: Array | None = None
+) -> dict[int, Array]:
+    """The median of errors (n, 6), or of the residual, in each window that can be judged."""
+    errors = sensing.residual if errors is None else errors
     window = windows_of(sensing, residuals)
     return {
-        int(w): np.median(sensing.residual[window == w, :3], axis=0)
+        int(w): np.median(errors[window == w], axis=0)
         for w in np.unique(window[window >= 0])
         if np.count_nonzero(window == w) >= FEWEST_POSES_OF_WINDOW
     }
@@ -138,23 +197,24 @@ def _middles(sensing: Sensing, residuals: PoseResiduals) -> dict[int, Array]:
 
 def _is_alone(sensing: Sensing, residuals: PoseResiduals, runs: list[int]) -> bool:
     """Whether a sensor is off for a long stretch in which the others on its body are right."""
-    span = runs[-1] - runs[0] + 1
-    if span < round(STRETCH * window_count(residuals)) or len(runs) < FILLED * span:
+    if not _lasts(runs, window_count(residuals)):
         return False
 
     def error(one: Sensing) -> float:
-        middles = [v for w, v in _middles(one, residuals).items() if w in runs]
+        middles = [v[:3] for w, v in _middles(one, residuals).items() if w in runs]
         return float(np.median(np.sum(np.square(middles), axis=1))) if middles else np.inf
 
     others = [error(one) for one in residuals.sensors if one is not sensing]
     return bool(others) and max(others) < FAST * error(sensing)
 
 
-def _is_shift(sensing: Sensing, inside: Mask) -> bool:
-    """Whether poses are off the same way, as metal makes them, and not at random."""
-    residual = sensing.residual[inside, :3]
-    mean = residual.mean(axis=0)
-    return bool(mean @ mean > ALIKE * np.mean(np.sum(residual**2, axis=1)))
+def _is_shift(sensing: Sensing, inside: Booleans) -> bool:
+    """Whether poses are off or turned the same way, as metal makes them, and not at random."""
+    for rows in np.split(sensing.residual[inside], 2, axis=1):
+        mean = rows.mean(axis=0)
+        if mean @ mean > ALIKE * np.mean(np.sum(rows**2, axis=1)):
+            return True
+    return False
 
 
 class PoseMovingMetal(PoseEffect):
@@ -162,7 +222,7 @@ class PoseMovingMetal(PoseEffect):
 
     name = 'moving_metal'
     summary = 'metal comes near for a while'
-    advice = 'See what was near these sensors at that time, and do not use their poses of it.'
+    advice = 'See what was near these sensors at that time or place; do not use their poses of it.'
     units = {'t_start_s': 's', 't_end_s': 's'}
     needs_levers = True
 
@@ -173,34 +233,38 @@ class PoseMovingMetal(PoseEffect):
         groups: list[tuple[int, int, list[str]]] = []
         for name, one in found.items():
             # A sensor that is off pulls the frames, and with them the others, a little way.
-            windows = one.windows if one.is_alone else _apart(one.windows, alone)
-            if not windows:
-                continue
-            group = windows[0], windows[-1], [name]
-            for other in [g for g in groups if g[0] <= group[1] and group[0] <= g[1]]:
-                groups.remove(other)
-                ends = min(other[0], group[0]), max(other[1], group[1])
-                group = *ends, other[2] + group[2]
-            groups.append(group)
+            stretches = [s for s in _stretches(one.windows) if one.is_alone or not alone & set(s)]
+            for windows in stretches:
+                group = windows[0], windows[-1], [name]
+                for other in [g for g in groups if g[0] <= group[1] and group[0] <= g[1]]:
+                    groups.remove(other)
+                    ends = min(other[0], group[0]), max(other[1], group[1])
+                    group = *ends, list(dict.fromkeys(other[2] + group[2]))
+                groups.append(group)
         start = residuals.setting.start
         length = residuals.setting.duration / window_count(residuals)
-        return [
-            EffectRecord(
+        records = []
+        for first, last, names in sorted(groups):
+            places = [p.tolist() for n in names if (p := found[n].place) is not None]
+            records.append(EffectRecord(
                 self.name,
                 {'t_start_s': start + first * length, 't_end_s': start + (last + 1) * length,
-                 'sensors': names},
+                 'sensors': names, **({'place_m': places[0]} if places else {})},
                 {'t_start_s': length, 't_end_s': length},
-            )
-            for first, last, names in sorted(groups)
-        ]  # fmt: skip
+                {'summary': PASSED} if places else {},
+            ))  # fmt: skip
+        return records
 
 
-def _apart(windows: Sequence[int], others: set[int]) -> list[int]:
-    """The stretches of windows that have none in common with others."""
-    stretches = np.split(np.array(windows), np.flatnonzero(np.diff(windows) > 1) + 1)
-    return [
-        int(w) for stretch in stretches if others.isdisjoint(stretch.tolist()) for w in stretch
-    ]
+def _stretches(windows: Sequence[int]) -> list[list[int]]:
+    """Windows, ascending, in groups of neighbours: the ends of an episode fluctuate."""
+    groups: list[list[int]] = []
+    for w in windows:
+        if groups and w - groups[-1][-1] <= NEIGHBOURS:
+            groups[-1].append(w)
+        else:
+            groups.append([w])
+    return groups
 
 
 class LooseMount(PoseEffect):

@@ -7,7 +7,6 @@ from itertools import combinations_with_replacement
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.effect import (
     SMOOTH,
@@ -19,13 +18,12 @@ from anser_ros.apps.poses.effect import (
     PoseView,
     Role,
 )
+from anser_ros.arrays import Array, Integers
 from anser_ros.calibration.error_map import PositionMap, Shape
 from anser_ros.effects.base import Remedy
 from anser_ros.effects.effect import needed, sigmas
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-
-Array = NDArray[np.float64]
 
 KINDS = {0: 'scale', 1: 'linear', 2: 'quadratic', 3: 'cubic'}
 """Degrees of the polynomials of position that are tried; of degree zero is a space that shrinks or
@@ -52,7 +50,7 @@ def monomials(position: Array, centre: Array, size: float, degree: int, lowest: 
 
 
 @cache
-def _factors(order: int) -> NDArray[np.int64]:
+def _factors(order: int) -> Integers:
     """Coordinates that are multiplied for each monomial of an order, shape (m, order)."""
     return np.array(list(combinations_with_replacement(range(3), order)), dtype=np.int64)
 
@@ -137,15 +135,6 @@ class FieldDistortion(PoseEffect):
             return False
         has_lowest = own.get('lowest', 1) <= site.get('lowest', 1)
         return bool(has_lowest and own['degree'] >= site.get('degree', 1))
-
-    def whole(self, term: PoseTerm) -> PoseTerm | None:
-        """Return the map of the same degree with its linear part, on all sensors."""
-        if 'lowest' not in term.site:
-            return None
-        site: PoseSite = {**term.site}
-        site.pop('lowest', None)
-        site.pop('sensor', None)
-        return PoseTerm(self, site, np.zeros(3 * _count(site)))
 
     def _derivative(self, term: PoseTerm, position: Array) -> Array:
         """What each parameter moves positions (n, 3) by, shape (n, 3, q), m."""

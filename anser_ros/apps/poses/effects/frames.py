@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.effect import (
@@ -22,10 +21,9 @@ from anser_ros.apps.poses.effect import (
 )
 from anser_ros.apps.poses.effects.episodes import LooseMount
 from anser_ros.apps.poses.sequence import OpticalPath, filtered
+from anser_ros.arrays import Array
 from anser_ros.effects.base import Remedy
 from anser_ros.field.model import EffectRecord
-
-Array = NDArray[np.float64]
 
 
 class FrameConvention(PoseEffect):
@@ -175,7 +173,7 @@ class PoseTimeOffset(NumberEffect):
     summary = 'the tracked stamps are late (positive) or early by the optical clock'
     advice = 'Correct the stamps by it; both streams stamped by one clock do not have it.'
     units = {'offset_s': 's'}
-    plausible = {'offset_s': (-5.0, 5.0)}
+    plausible = {'offset_s': (-3600.0, 3600.0)}  # a clock may be off by an hour of the day
     remedy = Remedy.OPTICAL
     role = Role.OFFSET
     key = 'offset_s'

@@ -3,31 +3,25 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from anser_ros.apps.poses.effect import PoseEffect
 from anser_ros.apps.poses.effects.episodes import in_episode
 from anser_ros.apps.poses.problem import PoseResiduals, Sensing, jitter, stamp_step
 from anser_ros.apps.poses.sequence import PoseSequence, PoseSession, jumping_poses
+from anser_ros.arrays import Array, Booleans
 from anser_ros.diagnosis.decisions import FEWEST_OUTLIERS
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S
 from anser_ros.sessions.plausibility import FROZEN_S
 
-Mask = NDArray[np.bool_]
-
-Array = NDArray[np.float64]
-
 FEWEST_STALE = 0.02
-"""Share (0 to 1) of poses of a moving body from which repeats are named: one in 60 comes again
-where a tracker of 60 Hz is polled a hertz too fast, which harms nothing."""
+"""Share (0 to 1) of poses in motion from which repeats are named: one in 60 harms nothing."""
 FEWEST_MOVING = 20  # poses of a moving body by which repeats are judged
 MOVING_M = 5e-4
 """Way between two poses, m, from which a body moves: trackers resolve a tenth of it."""
 FROZEN_WAY_M = 0.01
-"""Way of another stream, m, while one stands still that is frozen: far more than any tracker's
-jitter."""
+"""Way of another stream, m, while one is frozen: far more than any tracker's jitter."""
 NEAR = 3  # poses before and after that motion is judged by: one wrong neighbour decides nothing
 FEWEST_MISSING = 0.005  # share of poses, or of the time, from which missing ones are named
 FEWEST_MARKED, FEWEST_MARKED_SHARE = 5, 1e-3
@@ -100,7 +94,7 @@ class MissingPoses(PoseEffect):
         """Return a record for each stream that lacks poses."""
         found = []
         for poses in residuals.session.streams.values():
-            spans = _gaps(poses)
+            spans = _gaps(poses, residuals.session)
             lost = poses.missing.size / max(poses.missing.size + poses.size, 1)
             length = max(float(np.ptp(poses.time)), 1e-9)
             silent = sum(b - a for a, b in spans) / length
@@ -168,7 +162,7 @@ def _leaping(reference: PoseSequence | None) -> list[EffectRecord]:
     return [EffectRecord(PoseOutliers.name, values, {'fraction': sigma})]
 
 
-def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
+def _moving(poses: PoseSequence) -> Booleans:
     """Where a body moves between poses, judged by those some before and after."""
     n = poses.size
     before = np.maximum(np.arange(n) - NEAR, 0)
@@ -179,7 +173,8 @@ def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
     return np.asarray(near & (way > 2 * NEAR * MOVING_M))
 
 
-def _gaps(poses: PoseSequence) -> list[tuple[float, float]]:
+def _gaps(poses: PoseSequence, session: PoseSession) -> list[tuple[float, float]]:
+    """Spans, s, without poses; none in which all streams pause, as between two recordings."""
     steps = np.diff(poses.time)
     if steps.size < 10:
         return []
@@ -188,15 +183,16 @@ def _gaps(poses: PoseSequence) -> list[tuple[float, float]]:
     pauses = gaps[steps[gaps] > PAUSE_S]
     if pauses.size >= MANY_PAUSES:
         gaps = np.setdiff1d(gaps, pauses)
-    return [(float(poses.time[g]), float(poses.time[g + 1])) for g in gaps]
+    every = np.sort(np.concatenate([np.r_[p.time, p.missing] for p in session.streams.values()]))
+    ends = every[np.flatnonzero(np.diff(every) > PAUSE_S)]
+    spans = [(float(poses.time[g]), float(poses.time[g + 1])) for g in gaps]
+    return [(a, b) for a, b in spans if not np.any((ends >= a) & (ends < b))]
 
 
 LEAST_S = 2e-3
-"""Error of the stamps, s, from which it is named: less moves a hand by a tenth of a millimetre.
-Smaller names what harms nobody; larger leaves errors of a fast hand unnamed."""
+"""Error of the stamps, s, from which it is named: less moves a hand by a tenth of a millimetre."""
 LEAST_LIKELIHOOD_GAIN = 25.0
-"""Minus twice the log likelihood that it must take off in the median sensor; chance takes one, and
-so much once in two million sensors."""
+"""Minus twice the log likelihood that it must take off in the median sensor; chance takes one."""
 STEP_SHARE = (0.15, 0.7)
 """Error over the step that rounding to a step makes: 0.29 if even, more if a poll is late."""
 
@@ -222,9 +218,8 @@ def _stamp_error(residuals: PoseResiduals) -> tuple[float, float, float]:
 def _sigma(residuals: PoseResiduals) -> float:
     """Standard deviation of the median error of the stamps, s.
 
-    By Fisher's information about a variance: each pose has one degree of freedom along its
-    velocity, and tells as much of the stamps' error as that is of its error there. Sensors that
-    differ by more than this have errors of their own; those that share stamps share the error.
+    By Fisher's information about a variance: a pose has one degree of freedom along its velocity.
+    Sensors that differ by more have errors of their own; those that share stamps share the error.
     """
     sensors = residuals.sensors
     errors = np.array([s.noise.stamp_s for s in sensors])
@@ -248,7 +243,7 @@ class ReceiptJitter(PoseEffect):
 
     name = 'stamp_jitter'
     summary = 'stamps are those of receipt, and jitter'
-    advice = 'Use the counter of the device as stamp (import_poses --stamps device).'
+    advice = 'Use the counter of the device (import_poses --stamps device), if it is not in use.'
     units = {'rms_s': 's'}
     needs_levers = True
     makes_jitter = True
@@ -287,27 +282,22 @@ class QuantisedStamps(PoseEffect):
 
 
 NOISIER = 2.0
-"""Factor over the other sensors' median noise from which a sensor's is named; sensors of one kind
-at one place differ by a half."""
+"""Factor over other sensors' median noise to be named; those of one kind differ by a half."""
 GROWN = 2.0
-"""Factor of the jitter over that of a watch's first look from which it is reported: of trackers it
-grows by half over their volume."""
+"""Factor over a first look's jitter to be reported: over a tracker's volume it grows by half."""
 WIDEST = 1.3
 """Ratio of far to near distances (95 to 5 %) without which no power law of it can be seen."""
 LEAST_LAW_SIGMAS = 5.0
-"""Standard deviations by which the noise must differ from a constant: by the likelihood, and by
-those of the exponent, which few distances leave large."""
+"""Sigmas by which the noise must differ from a constant, by likelihood and by its exponent."""
 EXPONENTS = (2.8, 6.5)
-"""Exponents of the noise that a field makes: the signal falls with the third power, the gradient
-with the fourth; what is outside is something else."""
+"""Exponents of a field's noise: the signal falls with the third power, its gradient the fourth."""
 SHARES = np.array([1, 4, 1]) / 6
 """Shares of the variances of three poses in that of their second difference."""
 NEW_SHARE = 18 / 35
 """Share of squared second differences that is new: neighbours share values. Their correlations are
 -2/3 and 1/6, those of squares 4/9 and 1/36, on both sides."""
 REACHED = 12.0
-"""Squared deviation over its variance by the law that noise does not reach: once in 1e5. A pose
-that the law does not reach has another cause, and one that it reaches is no outlier."""
+"""Squared deviation over its variance by the law that noise does not reach: once in 1e5."""
 AT_REST_M_S, HARDLY_EVER = 0.01, 0.1
 """Speed, m/s, below which a body counts as at rest (a hand drifts by less), and share of poses in
 motion below which it always is."""
@@ -369,7 +359,7 @@ def _likeliest(square: Array, place: Array) -> Array:
     return np.asarray(min(tries, key=lambda result: float(result.fun)).x)
 
 
-def _jitter(sensing: Sensing, chosen: Mask) -> tuple[Array, Array]:
+def _jitter(sensing: Sensing, chosen: Booleans) -> tuple[Array, Array]:
     """`jitter` of those of some poses (n,) in which the body moves; of all where it hardly does.
 
     A body that rests at one place and moves at others jitters less at the one.
@@ -384,7 +374,7 @@ class PoseExcessNoise(PoseEffect):
 
     name = 'excess_noise'
     summary = "a sensor's noise is larger than the others'"
-    advice = 'Exchange the sensor or its cable, and record again.'
+    advice = 'Record again with sensors at equal distances: its place and rounding may make it.'
     units = {'factor': '1'}
     makes_jitter = True
 
@@ -420,15 +410,13 @@ class RangeNoise(PoseEffect):
 
     name = 'range_noise'
     summary = 'jitter grows with the distance from the field generator'
-    advice = 'Work nearer to the field generator.'
+    advice = 'Compare it with the data sheet; nearer to the field generator it is less.'
     units = {'exponent': '1', 'reference_m': 'm'}
     makes_jitter = True
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a power law of all sensors together, each with a level of its own."""
-        # Each sensor has a level of its own, so only what changes within one tells a power.
-        # Poses far away stand out from a noise that is taken as one; the law judges them too.
-        # Those of an episode are off by something else.
+        # Far poses stand out from one common noise; those of an episode have another cause.
         every = [
             _jitter(one, (one.used | one.out) & ~in_episode(one, residuals))
             for one in residuals.sensors

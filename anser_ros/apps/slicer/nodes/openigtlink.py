@@ -91,10 +91,9 @@ class _Client:
         self._connection = connection
         self._answer = answer
         self._requests = _Requests()
-        # Time between two TDATA, s, where they are wanted, and when the next is due.
-        self._tracking_s: float | None = None
         self.version = 1
-        self._due_s = 0.0
+        # Time between two TDATA, s, and when the next is due: never, where none are wanted.
+        self.tracking_s, self.due_s = 0.0, math.inf
         self._queue: deque[bytes] = deque(maxlen=QUEUE_LENGTH)
         self._filled = threading.Condition()
         self._ending = False
@@ -107,14 +106,6 @@ class _Client:
             self.dropped += len(self._queue) == QUEUE_LENGTH  # the oldest makes room
             self._queue.append(data)
             self._filled.notify()
-
-    def is_due(self, now_s: float) -> bool:
-        """Return whether a TDATA message is due."""
-        return self._tracking_s is not None and now_s >= self._due_s
-
-    def put_tracking(self, data: bytes, now_s: float) -> None:
-        self._due_s = now_s + (self._tracking_s or 0.0)
-        self.put(data)
 
     def end(self) -> None:
         with self._filled:
@@ -143,20 +134,11 @@ class _Client:
         for header, body in self._requests.feed(data):
             self.version = max(self.version, header.version)
             if header.kind == 'STT_TDATA':
-                self._tracking_s = igtl.resolution_s(header, body)
+                self.tracking_s, self.due_s = igtl.resolution_s(header, body), 0.0
             elif header.kind == 'STP_TDATA':
-                self._tracking_s = None
+                self.due_s = math.inf
             self.put(self._answer(header))
         return not data
-
-
-def _set_options(connection: socket.socket) -> None:
-    """Send at once, and find out when the other end is no longer there."""
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in KEEP_ALIVE.items():
-        if hasattr(socket, name):
-            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 class IgtlServer:
@@ -185,7 +167,6 @@ class IgtlServer:
 
     @property
     def n_clients(self) -> int:
-        """Return the number of connected clients."""
         self._forget_the_gone()
         return len(self._connections)
 
@@ -206,13 +187,13 @@ class IgtlServer:
     def send_tracking(self, tracking: Callable[[], bytes], now_s: float) -> None:
         """Queue a TDATA for the clients that want one by now; none is made for nobody."""
         with self._lock:
-            due = [client for client in self._connections if client.is_due(now_s)]
+            due = [client for client in self._connections if now_s >= client.due_s]
             data = tracking() if due else b''
             for client in due:
-                client.put_tracking(data, now_s)
+                client.due_s = now_s + client.tracking_s
+                client.put(data)
 
     def close(self) -> None:
-        """End the connections of all clients."""
         self._ending.set()
         self._thread.join()
         self._listener.close()
@@ -234,7 +215,11 @@ class IgtlServer:
                 self.refused += 1
                 connection.close()
                 continue
-            _set_options(connection)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # send at once
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            for name, value in KEEP_ALIVE.items():
+                if hasattr(socket, name):
+                    connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
             with self._lock:
                 self._connections.append(_Client(connection, self._answer))
 
@@ -251,8 +236,6 @@ WATCH_PERIOD_S = 0.05
 
 @dataclass(frozen=True)
 class OpenIGTLinkParameters:
-    """Holds the parameters of the OpenIGTLink server."""
-
     host: str = parameter('127.0.0.1', 'address to listen on; 0.0.0.0 lets other machines in')
     port: int = parameter(OPENIGTLINK, 'TCP port, 0 for a free one', minimum=0, maximum=65535)
     stale_after_s: float = parameter(
@@ -307,13 +290,7 @@ class OpenIGTLink(AnserNode):
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.EVENTS)
         self.create_timer(WATCH_PERIOD_S, self._watch, clock=self.steady_clock)
 
-    @property
-    def port(self) -> int:
-        """Return the TCP port in use."""
-        return self._server.port
-
     def status(self) -> Status:
-        """Return how many clients there are, and what they have missed."""
         values = {
             'address': f'{self.parameters.host}:{self._server.port}',
             'clients': self._server.n_clients,
@@ -327,7 +304,6 @@ class OpenIGTLink(AnserNode):
         return Status('', Level.OK, 'serving', values)
 
     def close(self) -> None:
-        """End the connections of all clients."""
         self._server.close()
 
     def _on_setup(self, message: String) -> None:

@@ -1,0 +1,1 @@
+"""Holds the one order of a frame, for live nodes and recordings: read, judge, refit, track."""

@@ -1,0 +1,331 @@
+"""Finds what is wired or mounted wrongly, before anything else is looked for.
+
+Plugs in each other's sockets, coils wound or plugged in the other way round, channels that receive
+nothing, and bodies that stand in their holder by a quarter turn. All of them are exact symmetries
+of a prediction, so that no fit is needed: the right one leaves a small part of what others leave.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
+from anser_ros.diagnosis import decisions
+from anser_ros.diagnosis.problem import Problem
+from anser_ros.effects.correction import Fields, tool_view
+from anser_ros.effects.effect import Site, Term
+from anser_ros.effects.seen import (
+    BODY_TURNED,
+    COIL_POLARITY,
+    DEAD_CHANNEL,
+    SENSOR_POLARITY,
+    SWAPPED_CHANNELS,
+    SWAPPED_COILS,
+)
+from anser_ros.field.measurements import Measurements
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import along_each_axis
+
+
+@dataclass(frozen=True)
+class _Readings:
+    """Holds a tool's readings and what some terms predict, zero where they do not count."""
+
+    channels: Integers  # (S,)
+    seen: ComplexArray  # (F, S, K), T
+    wanted: ComplexArray  # (F, S, K), T
+    driven: Booleans  # (S,), sensors that receive anything
+
+    @staticmethod
+    def of(
+        tool: Measurements, good: Booleans, terms: Sequence[Term], fields: Fields
+    ) -> '_Readings':
+        wanted = np.where(good[..., None], tool_view(tool, terms, fields).flux, 0.0)
+        seen = np.where(good[..., None], tool.flux, 0.0)
+        return _Readings(tool.sensors.channel, seen, wanted, ~_silent(seen, wanted))
+
+    def cells(self) -> ComplexArray:
+        """Return each sensor's correlation with its prediction, emitter by emitter, (S, K)."""
+        cross = np.einsum('fsk,fsk->sk', self.wanted.conj(), self.seen)
+        power = _power(self.wanted, (0,)) * _power(self.seen, (0,))
+        return np.asarray(cross / np.sqrt(np.maximum(power, 1e-300)))
+
+    def left(self) -> float:
+        """Return the share of the readings' power that the prediction leaves."""
+        seen, wanted = self.seen[:, self.driven], self.wanted[:, self.driven]
+        return float(_power(seen - wanted) / np.maximum(_power(seen), 1e-300))
+
+
+def _power(values: ComplexArray, axes: tuple[int, ...] = (0, 1, 2)) -> Array:
+    return np.asarray(np.sum(np.abs(values) ** 2, axis=axes))
+
+
+def _silent(seen: ComplexArray, wanted: ComplexArray) -> Booleans:
+    """Booleans (S,) of sensors with hardly any of the reading that they should have."""
+    power, expected = _power(seen, (0, 2)), _power(wanted, (0, 2))
+    return np.asarray((power < decisions.DEAD**2 * expected) & (expected > 0))
+
+
+def wiring_faults(problem: Problem) -> list[Term]:
+    """Return terms for the faults of wiring and mounting of the tools and emitters."""
+    found: list[Term] = []
+    coils = _swapped_coils(_read(problem, found))
+    if coils is not None:
+        found.append(coils)
+    for number in range(len(problem.tools)):
+        found += _rewired(problem, number, found)
+    tools = _read(problem, found)
+    dead = [int(c) for tool in tools for c in tool.channels[~tool.driven]]
+    found += _reversed(tools)
+    if dead := dead + _silent_references(problem):
+        found.append(Term(DEAD_CHANNEL, {'channels': tuple(dead)}))
+    return found
+
+
+def _read(problem: Problem, terms: Sequence[Term]) -> list[_Readings]:
+    pairs = zip(problem.tools, problem.good, strict=True)
+    return [_Readings.of(tool, good, terms, problem.fields) for tool, good in pairs]
+
+
+def _silent_references(problem: Problem) -> list[int]:
+    """Channels of references with hardly any of their clean reading."""
+    if problem.references is None:
+        return []
+    readings, clean = problem.references.readings, problem.references.baseline
+    counted = readings.valid[..., None]
+    silent = _silent(np.where(counted, readings.flux, 0.0), np.where(counted, clean, 0.0))
+    return [int(c) for c in readings.sensors.channel[silent]]
+
+
+def _rewired(problem: Problem, number: int, known: Sequence[Term]) -> list[Term]:
+    """Exchanged channels of a tool, or its quarter turn, whichever leaves less or says less.
+
+    A turn of a triaxial sensor is also an exchange of its coils, some of them reversed. What is
+    one fault is named before what is two.
+    """
+    tool, good = problem.tools[number], problem.good[number]
+
+    def read(terms: Sequence[Term]) -> _Readings:
+        return _Readings.of(tool, good, [*known, *terms], problem.fields)
+
+    def judged(way: Sequence[Term]) -> tuple[float, int, Sequence[Term]]:
+        signs = _reversed([read(way)])
+        return read([*way, *signs]).left(), len(way) + len(signs), way
+
+    plain = read(())
+    none = judged(())
+    ways = [judged([term]) for term in _swapped_channels(plain)]
+    for terms in _turns(plain, read) if none[0] > 1 - decisions.OTHERS_CORRELATION**2 else ():
+        way = judged(terms)
+        if way[0] < min(1 - decisions.OTHERS_CORRELATION**2, decisions.BETTER * none[0]):
+            ways.append(way)
+    if not ways:
+        return []
+    least = min(left for left, _, _ in ways)
+    alike = [way for way in ways if way[0] <= decisions.AS_LITTLE * least]
+    return list(min(alike, key=lambda way: way[1])[2])
+
+
+MOST_EXCHANGED = 12
+"""Channels of a body up to which each pair is tried in each other's place: 66 pairs."""
+RIDGE = 1e-6
+"""Damping of the free dipoles of a scan, over their mean information: they are nearly alike."""
+MOST_LEFT = 0.02
+"""Share of a scan's power that free dipoles leave at most where its wiring is right: less than a
+hundredth for coils of some centimetres, a third where one sensor of three is reversed."""
+
+
+def scan_faults(measurements: Sequence[Measurements], places: Array) -> list[Term]:
+    """Return what is reversed or turned in a scan, whose field is still unknown.
+
+    ``measurements``: with poses; ``places`` (P, 3): about where the emitters are, m. Each emitter
+    is three free dipoles at every place. Signs of emitters are signs of their dipoles, and nothing
+    is named unless it leaves a small part of what is left without it.
+    """
+    read = [m for m in measurements if m.usable.any()]
+    none = _scan_signs(read, places) if read else ([], 0.0, 0.0)
+    if none[2] < MOST_LEFT:
+        return []
+    tried = [none]
+    for channels in {tuple(m.sensors.channel.tolist()): None for m in read}:
+        for term in (*_exchanges(channels), *_quarter_turns(np.array(channels))):
+            righted = [rightly_wired(m, [term]) for m in read]
+            terms, left, _ = _scan_signs(righted, places)
+            tried.append(([term, *terms], left, none[2]))
+    least = min(left for _, left, _ in tried)
+    if least > decisions.BETTER * none[2]:
+        return []
+    alike = [way for way in tried if way[1] <= decisions.AS_LITTLE * least]
+    return min(alike, key=lambda way: len(way[0]))[0]
+
+
+def rightly_wired(measurements: Measurements, faults: Sequence[Term]) -> Measurements:
+    """Return a tool's measurements without the faults that `scan_faults` found in them."""
+    flux, sensors = measurements.flux, measurements.sensors
+    for term in faults:
+        sensors = term.effect.table(term, sensors)
+        mixing = term.effect.channel_matrix(term, sensors.channel)
+        if mixing is not None:
+            flux = np.einsum('ts,fsk->ftk', np.linalg.inv(mixing), flux)
+    return replace(measurements, flux=flux, sensors=sensors) if faults else measurements
+
+
+def _exchanges(channels: Sequence[int]) -> list[Term]:
+    """Each two channels of a body of few in each other's place."""
+    pairs = combinations(channels, 2) if len(channels) <= MOST_EXCHANGED else ()
+    sites: list[Site] = [{'channels': (b, a), 'read_as': (a, b)} for a, b in pairs]
+    return [Term(SWAPPED_CHANNELS, site) for site in sites]
+
+
+def _scan_signs(
+    measurements: Sequence[Measurements], places: Array
+) -> tuple[list[Term], float, float]:
+    """The sensors that are reversed, and the shares of power left with and without their signs.
+
+    With signs q of the sensors the dipoles explain q M q, where M is a sum over the emitters.
+    """
+    positions, directions = along_each_axis(places)
+    count = 3 * len(places)
+    normal, power = np.zeros((count, count)), np.zeros(measurements[0].flux.shape[2])
+    right: dict[int, ComplexArray] = {}
+    for m in measurements:
+        points, axes = m.placed()
+        for row, channel in enumerate(m.sensors.channel.tolist()):
+            keep = m.usable[:, row]
+            lengths, flux = np.full(keep.sum(), m.sensors.length[row]), m.flux[keep, row]
+            basis = flux_basis(points[keep, row], axes[keep, row], lengths, positions, directions)
+            normal += basis.T @ basis
+            right[channel] = right.get(channel, 0.0) + basis.T @ flux
+            power += np.sum(np.abs(flux) ** 2, axis=0)
+    ridge = RIDGE * float(np.trace(normal)) / count
+    sums = np.array(list(right.values()))  # (S, 3 P, K)
+    solved = np.linalg.solve(normal + ridge * np.eye(count), sums)
+    share = 1.0 / np.maximum(power, 1e-300)
+    together = np.einsum('sck,tck,k->st', sums.conj(), solved, share).real / len(share)
+    starts = np.concatenate([np.ones((1, len(together))), np.linalg.eigh(together)[1].T, together])
+    signs = max((_climbed(q, together) for q in starts), key=lambda q: float(q @ together @ q))
+    signs = -signs if (signs < 0).sum() > (signs > 0).sum() else signs
+    left, plain = (1.0 - float(q @ together @ q) for q in (signs, np.ones(len(signs))))
+    reversed_ = tuple(c for c, sign in zip(right, signs, strict=True) if sign < 0)
+    if not reversed_ or left > decisions.BETTER * plain:
+        return [], plain, plain
+    return [Term(SENSOR_POLARITY, {'channels': reversed_})], left, plain
+
+
+def _climbed(start: Array, together: Array) -> Array:
+    """Signs q near a start's, of which no other one makes q M q larger."""
+    signs = np.where(start < 0, -1.0, 1.0)
+    while True:
+        gains = np.diag(together) - signs * (together @ signs)
+        if gains.max() <= 1e-12:
+            return signs
+        signs[int(np.argmax(gains))] *= -1.0
+
+
+def _quarter_turns(channels: Integers) -> list[Term]:
+    """The quarter turns of a body with these channels, the least first."""
+    group = sorted(Rotation.create_group('O'), key=lambda one: round(float(one.magnitude()), 6))
+    turns = [np.round(np.degrees(turn.as_rotvec()), 6).tolist() for turn in group[1:]]
+    own = tuple(channels.tolist())
+    return [Term(BODY_TURNED, {'channels': own, 'rotation_deg': tuple(turn)}) for turn in turns]
+
+
+def _turns(plain: _Readings, read: Callable[[Sequence[Term]], _Readings]) -> Iterator[list[Term]]:
+    """Quarter turns of a body that are likest, up to the signs of its readings; least first."""
+    tried = []
+    for term in _quarter_turns(plain.channels):
+        readings = read([term])
+        weight = _power(readings.seen, (0,))
+        alike = float(np.sum(weight * np.abs(readings.cells()) ** 2) / max(weight.sum(), 1e-300))
+        tried.append((1 - alike, term))
+    least = min(left for left, _ in tried)
+    return iter([term] for left, term in tried if left <= decisions.AS_LITTLE * least)
+
+
+def _likeness(pairs: Sequence[tuple[ComplexArray, ComplexArray]]) -> Array:
+    """Correlation of each row's readings with each one's prediction, whatever their signs, (A, A).
+
+    ``pairs``: readings and predictions, (F, A, B) each. The correlations of single B are added up
+    without their phases.
+    """
+    cross = sum(np.abs(np.einsum('ftb,fsb->stb', w.conj(), s)).sum(axis=2) for s, w in pairs)
+    own, power = (sum(_power(pair[i], (0, 2)) for pair in pairs) for i in (0, 1))
+    return np.asarray(cross / np.sqrt(np.maximum(np.outer(own, power), 1e-300)))
+
+
+def _moved(alike: Array, is_driven: Booleans) -> Integers:
+    """Rows that are plainly another's; none when they are no permutation."""
+    rows = np.arange(len(alike))
+    order, own = np.argmax(alike, axis=1), np.diag(alike)
+    best = alike[rows, order]
+    moved = rows[
+        (order != rows)
+        & is_driven
+        & (best > decisions.OTHERS_CORRELATION)
+        & (1 - best**2 < decisions.BETTER * (1 - own**2))
+    ]
+    return np.asarray(moved if set(order[moved]) == set(moved) else moved[:0])
+
+
+def _swapped_channels(tool: _Readings) -> list[Term]:
+    """Channels of a tool that read as another's prediction."""
+    alike = _likeness([(tool.seen, tool.wanted)])
+    moved = _moved(alike, tool.driven)
+    true = np.argmax(alike, axis=1)[moved]
+    site: Site = {
+        'channels': tuple(tool.channels[true].tolist()),
+        'read_as': tuple(tool.channels[moved].tolist()),
+    }
+    return [Term(SWAPPED_CHANNELS, site)] if moved.size else []
+
+
+def _swapped_coils(tools: Sequence[_Readings]) -> Term | None:
+    """Emitters whose tones are like another's prediction, in all sensors, whatever their signs."""
+    alike = _likeness([(np.moveaxis(t.seen, 1, 2), np.moveaxis(t.wanted, 1, 2)) for t in tools])
+    moved = _moved(alike, np.ones(len(alike), dtype=bool))
+    if not moved.size:
+        return None
+    true = np.argmax(alike, axis=1)[moved]
+    return Term(SWAPPED_COILS, {'coils': tuple(true.tolist()), 'read_as': tuple(moved.tolist())})
+
+
+def _reversed(tools: Sequence[_Readings]) -> list[Term]:
+    """Sensors and emitters that are wound or plugged in the other way round.
+
+    A reading has the product of both signs, so that the signs of all cells are those of a matrix
+    of rank one. Reversing everything changes nothing: the fewest are named.
+    """
+    cells = np.concatenate([np.where(t.driven[:, None], t.cells().real, 0.0) for t in tools])
+    left, _, right = np.linalg.svd(cells, full_matrices=False)
+    sensors, coils = np.where(left[:, 0] < 0, -1.0, 1.0), np.where(right[0] < 0, -1.0, 1.0)
+    count, total = int((sensors < 0).sum() + (coils < 0).sum()), sensors.size + coils.size
+    if 2 * count > total or (2 * count == total and (coils < 0).sum() > (sensors < 0).sum()):
+        sensors, coils = -sensors, -coils
+    own = np.split(sensors[:, None], np.cumsum([len(tool.channels) for tool in tools])[:-1])
+    seen = [(t.seen * q).reshape(-1, coils.size, 1) for t, q in zip(tools, own, strict=True)]
+    wanted = [t.wanted.reshape(-1, coils.size, 1) for t in tools]
+    of_coils = (coils < 0) & _is_reversed(np.concatenate(seen), np.concatenate(wanted))
+    found = []
+    if of_coils.any():
+        found.append(Term(COIL_POLARITY, {'coils': tuple(np.flatnonzero(of_coils).tolist())}))
+    signs = np.where(of_coils, -1.0, 1.0)
+    turned = [
+        int(channel)
+        for tool in tools
+        for channel in tool.channels[_is_reversed(tool.seen, tool.wanted * signs) & tool.driven]
+    ]
+    if turned:
+        found.append(Term(SENSOR_POLARITY, {'channels': tuple(turned)}))
+    return found
+
+
+def _is_reversed(seen: ComplexArray, wanted: ComplexArray) -> Booleans:
+    """Which sensors (S,) read minus their prediction, (F, S, K) each."""
+    cross, power = np.sum(wanted.conj() * seen, axis=(0, 2)), _power(wanted, (0, 2))
+    gain = cross / np.where(power > 0, power, 1.0)
+    alike = np.abs(cross) / np.sqrt(np.maximum(power * _power(seen, (0, 2)), 1e-300))
+    is_own = alike > decisions.OWN_CORRELATION
+    return np.asarray((np.abs(gain + 1) < decisions.POLARITY_GAIN) & is_own)

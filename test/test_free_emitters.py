@@ -1,0 +1,174 @@
+"""Emitters of any shape: clusters of dipoles, delays of channels, errors that places share."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
+from anser_ros.calibration.held_out import rms
+from anser_ros.calibration.layouts import CLUSTER, FREE_KINDS, Generator, clusters, fit_clusters
+from anser_ros.calibration.population import alike_sigma_m
+from anser_ros.calibration.selection import COAXIAL
+from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters, has_turned
+from anser_ros.effects.correction import Correction
+from anser_ros.errors import ModelFileError
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import Dipoles, EffectRecord
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.settings import Accuracy
+
+TONES = (7500.0, 10500.0, 13500.0)
+X, _, Z = np.eye(3)
+CENTRES = np.array([[0.03, 0.0, 0.05], [-0.02, 0.04, 0.04], [-0.02, -0.04, 0.06]])
+NOISE_T, JITTER_M, JITTER_RAD = 1e-10, 5e-5, 3e-4
+ACCURACY = Accuracy(NOISE_T, JITTER_M, JITTER_RAD)
+DELAY_S = np.array([4e-8, -3e-8, -1e-8])
+
+
+def body():
+    return SensorTable(
+        np.arange(3), ('tool/x', 'tool/y', 'tool/z'), ('tool',) * 3, np.zeros((3, 3)), np.eye(3),
+        np.zeros(3),
+    )  # fmt: skip
+
+
+def shapeless(rng):
+    """Three emitters of five dipoles each, anywhere within 2 cm: nothing has an axis."""
+    places = CENTRES[:, None] + 0.02 * rng.uniform(-1, 1, (3, 5, 3))
+    moments = np.zeros((3, 5, 3, 3), complex)
+    for k, axis in enumerate(np.eye(3)):
+        moments[k, :, :, k] = 0.4 * axis + 0.15 * rng.normal(size=(5, 3))
+    return Dipoles.vectors(places.reshape(-1, 3), moments.reshape(15, 3, 3))
+
+
+def scan(rng, field, frames=250, delay_s=DELAY_S):
+    """Poses 0.14 to 0.3 m above the emitters, each in any orientation, and what is read there."""
+    place = rng.uniform([-0.09, -0.09, 0.2], [0.09, 0.09, 0.33], (frames, 3))
+    turn = Rotation.random(frames, random_state=3)
+    sensors = body()
+    points, axes = sensors.placed(place, turn.as_matrix())
+    flux = field.flux(points.reshape(-1, 3), axes.reshape(-1, 3), None).reshape(frames, 3, 3)
+    omega = 2 * np.pi * np.array(TONES)
+    flux = flux * np.exp(-1j * delay_s[:, None] * (omega - omega.mean()))
+    noise = NOISE_T * rng.normal(size=(*flux.shape, 2)) @ [1.0, 1j]
+    off = Rotation.from_rotvec(JITTER_RAD * rng.normal(size=(frames, 3)))
+    return Measurements(
+        'tool', sensors, 2.0 * np.arange(frames), flux + noise, np.ones((frames, 3), bool),
+        np.zeros((frames, 3), int), place + JITTER_M * rng.normal(size=place.shape),
+        (off * turn).as_matrix(), np.ones(frames, bool),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def found():
+    rng = np.random.default_rng(8)
+    field = shapeless(rng)
+    measured = scan(rng, field)
+    stated = CENTRES + [0.015, -0.01, 0.01]  # as well as a ruler tells
+    generator = Generator(stated, np.zeros(3), 0.05, ('a', 'b', 'c'), TONES)
+    options = Options(ACCURACY, estimate=KINDS)
+    corrected = correct_scan([measured], generator, options)
+    return field, corrected, fit_scan(corrected, ['scan'], generator, options)
+
+
+def at_new_places(rng, count=300):
+    points = rng.uniform([-0.08, -0.08, 0.21], [0.08, 0.08, 0.32], (count, 3))
+    axes = rng.normal(size=(count, 3))
+    return points, axes / np.linalg.norm(axes, axis=1)[:, None], np.zeros(count)
+
+
+def test_a_cluster_makes_the_field_of_any_source_of_its_size():
+    rng = np.random.default_rng(1)
+    field, where = shapeless(rng), at_new_places(rng)
+    truth = field.flux(*where)
+    left = []
+    for places in (
+        CENTRES[:, None],
+        CENTRES[:, None] + 0.03 * CLUSTER[:7],
+        CENTRES[:, None] + 0.03 * CLUSTER,
+    ):
+        errors = []
+        for k, own in enumerate(places):
+            sites = np.repeat(own, 3, axis=0), np.tile(np.eye(3), (len(own), 1))
+            basis = flux_basis(*where, *sites)
+            moments = np.linalg.lstsq(basis, truth[:, k], rcond=1e-9)[0]
+            errors.append(rms(truth[:, k] - basis @ moments) / rms(truth[:, k]))
+        left.append(max(errors))
+    assert left[0] > 0.02  # one dipole
+    assert left[1] < 0.03 * left[0]
+
+
+def test_emitters_at_one_place_have_one_cluster_and_others_their_own():
+    sites = clusters(np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.0], [0.1, 0.0, 0.0]]), 0.03)
+    assert len(sites) == 2 * 3 * 7
+    groups = sites.groups(3)
+    assert [emitters for emitters, _ in groups] == [[0, 1], [2]]
+    assert not set(groups[0][1]) & set(groups[1][1])
+
+
+def test_clusters_go_where_the_emitters_are():
+    rng = np.random.default_rng(2)
+    measured = scan(rng, shapeless(rng), delay_s=np.zeros(3))
+    weights = [np.ones(measured.valid.shape)]
+    sites = fit_clusters([measured], weights, CENTRES + [0.02, 0.02, -0.02])
+    middles = sites.positions[:: 3 * len(CLUSTER)]
+    assert np.linalg.norm(middles - CENTRES, axis=1).max() < 0.015
+
+
+def test_sources_without_an_axis_are_learnt_as_clusters(found):
+    field, corrected, calibration = found
+    assert calibration.layout.kind in FREE_KINDS
+    scores = {one.layout: one.score for one in calibration.candidates}
+    assert scores[calibration.layout] < 0.3 * min(scores[layout] for layout in COAXIAL)
+    where = at_new_places(np.random.default_rng(5))
+    truth = field.flux(*where)
+    gain = np.vdot(calibration.model.flux(*where), truth) / np.vdot(truth, truth)
+    assert abs(abs(gain) - 1.0) < 2e-3
+    assert rms(calibration.model.flux(*where) - truth) < 3e-3 * rms(truth)
+    assert corrected.sensor_fit.kept[0].mean() > 0.98
+
+
+def test_delays_are_found_and_undone(found):
+    _, corrected, _ = found
+    (record,) = (r for r in corrected.corrections if r.name == 'sensor_delay_spread')
+    values = np.array(record.parameters['values'])[:, 0]
+    assert np.abs(values - DELAY_S).max() < 3e-9
+    flux = np.ones((3, 3), complex)
+    omega = 2 * np.pi * np.array(TONES)
+    turn = np.exp(-1j * values[:, None] * (omega - omega.mean()))
+    undone = Correction.of([record], body(), TONES).flux(0.0, np.arange(3), turn)
+    assert np.allclose(undone, flux, rtol=1e-12)
+    bad = EffectRecord('sensor_delay_spread', {'channels': [0], 'values': [[0.0, 1.0]]})
+    with pytest.raises(ModelFileError, match='needs 1 values for each of its 1 channels'):
+        Correction.of([bad], body(), TONES)
+
+
+def test_errors_that_places_share_are_told_from_jitter():
+    rng = np.random.default_rng(6)
+    measured = scan(rng, shapeless(rng), 400)
+    kept = [np.ones(400, bool)]
+    jitter = 1e-4 * rng.normal(size=(400, 6))
+    assert alike_sigma_m([measured], [jitter], kept) < 4e-5
+    wave = 2e-4 * np.sin(20.0 * measured.position[:, [1, 2, 0]])
+    by_place = np.concatenate([wave, np.zeros((400, 3))], axis=1)
+    expected = np.sqrt(np.mean(wave**2))
+    assert alike_sigma_m([measured], [jitter + by_place], kept) == pytest.approx(expected, rel=0.2)
+    assert alike_sigma_m([measured], [jitter], [np.zeros(400, bool)]) == 0.0
+
+
+def test_sessions_that_turn_about_one_axis_each_determine_a_lever_arm_together():
+    rng = np.random.default_rng(7)
+    whole = scan(rng, shapeless(rng), 60)
+    about = [
+        replace(
+            whole,
+            rotation=Rotation.from_rotvec(np.outer(np.linspace(-1, 1, 60), axis)).as_matrix(),
+        )
+        for axis in (X, Z)
+    ]
+    assert not has_turned(about[:1]) and has_turned(about)
+    assert 'lever_arm' not in SensorParameters(about[:1], KINDS).kinds
+    assert 'lever_arm' in SensorParameters(about, KINDS).kinds

@@ -1,0 +1,136 @@
+"""Faults of wiring and mounting, alone and together, are named, and undoing them leaves noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_world import world
+from scipy.spatial.transform import Rotation
+
+from anser_ros.diagnosis.problem import evaluate
+from anser_ros.diagnosis.wiring import rightly_wired, scan_faults, wiring_faults
+from anser_ros.effects.effect import effect_named
+from anser_ros.physics.pose_track import PoseTrack
+
+TURN = (0.0, 0.0, 90.0)
+
+
+def turned_back(made, turn):
+    """State a body of a session as the true one turned back, deg."""
+    track, turn = made.tool.track, Rotation.from_rotvec(turn, degrees=True)
+    stated = Rotation.from_quat(track.quaternion) * turn.inv()
+    made.track(PoseTrack(track.time, track.position, stated.as_quat()))
+
+
+def faults_of(
+    emitters=3, sensors=(0, 1, 2), signs=(), coils=(), order=None, tones=None, turn=None
+):
+    """The faults of a session that has these, the truth of its turn, and what the undoing leaves.
+
+    ``signs``, ``coils``: rows and emitters that are reversed; ``order``, ``tones``: rows and
+    emitters that are read; ``turn``: of the body in its holder, deg.
+    """
+    made = world(seed=2, frames=200, emitters=emitters)
+    rows = list(sensors)
+    made.tool = made.tool.sensors_only(rows)
+    if turn is not None:
+        turned_back(made, turn)
+    flux = made.tool.flux[:, order or slice(None)][:, :, tones or slice(None)].copy()
+    flux[:, list(signs)] *= -1.0
+    flux[:, :, list(coils)] *= -1.0
+    made.tool = replace(made.tool, flux=flux)
+    problem = replace(made.problem(), references=None)
+    found = wiring_faults(problem)
+    return {t.effect.name: t for t in found}, evaluate(problem, found).misfit
+
+
+@pytest.mark.parametrize(
+    ('fault', 'expected'),
+    [
+        ({}, {}),
+        ({'signs': [2]}, {'sensor_polarity': {'channels': (2,)}}),
+        ({'coils': [0, 2]}, {'coil_polarity': {'coils': (0, 2)}}),
+        (
+            {'signs': [1], 'coils': [2]},
+            {'sensor_polarity': {'channels': (1,)}, 'coil_polarity': {'coils': (2,)}},
+        ),
+        ({'order': [1, 0, 2]}, {'swapped_channels': {'channels': (1, 0), 'read_as': (0, 1)}}),
+        (
+            {'order': [1, 0, 2], 'coils': [1]},
+            {
+                'swapped_channels': {'channels': (1, 0), 'read_as': (0, 1)},
+                'coil_polarity': {'coils': (1,)},
+            },
+        ),
+        (
+            {'tones': [2, 1, 0], 'signs': [1]},
+            {
+                'swapped_coils': {'coils': (2, 0), 'read_as': (0, 2)},
+                'sensor_polarity': {'channels': (1,)},
+            },
+        ),
+        ({'turn': [90.0, 0, 0]}, {'body_turned': {'rotation_deg': (90.0, 0.0, 0.0)}}),
+        (
+            {'turn': [0, 0, -90.0], 'coils': [1]},
+            {'body_turned': {'rotation_deg': (0.0, 0.0, -90.0)}, 'coil_polarity': {'coils': (1,)}},
+        ),
+        (
+            {'sensors': range(6), 'turn': [0, 180.0, 0]},
+            {'body_turned': {'rotation_deg': (0.0, 180.0, 0.0)}},
+        ),
+    ],
+)  # fmt: skip
+def test_faults_of_wiring_are_named_and_undone(fault, expected):
+    found, misfit = faults_of(**fault)
+    assert set(found) == set(expected)
+    for name, site in expected.items():
+        assert {key: found[name].site[key] for key in site} == site
+    assert misfit < 1.2
+
+
+def test_a_turned_body_comes_back_from_its_record():
+    effect, site = (
+        effect_named('body_turned'),
+        {'channels': (0, 1), 'rotation_deg': (0.0, 90.0, 0.0)},
+    )
+    found, _ = faults_of(turn=[0.0, 90.0, 0.0])
+    term = found['body_turned']
+    assert effect.term(effect.record(term, np.zeros((0, 0)))).site == term.site
+    table = world(seed=2, frames=60).tool.sensors
+    turned = effect.table(replace(term, site=site), table)
+    np.testing.assert_allclose(turned.axis[0], [0.0, 0.0, -1.0], atol=1e-12)
+    np.testing.assert_allclose(turned.position[1], [-0.015, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(turned.axis[2:], table.axis[2:])
+
+
+@pytest.mark.parametrize(
+    ('fault', 'expected'),
+    [
+        (None, []),
+        ('sign', [('sensor_polarity', {'channels': (1, 4)})]),
+        ('turn', [('body_turned', {'channels': (0, 1, 2, 3, 4, 5), 'rotation_deg': TURN})]),
+        ('swap', [('swapped_channels', {'channels': (3, 1), 'read_as': (1, 3)})]),
+        ('coil', []),  # the field is unknown: its sign is that of the dipoles
+    ],
+)  # fmt: skip
+def test_a_scan_says_what_is_wrong_with_its_wiring(fault, expected):
+    made = world(seed=2, frames=300, emitters=3)
+    clean = made.tool.flux.copy()
+    if fault == 'turn':
+        turned_back(made, TURN)
+    flux = made.tool.flux.copy()
+    if fault == 'sign':
+        flux[:, [1, 4]] *= -1.0
+    if fault == 'coil':
+        flux[:, :, 1] *= -1.0
+    if fault == 'swap':
+        flux[:, [1, 3]] = flux[:, [3, 1]]
+    tool = replace(made.tool, flux=flux)
+    line = np.linspace(-0.12, 0.12, 5)
+    found = scan_faults([tool], np.array([(x, y, 0.0) for x in line for y in line]))
+    assert [(term.effect.name, dict(term.site)) for term in found] == expected
+    righted = rightly_wired(tool, found)
+    if fault != 'coil':
+        np.testing.assert_allclose(righted.flux, clean)
+    if fault == 'turn':
+        np.testing.assert_allclose(righted.sensors.axis[0], [0.0, 1.0, 0.0], atol=1e-12)
