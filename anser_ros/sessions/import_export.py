@@ -1,9 +1,8 @@
 """Makes a session of somebody else's bag, and files that other programs read of a session."""
 
-import csv
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -124,18 +123,14 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBa
 
 def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
     """A table of stamps, positions, m, and quaternions."""
-    numbers = np.column_stack([poses.position, poses.quaternion]).tolist()
-    rows = zip(poses.stamp_ns.tolist(), numbers, strict=True)
     if form == MAT:
         stamps, places, turns = poses.stamp_ns, poses.position, poses.quaternion
         _write_mat(path, stamp_ns=stamps, position_m=places, quaternion_xyzw=turns)
-    elif form == TUM:
-        with path.open('w', encoding='utf-8') as stream:
-            for stamp, row in rows:
-                words = ' '.join(f'{value:.9g}' for value in row)
-                stream.write(f'{stamp // SECOND_NS}.{stamp % SECOND_NS:09d} {words}\n')
-    else:
-        _write_csv(path, POSE_COLUMNS, ([s, *(f'{v:.9g}' for v in row)] for s, row in rows))
+        return
+    parts = poses.stamp_ns // SECOND_NS, poses.stamp_ns % SECOND_NS
+    seconds = [f'{s}.{ns:09d}' for s, ns in zip(*parts, strict=True)]
+    numbers = np.column_stack([poses.position, poses.quaternion])
+    _write_text(path, [seconds if form == TUM else poses.stamp_ns, *numbers.T], POSE_COLUMNS, form)
 
 
 def _write_fluxes(path: Path, fluxes: RecordedFluxes, form: str) -> None:
@@ -144,24 +139,21 @@ def _write_fluxes(path: Path, fluxes: RecordedFluxes, form: str) -> None:
         flux = {'flags': fluxes.flags, 'flux_t': fluxes.flux}
         _write_mat(path, stamp_ns=fluxes.stamp_ns, channel=fluxes.channel, **flux)
         return
-    columns = [f'coil{k}_{part}_t' for k in range(fluxes.flux.shape[2]) for part in ('re', 'im')]
-    _write_csv(path, ('stamp_ns', 'channel', 'flags', *columns), _flux_rows(fluxes))
+    frames, channels, coils = fluxes.flux.shape
+    parts = np.ascontiguousarray(fluxes.flux).view(np.float64).reshape(-1, 2 * coils)
+    names = [f'coil{k}_{part}_t' for k in range(coils) for part in ('re', 'im')]
+    stamps, channel = fluxes.stamp_ns.repeat(channels), np.tile(fluxes.channel, frames)
+    columns = [stamps, channel, fluxes.flags.ravel(), *parts.T]
+    _write_text(path, columns, ('stamp_ns', 'channel', 'flags', *names), form)
 
 
-def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[list[object]]) -> None:
-    with path.open('w', encoding='utf-8', newline='') as stream:
-        writer = csv.writer(stream)
-        writer.writerow(columns)
-        writer.writerows(rows)
+def _write_text(path: Path, columns: Sequence[Any], names: Sequence[str], form: str) -> None:
+    """A table with commas and a header, or of TUM with neither."""
+    import pandas  # late: it takes half a second
 
-
-def _flux_rows(fluxes: RecordedFluxes) -> Iterator[list[object]]:
-    for stamp, flags, frame in zip(
-        fluxes.stamp_ns.tolist(), fluxes.flags.tolist(), fluxes.flux, strict=True
-    ):
-        for channel, flag, values in zip(fluxes.channel.tolist(), flags, frame, strict=True):
-            parts = np.ascontiguousarray(values).view(np.float64).tolist()
-            yield [stamp, channel, flag, *(f'{value:.9g}' for value in parts)]
+    layout = {'sep': ' ', 'header': False} if form == TUM else {'lineterminator': '\r\n'}
+    frame = pandas.DataFrame(dict(zip(names, columns, strict=True)))
+    frame.to_csv(path, index=False, float_format='%.9g', na_rep='nan', **layout)
 
 
 def _write_mat(path: Path, **arrays: NDArray[Any]) -> None:

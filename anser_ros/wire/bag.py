@@ -80,7 +80,6 @@ class Salvage:
     """Holds what a reader has met and lost, filled in while the messages are iterated."""
 
     lost: str = ''
-    bad_chunks: int = 0
     topics: dict[str, str] = field(default_factory=dict)  # types by topic
 
     def add(self, words: str) -> None:
@@ -112,49 +111,46 @@ def _indexed(stream: io.BufferedReader) -> Iterator[_Found] | None:
     )
 
 
-def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator[Any]:
-    """Yield the records of a bag without index, chunk by chunk, as far as it can be read."""
-    reader = StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
-    whole = 0
+def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[_Found]:
+    """The messages of a bag without index, chunk by chunk, as far as it can be read."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    messages, whole, bad_chunks = [], 0, 0
     try:
+        reader = StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
         for record in reader.records:
             whole = stream.tell()
             if isinstance(record, DataEnd):
                 break
-            if not isinstance(record, Chunk):
-                yield record
-                continue
-            if record.uncompressed_size > _RECORD_LIMIT:
-                salvage.bad_chunks += 1
-                continue
-            try:
-                inner = breakup_chunk(record, validate_crc=True)
-            except _BROKEN:
-                salvage.bad_chunks += 1
-                continue
-            yield from inner
+            inner, bad = _unchunked(record)
+            bad_chunks += bad
+            for one in inner:
+                if isinstance(one, Schema):
+                    schemas[one.id] = one
+                elif isinstance(one, Channel):
+                    channels[one.id] = one
+                elif isinstance(one, Message) and one.channel_id in channels:
+                    channel = channels[one.channel_id]
+                    schema = schemas.get(channel.schema_id)
+                    messages.append((schema, channel, one.log_time, one.data))
     except _BROKEN as error:
         why = ': '.join(filter(None, (type(error).__name__, ' '.join(str(error).split())[:120])))
         salvage.add(f'the bag breaks off after {whole} of {size} bytes ({why})')
-    if salvage.bad_chunks:
-        salvage.add(f'{salvage.bad_chunks} chunks with a bad checksum or size left out')
+    if bad_chunks:
+        salvage.add(f'{bad_chunks} chunks with a bad checksum or size left out')
+    return sorted(messages, key=itemgetter(2))
 
 
-def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[_Found]:
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    messages = []
-    for record in _records(stream, salvage, size):
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, Message) and record.channel_id in channels:
-            channel = channels[record.channel_id]
-            schema = schemas.get(channel.schema_id)
-            messages.append((schema, channel, record.log_time, record.data))
-    messages.sort(key=itemgetter(2))
-    return messages
+def _unchunked(record: Any) -> tuple[list[Any], bool]:
+    """What is in a record, and whether it is a chunk that is damaged."""
+    if not isinstance(record, Chunk):
+        return [record], False
+    try:
+        if record.uncompressed_size > _RECORD_LIMIT:
+            return [], True
+        return breakup_chunk(record, validate_crc=True), False
+    except _BROKEN:
+        return [], True
 
 
 def _mcap(path: Path, salvage: Salvage) -> Iterator[_Found]:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from anser_ros.errors import ParameterError
 
@@ -19,23 +19,21 @@ _WORDS = {
 }  # fmt: skip
 UNITS = {word: unit for unit, words in _WORDS.items() for word in words.split()}
 """Units by the words for them."""
-PLACE = {
-    '', 't', 'p', 'pos', 'position', 'trans', 'translation', 'loc', 'location', 'coord',
-    'coordinate',
-}  # fmt: skip
-TURN = {'q', 'quat', 'quaternion', 'rot', 'rotation', 'ori', 'orient', 'orientation', 'o', 'r'}
-TIME = {'time', 'timestamp', 'timestamps', 'stamp', 'clock'}
-OTHER = {
-    'v', 'vel', 'velocity', 'acc', 'accel', 'acceleration', 'gyro', 'mag', 'force', 'sigma',
-    'std', 'cov', 'err', 'error', 'bias', 'true',
-}  # fmt: skip
-"""Words of columns with axes that are neither places nor rotations."""
-ANGLES = {'roll', 'pitch', 'yaw', 'azimuth', 'elevation', 'euler', 'heading'}
-_AXIS = re.compile(f'({"|".join(sorted(PLACE | TURN, key=len, reverse=True))})([xyzw])')
+PLACE, TURN, TIME, ANGLES, OTHER = (
+    set(words.split())
+    for words in (
+        't p pos position trans translation loc location coord coordinate',
+        'q quat quaternion rot rotation ori orient orientation o r',
+        'time timestamp timestamps stamp clock',
+        'roll pitch yaw azimuth elevation euler heading',
+        'v vel velocity acc accel acceleration gyro mag force sigma std cov err error bias',
+    )
+)
+"""Words of places, turns, times, angles, and of columns with axes that are none of these."""
+_AXIS = re.compile(f'({"|".join(sorted(PLACE | TURN, key=len, reverse=True))}|)([xyzw])')
 
 
-@dataclass(frozen=True)
-class Meaning:
+class Meaning(NamedTuple):
     """Holds what a name says: kind (``place``, ``turn``, ``time``, ``angle`` or none), axis, unit,
     and the other words, which are of a body or sensor."""
 
@@ -51,17 +49,13 @@ def is_unit(cell: str) -> bool:
     return not word or word in UNITS or word in ('none', 'quat', 'quaternion')
 
 
-def words_of(name: str) -> list[str]:
-    """Return the words of a name: ``Tool1 posX (mm)`` has tool, 1, pos, x, mm."""
-    parted = re.sub('([a-z])([A-Z])', r'\1 \2', name)
-    return re.findall('[^\\W\\d_]+|\\d+', parted.casefold())
-
-
 def meaning_of(name: str, unit: str = '') -> Meaning:
-    """Return what a name means, with the unit that a row of units states."""
-    words = words_of(name)
-    if not words:
-        return Meaning()
+    """Return what a name means, with the unit that a row of units states.
+
+    ``Tool1 posX (mm)`` has the words tool, 1, pos, x, mm.
+    """
+    parted = re.sub('([a-z])([A-Z])', r'\1 \2', name)
+    words = re.findall('[^\\W\\d_]+|\\d+', parted.casefold())
     unit = UNITS.get(unit, '')
     stated = [word for word in words[:-1] if word in UNITS and len(word) > 1 and word != 'in']
     stated += [word for word in words[-1:] if word in UNITS]
@@ -69,17 +63,16 @@ def meaning_of(name: str, unit: str = '') -> Meaning:
         unit = UNITS[stated[-1]]
         words.remove(stated[-1])
     is_span = len(words) == 1 and UNITS.get(words[0]) in TIME_NS
-    if is_span or words == ['t'] or TIME.intersection((words[0], words[-1])):
-        return Meaning('time', unit=unit or UNITS.get(words[0], ''), group=tuple(words))
+    if is_span or words == ['t'] or TIME.intersection(words[:1] + words[-1:]):
+        return Meaning('time', '', unit or UNITS.get(words[0], ''), tuple(words))
     if ANGLES.intersection(words) or unit in ('deg', 'rad'):
-        return Meaning('angle', unit=unit)
+        return Meaning('angle', '', unit)
     kind, axis, place = _axis(words)
     others = [*words[:place], *words[place + 1 :]]
     if not axis or OTHER.intersection(others):
         return Meaning()
     kinds = [word for word in others if word in TURN or word in PLACE]
-    kind = kind or (kinds[0] if kinds else '')
-    is_turn = kind in TURN or axis == 'w'
+    is_turn = axis == 'w' or (kind or ''.join(kinds[:1])) in TURN
     group = tuple(word for word in others if word not in kinds)
     return Meaning('turn' if is_turn else 'place', axis, unit, group)
 
@@ -98,12 +91,27 @@ def _axis(words: list[str]) -> tuple[str, str, int]:
     return '', '', 0
 
 
-@dataclass(frozen=True)
-class PoseColumns:
+def triples(names: Sequence[str], found: Sequence[Meaning]) -> dict[str, Any]:
+    """Return the columns of places and turns, by kind, the body's words and axis.
+
+    Raises `ParameterError` for two of the same meaning.
+    """
+    axes: dict[str, dict[tuple[str, ...], dict[str, int]]] = {'place': {}, 'turn': {}}
+    for column, one in enumerate(found):
+        if one.kind in axes:
+            known = axes[one.kind].setdefault(one.group, {})
+            axis = 'w' if one.axis == '0' else one.axis  # NDI's Q0 Qx Qy Qz
+            if axis in known:
+                raise ParameterError(f'{names[known[axis]]} and {names[column]} mean the same')
+            known[axis] = column
+    return axes
+
+
+class PoseColumns(NamedTuple):
     """Holds which columns are the pose of one body: x y z, and the quaternion x y z w."""
 
-    place: tuple[int, ...]
-    turn: tuple[int, ...]
+    place: list[int]
+    turn: list[int]
     unit: str  # of length, a key of `LENGTH_M`; empty if no name states it
 
 
@@ -114,20 +122,13 @@ def pose_columns(
 
     Raises `ParameterError`, which says what is not clear, when no pose or no time is named.
     """
-    found = [meaning_of(name, unit) for name, unit in zip(names, units, strict=True)]
-    axes: dict[str, dict[tuple[str, ...], dict[str, int]]] = {'place': {}, 'turn': {}}
-    for column, one in enumerate(found):
-        if one.kind in axes:
-            known = axes[one.kind].setdefault(one.group, {})
-            axis = 'w' if one.axis == '0' else one.axis  # NDI's Q0 Qx Qy Qz
-            if axis in known:
-                raise ParameterError(f'{names[known[axis]]} and {names[column]} mean the same')
-            known[axis] = column
+    found = list(map(meaning_of, names, units))
+    axes = triples(names, found)
     places = {group: one for group, one in axes['place'].items() if set('xyz') <= set(one)}
     turns = {group: one for group, one in axes['turn'].items() if set('xyzw') <= set(one)}
     both = {group: (places[group], turns[group]) for group in places if group in turns}
     if not both and len(places) == len(turns) == 1:
-        both = {(): (next(iter(places.values())), next(iter(turns.values())))}
+        both = {(): (*places.values(), *turns.values())}
     if not both:
         angles = [n for n, one in zip(names, found, strict=True) if one.kind in ('angle', 'turn')]
         raise ParameterError(
@@ -141,20 +142,20 @@ def pose_columns(
         if len(unit) > 1 or not unit <= {*LENGTH_M, ''}:
             raise ParameterError(f'the columns x, y, z are in {", ".join(sorted(unit))}')
         label = '_'.join(word for word in group if word not in common)
-        bodies[label] = PoseColumns(
-            tuple(place[axis] for axis in 'xyz'), tuple(turn[axis] for axis in 'xyzw'), unit.pop()
-        )
+        columns = [place[axis] for axis in 'xyz'], [turn[axis] for axis in 'xyzw']
+        bodies[label] = PoseColumns(*columns, unit.pop())
     return bodies, _times(names, found)
 
 
 def _times(names: Sequence[str], found: Sequence[Meaning]) -> list[tuple[int, str]]:
     """The column of times and its unit; two where seconds and their rest in ns stand apart."""
     times = [(column, one) for column, one in enumerate(found) if one.kind == 'time']
-    stamps = [(column, one) for column, one in times if 'stamp' in one.group] or times
-    parts = {one.unit: column for column, one in stamps}
-    if len(stamps) == 2 and set(parts) == {'s', 'ns'} and stamps[0][1].group == stamps[1][1].group:
-        return [(parts['s'], 's'), (parts['ns'], 'ns')]
-    if len(stamps) != 1:
-        words = ', '.join(names[column] for column, _ in stamps)
-        raise ParameterError(f'several times: {words}' if stamps else 'no time')
-    return [(stamps[0][0], stamps[0][1].unit)]
+    times = [one for one in times if 'stamp' in one[1].group] or times
+    if len({one.group for _, one in times}) == 1 < len(times):
+        times.sort(key=lambda one: one[1].unit == 'ns')
+        if [one.unit for _, one in times] == ['s', 'ns']:
+            return [(column, one.unit) for column, one in times]
+    if len(times) != 1:
+        words = ', '.join(names[column] for column, _ in times)
+        raise ParameterError(f'several times: {words}' if times else 'no time')
+    return [(times[0][0], times[0][1].unit)]

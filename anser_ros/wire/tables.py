@@ -7,23 +7,22 @@ pandas splits and converts the cells, and is imported only where a table is read
 
 import codecs
 import csv
-import io
 import json
 import os
 import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.arrays import Array
 from anser_ros.errors import ParameterError
-from anser_ros.wire.table_names import LENGTH_M, is_unit, meaning_of
-
-Array = NDArray[np.float64]
+from anser_ros.wire.table_names import LENGTH_M, is_unit, meaning_of, triples
 
 SEPARATORS = ('\t', ';', ',', None)
 """Between cells, in the order in which they are preferred; None: any blanks."""
@@ -32,8 +31,7 @@ TITLE_LINES = 60
 """Lines in which the first row of numbers is looked for."""
 GAPS = ('', '-', '--', 'na', 'n/a', '#n/a', 'nan', 'null', 'none')
 """Words for no number."""
-_NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?', re.IGNORECASE)
-_WHOLE = re.compile(r'[-+]?\d{1,18}|1\d{18}')
+_NUMBER, _WHOLE = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?', r'[-+]?\d{1,18}|1\d{18}'
 _COMMA = re.compile(r'(?<=\d),(?=\d+(?:e[-+]?\d+)?$)', re.IGNORECASE)  # of a decimal
 _MARKS = {
     codecs.BOM_UTF8: 'utf-8-sig', codecs.BOM_UTF16_LE: 'utf-16', codecs.BOM_UTF16_BE: 'utf-16',
@@ -60,29 +58,29 @@ def decode_text(path: str | os.PathLike[str]) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """Holds the cells (n, k) of a table as texts, empty for a gap, under the names of its header.
+    """Holds the cells of a table as texts, empty for a gap: a data frame of pandas, with the names
+    of the header, or numbers of columns from 1 on, and with the rows' lines in the file.
 
-    Without a header the names are the numbers of the columns from 1 on. ``lines`` are the rows'
-    lines in the file; ``titles`` the cells of the lines above the header.
+    ``titles`` are the cells of the lines above the header.
     """
 
     path: str
-    names: tuple[str, ...]
+    cells: Any
     units: tuple[str, ...]
     has_names: bool
-    lines: list[int]
     titles: list[list[str]]
-    cells: NDArray[Any]
-    has_comma: bool = False  # in place of the point of a number
 
-    def words(self, name: str) -> list[str]:
-        """Return a column as texts, by its name in any case; raises `ParameterError`."""
-        found = [i for i, known in enumerate(self.names) if known.casefold() == name.casefold()]
-        found = [i for i in found if self.names[i] == name] or found
-        if not found:
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the columns."""
+        return tuple(self.cells.columns)
+
+    def words(self, name: str) -> Any:
+        """Return a column as a series of texts, by its name in any case; `ParameterError`."""
+        alike = [known for known in self.names if known.casefold() == name.casefold()]
+        if not alike:
             raise ParameterError(f'{self.path}: no {name!r}; there are: {", ".join(self.names)}')
-        texts = (cell.strip() for cell in self.cells[:, found[0]])
-        return [_COMMA.sub('.', text) if self.has_comma else text for text in texts]
+        return self.cells[name if name in alike else alike[0]]
 
     def array(self, name: str) -> NDArray[Any]:
         """Return a column (n,): whole numbers as such, others with NaN for a gap.
@@ -90,18 +88,15 @@ class Table:
         Raises `ParameterError` for a word, with its line.
         """
         words = self.words(name)
-        if all(map(_WHOLE.fullmatch, words)):
-            return np.array([int(word) for word in words], dtype=np.int64)
-        values = np.full(len(words), np.nan)
-        for row, word in enumerate(words):
-            try:
-                values[row] = np.nan if word.casefold() in GAPS else float(word)
-            except ValueError as error:
-                raise ParameterError(
-                    f'{self.path}: line {self.lines[row]}: {name} is {word!r}, which is no '
-                    'number; leave the cell empty where there is none'
-                ) from error
-        return values
+        if words.str.fullmatch(_WHOLE).all():
+            return np.asarray(words.astype(np.int64))
+        words = words.mask(words.str.casefold().isin(GAPS), 'nan')
+        if len(bad := words[~words.str.fullmatch(f'{_NUMBER}|[-+]?inf|nan', case=False)]):
+            raise ParameterError(
+                f'{self.path}: line {bad.index[0]}: {name} is {bad.iloc[0]!r}, which is no '
+                'number; leave the cell empty where there is none'
+            )
+        return np.asarray(words.astype(np.float64))
 
     def numbers(self, names: Sequence[str], *, with_gaps: bool = False) -> Array:
         """Return columns (n, k) as numbers, with gaps as NaN if allowed; `ParameterError`."""
@@ -109,9 +104,8 @@ class Table:
         bad = np.argwhere(~np.isfinite(values))
         if bad.size and not with_gaps:
             row, column = bad[0]
-            raise ParameterError(
-                f'{self.path}: line {self.lines[row]}: {names[column]} must be finite'
-            )
+            line = self.cells.index[row]
+            raise ParameterError(f'{self.path}: line {line}: {names[column]} must be finite')
         return values
 
     def positions(self, prefix: str = '', *, with_gaps: bool = False) -> Array:
@@ -119,20 +113,17 @@ class Table:
 
         Their names, or a row of units, state the unit: ``x_mm``, ``true_x_m``.
         """
-        begin = f'{prefix}_' if prefix else ''
-        found = {
-            i: meaning_of(name[len(begin) :], self.units[i])
-            for i, name in enumerate(self.names) if name.casefold().startswith(begin)
-        }  # fmt: skip
-        chosen = {m.axis: i for i, m in found.items() if (m.kind, m.group) == ('place', ())}
-        units = {found[i].unit for i in chosen.values()}
-        if sorted(chosen) != ['x', 'y', 'z'] or len(units) > 1 or not units <= set(LENGTH_M):
+        found = list(map(meaning_of, self.names, self.units))
+        axes = triples(self.names, found)['place'].get((prefix,) if prefix else (), {})
+        units = {found[column].unit for column in axes.values()}
+        if not set('xyz') <= set(axes) or len(units) > 1 or not units <= set(LENGTH_M):
+            begin = f'{prefix}_' if prefix else ''
             wanted = (', '.join(f'{begin}{a}_{u}' for a in 'xyz') for u in ('m', 'mm'))
             raise ParameterError(
                 f'{self.path}: needs the columns {", or ".join(wanted)}; there are: '
                 f'{", ".join(self.names)}'
             )
-        names = [self.names[chosen[axis]] for axis in 'xyz']
+        names = [self.names[axes[axis]] for axis in 'xyz']
         return LENGTH_M[units.pop()] * self.numbers(names, with_gaps=with_gaps)
 
     def rows(self, names: Sequence[str]) -> list[dict[str, str]]:
@@ -142,7 +133,7 @@ class Table:
 
 
 def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
-    """Read a table, its cells as they are written if ``as_text``.
+    """Read a table; of one ``as_text``, such as of names, the first line is the header.
 
     Raises `ParameterError` for a file that cannot be read, has no row of numbers, several columns
     of a name, or a row of another length than its header, with its line.
@@ -150,15 +141,16 @@ def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
     name = os.fspath(path)
     every = [(n, line.strip(' ')) for n, line in enumerate(decode_text(path).splitlines(), 1)]
     lines = [one for one in every if one[1].strip('\t ,;') and not one[1].startswith(COMMENTS)]
+    texts = [line for _, line in lines]
     if not lines:
         raise ParameterError(f'{name}: no rows')
-    texts = [line for _, line in lines]
-    separator, first = _find_rows(texts, is_text=as_text)
-    if first == len(lines) and not as_text:
+    separator, first = _find_rows(texts)
+    if as_text:
+        separator, first = max(SEPARATORS[:-1], key=lambda s: len(_cells(texts[0], s))), 1
+    elif first == len(lines):
         raise ParameterError(f'{name}: no row of numbers; it begins with {texts[0][:60]!r}')
-    sizes = [len(_cells(line, separator)) for line in texts]
     above = [_cells(line, separator) for line in texts[:first]]
-    width = sizes[first] if first < len(sizes) else sizes[-1]
+    width = len(_cells(texts[min(first, len(lines) - 1)], separator))
     head, units = _header(above, width)
     if not above:  # names may stand behind the mark of a comment
         notes = (line.strip('#% ') for _, line in reversed(every) if line.startswith(COMMENTS))
@@ -172,68 +164,63 @@ def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
     twice = [known for known, many in Counter(filter(None, names)).items() if many > 1]
     if twice:
         raise ParameterError(f'{name}: several columns are called {", ".join(twice)}')
-    cells = _split(name, texts[first:], separator, max([len(names), *sizes]))
-    for (n, _), size, row in zip(lines[first:], sizes[first:], cells, strict=True):
-        if any(row[len(names) :]) or (size < len(names) and n != lines[-1][0]):  # it may be cut
-            raise ParameterError(f'{name}: line {n} has {size} cells, the header {len(names)}')
-    cells = cells[:, : len(names)]
-    new = [row for row, found in enumerate(cells.tolist()) if found != head]  # not started again
-    return Table(
-        name, tuple(names), tuple([*units, *([''] * len(names))][: len(names)]), bool(head),
-        [lines[first + row][0] for row in new], above, cells[new], separator != ',',
-    )  # fmt: skip
+    cells = _split(name, lines[first:], separator, names)
+    if head:
+        cells = cells[(cells != head).any(axis=1)]  # it may stand once more
+    stated = (*units, *([''] * len(names)))[: len(names)]
+    return Table(name, cells, stated, bool(head), above)
 
 
-def _split(name: str, rows: list[str], separator: str | None, width: int) -> NDArray[Any]:
-    """Cells (n, width) of rows as texts, empty where a row is shorter."""
+def _split(
+    path: str, lines: list[tuple[int, str]], separator: str | None, names: list[str]
+) -> Any:
+    """The cells of numbered lines by names; `ParameterError` for a line of another length."""
     import pandas  # late: it takes half a second, and few commands read a table
 
-    if not rows:
-        return np.empty((0, width), dtype=object)
-    try:
-        frame = pandas.read_csv(
-            io.StringIO('\n'.join(rows)), sep=separator or r'\s+', header=None, dtype=str,
-            names=range(width), index_col=False, skipinitialspace=True, keep_default_na=False,
-        )  # fmt: skip
-    except ValueError as error:  # as its errors of syntax are
-        raise ParameterError(f'{name}: no table: {error}') from error
-    return np.asarray(frame.fillna('').to_numpy(dtype=object))
+    count, rows = len(names), [_cells(line, separator) for _, line in lines]
+    columns = dict(enumerate(zip_longest(names, *rows)))
+    cells = pandas.DataFrame(columns, [0, *(n for n, _ in lines)], dtype=object)[1:]
+    lacks = cells.iloc[:, :count].isna().any(axis=1)
+    lacks[-1:] = False  # it may be cut
+    wrong = lacks | (cells.iloc[:, count:].fillna('') != '').any(axis=1)
+    if wrong.any():
+        size = cells.loc[line := wrong.idxmax()].notna().sum()
+        raise ParameterError(f'{path}: line {line} has {size} cells, the header {count}')
+    cells = cells.iloc[:, :count].fillna('').set_axis(names, axis=1)
+    return cells if separator == ',' else cells.replace(_COMMA, '.', regex=True)
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
-    if separator is None:
-        return line.split()
-    if '"' in line:
-        line_cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-        return [cell.strip() for cell in line_cells]
-    return [cell.strip() for cell in line.split(separator)]
+    if separator is not None and '"' in line:
+        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    else:
+        cells = line.split(separator)
+    return [cell.strip() for cell in cells]
 
 
-def _count(line: str, separator: str | None) -> int:
-    """How many cells of a line are numbers."""
-    cells = _cells(line, separator)
-    if separator != ',':
-        cells = [_COMMA.sub('.', cell) for cell in cells]
-    return sum(_NUMBER.fullmatch(cell) is not None for cell in cells)
+def _find_rows(lines: list[str]) -> tuple[str | None, int]:
+    """The separator with which most cells are numbers, and the first line with as many."""
 
+    def count(line: str, separator: str | None) -> int:
+        cells = _cells(line, separator)
+        if separator != ',':
+            cells = [_COMMA.sub('.', cell) for cell in cells]
+        return sum(_is_number(cell) for cell in cells)
 
-def _find_rows(lines: list[str], *, is_text: bool) -> tuple[str | None, int]:
-    """The separator with which most cells are numbers, and the first line with as many.
-
-    Of a text, such as names and directions, the first line is the header.
-    """
-    if is_text:
-        return max(SEPARATORS[:-1], key=lambda s: len(_cells(lines[0], s))), 1
     sample = lines[len(lines) // 2 :][:20]
-    separator = max(SEPARATORS, key=lambda s: sum(_count(line, s) for line in sample))
-    usual = float(np.median([_count(line, separator) for line in sample]))
-    counts = [_count(line, separator) for line in lines[:TITLE_LINES]]
+    separator = max(SEPARATORS, key=lambda s: sum(count(line, s) for line in sample))
+    usual = float(np.median([count(line, separator) for line in sample]))
+    counts = [count(line, separator) for line in lines[:TITLE_LINES]]
     first = next((i for i, n in enumerate(counts) if n >= max(0.6 * usual, 1.0)), len(lines))
     width = len(_cells(lines[first], separator)) if first < len(lines) else 0
     # Rows with gaps may come before the first whole one.
     while first and counts[first - 1] and len(_cells(lines[first - 1], separator)) == width:
         first -= 1
     return separator, first
+
+
+def _is_number(cell: str) -> bool:
+    return re.fullmatch(_NUMBER, cell, re.IGNORECASE) is not None
 
 
 def _header(above: list[list[str]], width: int) -> tuple[list[str], list[str]]:
@@ -249,7 +236,7 @@ def _header(above: list[list[str]], width: int) -> tuple[list[str], list[str]]:
     if len(set(named)) < len(named):  # bodies and kinds stand above the axes
         same = [
             row[: len(head)] for row in above[:-1]
-            if len(row) >= len(head) and not any(map(_NUMBER.fullmatch, row))
+            if len(row) >= len(head) and not any(map(_is_number, row))
         ]  # fmt: skip
         head = [' '.join(filter(None, column)) for column in zip(*same, head, strict=True)]
     return head, units

@@ -225,10 +225,10 @@ def _table(path: Path) -> dict[str, RawRows]:
     label, valid = (
         next((by_name[n] for n in known if n in by_name), '') for known in (LABELS, VALID)
     )
-    gone = np.zeros(len(table.lines), dtype=bool)
+    gone = np.zeros(len(table.cells), dtype=bool)
     if valid:
         gone = np.array([cell.casefold() in NOT_VALID for cell in table.words(valid)])
-    whose = table.words(label) if label else [''] * len(table.lines)
+    whose = table.words(label) if label else [''] * len(table.cells)
     rows: dict[str, RawRows] = {}
     for body, columns in bodies.items():
         cells = [table.array(table.names[column]) for column in (*columns.place, *columns.turn)]
@@ -282,7 +282,7 @@ def _advice(table: Table, error: ParameterError) -> str:
     """What a header lacks, what it has, and a document for `anser import`, written beside it."""
     path = Path(table.path)
     document = path.with_name(f'{path.stem}.tables.yaml')
-    found = [meaning_of(name, unit) for name, unit in zip(table.names, table.units, strict=True)]
+    found = list(map(meaning_of, table.names, table.units))
     seen: dict[tuple[str, str], str] = {}
     for name, one in zip(table.names, found, strict=True):
         seen.setdefault((one.kind, one.axis), name)

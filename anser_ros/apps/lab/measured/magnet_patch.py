@@ -81,8 +81,8 @@ def read_poses(path: Path, magnet: str) -> dict[str, Array]:
     Raises `FitError` when a column is missing, or the rows are not whole poses.
     """
     table = read_table(existing(path))
-    if len(table.lines) % SENSORS:
-        raise FitError(f'{path.name}: {len(table.lines)} rows are not poses of {SENSORS} sensors')
+    if len(table.cells) % SENSORS:
+        raise FitError(f'{path.name}: {len(table.cells)} rows are not poses of {SENSORS} sensors')
     groups = {
         'field': ('Bx', 'By', 'Bz'),
         'place': ('sensor_x', 'sensor_y', 'sensor_z'),
