@@ -212,7 +212,7 @@ def _read(
     try:
         if table.names != columns:
             raise ValueError(f'columns must be {", ".join(columns)}')
-        rows = table.rows(columns)
+        rows = table.cells.to_dict('records')
         return {(int(row['stamp_ns']), row[columns[1]]): float(value(row)) for row in rows}
     except (ValueError, TypeError) as error:
         raise ParameterError(f'{path}: {error}') from error

@@ -246,10 +246,8 @@ class _Collector:
         self.flux: dict[str, list[tuple[int, FluxPoints]]] = {'tool': [], 'reference': []}
         self.poses: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         self.refused: Counter[str] = Counter()
-        self.topics: dict[str, str] = {}
 
     def add(self, raw: RawMessage) -> None:
-        self.topics[raw.topic] = raw.type_name
         try:
             if raw.topic.endswith('/setup') and raw.type_name == SETUP_TYPE:
                 self.setups.append(str(self.decoder.decode(raw).data))
@@ -341,7 +339,7 @@ def read_bag(path: str | os.PathLike[str]) -> recorded.Bag:
     tool, reference = collector.flux_stream('tool'), collector.flux_stream('reference')
     if tool is None and reference is None:
         reasons = ''.join(f'; {text}' for text in list(collector.refused)[:1])
-        reasons = reasons or _rename_words(collector.topics)
+        reasons = reasons or _rename_words(salvage.topics)
         raise BagError(f'{os.fspath(path)}: the bag has no readable flux{reasons}')
     return recorded.Bag(
         os.fspath(path), setup, text, tool, reference, collector.pose_streams(),
@@ -528,31 +526,23 @@ def published_poses(
     Of all, those of `geometry_msgs/PoseStamped` are meant, and where there are none, those of
     other types that hold poses. ``salvage`` takes what could not be read.
     """
-    salvage = salvage or Salvage()
-    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics or ()}
-    stamps: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics or ()}
-    plain: set[str] = set()
-    decoder = MessageDecoder()
+    salvage, decoder, plain = salvage or Salvage(), MessageDecoder(), set[str]()
+    rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = {t: [] for t in topics or ()}
     for raw in iter_messages(path, salvage):
-        if raw.type_name not in recorded.POSE_TYPES:
+        is_plain = raw.type_name == recorded.POSE_TYPE
+        may_hold = raw.topic in rows or raw.type_name == recorded.POSE_TYPES[-1]
+        if topics is None:
+            may_hold = is_plain or not plain
+        if raw.type_name not in recorded.POSE_TYPES or not may_hold:
             continue
-        is_unasked = raw.topic not in rows and raw.type_name != recorded.POSE_TYPES[-1]
-        if topics is not None and is_unasked:
-            continue
-        if raw.type_name == recorded.POSE_TYPE:
-            plain.add(raw.topic)
-        elif plain and topics is None:
-            continue
+        plain.update([raw.topic] if is_plain else [])
         for topic, stamp, numbers in recorded.poses_in(raw.topic, decoder.decode(raw)):
             if topics is None or topic in rows:
-                stamps.setdefault(topic, []).append((stamp, raw.log_time_ns))
-                rows.setdefault(topic, []).append(numbers)
+                rows.setdefault(topic, []).append((stamp, raw.log_time_ns, numbers))
     found = {}
-    for topic, values in rows.items():
-        if topics is None and plain and topic not in plain:
-            continue
-        table = np.array(values, dtype=np.float64).reshape(-1, 7)
-        times = np.array(stamps[topic], dtype=np.int64).reshape(-1, 2)
+    for topic in [t for t in rows if topics is not None or not plain or t in plain]:
+        table = np.array([numbers for *_, numbers in rows[topic]]).reshape(-1, 7)
+        times = np.array([row[:2] for row in rows[topic]], dtype=np.int64).reshape(-1, 2)
         is_unset = len(times) > 1 and not times[:, 0].any()
         if is_unset:
             salvage.add(

@@ -5,7 +5,6 @@ quotes, encodings, titles, rows of units and headers of several lines are found 
 pandas splits and converts the cells, and is imported only where a table is read.
 """
 
-import codecs
 import csv
 import json
 import os
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from anser_ros.arrays import Array
 from anser_ros.errors import ParameterError
 from anser_ros.wire.table_names import LENGTH_M, is_unit, meaning_of, triples
+from anser_ros.wire.text_files import read_text
 
 SEPARATORS = ('\t', ';', ',', None)
 """Between cells, in the order in which they are preferred; None: any blanks."""
@@ -33,27 +33,6 @@ GAPS = ('', '-', '--', 'na', 'n/a', '#n/a', 'nan', 'null', 'none')
 """Words for no number."""
 _NUMBER, _WHOLE = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?', r'[-+]?\d{1,18}|1\d{18}'
 _COMMA = re.compile(r'(?<=\d),(?=\d+(?:e[-+]?\d+)?$)', re.IGNORECASE)  # of a decimal
-_MARKS = {
-    codecs.BOM_UTF8: 'utf-8-sig', codecs.BOM_UTF16_LE: 'utf-16', codecs.BOM_UTF16_BE: 'utf-16',
-}  # fmt: skip
-
-
-def decode_text(path: str | os.PathLike[str]) -> str:
-    """Return the text of a file in UTF-8 or UTF-16, else Windows' letters; `ParameterError`."""
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise ParameterError(f'{os.fspath(path)}: {error.strerror}') from error
-    encoding = next((name for mark, name in _MARKS.items() if data.startswith(mark)), 'utf-8')
-    if encoding == 'utf-8' and data[1:64:2].strip(b'\0') == b'' and len(data) > 2:
-        encoding = 'utf-16-le'
-    try:
-        text = data.decode(encoding)
-    except UnicodeDecodeError:
-        text = data.decode('cp1252', 'replace')
-    if '\0' in text:
-        raise ParameterError(f'{os.fspath(path)}: not a text in UTF-8')
-    return text
 
 
 @dataclass(frozen=True)
@@ -126,11 +105,6 @@ class Table:
         names = [self.names[axes[axis]] for axis in 'xyz']
         return LENGTH_M[units.pop()] * self.numbers(names, with_gaps=with_gaps)
 
-    def rows(self, names: Sequence[str]) -> list[dict[str, str]]:
-        """Return the rows as texts by some names; raises `ParameterError`."""
-        columns = [self.words(name) for name in names]
-        return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
-
 
 def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
     """Read a table; of one ``as_text``, such as of names, the first line is the header.
@@ -139,7 +113,10 @@ def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
     of a name, or a row of another length than its header, with its line.
     """
     name = os.fspath(path)
-    every = [(n, line.strip(' ')) for n, line in enumerate(decode_text(path).splitlines(), 1)]
+    every = [
+        (n, line.strip(' '))
+        for n, line in enumerate(read_text(path, any_letters=True).splitlines(), 1)
+    ]
     lines = [one for one in every if one[1].strip('\t ,;') and not one[1].startswith(COMMENTS)]
     texts = [line for _, line in lines]
     if not lines:
@@ -256,7 +233,7 @@ def read_points(path: Path) -> Array:
     """
     if not path.name.endswith(MARKUPS):
         return read_table(path).positions(with_gaps=True)
-    text = decode_text(path)
+    text = read_text(path, any_letters=True)
     if path.suffix == '.json':
         try:
             (markups,) = json.loads(text)['markups']

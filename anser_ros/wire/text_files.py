@@ -15,14 +15,26 @@ import yaml
 from anser_ros.errors import AnserError, ModelFileError, ParameterError, SetupError
 
 
-def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterError) -> str:
-    """Return the text (UTF-8, with or without its mark) of a file; raises an error of a kind."""
+def read_text(
+    path: str | os.PathLike[str],
+    kind: type[AnserError] = ParameterError,
+    *,
+    any_letters: bool = False,
+) -> str:
+    """Return the text (UTF-8, UTF-16) of a file, or if wanted Windows' letters; raises a kind."""
     try:
-        return Path(path).read_text(encoding='utf-8-sig')
+        data = Path(path).read_bytes()
+        is_wide = data[:2] in (b'\xff\xfe', b'\xfe\xff') or (
+            len(data) > 2 and not data[1:64:2].strip(b'\0')
+        )
+        text = data.decode('utf-16' if is_wide else 'utf-8-sig')
     except OSError as error:
         raise kind(f'{os.fspath(path)}: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise kind(f'{os.fspath(path)}: not a text in UTF-8') from error
+    except UnicodeDecodeError:
+        text = data.decode('cp1252', 'replace') if any_letters else '\0'
+    if '\0' in text:
+        raise kind(f'{os.fspath(path)}: not a text in UTF-8')
+    return text
 
 
 # libyaml's are several times as fast, where it is there.

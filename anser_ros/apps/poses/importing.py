@@ -38,7 +38,8 @@ from anser_ros.wire.recorded import (
     tracked_topic,
 )
 from anser_ros.wire.table_names import LENGTH_M, TIME_NS, UNITS, meaning_of, pose_columns
-from anser_ros.wire.tables import Table, decode_text, read_table
+from anser_ros.wire.tables import Table, read_table
+from anser_ros.wire.text_files import read_text
 
 ORDERS = {
     'xyzw': ((0, 1, 2, 3), 1.0),
@@ -106,7 +107,7 @@ def read_form(path: Path) -> Found:
     """
     if path.suffix.lower() in PLUS:
         return _plus(path), 0
-    lines = [line for line in decode_text(path).splitlines() if line.strip()]
+    lines = [line for line in read_text(path, any_letters=True).splitlines() if line.strip()]
     lines = [line for line in lines if not line.lstrip().startswith('#')]
     if not lines:
         raise ParameterError(f'{path}: no rows')

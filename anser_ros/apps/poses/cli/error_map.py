@@ -1,7 +1,6 @@
 """Learn a correction of positions where true ones are known, and apply it to others."""
 
 import argparse
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from anser_ros.calibration.error_map import ErrorMap, HeldOutError, learn_error_
 from anser_ros.cli.output import Result, Tell, add_json, add_out, make_folder, write_files
 from anser_ros.errors import ParameterError, PlausibilityError
 from anser_ros.sessions.plausibility import check_points
-from anser_ros.wire.tables import MARKUPS, Table, read_points, read_table
+from anser_ros.wire.tables import MARKUPS, read_points, read_table
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')
@@ -70,7 +69,8 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     written = write_files(args.out, {'error_map.json': document, 'model.yaml': model})
     if args.apply is not None:
         written = (*written, args.out / 'corrected.csv')
-        _write(written[-1], poses, corrected)
+        cells = poses.cells.assign(**dict(zip(TRACKED, corrected.T, strict=True)))
+        cells.to_csv(written[-1], index=False, na_rep='nan')
     return Result(document, (), (verdict(error_map),), written)
 
 
@@ -130,11 +130,3 @@ def _errors(error: HeldOutError) -> dict[str, float | None]:
         'in_plane_rmse_m': error.in_plane,
         'out_of_plane_rmse_m': error.out_of_plane,
     }
-
-
-def _write(path: Path, poses: Table, places: Array) -> None:
-    with path.open('w', encoding='utf-8', newline='') as stream:
-        writer = csv.DictWriter(stream, poses.names)
-        writer.writeheader()
-        for row, place in zip(poses.rows(poses.names), places, strict=True):
-            writer.writerow({**row, **dict(zip(TRACKED, place.tolist(), strict=True))})
