@@ -80,8 +80,8 @@ def import_bag(
             written[topic] += 1
         missing = sorted(set(names) - seen)
         if missing or not written:
-            what = f'no topic {", ".join(missing)}; there are: {", ".join(sorted(seen))}'
-            raise BagError(f'{os.fspath(path)}: {what if missing else "no message can be read"}')
+            what = f'no topic {", ".join(missing)}' if missing else 'no type is known'
+            raise BagError(f'{os.fspath(path)}: {what}; there are: {salvage.topic_words()}')
     return ImportedBag(dict(written), dict(left_out), salvage.lost)
 
 
