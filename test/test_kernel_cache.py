@@ -106,9 +106,9 @@ def test_a_kernel_that_does_not_compile_is_said(tmp_path, monkeypatch):
         text = 'import sys; sys.exit("first line\\nno compiler")'
         yield [subprocess.Popen([sys.executable, '-c', text], stderr=subprocess.PIPE, text=True)]
 
-    monkeypatch.setattr(warm_up, '_processes', failing)
+    monkeypatch.setattr(kernel_cache, '_processes', failing)
     with pytest.raises(ParameterError, match='no compiler'):
-        warm_up.compile_kernels(said.append)
+        kernel_cache.compile_kernels(said.append)
     assert not KernelCache(tmp_path).is_full
     assert said == [f'compiling {KernelCache(tmp_path).total} kernels, once after an installation']
 
@@ -116,7 +116,7 @@ def test_a_kernel_that_does_not_compile_is_said(tmp_path, monkeypatch):
 def test_nothing_is_said_where_all_is_there(tmp_path, monkeypatch):
     monkeypatch.setattr(kernel_cache, 'kept_folder', lambda: tmp_path)
     KernelCache(tmp_path).finish()
-    warm_up.compile_kernels(pytest.fail)
+    kernel_cache.compile_kernels(pytest.fail)
 
 
 HERE = Path(__file__).parent
