@@ -10,14 +10,8 @@ from scipy.spatial.transform import Rotation
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.channels import ComplexGain
-from anser_ros.effects.effect import Effect, Remedy, Site, Term, needed, recorded_site, sigmas
-from anser_ros.field.model import (
-    Dipoles,
-    EffectRecord,
-    size_parameters,
-    spread_along,
-    symmetry_axis,
-)
+from anser_ros.effects.effect import Effect, Remedy, Site, Term, sigmas
+from anser_ros.field.model import Dipoles, EffectRecord, size_figures, spread_along, symmetry_axis
 
 
 def _of_one(term: Term, emitters: int, factor: complex) -> ComplexArray:
@@ -171,7 +165,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         )
 
     def term(self, record: EffectRecord) -> CoilDriftTerm:
-        theta = np.array([float(needed(record, 'amount')), np.log(float(needed(record, 'tau_s')))])
+        theta = np.array([float(record.needed('amount')), np.log(float(record.needed('tau_s')))])
         return CoilDriftTerm(self, self.site_of(record), theta)
 
 
@@ -223,12 +217,12 @@ class CoilCrosstalk(Effect[Term]):
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         keys = ('eps', 'eps_quadrature')[: term.theta.size]
-        parameters = {**recorded_site(term), **dict(zip(keys, term.theta.tolist(), strict=True))}
+        parameters = {**term.recorded_site, **dict(zip(keys, term.theta.tolist(), strict=True))}
         sigma = sigmas(covariance).tolist()
         return EffectRecord(self.name, parameters, dict(zip(keys, sigma, strict=True)))
 
     def term(self, record: EffectRecord) -> Term:
-        site, eps = self.site_of(record), float(needed(record, 'eps'))
+        site, eps = self.site_of(record), float(record.needed('eps'))
         if record.parameters.get('mutual'):
             return Term(self, {**site, 'mutual': True}, np.array([eps]))
         across = float(record.parameters.get('eps_quadrature', 0.0))
@@ -258,9 +252,7 @@ class CoilMoved(Effect[Term]):
         out[:, :, coil] = -np.moveaxis(view.d_position[..., coil], 2, -1)
         return out
 
-    def sources(
-        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
-    ) -> Dipoles | None:
+    def sources(self, term: Term, base: Dipoles, light: Dipoles, omega: Array) -> Dipoles | None:
         return self._changed(term, base)
 
     def light(self, term: Term, illumination: Dipoles) -> Dipoles:
@@ -335,11 +327,11 @@ class CoilTurned(CoilMoved):
         assert isinstance(term, CoilTurnedTerm)
         figures = {'rotation_deg': np.degrees(term.theta).tolist(), 'centre_m': list(term.centre)}
         deviation = {'rotation_deg': np.degrees(sigmas(covariance)).tolist()}
-        return EffectRecord(self.name, {**recorded_site(term), **figures}, deviation)
+        return EffectRecord(self.name, {**term.recorded_site, **figures}, deviation)
 
     def term(self, record: EffectRecord) -> Term:
-        theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
-        centre = tuple(float(value) for value in needed(record, 'centre_m'))
+        theta = np.radians(np.asarray(record.needed('rotation_deg'), dtype=np.float64))
+        centre = tuple(float(value) for value in record.needed('centre_m'))
         return CoilTurnedTerm(self, self.site_of(record), theta, centre=centre)
 
 
@@ -405,13 +397,13 @@ class EmitterSize(Effect[EmitterSizeTerm]):
         return view.along(unit.flux(*view.flat))[..., None]
 
     def sources(
-        self, term: EmitterSizeTerm, base: Dipoles, illumination: Dipoles, omega: Array
+        self, term: EmitterSizeTerm, base: Dipoles, light: Dipoles, omega: Array
     ) -> Dipoles | None:
         return spread_along(base, term.site['coil'], term.axis, SIZE_UNIT * float(term.theta[0]))
 
     def record(self, term: EmitterSizeTerm, covariance: Array) -> EffectRecord:
         sigma_m2 = SIZE_UNIT * float(np.sqrt(covariance[0, 0]))
-        figures, sigmas = size_parameters(term.second_moment_m2, sigma_m2)
+        figures, sigmas = size_figures(term.second_moment_m2, sigma_m2)
         return EffectRecord(
             self.name,
             {
@@ -424,11 +416,11 @@ class EmitterSize(Effect[EmitterSizeTerm]):
         )
 
     def term(self, record: EffectRecord) -> EmitterSizeTerm:
-        modelled = float(needed(record, 'model_second_moment_m2'))
-        theta = (float(needed(record, 'second_moment_m2')) - modelled) / SIZE_UNIT
+        modelled = float(record.needed('model_second_moment_m2'))
+        theta = (float(record.needed('second_moment_m2')) - modelled) / SIZE_UNIT
         return EmitterSizeTerm(
             self, self.site_of(record), np.array([theta]),
-            axis=np.asarray(needed(record, 'axis'), dtype=np.float64), modelled_m2=modelled,
+            axis=np.asarray(record.needed('axis'), dtype=np.float64), modelled_m2=modelled,
         )  # fmt: skip
 
 

@@ -9,16 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
-from anser_ros.effects.effect import (
-    Effect,
-    Remedy,
-    Site,
-    Term,
-    TermT,
-    needed,
-    recorded_site,
-    sigmas,
-)
+from anser_ros.effects.effect import Effect, Remedy, Site, Term, TermT, sigmas
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -184,12 +175,12 @@ class OpticalScale(OpticalEffect[Term]):
             shear = {'shear': values[1:-3].tolist()} if 'axis' in term.site else {}
             return {'scale': scale + float(values[0]), **shear, 'shift_m': values[-3:].tolist()}
 
-        parameters = {**figures(1.0, term.theta), **recorded_site(term)}
+        parameters = {**figures(1.0, term.theta), **term.recorded_site}
         return EffectRecord(self.name, parameters, figures(0.0, sigmas(covariance)))
 
     def term(self, record: EffectRecord) -> Term:
-        shift, given = needed(record, 'shift_m'), record.parameters
-        theta = [float(needed(record, 'scale')) - 1, *given.get('shear', ()), *shift]
+        shift, given = record.needed('shift_m'), record.parameters
+        theta = [float(record.needed('scale')) - 1, *given.get('shear', ()), *shift]
         axis = given.get('axis')
         site: Site = {} if axis is None else {'axis': tuple(float(value) for value in axis)}
         return Term(self, site, np.array(theta))
@@ -240,9 +231,9 @@ class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
         return EffectRecord(self.name, parameters, figures(sigmas(covariance)))
 
     def term(self, record: EffectRecord) -> RegistrationDriftTerm:
-        duration = float(needed(record, 'duration_s'))
-        start = np.asarray(needed(record, 'translation_m'), dtype=np.float64)
-        way = np.asarray(needed(record, 'velocity_m_per_s'), dtype=np.float64) * duration
+        duration = float(record.needed('duration_s'))
+        start = np.asarray(record.needed('translation_m'), dtype=np.float64)
+        way = np.asarray(record.needed('velocity_m_per_s'), dtype=np.float64) * duration
         return RegistrationDriftTerm(self, {}, np.concatenate([start, way]), duration=duration)
 
 

@@ -9,17 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
-from anser_ros.effects.effect import (
-    Effect,
-    Family,
-    Remedy,
-    Site,
-    Term,
-    needed,
-    recorded_site,
-    sigmas,
-    whole_numbers,
-)
+from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term, sigmas, whole_numbers
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.rotations import tangents, tilted
@@ -102,7 +92,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
     def record(self, term: SensorAxisTerm, covariance: Array) -> EffectRecord:
         if 'channel' not in term.site:
             turn, sigma = (np.degrees(v).tolist() for v in (term.theta, sigmas(covariance)))
-            parameters = {**recorded_site(term), 'rotation_deg': turn}
+            parameters = {**term.recorded_site, 'rotation_deg': turn}
             return EffectRecord(self.name, parameters, {'rotation_deg': sigma})
         tilt = float(np.linalg.norm(term.theta))
         unit = term.theta / max(tilt, 1e-12)
@@ -119,11 +109,11 @@ class SensorAxis(Effect[SensorAxisTerm]):
 
     def term(self, record: EffectRecord) -> SensorAxisTerm:
         if 'channels' in record.parameters:
-            theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
+            theta = np.radians(np.asarray(record.needed('rotation_deg'), dtype=np.float64))
             channels = whole_numbers(record.parameters['channels'])
             return SensorAxisTerm(self, {'channels': channels}, theta)
-        surveyed = np.asarray(needed(record, 'surveyed_axis'), dtype=np.float64)
-        axis = np.asarray(needed(record, 'axis'), dtype=np.float64)
+        surveyed = np.asarray(record.needed('surveyed_axis'), dtype=np.float64)
+        axis = np.asarray(record.needed('axis'), dtype=np.float64)
         along = float(axis @ surveyed)
         if along <= 0:
             raise ModelFileError('model: sensor_axis turns an axis by a right angle or more')
@@ -270,7 +260,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         channels = self.site_of(record)['channels']
         surveyed = record.parameters.get('surveyed_length_m') or [0.0] * len(channels)
         base = float(np.mean(np.square(surveyed)))
-        theta = (float(needed(record, 'length_m')) ** 2 - base) / SIZE_UNIT
+        theta = (float(record.needed('length_m')) ** 2 - base) / SIZE_UNIT
         lengths = dict(zip(channels, (float(v) for v in surveyed), strict=True))
         return SensorSizeTerm(self, {}, np.array([theta]), surveyed=lengths)
 
@@ -339,7 +329,7 @@ class SensorSpread(Effect[SpreadTerm]):
 
     def term(self, record: EffectRecord) -> SpreadTerm:
         channels = self.site_of(record)['channels']
-        values = np.asarray(needed(record, 'values'), dtype=np.float64)
+        values = np.asarray(record.needed('values'), dtype=np.float64)
         width = len(self.faultless) or (values.shape[1] if values.ndim == 2 else 2)
         if values.shape != (len(channels), width) or len(set(channels)) != len(channels):
             raise ModelFileError(
