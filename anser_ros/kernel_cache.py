@@ -101,7 +101,7 @@ def _state() -> tuple[str, int]:
 
 
 class KernelCache:
-    """Keeps the mark, the lock and the progress of one state of the kernels' sources.
+    """Keeps the mark and the lock of one state of the kernels' sources, and counts what is there.
 
     They are in a folder, by default beside the kernels, of which there are ``total``.
     """
@@ -112,7 +112,6 @@ class KernelCache:
         processor = str(cpu_target.target_context.codegen().magic_tuple())
         name = f'{key}_{hashlib.sha256(processor.encode()).hexdigest()[:8]}'
         self._mark = self._folder / f'{name}.ready'
-        self._progress = self._folder / f'{name}.progress'
         self._lock = self._folder / 'kernels.lock'
 
     @property
@@ -122,11 +121,8 @@ class KernelCache:
 
     @property
     def done(self) -> int:
-        """Return how many kernels are known to be there."""
-        try:
-            return len(set(self._progress.read_text(encoding='utf-8').split()))
-        except FileNotFoundError:
-            return 0
+        """Return how many kernels are there, by the indices that numba keeps of them."""
+        return sum(1 for _ in self._folder.rglob('*.nbi'))
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[bool]:
@@ -150,19 +146,9 @@ class KernelCache:
             else:
                 yield True
 
-    def begin(self) -> None:
-        """Forget how far an earlier attempt came."""
-        self._progress.unlink(missing_ok=True)
-
-    def add(self, name: str) -> None:
-        """Note a kernel that is there; processes may do so at the same time."""
-        with self._progress.open('a', encoding='utf-8') as file:
-            file.write(f'{name}\n')
-
     def finish(self) -> None:
         """Note that all kernels are there, and remove those of sources that are long gone."""
         self._mark.touch()
-        self._progress.unlink(missing_ok=True)
         kept = kept_folder()
         if self._folder == kept:
             last = sorted(kept.parent.iterdir(), key=lambda f: f.stat().st_mtime, reverse=True)
@@ -207,7 +193,6 @@ def compile_kernels(
                 if wait():
                     continue
                 return
-            cache.begin()
             with _processes() as running:
                 while any(process.poll() is None for process in running):
                     if not wait():

@@ -8,10 +8,6 @@ import argparse
 import contextlib
 import json
 import sys
-from typing import Any
-
-import numba.core.event
-from numba.core.dispatcher import Dispatcher
 
 from anser_ros.field.model import FieldModel
 from anser_ros.kernel_cache import PARTS, KernelCache, compile_kernels
@@ -20,7 +16,6 @@ from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import config_path, read_config
 
 SCHEMA = 'anser_warm_up/1'
-PACKAGE = 'anser_ros.'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,39 +38,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-class _Listener(numba.core.event.Listener):
-    """Notes every kernel of the package that has been compiled."""
-
-    def __init__(self, cache: KernelCache) -> None:
-        self._cache = cache
-
-    def on_start(self, event: Any) -> None:
-        """Do nothing: a kernel counts when it is there."""
-
-    def on_end(self, event: Any) -> None:
-        """Note the kernel that has been compiled, if it is of the package."""
-        function = event.data['dispatcher'].py_func
-        if function.__module__.startswith(PACKAGE):
-            self._cache.add(f'{function.__module__}.{function.__qualname__}')
-
-
-def kernels() -> dict[str, Dispatcher]:
-    """Return all kernels of the modules that have been imported, by name."""
-    modules = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
-    found = [v for module in modules for v in vars(module).values() if isinstance(v, Dispatcher)]
-    alone = [k for k in found if 'inline' not in k.targetoptions]
-    return {f'{k.py_func.__module__}.{k.py_func.__qualname__}': k for k in alone}
-
-
 def main(part: str) -> int:
     """Call the kernels of one part the way that nodes and commands do."""
-    cache = KernelCache()
-    numba.core.event.register('numba:compile', _Listener(cache))
     for step in STEPS[part]:
         step()
-    for name, kernel in kernels().items():
-        if kernel.signatures:
-            cache.add(name)
     return 0
 
 
