@@ -9,7 +9,7 @@ induces, in which a tone counts in proportion to its frequency.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 
@@ -141,11 +141,6 @@ MOST_PAIRS = 300
 """Pairs of channels that are tried at most, those of the lowest numbers: all of 25 channels."""
 
 
-def _pairs(count: int) -> list[tuple[int, int]]:
-    """Places of the off-diagonal entries, row by row."""
-    return [(i, j) for i in range(count) for j in range(count) if i != j]
-
-
 class ChannelCrosstalk(Effect[Term]):
     """Theta is the off-diagonal entries of M, row by row; readings are M times the true ones."""
 
@@ -174,7 +169,7 @@ class ChannelCrosstalk(Effect[Term]):
         matrix = self._matrix(term)[np.ix_(known, known)]
         own = np.linalg.solve(matrix, view.linear[:, here])
         out = view.columns(term.theta.size)
-        for column, (i, j) in enumerate(_pairs(size)):
+        for column, (i, j) in enumerate(permutations(range(size), 2)):
             if i in known and j in known:
                 out[:, rows[i], :, column] = own[:, known.index(j)]
         return out
@@ -182,7 +177,7 @@ class ChannelCrosstalk(Effect[Term]):
     def _matrix(self, term: Term) -> Array:
         size = len(term.site['channels'])
         matrix = np.eye(size)
-        for value, place in zip(term.theta, _pairs(size), strict=True):
+        for value, place in zip(term.theta, permutations(range(size), 2), strict=True):
             matrix[place] = value
         return matrix
 
@@ -217,7 +212,7 @@ class ChannelCrosstalk(Effect[Term]):
                 f'model: channel_crosstalk of {count} channels has a matrix {matrix.shape}'
             )
         matrix = matrix / np.diag(matrix)[:, None]
-        return Term(self, site, np.array([matrix[place] for place in _pairs(count)]))
+        return Term(self, site, matrix[~np.eye(count, dtype=bool)])
 
 
 PICKUP_UNIT = 1e-9
@@ -246,9 +241,9 @@ class Pickup(Effect[Term]):
         if row is None:
             return None
         emitters = view.omega.size
-        out = view.columns(2 * emitters)
-        for k in range(emitters):
-            out[:, row, k, k], out[:, row, k, emitters + k] = PICKUP_UNIT, 1j * PICKUP_UNIT
+        out, every = view.columns(2 * emitters), np.arange(emitters)
+        out[:, row, every, every] = PICKUP_UNIT
+        out[:, row, every, emitters + every] = 1j * PICKUP_UNIT
         return out
 
     def offset(self, term: Term, channels: Integers, emitters: int) -> ComplexArray:

@@ -184,11 +184,9 @@ class CoilCrosstalk(Effect[Term]):
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         coils = range(apparatus.emitters)
-        one_way: list[Site] = [{'coils': p} for p in permutations(coils, 2)]
+        one_way = [Term(self, {'coils': p}, np.zeros(2)) for p in permutations(coils, 2)]
         both: list[Site] = [{'coils': p, 'mutual': True} for p in combinations(coils, 2)]
-        return [
-            Term(self, site, np.zeros(1 if 'mutual' in site else 2)) for site in one_way + both
-        ]
+        return one_way + [Term(self, site, np.zeros(1)) for site in both]
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return the source emitter's flux, placed in the other emitter's tone."""
@@ -379,17 +377,18 @@ class EmitterSize(Effect[EmitterSizeTerm]):
 
         Those of a drawn emitter do not, so that one whose size is known is no candidate.
         """
-        light, found = apparatus.illumination, []
-        for k in range(apparatus.emitters):
-            axis = symmetry_axis(light.positions, light.directions, light.moments[:, k : k + 1])
-            if axis is not None:
-                found.append(
-                    EmitterSizeTerm(
-                        self, {'coil': k}, np.zeros(1), axis=axis.direction,
-                        modelled_m2=axis.second_moment_m2,
-                    )
-                )  # fmt: skip
-        return found
+        light = apparatus.illumination
+        axes = (
+            symmetry_axis(light.positions, light.directions, m[:, None]) for m in light.moments.T
+        )
+        return [
+            EmitterSizeTerm(
+                self, {'coil': k}, np.zeros(1), axis=axis.direction,
+                modelled_m2=axis.second_moment_m2,
+            )
+            for k, axis in enumerate(axes)
+            if axis is not None
+        ]  # fmt: skip
 
     def columns(self, term: EmitterSizeTerm, view: View) -> ComplexArray:
         """Return the flux that a unit of second moment adds."""

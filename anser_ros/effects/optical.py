@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,11 +21,8 @@ class OpticalEffect(Effect[TermT]):
     typical: ClassVar[tuple[float, ...]]
 
     def candidates(self, apparatus: Apparatus) -> Sequence[TermT]:
-        return [self.zero(apparatus)] if apparatus.tools else []
-
-    def zero(self, apparatus: Apparatus) -> TermT:
-        """Return the term with parameters of zero."""
-        return Term(self, {}, np.zeros(len(self.typical)))  # type: ignore[return-value]
+        zero = cast(TermT, Term(self, {}, np.zeros(len(self.typical))))
+        return [zero] if apparatus.tools else []
 
     def columns(self, term: TermT, view: View) -> ComplexArray | None:
         """Return the derivative by a tool's motion, or None for references."""
@@ -202,10 +199,10 @@ class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
     plausible = {'translation_m': (-0.05, 0.05), 'velocity_m_per_s': (-0.01, 0.01)}
     typical = (5e-3,) * 6
 
-    def zero(self, apparatus: Apparatus) -> RegistrationDriftTerm:
-        """Return no drift, over the session's time."""
+    def candidates(self, apparatus: Apparatus) -> Sequence[RegistrationDriftTerm]:
         duration = max(apparatus.duration, 1e-3)
-        return RegistrationDriftTerm(self, {}, np.zeros(6), duration=duration)
+        zero = RegistrationDriftTerm(self, {}, np.zeros(6), duration=duration)
+        return [zero] if apparatus.tools else []
 
     def amounts(self, term: RegistrationDriftTerm) -> Integers:
         """Return the growth's index alone: a constant shift is a registration's."""

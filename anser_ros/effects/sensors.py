@@ -35,17 +35,13 @@ class SensorAxis(Effect[SensorAxisTerm]):
     typical = 0.1  # tilts are some degrees
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
-        axes = {
-            int(c): tuple(float(v) for v in a)
-            for table in apparatus.tools
-            for c, a in zip(table.channel, table.axis, strict=True)
-        }
         terms = [
-            SensorAxisTerm(self, {'channel': c}, np.zeros(2), surveyed=axes[c])
-            for c in apparatus.tool_channels
+            SensorAxisTerm(self, {'channel': channel}, np.zeros(2), surveyed=tuple(axis))
+            for table in apparatus.tools
+            for channel, axis in zip(table.channel.tolist(), table.axis.tolist(), strict=True)
         ]
         # The turn of all that a tool has is hardly told from another frame of its poses.
-        return [*terms, *(t for t in self.anew(apparatus) if len(t.channels) < len(axes))]
+        return [*terms, *(t for t in self.anew(apparatus) if len(t.channels) < len(terms))]
 
     def anew(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
         return [SensorAxisTerm(self, {'channels': c}, np.zeros(3)) for c in apparatus.clusters()]
@@ -55,22 +51,17 @@ class SensorAxis(Effect[SensorAxisTerm]):
         if view.is_reference:
             return None
         out = view.columns(term.theta.size)
-        if 'channel' in term.site:
-            row = view.row(term.site['channel'])
+        for row in map(view.row, term.channels):
             if row is None:
                 return None
-            surveyed = np.array(term.surveyed)
-            pair, axis = tangents(surveyed[None])[0], self._tilted(term)
-            length = np.linalg.norm(surveyed + term.theta @ pair)
-            across = (pair - np.outer(pair @ axis, axis)) / length
+            if 'channel' in term.site:
+                surveyed = np.array(term.surveyed)
+                pair, axis = tangents(surveyed[None])[0], self._tilted(term)
+                length = np.linalg.norm(surveyed + term.theta @ pair)
+                across = (pair - np.outer(pair @ axis, axis)) / length
+            else:
+                across = np.cross(np.eye(3), view.sensors.axis[row])
             steps = np.einsum('fij,tj->fti', view.rotation, across)
-            out[:, row] = np.einsum('fik,fti->fkt', view.d_axis[:, row], steps)
-            return out
-        for row in map(view.row, term.site['channels']):
-            if row is None:
-                return None
-            axis = view.sensors.axis[row]
-            steps = np.einsum('fij,tj->fti', view.rotation, np.cross(np.eye(3), axis))
             out[:, row] = np.einsum('fik,fti->fkt', view.d_axis[:, row], steps)
         return out
 
@@ -130,13 +121,16 @@ class PlacedElsewhere(Effect[Term]):
     typical = 5e-3  # offsets are some millimetres
     recorded = {'offset_m': (3, 1.0)}
 
-    def rows(self, term: Term, sensors: SensorTable) -> Booleans:
-        """Return which sensors (S,) are shifted."""
-        raise NotImplementedError
+    @staticmethod
+    def _rows(term: Term, sensors: SensorTable) -> Booleans:
+        """Which sensors (S,) are shifted: those of the site's channels, or all of its body."""
+        if 'body' in term.site:
+            return np.array([body == term.site['body'] for body in sensors.body])
+        return np.isin(sensors.channel, term.site['channels'])
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return the derivative by the centres of those sensors, along the body's axes."""
-        rows = self.rows(term, view.sensors)
+        rows = self._rows(term, view.sensors)
         if view.is_reference or not rows.any():
             return None
         out = view.columns(3)
@@ -144,7 +138,7 @@ class PlacedElsewhere(Effect[Term]):
         return out
 
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
-        rows = self.rows(term, sensors)[:, None]
+        rows = self._rows(term, sensors)[:, None]
         return replace(sensors, position=sensors.position + rows * term.theta)
 
 
@@ -164,10 +158,6 @@ class SensorPosition(PlacedElsewhere):
                 groups += [g for g in apparatus.clusters() if own > set(g)]
         return [Term(self, {'channels': group}, np.zeros(3)) for group in groups]
 
-    def rows(self, term: Term, sensors: SensorTable) -> Booleans:
-        """Return the sensors of the site's channels."""
-        return np.isin(sensors.channel, term.site['channels'])
-
 
 class LeverArm(PlacedElsewhere):
     """Shifts all of a body's sensors."""
@@ -179,10 +169,6 @@ class LeverArm(PlacedElsewhere):
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         bodies = [table.body[0] for table in apparatus.tools if len(table)]
         return [Term(self, {'body': body}, np.zeros(3)) for body in bodies]
-
-    def rows(self, term: Term, sensors: SensorTable) -> Booleans:
-        """Return the sensors of the site's body."""
-        return np.array([body == term.site['body'] for body in sensors.body])
 
 
 SIZE_UNIT = 1e-4
