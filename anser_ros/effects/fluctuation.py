@@ -84,8 +84,7 @@ class Fluctuation(Effect[FluctuationTerm]):
     def term(self, record: EffectRecord) -> FluctuationTerm:
         """Return where it is; what it does in a frame only the frame can tell."""
         record.needed('rms')
-        given = {key: value for key, value in record.parameters.items() if key != 'rms'}
-        site = {key: READ_SITE[key](value) for key, value in given.items()}
+        site = {k: READ_SITE[k](v) for k, v in record.parameters.items() if k != 'rms'}
         return FluctuationTerm(self, cast(Site, site))
 
 
