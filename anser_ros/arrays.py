@@ -1,4 +1,6 @@
-"""Names the types of arrays that all packages use, by the kind of their values."""
+"""Names the types of arrays that all packages use; complex values by their parts."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,3 +11,14 @@ Single = NDArray[np.float32]
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 AnyArray = NDArray[np.generic]
+
+
+def complex_of(parts: Array) -> ComplexArray:
+    """Return complex numbers (n,) from their real, then imaginary parts (2 n,)."""
+    real, imaginary = parts.reshape(2, -1)
+    return np.asarray(real + 1j * imaginary)
+
+
+def pairs_of(values: ComplexArray) -> Any:
+    """Return complex numbers as a record has them, as lists of [re, im]."""
+    return np.stack([values.real, values.imag], axis=-1).tolist()

@@ -101,7 +101,7 @@ def _state() -> tuple[str, int]:
 
 
 class KernelCache:
-    """Keeps the mark, the lock and the progress of one state of the kernels' sources.
+    """Keeps the mark and the lock of one state of the kernels' sources, and counts what is there.
 
     They are in a folder, by default beside the kernels, of which there are ``total``.
     """
@@ -112,7 +112,6 @@ class KernelCache:
         processor = str(cpu_target.target_context.codegen().magic_tuple())
         name = f'{key}_{hashlib.sha256(processor.encode()).hexdigest()[:8]}'
         self._mark = self._folder / f'{name}.ready'
-        self._progress = self._folder / f'{name}.progress'
         self._lock = self._folder / 'kernels.lock'
 
     @property
@@ -122,15 +121,12 @@ class KernelCache:
 
     @property
     def done(self) -> int:
-        """Return how many kernels are known to be there."""
-        try:
-            return len(set(self._progress.read_text(encoding='utf-8').split()))
-        except FileNotFoundError:
-            return 0
+        """Return how many kernels are there, by the indices that numba keeps of them."""
+        return sum(1 for _ in self._folder.rglob('*.nbi'))
 
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
-        """Be the only process that compiles; wait for another one that does.
+    def locked(self) -> Iterator[bool]:
+        """Be the only process that compiles; False where another one does.
 
         Raises `ParameterError` when nothing can be written into the cache.
         """
@@ -143,22 +139,16 @@ class KernelCache:
                 f'{self._folder}: {error.strerror}'
             ) from error
         with lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
-
-    def begin(self) -> None:
-        """Forget how far an earlier attempt came."""
-        self._progress.unlink(missing_ok=True)
-
-    def add(self, name: str) -> None:
-        """Note a kernel that is there; processes may do so at the same time."""
-        with self._progress.open('a', encoding='utf-8') as file:
-            file.write(f'{name}\n')
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                yield False
+            else:
+                yield True
 
     def finish(self) -> None:
         """Note that all kernels are there, and remove those of sources that are long gone."""
         self._mark.touch()
-        self._progress.unlink(missing_ok=True)
         kept = kept_folder()
         if self._folder == kept:
             last = sorted(kept.parent.iterdir(), key=lambda f: f.stat().st_mtime, reverse=True)
@@ -167,36 +157,68 @@ class KernelCache:
 
 
 POLL_S = 0.1
-"""Time from one look at the compiling process to the next, s."""
-LINE_INTERVAL_S = 1.0
-"""Time from one line about the progress to the next, s."""
+"""Time from one look at the compiling processes to the next, s."""
+PARTS = ('coils', 'metal and bodies')
+"""What processes compile at the same time, as `cli.warm_up` has it."""
 
 
-def wait_for_kernels(say: Callable[[str], None]) -> str:
-    """Have all kernels compiled if they are not; return why it failed, empty when all is there.
+def compile_kernels(
+    say: Callable[[str], None],
+    is_stopped: Callable[[], bool] = lambda: False,
+    interval_s: float = 5.0,
+) -> None:
+    """Have processes compile all kernels that are not there, or wait for others that do.
 
-    Of nodes that start together one process compiles, and the others wait for it. ``say`` gets a
-    line at once and every second, none where all kernels are there.
+    ``say`` gets a line at the start and after each interval; ``is_stopped`` is whether to give up,
+    which is no error. Raises `ParameterError` when a process fails, with its last line.
     """
     cache = KernelCache()
     if cache.is_full:
-        return ''
-    command = [sys.executable, '-P', '-m', 'anser_ros.cli.main', 'warm_up']
-    process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
-    shown_s = -LINE_INTERVAL_S
+        return
+    begin_s = shown_s = time.monotonic()
+    words = f'compiling {cache.total} kernels, once after an installation'
+    say(words)
+
+    def wait() -> bool:
+        nonlocal shown_s
+        time.sleep(POLL_S)
+        if time.monotonic() - shown_s > interval_s:
+            shown_s = time.monotonic()
+            say(f'{words}: {cache.done} after {shown_s - begin_s:.0f} s')
+        return not is_stopped()
+
+    while not cache.is_full:
+        with cache.locked() as is_ours:
+            if not is_ours:
+                if wait():
+                    continue
+                return
+            with _processes() as running:
+                while any(process.poll() is None for process in running):
+                    if not wait():
+                        return
+                for process in running:
+                    if process.returncode:
+                        lines = process.communicate()[1].splitlines() or ['no word']
+                        raise ParameterError(f'kernels cannot be compiled: {lines[-1]}')
+            cache.finish()
+
+
+@contextlib.contextmanager
+def _processes() -> Iterator[list['subprocess.Popen[str]']]:
+    """Start a process for each part; end those that are left."""
+    command = [sys.executable, '-P', '-m', 'anser_ros.cli.warm_up']
+    running = [
+        subprocess.Popen(
+            [*command, part], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE, text=True,
+        )
+        for part in PARTS
+    ]  # fmt: skip
     try:
-        while process.poll() is None:
-            if time.monotonic() - shown_s >= LINE_INTERVAL_S:
-                shown_s = time.monotonic()
-                say(
-                    f'compiling kernels, once after an installation: {cache.done} of {cache.total}'
-                )
-            time.sleep(POLL_S)
+        yield running
     finally:
-        if process.poll() is None:
-            process.terminate()
-        words = process.communicate()[1].strip().splitlines()
-    return (words or ['no kernels'])[-1] if process.returncode else ''
+        for process in running:
+            if process.poll() is None:
+                process.kill()
+            process.communicate()

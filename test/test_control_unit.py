@@ -12,21 +12,8 @@ from anser_ros.simulation import effects
 from anser_ros.simulation.control_unit import ControlUnit, FrontEnd
 from anser_ros.simulation.effects import CATALOGUE, draw
 from anser_ros.simulation.world import World, steel_disc
+from anser_ros.wire import frames
 from anser_ros.wire.channel_calibration import parse_channels
-from anser_ros.wire.frames import (
-    DeviceState,
-    DeviceStatus,
-    Hello,
-    Identify,
-    Reply,
-    ReplyCode,
-    SampleBlock,
-    SamplesFlag,
-    SetFrequencies,
-    Start,
-    Stop,
-    encode,
-)
 from anser_ros.wire.protocols import FrameReader
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import config_path, read_config
@@ -54,26 +41,30 @@ def decode(pieces):
 
 def streamed(unit, samples):
     """Start a unit; return its bytes over so many samples."""
-    unit.receive(encode(Start()))
+    unit.receive(frames.encode(frames.Start()))
     return b''.join(piece.data for piece in unit.advance(samples))
 
 
 def codes_of(unit, samples):
     """Start a unit; return the codes of so many samples, shape (samples, columns)."""
     payloads = [record.payload for record in FrameReader().feed(streamed(unit, samples))]
-    return np.concatenate([p.codes for p in payloads if isinstance(p, SampleBlock)])
+    return np.concatenate([p.codes for p in payloads if isinstance(p, frames.SampleBlock)])
 
 
 def fluxes(unit, seconds=0.1):
     """Fluxes (windows, S, K), their sigmas and the mid times, as acquisition makes them."""
-    unit.receive(encode(Start()))
+    unit.receive(frames.encode(frames.Start()))
     begin, arrival_ns, found = unit.samples / unit.sample_rate_hz, 10**12, []
-    (hello,) = [p for p in decode(unit.receive(encode(Identify()))) if isinstance(p, Hello)]
+    (hello,) = [
+        p
+        for p in decode(unit.receive(frames.encode(frames.Identify())))
+        if isinstance(p, frames.Hello)
+    ]
     stream = FluxStream(hello, SETUP, CHANNELS, WINDOW_S, 1 / WINDOW_S)
     stream.restart(arrival_ns)
     for _ in range(round(seconds / 0.005)):
         for block in decode(unit.advance(200)):
-            if isinstance(block, SampleBlock):
+            if isinstance(block, frames.SampleBlock):
                 arrival_ns += 10**6
                 found += stream.push([block], [arrival_ns])
     flux = [np.concatenate([frame.tool.flux, frame.reference.flux]) for frame in found]
@@ -85,52 +76,54 @@ class TestProtocol:
     def test_says_hello_and_status_once_a_second_even_when_idle(self):
         unit = ControlUnit(world(), CHANNELS)
         payloads = [p for _ in range(300) for p in decode(unit.advance(400))]
-        assert [type(p) for p in payloads] == [Hello, DeviceStatus] * 3
-        assert payloads[1].state is DeviceState.IDLE
+        assert [type(p) for p in payloads] == [frames.Hello, frames.DeviceStatus] * 3
+        assert payloads[1].state is frames.DeviceState.IDLE
 
     def test_streams_between_start_and_stop(self):
         unit = ControlUnit(world(), CHANNELS)
         unit.advance(400)
-        (reply,) = decode(unit.receive(encode(Start(), 7)))
-        assert reply == Reply(0x82, ReplyCode.OK)
+        (reply,) = decode(unit.receive(frames.encode(frames.Start(), 7)))
+        assert reply == frames.Reply(0x82, frames.ReplyCode.OK)
         blocks = [p for _ in range(4) for p in decode(unit.advance(100))]
         assert [b.sequence for b in blocks] == list(range(10))
         assert [b.timestamp_ticks for b in blocks] == [10_000 + 1000 * k for k in range(10)]
         assert blocks[0].codes.shape == (40, 42)
-        unit.receive(encode(Stop()))
+        unit.receive(frames.encode(frames.Stop()))
         assert decode(unit.advance(100)) == []
 
     def test_time_that_was_skipped_is_missing_from_the_sequence(self):
         unit = ControlUnit(world(), CHANNELS)
-        unit.receive(encode(Start()))
+        unit.receive(frames.encode(frames.Start()))
         unit.advance(90)
         unit.skip(100)
-        blocks = [p for p in decode(unit.advance(50)) if isinstance(p, SampleBlock)]
+        blocks = [p for p in decode(unit.advance(50)) if isinstance(p, frames.SampleBlock)]
         assert [(b.sequence, b.timestamp_ticks, b.flags) for b in blocks] == [
-            (4, 4000, SamplesFlag.LOST_BEFORE),
+            (4, 4000, frames.SamplesFlag.LOST_BEFORE),
             (5, 5000, 0),
         ]
 
     def test_sets_tones_and_refuses_wrong_ones(self):
         unit = ControlUnit(world(), CHANNELS)
-        reply, hello = decode(unit.receive(encode(SetFrequencies(tuple(TONES + 1000)))))
-        assert reply.code is ReplyCode.OK
+        reply, hello = decode(
+            unit.receive(frames.encode(frames.SetFrequencies(tuple(TONES + 1000))))
+        )
+        assert reply.code is frames.ReplyCode.OK
         assert hello.frequencies_hz == tuple(TONES + 1000)
         for wrong in ((6000.0,), (30000.0,) * 8):
-            (reply,) = decode(unit.receive(encode(SetFrequencies(wrong))))
-            assert reply.code is ReplyCode.BAD_ARGUMENT and reply.text
+            (reply,) = decode(unit.receive(frames.encode(frames.SetFrequencies(wrong))))
+            assert reply.code is frames.ReplyCode.BAD_ARGUMENT and reply.text
 
     def test_counts_what_it_refused_and_what_it_dropped(self):
         unit = ControlUnit(world(), CHANNELS)
-        damaged = bytearray(encode(Start()))
+        damaged = bytearray(frames.encode(frames.Start()))
         damaged[-1] ^= 1
         assert unit.receive(bytes(damaged)) == []
-        assert unit.receive(encode(Reply(1, ReplyCode.OK))) == []
-        unit.receive(encode(Start()))
+        assert unit.receive(frames.encode(frames.Reply(1, frames.ReplyCode.OK))) == []
+        unit.receive(frames.encode(frames.Start()))
         unit.drop()
         payloads = decode(unit.advance(40))
         assert payloads[1].refused_records == 1 and payloads[1].dropped_blocks == 1
-        assert payloads[2].flags == SamplesFlag.LOST_BEFORE
+        assert payloads[2].flags == frames.SamplesFlag.LOST_BEFORE
 
 
 class TestSignals:
@@ -193,7 +186,7 @@ class TestEffects:
 
         def current_share(unit, seconds):
             unit.advance(int(seconds * unit.sample_rate_hz))
-            unit.receive(encode(Start()))
+            unit.receive(frames.encode(frames.Start()))
             got, _, times = fluxes(unit, 0.1)
             return got[:, 20, 2].real / [world().flux(t)[20, 2].real for t in times]
 

@@ -116,10 +116,8 @@ class TestTraces:
         trace = PoseTrace(target)
         trace.stamp_s += [0.55, 7.0]
         trace.position += [(0.55, 0.003, 0.12), (0.0, 0.0, 0.0)]
-        trace.axis += [(0.0, 1.0, 0.0), (0.0, 1.0, 0.0)]
-        away, angle = trace.errors(optical.track())
+        away = trace.distances(optical.track())
         assert away[0] == pytest.approx(0.003) and np.isnan(away[1])
-        assert angle[0] == pytest.approx(0.0, abs=1e-6)
 
     def test_what_is_forgotten_changes_no_row(self):
         optical, traces = OpticalTrace(), [PoseTrace(targets_of(SETUP)[0]) for _ in range(2)]
@@ -128,7 +126,6 @@ class TestTraces:
             for trace in traces:
                 trace.stamp_s.append(0.02 * k)
                 trace.position.append((1e-3 * k, 0.0, 0.12))
-                trace.axis.append((0.0, 1.0, 0.0))
                 trace.sigma_m.append(1e-4 * k)
                 trace.latency_s.append(1e-3)
             if k % 10 == 9:

@@ -144,9 +144,9 @@ def test_a_refit_says_in_how_many_frames_it_did_what():
     summary = RefitSummary()
     for state, out in (('refit', ()), ('refit', ('ref/1',)), ('frozen', ('ref/1',))):
         summary.add(SimpleNamespace(state=state, left_out=out))
-    document = to_document(Evaluation({}, {}, 0.0, summary))
+    document = to_document(Evaluation({}, {}, summary))
     assert document['refit'] == {'states': {'refit': 2, 'frozen': 1}, 'left_out': {'ref/1': 2}}
-    assert 'refit' not in to_document(Evaluation({}, {}, 0.0))
+    assert 'refit' not in to_document(Evaluation({}, {}))
 
 
 MODEL = REPO / 'config' / 'demo_model.yaml'
@@ -229,7 +229,7 @@ def series(name, scale, rng, lost=()):
 def evaluation():
     rng = np.random.default_rng(2)
     sensors = {n: series(n, 1.0, rng, lost) for n, lost in (('a/x', ()), ('a/y', (3, 4)))}
-    return Evaluation(sensors, {'a': series('a', 3.0, rng)}, 1e-3)
+    return Evaluation(sensors, {'a': series('a', 3.0, rng)})
 
 
 def test_sigma_that_is_too_small_shows(evaluation):
@@ -258,7 +258,7 @@ def test_the_page_holds_all_figures(evaluation, tmp_path):
     assert 'run &lt;1&gt;.mcap' in text and 'http' not in text
     nothing = np.full(FRAMES, np.nan)
     blind = PoseSeries('a', evaluation.bodies['a'].estimates, nothing, nothing)
-    seen = Evaluation({'a': blind}, {}, 1e-3)
+    seen = Evaluation({'a': blind}, {})
     assert not figures.write_figures(seen, document, tmp_path / 'none', session='', model='')
 
 

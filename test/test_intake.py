@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from anser_ros.errors import LayoutError
-from anser_ros.frames.faults import FAULTS, MISSING_CODE, reading_codes, value_codes
-from anser_ros.frames.intake import Intake
+from anser_ros.frames.intake import FAULTS, MISSING_CODE, Intake, reading_codes, value_codes
 from anser_ros.stamps import SECOND_NS, Order, order_of
 from anser_ros.wire.points import DROPPED, SATURATED, STALE
 

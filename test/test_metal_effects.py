@@ -17,16 +17,7 @@ from anser_ros.effects.correction import tool_view
 from anser_ros.effects.metal_at_rest import REMAINDER, UP_M, Couplings, IlluminationChange
 from anser_ros.effects.moving_metal import DepartedMetal, FreePath, StraightPath, moving_times
 from anser_ros.field.model import Dipoles
-from anser_ros.metal.body import (
-    BODIES,
-    ODD,
-    SMALL,
-    body_spread,
-    centre_sigma,
-    multipoles,
-    sheet_sources,
-    sphere_polarisability,
-)
+from anser_ros.metal import body as bodies
 from anser_ros.physics.constants import MU_0
 
 
@@ -52,7 +43,7 @@ def directions(rng, count):
 def test_a_large_perfect_sheet_is_a_mirror():
     source = Dipoles(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.array([[1.0 + 0j]]))
     centre, edges = np.array([0.0, 0.0, -0.1]), np.array([0.9, 0.9])
-    sheet = sheet_sources(centre, edges, 1e-9, 36, source, np.array([4e4]))
+    sheet = bodies.sheet_sources(centre, edges, 1e-9, 36, source, np.array([4e4]))
     image = Dipoles(np.array([[0.0, 0.0, -0.2]]), source.directions, -source.moments)
     points = np.array([[0.0, 0.0, 0.1], [0.05, 0.0, 0.12]])
     np.testing.assert_allclose(sheet.field(points)[:, 2], image.field(points)[:, 2], rtol=0.03)
@@ -86,10 +77,10 @@ def test_paths_keep_to_their_ends_and_times():
     np.testing.assert_allclose(moving_times(path, theta, time), [3.2, 6.8], atol=0.3)
 
 
-@pytest.mark.parametrize('kind', [*BODIES])
+@pytest.mark.parametrize('kind', [*bodies.BODIES])
 def test_a_body_answers_alike_whoever_asks(kind):
     """Modes, couplings and plain dipoles give one flux; sensor and emitter may change places."""
-    shapes = BODIES[kind]()
+    shapes = bodies.BODIES[kind]()
     rng = np.random.default_rng(5)
     couplings = rng.normal(size=shapes.size) + 1j * rng.normal(size=shapes.size)
     centre, omega = np.array([0.01, 0.02, -0.1]), 2e4 * np.pi * np.array([0.9, 1.0])
@@ -122,11 +113,11 @@ def test_a_coupled_body_is_a_sum_of_few_multipoles():
     places = np.c_[rng.uniform(-0.12, 0.12, (150, 2)), rng.uniform(0.1, 0.2, (150, 1))]
     axes = directions(rng, 150)
     wanted = sources.flux(places, axes, None)
-    shapes = multipoles()
+    shapes = bodies.multipoles()
     ears = shapes.received(centre, places, axes, np.zeros(150))
     drive = shapes.driven(emitters.field(centre + shapes.offsets))
     unit = shapes.mode_flux(ears, drive, np.eye(shapes.size), np.full(6, 4e4))
-    unit = (unit * body_spread(0.04, 1.0)).reshape(-1, shapes.size)
+    unit = (unit * bodies.body_spread(0.04, 1.0)).reshape(-1, shapes.size)
     normal = unit.T @ unit
     normal += 1e-9 * np.trace(normal) / len(normal) * np.eye(len(normal))
     solution = np.linalg.solve(normal, unit.T @ wanted.ravel())
@@ -138,13 +129,13 @@ def test_the_place_of_metal_is_no_surer_than_its_shape(found):
     """Of a ball's strength, however little the data scatter."""
     radius = 0.04
     ball = -2 * np.pi * radius**3 * np.eye(3).astype(complex)
-    assert centre_sigma(ball) == pytest.approx(ODD * radius)
+    assert bodies.centre_sigma(ball) == pytest.approx(bodies.ODD * radius)
     for name, keys in (('static_metal', ['position_m']), ('moving_metal', ['start_m', 'path'])):
         term = found[name]
         record = term.effect.record(term, np.zeros((term.theta.size, term.theta.size)))
         total = np.array(record.parameters['polarizability']) @ [1.0, 1.0j]
         for key in keys:
-            assert np.min(record.uncertainty[key]) >= centre_sigma(total) > 1e-3
+            assert np.min(record.uncertainty[key]) >= bodies.centre_sigma(total) > 1e-3
 
 
 @pytest.mark.parametrize('metal', ['static_metal', 'conductive_plate', 'moving_metal'])
@@ -170,7 +161,7 @@ def test_a_coil_that_moved_lights_metal_from_where_it_is(problem, found, metal):
 
 def test_leftovers_are_linear_and_belong_to_their_metal(problem, found):
     parent = found['static_metal']
-    shapes = multipoles()
+    shapes = bodies.multipoles()
     rng = np.random.default_rng(0)
     modes = 0.1 * rng.normal(size=(shapes.size, 4))
     view = tool_view(problem.tools[0], [], problem.fields)
@@ -211,7 +202,7 @@ BALLS = np.array([[0.0, 0.0, 0.0], [0.04, 0.01, 0.0], [-0.01, 0.035, 0.01]])
 def metal_at(centre, light, omega):
     """Dipoles of three conducting balls that do not see each other."""
     points = centre + BALLS
-    strength = sphere_polarisability(0.016, 3.5e7, 1.0, omega)
+    strength = bodies.sphere_polarisability(0.016, 3.5e7, 1.0, omega)
     return Dipoles.vectors(points, light.field(points) * strength)
 
 
@@ -288,7 +279,7 @@ RADIUS = 0.02
 def polarisability(radius, conductivity, permeability, frequency):
     """Return the sphere's polarisability at one frequency, m^3."""
     omega = np.array([2 * math.pi * frequency])
-    return MU_0 * sphere_polarisability(radius, conductivity, permeability, omega)[0]
+    return MU_0 * bodies.sphere_polarisability(radius, conductivity, permeability, omega)[0]
 
 
 def test_static_permeable_sphere():
@@ -312,8 +303,10 @@ def test_conductor_against_the_bessel_series(frequency):
 
 
 def test_the_series_and_the_closed_form_meet():
-    edge = (SMALL / RADIUS) ** 2 / MU_0
-    below, above = sphere_polarisability(RADIUS, 1.0, 1.0, edge * np.array([0.99999, 1.00001]))
+    edge = (bodies.SMALL / RADIUS) ** 2 / MU_0
+    below, above = bodies.sphere_polarisability(
+        RADIUS, 1.0, 1.0, edge * np.array([0.99999, 1.00001])
+    )
     assert above == pytest.approx(below, rel=5e-5)
 
 

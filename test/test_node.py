@@ -1,6 +1,8 @@
 """The base of the nodes: parameter tables, diagnostics, guarded callbacks, start and end."""
 
+import os
 import signal
+import subprocess
 import sys
 import time
 from dataclasses import dataclass
@@ -19,6 +21,7 @@ from anser_ros.nodes.runtime import process as processes
 from anser_ros.nodes.runtime.diagnostics import Throttle
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import complaints, parameter
+from anser_ros.parallel import ONE_THREAD
 
 pytestmark = pytest.mark.light
 
@@ -275,3 +278,15 @@ def test_the_executor_is_the_one_told_of_events_where_rclpy_has_it(monkeypatch):
     monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)
     monkeypatch.setattr(processes, 'SingleThreadedExecutor', lambda: 'waiting')
     assert processes.make_executor() == 'waiting'
+
+
+@pytest.mark.processes
+def test_a_node_gives_blas_one_thread_before_numpy_reads_it():
+    asked = (
+        'import os, sys, anser_ros.nodes as n\n'
+        'print("numpy" in sys.modules, *map(os.environ.get, n.ONE_THREAD))'
+    )
+    free = {name: text for name, text in os.environ.items() if name not in ONE_THREAD}
+    for own, expected in (({}, 'False 1 1 1'), ({ONE_THREAD[0]: '2'}, 'False 2 1 1')):
+        done = subprocess.run([sys.executable, '-c', asked], env=free | own, capture_output=True)
+        assert done.stdout.decode().strip() == expected, done.stderr

@@ -148,8 +148,7 @@ def track(
     >>> result.to_dict()['bodies']['tool_a']['position_rmse_m'] < 0.2e-3
     True
     """
-    usual = TrackerSettings()
-    settings = usual if gate is None else TrackerSettings(gate=gate)
+    settings = TrackerSettings() if gate is None else TrackerSettings(gate=gate)
     found = track_session(session, model.field, settings, baseline, refit, progress=progress)
     tables: dict[str, dict[str, TrackedPoses]] = {}
     for group, series in (('sensors', found.sensors), ('bodies', found.bodies)):

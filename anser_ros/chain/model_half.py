@@ -6,8 +6,7 @@ from anser_ros.arrays import Array
 from anser_ros.chain.frame import Answer, ChainFrame, FrameReadings
 from anser_ros.effects.correction import Correction
 from anser_ros.field.model import FieldModel
-from anser_ros.frames.faults import GOOD, reading_codes
-from anser_ros.frames.intake import Frame, Intake
+from anser_ros.frames.intake import GOOD, Frame, Intake, reading_codes
 from anser_ros.pose_states import OK, Withheld
 from anser_ros.refit.frame import Pace
 from anser_ros.refit.live_refit import LiveRefit

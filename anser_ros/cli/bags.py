@@ -36,7 +36,6 @@ and 0.4 mrad each."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = 'example: anser bags --out bags/'
     parser.add_argument(
         '--setup', default='demo_setup.yaml',

@@ -5,9 +5,11 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 from rich.table import Table
 
 from anser_ros.arrays import Array
@@ -17,6 +19,7 @@ from anser_ros.calibration.result import Calibration, to_document
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli import output
 from anser_ros.cli.diagnosis_words import flux_unit
+from anser_ros.cli.page import legend_under
 from anser_ros.effects.effect import effect_named
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.field.model import EffectRecord
@@ -32,7 +35,6 @@ LONG = ('values', 'uncertainty', 'axes')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = 'example: anser calibrate bags/scan.mcap --out model.yaml --report report/'
     parser.add_argument('sessions', nargs='+', metavar='SESSION', help='bags to learn from')
     words = 'model file to write; its folder is made if missing'
@@ -162,10 +164,6 @@ def _short(value: Any) -> str:
     return f'{value:.5g}' if isinstance(value, float) else str(value)
 
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-
 SHOWN_UNITS = {
     '1': (100.0, '%'),
     'rad': (1e3, 'mrad'),
@@ -204,7 +202,7 @@ def population_table(records: Sequence[EffectRecord]) -> tuple[list[str], list[l
     return head, [list(row) for row in zip(*columns, strict=True)]
 
 
-def population_figure(records: Sequence[EffectRecord]) -> 'Figure | None':
+def population_figure(records: Sequence[EffectRecord]) -> Figure | None:
     """Draw each channel's values with one sigma, and the population's width behind them.
 
     Returns None where no record is a population.
@@ -212,10 +210,6 @@ def population_figure(records: Sequence[EffectRecord]) -> 'Figure | None':
     found = populations(records)
     if not found:
         return None
-    from matplotlib import pyplot as plt
-
-    from anser_ros.cli.page import legend_under
-
     width = 4 * len(found)
     figure, panels = plt.subplots(
         1, len(found), figsize=(width, 3.5), squeeze=False, layout='constrained'
@@ -253,17 +247,13 @@ def _shown(record: EffectRecord) -> tuple[tuple[str, ...], str, Array, Array]:
     return ('rms',), unit, mean[0], mean[1]
 
 
-def choice_figure(calibration: Calibration) -> 'Figure | None':
+def choice_figure(calibration: Calibration) -> Figure | None:
     """Draw held-out errors by the number of dipoles, and by damping for the six best layouts.
 
     Returns None where no layouts were compared.
     """
     if not calibration.candidates:
         return None
-    from matplotlib import pyplot as plt
-
-    from anser_ros.cli.page import legend_under
-
     layout = replace(calibration.layout, local=False)
     picked = next(one for one in calibration.candidates if one.layout == layout)
     factor, unit = flux_unit(picked.score)

@@ -4,8 +4,6 @@ Two chains of field model and tracker run side by side: one refits its model to 
 coils, the other keeps the model as calibrated. A steel disc comes from below and leaves again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -25,8 +23,8 @@ from anser_ros.cli.commands import COMPOSED, NODES
 from anser_ros.cli.main import check_packages
 from anser_ros.cli.output import add_json, add_out, make_new_folder
 from anser_ros.cli.processes import LAST_DOMAIN, VARIABLE, Supervisor, own_domain, tail
-from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.errors import ParameterError
+from anser_ros.kernel_cache import compile_kernels
 from anser_ros.tracking.estimate import NO_GATE
 from anser_ros.wire.bag_writer import bag_summary
 from anser_ros.wire.text_files import config_path

@@ -17,14 +17,7 @@ from anser_ros.arrays import Array
 from anser_ros.cli import output
 from anser_ros.cli import page as html
 from anser_ros.cli.calibrate import population_figure, population_table
-from anser_ros.cli.diagnosis_words import (
-    flux_unit,
-    held_out_rows,
-    paths,
-    short_ones,
-    value_text,
-    verdict,
-)
+from anser_ros.cli.diagnosis_words import flux_unit, held_out_rows, short_ones, value_text, verdict
 from anser_ros.cli.sessions import add_session_kinds, named_kind, need_model, snapshot_notes
 from anser_ros.diagnosis.problem import Part, State, tool_parts
 from anser_ros.diagnosis.search import Candidate
@@ -35,7 +28,6 @@ from anser_ros.sessions.starting_model import model_for, save_model
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = (
         'example: anser diagnose bags/moving.mcap --model config/demo_model.yaml --out result/'
     )
@@ -88,18 +80,12 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
 def strongest(state: State) -> str:
     """State in words on which channel and emitter the residual is largest."""
     largest = []
-    parts = tool_parts(state)
-    for kind, axis in (('channel', 1), ('emitter', 0)):
-        sizes: dict[int, float] = {}
-        for part in parts:
-            values = np.sqrt(_power(part).mean(axis=axis)).tolist()
-            names = part.view.sensors.channel.tolist() if axis else range(len(values))
-            for name, value in zip(names, values, strict=True):
-                sizes[name] = max(sizes.get(name, 0.0), value)
-        worst = max(sizes, key=lambda name: sizes[name])
-        usual = float(np.median(list(sizes.values())))
+    for kind in ('channel', 'emitter'):
+        names, sizes = _by(state, kind)
+        worst = int(np.argmax(sizes))
         largest.append(
-            f'{kind} {worst} ({sizes[worst]:.1f} times the expected, the median is {usual:.1f}'
+            f'{kind} {names[worst]} ({sizes[worst]:.1f} times the expected, the median is '
+            f'{np.median(sizes):.1f}'
         )
     return f'It is largest on {") and on ".join(largest)}).'
 
@@ -271,7 +257,9 @@ def effects_section(document: dict[str, Any]) -> Iterator[str]:
 def _paths(document: dict[str, Any], result: SessionDiagnosis) -> Iterator[str]:
     """Every course that an effect was found to have: a picture, and its numbers on demand."""
     for effect in document['effects']:
-        for key, path in paths(effect['parameters']):
+        for key, path in effect['parameters'].items():
+            if not isinstance(path, dict) or 'time_s' not in path:
+                continue
             sigma = effect['uncertainty'].get(key)
             yield html.heading(f'{effect["name"]}: {key}', level=3)
             if 'position_m' in path:

@@ -107,15 +107,6 @@ def short_ones(parameters: dict[str, Any]) -> list[tuple[str, Any]]:
     return [(key, value) for key, value in parameters.items() if _size(value) <= LONGEST]
 
 
-def paths(parameters: dict[str, Any]) -> list[tuple[str, dict[str, list[Any]]]]:
-    """Return parameters that are courses over time, by name: columns of equal length."""
-    return [
-        (key, value)
-        for key, value in parameters.items()
-        if isinstance(value, dict) and 'time_s' in value
-    ]
-
-
 def _size(value: Any) -> int:
     if isinstance(value, dict):
         return sum(_size(item) for item in value.values())

@@ -9,7 +9,6 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from anser_ros import extensions
 from anser_ros.cli import output, sessions
@@ -23,8 +22,6 @@ from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, track_session
 from anser_ros.tracking.estimate import TrackerSettings
-
-Array = NDArray[np.float64]
 
 MOST_POINTS = 4000
 """Most points that a figure shows of one coil: more cannot be distinguished."""

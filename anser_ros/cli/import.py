@@ -14,7 +14,6 @@ DOCUMENTS = ('.yaml', '.yml')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = (
         'example: anser import examples/data/tables.yaml --out session.mcap; with the bag of '
         'another program: anser import rosbag2_folder/ --remap /em/flux:=/anser/tool/flux '

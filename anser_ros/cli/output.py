@@ -142,7 +142,7 @@ def progress_of(command: str) -> Iterator[Tell]:
     """Yield a function that takes how far a command is, which a bar or lines then show."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _Lines(command).tell
+        yield _lines(command)
         return
     columns = (
         TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(),
@@ -186,28 +186,24 @@ class _Remaining:
         return f'about {took_s * (1.0 - share) / (share - done):.0f} s left'
 
 
-class _Lines:
-    """Says a line on stderr every few seconds; a short command says nothing."""
+def _lines(command: str) -> Tell:
+    """What says a line on stderr every few seconds; of a short command it says nothing."""
+    remaining, begin_s = _Remaining(), time.monotonic()
+    shown_s = begin_s
 
-    def __init__(self, command: str) -> None:
-        self._command, self._remaining = command, _Remaining()
-        self._begin_s = self._shown_s = time.monotonic()
-
-    def tell(self, stage: str, share: float | None = None) -> None:
-        """Take in how far a stage is, and say it where it is time to."""
+    def tell(stage: str, share: float | None = None) -> None:
+        nonlocal shown_s
         now_s = time.monotonic()
         if share is None:
-            if now_s - self._begin_s > LINE_INTERVAL_S:
-                self._say(f'{stage}, after {now_s - self._begin_s:.0f} s')
-            return
-        left = self._remaining.words(stage, share)
-        if now_s - self._shown_s < LINE_INTERVAL_S:
-            return
-        self._shown_s = now_s
-        self._say(', '.join(filter(None, (f'{stage}, {share:.0%}', left))))
+            past_s, words = now_s - begin_s, f'after {now_s - begin_s:.0f} s'
+        else:
+            left = remaining.words(stage, share)
+            past_s, words = now_s - shown_s, ', '.join(filter(None, (f'{share:.0%}', left)))
+        if past_s >= LINE_INTERVAL_S:
+            shown_s = shown_s if share is None else now_s
+            print(f'{command}: {stage}, {words}', file=sys.stderr, flush=True)
 
-    def _say(self, words: str) -> None:
-        print(f'{self._command}: {words}', file=sys.stderr, flush=True)
+    return tell
 
 
 def check_file(path: Path) -> None:

@@ -55,7 +55,6 @@ class Proposal(NamedTuple):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = (
         'example: anser place config/demo_setup.yaml --references 8 --from frame --out places/'
     )

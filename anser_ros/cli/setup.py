@@ -347,7 +347,6 @@ DOCUMENT, PICTURE = 'setup.yaml', 'setup.png'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = (
         'example: anser setup --board anser '
         '--sensor "0,pen/0,pen,0,0,0,z" --sensor "16,ref/0,fg,150,0,20,1 0 1" --out my_setup/; '

@@ -7,31 +7,18 @@ installer, it can be done before: as the user who will run the nodes.
 import argparse
 import contextlib
 import json
-import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from typing import Any
 
-import numba.core.event
-from numba.core.dispatcher import Dispatcher
-
-from anser_ros.cli.output import LINE_INTERVAL_S
-from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.kernel_cache import KernelCache
+from anser_ros.kernel_cache import PARTS, KernelCache, compile_kernels
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import config_path, read_config
 
 SCHEMA = 'anser_warm_up/1'
-POLL_S = 0.2
-"""Time from one look at the processes to the next, s: how late their end is noticed."""
-PACKAGE = 'anser_ros.'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
     parser.epilog = 'example: anser warm_up'
     parser.add_argument('--json', action='store_true', help='print the number of kernels as JSON')
 
@@ -51,91 +38,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def compile_kernels(
-    say: Callable[[str], None], is_stopped: Callable[[], bool] = lambda: False
-) -> None:
-    """Let processes compile all kernels, unless they are there.
-
-    ``say`` gets a line at the start and every few seconds; ``is_stopped`` is whether to give up,
-    which is no error. Raises `ParameterError` when a process fails, with its last line.
-    """
-    cache = KernelCache()
-    if cache.is_full:
-        return
-    with cache.locked():
-        if cache.is_full:
-            return
-        cache.begin()
-        begin_s = shown_s = time.monotonic()
-        say(f'compiling {cache.total} kernels, once after an installation')
-        with _processes() as running:
-            while any(process.poll() is None for process in running):
-                if is_stopped():
-                    return
-                if time.monotonic() - shown_s > LINE_INTERVAL_S:
-                    shown_s = time.monotonic()
-                    say(f'{cache.done} of {cache.total} kernels, {shown_s - begin_s:.0f} s')
-                time.sleep(POLL_S)
-            for process in running:
-                if process.returncode:
-                    lines = process.communicate()[1].splitlines() or ['no word']
-                    raise ParameterError(f'kernels cannot be compiled: {lines[-1]}')
-        cache.finish()
-
-
-@contextlib.contextmanager
-def _processes() -> Iterator[list['subprocess.Popen[str]']]:
-    """Start a process for each part; end those that are left."""
-    command = [sys.executable, '-P', '-m', 'anser_ros.cli.warm_up']
-    running = [
-        subprocess.Popen(
-            [*command, part], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE, text=True,
-        )
-        for part in PARTS
-    ]  # fmt: skip
-    try:
-        yield running
-    finally:
-        for process in running:
-            if process.poll() is None:
-                process.kill()
-            process.communicate()
-
-
-class _Listener(numba.core.event.Listener):
-    """Notes every kernel of the package that has been compiled."""
-
-    def __init__(self, cache: KernelCache) -> None:
-        self._cache = cache
-
-    def on_start(self, event: Any) -> None:
-        """Do nothing: a kernel counts when it is there."""
-
-    def on_end(self, event: Any) -> None:
-        """Note the kernel that has been compiled, if it is of the package."""
-        function = event.data['dispatcher'].py_func
-        if function.__module__.startswith(PACKAGE):
-            self._cache.add(f'{function.__module__}.{function.__qualname__}')
-
-
-def kernels() -> dict[str, Dispatcher]:
-    """Return all kernels of the modules that have been imported, by name."""
-    modules = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
-    found = [v for module in modules for v in vars(module).values() if isinstance(v, Dispatcher)]
-    alone = [k for k in found if 'inline' not in k.targetoptions]
-    return {f'{k.py_func.__module__}.{k.py_func.__qualname__}': k for k in alone}
-
-
 def main(part: str) -> int:
     """Call the kernels of one part the way that nodes and commands do."""
-    cache = KernelCache()
-    numba.core.event.register('numba:compile', _Listener(cache))
-    for step in PARTS[part]:
+    for step in STEPS[part]:
         step()
-    for name, kernel in kernels().items():
-        if kernel.signatures:
-            cache.add(name)
     return 0
 
 
@@ -196,7 +102,7 @@ def _demo_model() -> FieldModel:
     return load_model(config_path('demo_model.yaml'))
 
 
-PARTS = {'coils': (_track,), 'metal and bodies': (_solve_body, _refit, _watch_samples)}
+STEPS = dict(zip(PARTS, ((_track,), (_solve_body, _refit, _watch_samples)), strict=True))
 """What each of the processes does, both for as long. What one has compiled the other one loads: so
 bodies, which tracking comes to last, are the second one's first."""
 

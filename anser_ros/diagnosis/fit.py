@@ -19,18 +19,10 @@ from anser_ros.diagnosis.engine import BlockSums, JointFit, block_sums, descende
 from anser_ros.diagnosis.problem import Problem, State, evaluate, tools_misfit
 from anser_ros.diagnosis.screening import noise_scale
 from anser_ros.effects.base import View
-from anser_ros.effects.effect import (
-    BodyTerm,
-    Family,
-    Resting,
-    Richness,
-    SizedShapes,
-    Term,
-    both_phases,
-)
+from anser_ros.effects.effect import BodyTerm, Family, Resting, Richness, SizedShapes, Term
 from anser_ros.effects.metal_at_rest import REMAINDER, Couplings, IlluminationChange
 from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
-from anser_ros.metal.scattering import Shapes
+from anser_ros.metal.scattering import Shapes, both_phases
 from anser_ros.parallel import in_order
 
 Known = tuple[list[Array | None], Array]

@@ -31,10 +31,10 @@ class Remedy(Enum):
 class BaseEffect(Generic[AnyTerm]):
     """Changes nothing; it is the base of the effects on fluxes and on poses."""
 
-    name: ClassVar[str] = ''
-    summary: ClassVar[str] = ''
-    units: ClassVar[Mapping[str, str]] = {}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    name: str = ''
+    summary: str = ''
+    units: Mapping[str, str] = {}
+    plausible: Mapping[str, tuple[float, float]] = {}
     remedy: ClassVar[Remedy] = Remedy.NONE
     # standard deviation of each parameter, or of all, before anything is measured
     typical: ClassVar[float | tuple[float, ...]] = 1.0

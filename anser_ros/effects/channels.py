@@ -9,23 +9,13 @@ induces, in which a tone counts in proportion to its frequency.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 
-from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.arrays import Array, ComplexArray, Integers, complex_of, pairs_of
 from anser_ros.effects.base import Apparatus, View
-from anser_ros.effects.effect import (
-    Effect,
-    Remedy,
-    Site,
-    Term,
-    complex_of,
-    needed,
-    pairs_of,
-    recorded_site,
-    sigmas,
-)
+from anser_ros.effects.effect import Effect, Remedy, Site, Term, sigmas
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 
@@ -45,12 +35,12 @@ class ComplexGain(Effect[Term]):
         sigma_gain, sigma_rad = (np.sqrt(way @ covariance @ way) for way in (along, across))
         figures = {'gain': abs(gain), 'phase_deg': float(np.degrees(np.angle(gain)))}
         deviations = {'gain': float(sigma_gain), 'phase_deg': float(np.degrees(sigma_rad))}
-        return EffectRecord(self.name, {**recorded_site(term), **figures}, deviations)
+        return EffectRecord(self.name, {**term.recorded_site, **figures}, deviations)
 
     def term(self, record: EffectRecord) -> Term:
         """Return the term of a gain and a phase; a record without a phase has none."""
         phase = np.radians(float(record.parameters.get('phase_deg', 0.0)))
-        gain = float(needed(record, 'gain')) * np.exp(1j * phase)
+        gain = float(record.needed('gain')) * np.exp(1j * phase)
         return Term(self, self.site_of(record), np.array([gain.real - 1, gain.imag]))
 
 
@@ -118,7 +108,7 @@ class CommonGain(Effect[Term]):
         return EffectRecord(self.name, {'gain': gain}, {'gain': sigma})
 
     def term(self, record: EffectRecord) -> Term:
-        return Term(self, {}, np.array([float(needed(record, 'gain')) - 1]))
+        return Term(self, {}, np.array([float(record.needed('gain')) - 1]))
 
 
 DELAY_UNIT = 1e-6
@@ -151,11 +141,6 @@ MOST_PAIRS = 300
 """Pairs of channels that are tried at most, those of the lowest numbers: all of 25 channels."""
 
 
-def _pairs(count: int) -> list[tuple[int, int]]:
-    """Places of the off-diagonal entries, row by row."""
-    return [(i, j) for i in range(count) for j in range(count) if i != j]
-
-
 class ChannelCrosstalk(Effect[Term]):
     """Theta is the off-diagonal entries of M, row by row; readings are M times the true ones."""
 
@@ -184,7 +169,7 @@ class ChannelCrosstalk(Effect[Term]):
         matrix = self._matrix(term)[np.ix_(known, known)]
         own = np.linalg.solve(matrix, view.linear[:, here])
         out = view.columns(term.theta.size)
-        for column, (i, j) in enumerate(_pairs(size)):
+        for column, (i, j) in enumerate(permutations(range(size), 2)):
             if i in known and j in known:
                 out[:, rows[i], :, column] = own[:, known.index(j)]
         return out
@@ -192,7 +177,7 @@ class ChannelCrosstalk(Effect[Term]):
     def _matrix(self, term: Term) -> Array:
         size = len(term.site['channels'])
         matrix = np.eye(size)
-        for value, place in zip(term.theta, _pairs(size), strict=True):
+        for value, place in zip(term.theta, permutations(range(size), 2), strict=True):
             matrix[place] = value
         return matrix
 
@@ -209,7 +194,7 @@ class ChannelCrosstalk(Effect[Term]):
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         matrix = self._matrix(term)
         sigma = self._matrix(term.with_theta(sigmas(covariance))) - np.eye(len(matrix))
-        parameters = {**recorded_site(term), 'matrix': matrix.tolist()}
+        parameters = {**term.recorded_site, 'matrix': matrix.tolist()}
         return EffectRecord(self.name, parameters, {'matrix': sigma.tolist()})
 
     def possible(self, record: EffectRecord) -> bool:
@@ -221,13 +206,13 @@ class ChannelCrosstalk(Effect[Term]):
         """Read the leaks from a record's matrix, whose diagonal is scaled to one."""
         site = self.site_of(record)
         count = len(site['channels'])
-        matrix = np.asarray(needed(record, 'matrix'), dtype=np.float64)
+        matrix = np.asarray(record.needed('matrix'), dtype=np.float64)
         if matrix.shape != (count, count):
             raise ModelFileError(
                 f'model: channel_crosstalk of {count} channels has a matrix {matrix.shape}'
             )
         matrix = matrix / np.diag(matrix)[:, None]
-        return Term(self, site, np.array([matrix[place] for place in _pairs(count)]))
+        return Term(self, site, matrix[~np.eye(count, dtype=bool)])
 
 
 PICKUP_UNIT = 1e-9
@@ -256,9 +241,9 @@ class Pickup(Effect[Term]):
         if row is None:
             return None
         emitters = view.omega.size
-        out = view.columns(2 * emitters)
-        for k in range(emitters):
-            out[:, row, k, k], out[:, row, k, emitters + k] = PICKUP_UNIT, 1j * PICKUP_UNIT
+        out, every = view.columns(2 * emitters), np.arange(emitters)
+        out[:, row, every, every] = PICKUP_UNIT
+        out[:, row, every, emitters + every] = 1j * PICKUP_UNIT
         return out
 
     def offset(self, term: Term, channels: Integers, emitters: int) -> ComplexArray:
@@ -272,12 +257,12 @@ class Pickup(Effect[Term]):
         rms = float(np.sqrt(np.mean(np.abs(phasor) ** 2)))
         return EffectRecord(
             self.name,
-            {**recorded_site(term), 'phasor_t': pairs_of(phasor), 'rms_t': rms},
+            {**term.recorded_site, 'phasor_t': pairs_of(phasor), 'rms_t': rms},
             {'phasor_t': sigma.T.tolist(), 'rms_t': float(np.sqrt(np.mean(sigma**2)))},
         )
 
     def term(self, record: EffectRecord) -> Term:
-        parts = np.asarray(needed(record, 'phasor_t'), dtype=np.float64)
+        parts = np.asarray(record.needed('phasor_t'), dtype=np.float64)
         return Term(self, self.site_of(record), parts.T.ravel() / PICKUP_UNIT)
 
 
@@ -402,14 +387,14 @@ class Saturation(Effect[SaturationTerm]):
         full_scale = 1 / np.sqrt(SATURATION_UNIT * value)
         relative = 0.5 * float(np.sqrt(covariance[0, 0])) / value
         parameters = {
-            **recorded_site(term),
+            **term.recorded_site,
             'full_scale_t': float(full_scale),
             'tone_weights': term.weights.tolist(),
         }
         return EffectRecord(self.name, parameters, {'full_scale_t': float(full_scale * relative)})
 
     def term(self, record: EffectRecord) -> SaturationTerm:
-        full_scale = float(needed(record, 'full_scale_t'))
+        full_scale = float(record.needed('full_scale_t'))
         site: Site = {
             **self.site_of(record),
             'shape': str(record.parameters.get('shape', SHAPES[0])),

@@ -89,30 +89,22 @@ def reference_view(
     reference: Measurements, baseline: ComplexArray, terms: Sequence[Term], fields: Fields
 ) -> View:
     """Predict the reference sensors: their clean readings (S, K) and what the effects change."""
-    sensors, frames = reference.sensors, reference.time.size
-    base = fields.illumination
+    sensors, base = reference.sensors, fields.illumination
     added = _sources(terms, fields, base)
-    flux, d_position, d_axis = fields.slopes(
-        sensors.position, sensors.axis, sensors.length, far=True
-    )
-    change = np.zeros_like(flux)
-    if added.positions.shape[0]:
-        change = added.flux(sensors.position, sensors.axis, sensors.length)
-    shape = (frames, *change.shape)
-    eye = np.broadcast_to(np.eye(3), (frames, 3, 3))
-    linear = np.broadcast_to(baseline + change, shape)
+    where = sensors.position, sensors.axis, sensors.length
+    _, d_position, d_axis = fields.slopes(*where, far=True)
+
+    def always(values: Any) -> Any:
+        return np.broadcast_to(values, (reference.time.size, *values.shape))
+
+    linear = always(baseline + added.flux(*where))
     view = View(
-        time=reference.time, sensors=sensors, position=np.zeros((frames, 3)), rotation=eye,
-        velocity=np.zeros((frames, 6)),
-        centres=np.broadcast_to(sensors.position, (frames, len(sensors), 3)),
-        axes=np.broadcast_to(sensors.axis, (frames, len(sensors), 3)),
-        linear=linear, flux=linear,
-        d_position=np.broadcast_to(d_position, (frames, *d_position.shape)),
-        d_axis=np.broadcast_to(d_axis, (frames, *d_axis.shape)),
-        d_turn=np.broadcast_to(np.zeros_like(d_axis), (frames, *d_axis.shape)),
-        dipoles=base.joined(added), illumination=changed_illumination(terms, base),
-        omega=fields.omega,
-        is_reference=True,
+        time=reference.time, sensors=sensors, position=always(np.zeros(3)),
+        rotation=always(np.eye(3)), velocity=always(np.zeros(6)),
+        centres=always(sensors.position), axes=always(sensors.axis), linear=linear, flux=linear,
+        d_position=always(d_position), d_axis=always(d_axis),
+        d_turn=always(np.zeros_like(d_axis)), dipoles=base.joined(added),
+        illumination=changed_illumination(terms, base), omega=fields.omega, is_reference=True,
     )  # fmt: skip
     return _measured(_with_motion(view, terms), terms)
 

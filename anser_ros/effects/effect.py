@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import anser_ros.effects
-from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.arrays import Array, ComplexArray, Integers, complex_of
 from anser_ros.effects.base import Apparatus, BaseEffect, BaseTerm, View
 from anser_ros.effects.base import Remedy as Remedy
 from anser_ros.errors import ModelFileError
@@ -87,6 +87,11 @@ class Term(BaseTerm):
     def belongs_to(self, other: 'Term') -> bool:
         """Return whether this term is part of another one's explanation and goes with that one."""
         return self.effect.belongs(self, other)
+
+    @property
+    def recorded_site(self) -> dict[str, Any]:
+        """Return the site as a record has it, with lists in place of tuples."""
+        return {key: list(v) if isinstance(v, tuple) else v for key, v in self.site.items()}
 
     @property
     def channels(self) -> tuple[int, ...]:
@@ -335,7 +340,7 @@ class Effect(BaseEffect[TermT]):
     # --- record ------------------------------------------------------------------------------
     def record(self, term: TermT, covariance: Array) -> EffectRecord:
         """Return the site, and theta by the keys and units of ``recorded``."""
-        site, sigma = recorded_site(term), sigmas(covariance)
+        site, sigma = term.recorded_site, sigmas(covariance)
         return EffectRecord(self.name, {**site, **self._figures(term.theta)}, self._figures(sigma))
 
     def _figures(self, values: Array) -> dict[str, Any]:
@@ -349,7 +354,7 @@ class Effect(BaseEffect[TermT]):
     def term(self, record: EffectRecord) -> TermT:
         """Return the term of a record; raises `ModelFileError` on missing parameters."""
         parts = [
-            np.asarray(needed(record, key), dtype=np.float64).reshape(width) / factor
+            np.asarray(record.needed(key), dtype=np.float64).reshape(width) / factor
             for key, (width, factor) in self.recorded.items()
         ]
         return cast(TermT, Term(self, self.site_of(record), np.concatenate(parts)))
@@ -357,7 +362,7 @@ class Effect(BaseEffect[TermT]):
     def site_of(self, record: EffectRecord) -> Site:
         """Return what a record says of the site; raises `ModelFileError` where it lacks a key."""
         keys = [key for key in self.units if key in READ_SITE]
-        return cast(Site, {key: READ_SITE[key](needed(record, key)) for key in keys})
+        return cast(Site, {key: READ_SITE[key](record.needed(key)) for key in keys})
 
     # --- forward -----------------------------------------------------------------------------
     @property
@@ -377,9 +382,7 @@ class Effect(BaseEffect[TermT]):
         """Return the emitters' own field as metal sees it, from the one that is known."""
         return illumination
 
-    def sources(
-        self, term: TermT, base: Dipoles, illumination: Dipoles, omega: Array
-    ) -> Dipoles | None:
+    def sources(self, term: TermT, base: Dipoles, light: Dipoles, omega: Array) -> Dipoles | None:
         """Return dipoles that the effect adds; ``base`` makes the field where sensors are."""
         return None
 
@@ -412,14 +415,6 @@ class Effect(BaseEffect[TermT]):
         return flux
 
 
-def needed(record: EffectRecord, key: str) -> Any:
-    """Return a record's parameter; raises `ModelFileError` when it is missing."""
-    try:
-        return record.parameters[key]
-    except KeyError:
-        raise ModelFileError(f'model: the effect {record.name} lacks {key!r}') from None
-
-
 def whole_numbers(values: Sequence[Any]) -> tuple[int, ...]:
     """Return the numbers of channels or coils as they are in a record."""
     return tuple(int(number) for number in values)
@@ -432,30 +427,9 @@ READ_SITE: Mapping[str, Callable[[Any], Any]] = {
 """How the keys of a site are read from a record."""
 
 
-def recorded_site(term: Term) -> dict[str, Any]:
-    """Return a term's site as its record has it, with lists in place of tuples."""
-    return {key: list(v) if isinstance(v, tuple) else v for key, v in term.site.items()}
-
-
 def sigmas(covariance: Array) -> Array:
     """Return the standard deviations that a covariance matrix holds."""
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
-
-
-def complex_of(parts: Array) -> ComplexArray:
-    """Return complex numbers (n,) from their real, then imaginary parts (2 n,)."""
-    real, imaginary = parts.reshape(2, -1)
-    return np.asarray(real + 1j * imaginary)
-
-
-def pairs_of(values: ComplexArray) -> Any:
-    """Return complex numbers as a record has them, as lists of [re, im]."""
-    return np.stack([values.real, values.imag], axis=-1).tolist()
-
-
-def both_phases(unit: NDArray[np.inexact]) -> ComplexArray:
-    """Return columns (..., m) in phase, then in quadrature, (..., 2 m)."""
-    return np.concatenate([unit, 1j * unit], axis=-1)
 
 
 @cache

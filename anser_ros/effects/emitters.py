@@ -10,14 +10,8 @@ from scipy.spatial.transform import Rotation
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.channels import ComplexGain
-from anser_ros.effects.effect import Effect, Remedy, Site, Term, needed, recorded_site, sigmas
-from anser_ros.field.model import (
-    Dipoles,
-    EffectRecord,
-    size_parameters,
-    spread_along,
-    symmetry_axis,
-)
+from anser_ros.effects.effect import Effect, Remedy, Site, Term, sigmas
+from anser_ros.field.model import Dipoles, EffectRecord, size_figures, spread_along, symmetry_axis
 
 
 def _of_one(term: Term, emitters: int, factor: complex) -> ComplexArray:
@@ -171,7 +165,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         )
 
     def term(self, record: EffectRecord) -> CoilDriftTerm:
-        theta = np.array([float(needed(record, 'amount')), np.log(float(needed(record, 'tau_s')))])
+        theta = np.array([float(record.needed('amount')), np.log(float(record.needed('tau_s')))])
         return CoilDriftTerm(self, self.site_of(record), theta)
 
 
@@ -190,11 +184,9 @@ class CoilCrosstalk(Effect[Term]):
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         coils = range(apparatus.emitters)
-        one_way: list[Site] = [{'coils': p} for p in permutations(coils, 2)]
+        one_way = [Term(self, {'coils': p}, np.zeros(2)) for p in permutations(coils, 2)]
         both: list[Site] = [{'coils': p, 'mutual': True} for p in combinations(coils, 2)]
-        return [
-            Term(self, site, np.zeros(1 if 'mutual' in site else 2)) for site in one_way + both
-        ]
+        return one_way + [Term(self, site, np.zeros(1)) for site in both]
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return the source emitter's flux, placed in the other emitter's tone."""
@@ -223,12 +215,12 @@ class CoilCrosstalk(Effect[Term]):
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         keys = ('eps', 'eps_quadrature')[: term.theta.size]
-        parameters = {**recorded_site(term), **dict(zip(keys, term.theta.tolist(), strict=True))}
+        parameters = {**term.recorded_site, **dict(zip(keys, term.theta.tolist(), strict=True))}
         sigma = sigmas(covariance).tolist()
         return EffectRecord(self.name, parameters, dict(zip(keys, sigma, strict=True)))
 
     def term(self, record: EffectRecord) -> Term:
-        site, eps = self.site_of(record), float(needed(record, 'eps'))
+        site, eps = self.site_of(record), float(record.needed('eps'))
         if record.parameters.get('mutual'):
             return Term(self, {**site, 'mutual': True}, np.array([eps]))
         across = float(record.parameters.get('eps_quadrature', 0.0))
@@ -258,9 +250,7 @@ class CoilMoved(Effect[Term]):
         out[:, :, coil] = -np.moveaxis(view.d_position[..., coil], 2, -1)
         return out
 
-    def sources(
-        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
-    ) -> Dipoles | None:
+    def sources(self, term: Term, base: Dipoles, light: Dipoles, omega: Array) -> Dipoles | None:
         return self._changed(term, base)
 
     def light(self, term: Term, illumination: Dipoles) -> Dipoles:
@@ -335,11 +325,11 @@ class CoilTurned(CoilMoved):
         assert isinstance(term, CoilTurnedTerm)
         figures = {'rotation_deg': np.degrees(term.theta).tolist(), 'centre_m': list(term.centre)}
         deviation = {'rotation_deg': np.degrees(sigmas(covariance)).tolist()}
-        return EffectRecord(self.name, {**recorded_site(term), **figures}, deviation)
+        return EffectRecord(self.name, {**term.recorded_site, **figures}, deviation)
 
     def term(self, record: EffectRecord) -> Term:
-        theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
-        centre = tuple(float(value) for value in needed(record, 'centre_m'))
+        theta = np.radians(np.asarray(record.needed('rotation_deg'), dtype=np.float64))
+        centre = tuple(float(value) for value in record.needed('centre_m'))
         return CoilTurnedTerm(self, self.site_of(record), theta, centre=centre)
 
 
@@ -387,17 +377,18 @@ class EmitterSize(Effect[EmitterSizeTerm]):
 
         Those of a drawn emitter do not, so that one whose size is known is no candidate.
         """
-        light, found = apparatus.illumination, []
-        for k in range(apparatus.emitters):
-            axis = symmetry_axis(light.positions, light.directions, light.moments[:, k : k + 1])
-            if axis is not None:
-                found.append(
-                    EmitterSizeTerm(
-                        self, {'coil': k}, np.zeros(1), axis=axis.direction,
-                        modelled_m2=axis.second_moment_m2,
-                    )
-                )  # fmt: skip
-        return found
+        light = apparatus.illumination
+        axes = (
+            symmetry_axis(light.positions, light.directions, m[:, None]) for m in light.moments.T
+        )
+        return [
+            EmitterSizeTerm(
+                self, {'coil': k}, np.zeros(1), axis=axis.direction,
+                modelled_m2=axis.second_moment_m2,
+            )
+            for k, axis in enumerate(axes)
+            if axis is not None
+        ]  # fmt: skip
 
     def columns(self, term: EmitterSizeTerm, view: View) -> ComplexArray:
         """Return the flux that a unit of second moment adds."""
@@ -405,13 +396,13 @@ class EmitterSize(Effect[EmitterSizeTerm]):
         return view.along(unit.flux(*view.flat))[..., None]
 
     def sources(
-        self, term: EmitterSizeTerm, base: Dipoles, illumination: Dipoles, omega: Array
+        self, term: EmitterSizeTerm, base: Dipoles, light: Dipoles, omega: Array
     ) -> Dipoles | None:
         return spread_along(base, term.site['coil'], term.axis, SIZE_UNIT * float(term.theta[0]))
 
     def record(self, term: EmitterSizeTerm, covariance: Array) -> EffectRecord:
         sigma_m2 = SIZE_UNIT * float(np.sqrt(covariance[0, 0]))
-        figures, sigmas = size_parameters(term.second_moment_m2, sigma_m2)
+        figures, sigmas = size_figures(term.second_moment_m2, sigma_m2)
         return EffectRecord(
             self.name,
             {
@@ -424,11 +415,11 @@ class EmitterSize(Effect[EmitterSizeTerm]):
         )
 
     def term(self, record: EffectRecord) -> EmitterSizeTerm:
-        modelled = float(needed(record, 'model_second_moment_m2'))
-        theta = (float(needed(record, 'second_moment_m2')) - modelled) / SIZE_UNIT
+        modelled = float(record.needed('model_second_moment_m2'))
+        theta = (float(record.needed('second_moment_m2')) - modelled) / SIZE_UNIT
         return EmitterSizeTerm(
             self, self.site_of(record), np.array([theta]),
-            axis=np.asarray(needed(record, 'axis'), dtype=np.float64), modelled_m2=modelled,
+            axis=np.asarray(record.needed('axis'), dtype=np.float64), modelled_m2=modelled,
         )  # fmt: skip
 
 

@@ -6,25 +6,15 @@ corresponding constant effect, as that of the optical jitter is. A fluctuation c
 column whatever its course, and explains and hides only what those columns can.
 """
 
-from collections.abc import Sequence
-from typing import Any, ClassVar, cast
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 import numpy as np
 
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.channels import SensorGain, ToolGain
-from anser_ros.effects.effect import (
-    READ_SITE,
-    Effect,
-    Family,
-    FluctuationTerm,
-    Remedy,
-    Site,
-    Term,
-    needed,
-    recorded_site,
-)
+from anser_ros.effects.effect import READ_SITE, Effect, Family, FluctuationTerm, Remedy, Site, Term
 from anser_ros.effects.emitters import CoilGain
 from anser_ros.effects.optical import Registration, TimeOffset
 from anser_ros.effects.sensors import SensorAxis, SensorPosition
@@ -36,11 +26,13 @@ or a curve has, and less than shaped metal (60), which must not explain an emitt
 
 
 class Fluctuation(Effect[FluctuationTerm]):
-    """Lets one constant effect fluctuate; it is the base of all that do so."""
+    """Lets a constant effect, along whose columns a frame may move, fluctuate."""
 
-    of: ClassVar[Effect[Any]]  # the constant effect whose columns a frame may move along
     family = Family.FLUCTUATION
     plausible = {'rms': (0.0, 1.0)}
+
+    def __init__(self, of: Effect[Any], name: str, summary: str, units: Mapping[str, str]) -> None:
+        self.of, self.name, self.summary, self.units = of, name, summary, units
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
         """Try every site of the constant effect on emitters and tools."""
@@ -87,86 +79,59 @@ class Fluctuation(Effect[FluctuationTerm]):
         spread = np.zeros(1) if term.spread is None else term.spread
         rms = float(np.sqrt(np.sum(spread**2)))
         sigma = rms / float(np.sqrt(2 * max(term.frames, 1)))
-        return EffectRecord(self.name, {**recorded_site(term), 'rms': rms}, {'rms': sigma})
+        return EffectRecord(self.name, {**term.recorded_site, 'rms': rms}, {'rms': sigma})
 
     def term(self, record: EffectRecord) -> FluctuationTerm:
         """Return where it is; what it does in a frame only the frame can tell."""
-        needed(record, 'rms')
-        given = {key: value for key, value in record.parameters.items() if key != 'rms'}
-        site = {key: READ_SITE[key](value) for key, value in given.items()}
+        record.needed('rms')
+        site = {k: READ_SITE[k](v) for k, v in record.parameters.items() if k != 'rms'}
         return FluctuationTerm(self, cast(Site, site))
 
 
 class CoilFluctuation(Fluctuation):
     """Changes a `CoilGain`; live, the references determine the strength of the moment."""
 
-    name = 'coil_fluctuation'
-    summary = "an emitter's strength steps, swings or fails, not as a warming coil's does"
-    units = {'coil': '1', 'rms': '1'}
     remedy = Remedy.FLUX
     drifts = True
     followed = True
-    of = CoilGain()
 
 
-class SensorGainDrift(Fluctuation):
-    """Changes a `SensorGain` from frame to frame."""
-
-    name = 'sensor_gain_drift'
-    summary = "a sensor's gain changes with time"
-    units = {'channel': '1', 'rms': '1'}
-    of = SensorGain()
-
-
-class ToolGainDrift(Fluctuation):
-    """Changes a `ToolGain` from frame to frame."""
-
-    name = 'tool_gain_drift'
-    summary = "the gain that all of a tool's sensors share changes with time"
-    units = {'body': '1', 'rms': '1'}
-    of = ToolGain()
-
-
-class LooseSensorAxis(Fluctuation):
-    """Changes a `SensorAxis` from frame to frame."""
-
-    name = 'loose_sensor_axis'
-    summary = "a sensor's axis changes with time"
-    units = {'channel': '1', 'channels': '1', 'rms': 'rad'}
-    of = SensorAxis()
-
-
-class LooseSensorPosition(Fluctuation):
+class LooseCluster(Fluctuation):
     """Changes a `SensorPosition`, of clusters only: one coil reads too little for it."""
-
-    name = 'loose_sensor_position'
-    summary = "a cluster's place in its body changes with time"
-    units = {'channels': '1', 'rms': 'm'}
-    of = SensorPosition()
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
         return [term for term in super().candidates(apparatus) if len(term.site['channels']) > 1]
 
 
-class StampJitter(Fluctuation):
-    """Changes a `TimeOffset` from frame to frame."""
-
-    name = 'stamp_jitter'
-    summary = 'the optical stamps are early or late by a different time in every frame'
-    units = {'rms': 's'}
-    of = TimeOffset()
-
-
-class OpticalJitter(Fluctuation):
-    """Changes a `Registration`: what the optical poses err by beyond what they may."""
-
-    name = 'optical_jitter'
-    summary = 'the optical poses have larger errors than stated'
-    units = {'rms': 'm and rad'}
-    of = Registration()
-
-
 EFFECTS = (
-    CoilFluctuation(), SensorGainDrift(), ToolGainDrift(), LooseSensorAxis(),
-    LooseSensorPosition(), StampJitter(), OpticalJitter(),
+    CoilFluctuation(
+        CoilGain(), 'coil_fluctuation',
+        "an emitter's strength steps, swings or fails, not as a warming coil's does",
+        {'coil': '1', 'rms': '1'},
+    ),
+    Fluctuation(
+        SensorGain(), 'sensor_gain_drift', "a sensor's gain changes with time",
+        {'channel': '1', 'rms': '1'},
+    ),
+    Fluctuation(
+        ToolGain(), 'tool_gain_drift',
+        "the gain that all of a tool's sensors share changes with time",
+        {'body': '1', 'rms': '1'},
+    ),
+    Fluctuation(
+        SensorAxis(), 'loose_sensor_axis', "a sensor's axis changes with time",
+        {'channel': '1', 'channels': '1', 'rms': 'rad'},
+    ),
+    LooseCluster(
+        SensorPosition(), 'loose_sensor_position',
+        "a cluster's place in its body changes with time", {'channels': '1', 'rms': 'm'},
+    ),
+    Fluctuation(
+        TimeOffset(), 'stamp_jitter',
+        'the optical stamps are early or late by a different time in every frame', {'rms': 's'},
+    ),
+    Fluctuation(
+        Registration(), 'optical_jitter', 'the optical poses have larger errors than stated',
+        {'rms': 'm and rad'},
+    ),
 )  # fmt: skip

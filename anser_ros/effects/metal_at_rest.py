@@ -11,21 +11,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers, complex_of, pairs_of
 from anser_ros.effects.base import Apparatus, View
-from anser_ros.effects.effect import (
-    FROZEN,
-    Effect,
-    Family,
-    Remedy,
-    Resting,
-    Term,
-    both_phases,
-    complex_of,
-    needed,
-    pairs_of,
-    sigmas,
-)
+from anser_ros.effects.effect import FROZEN, Effect, Family, Remedy, Resting, Term, sigmas
 from anser_ros.field.model import Dipoles, EffectRecord
 from anser_ros.metal.body import (
     BODIES,
@@ -39,7 +27,7 @@ from anser_ros.metal.body import (
     sheet_sizes,
     sheet_sources,
 )
-from anser_ros.metal.scattering import UNIT, Shapes
+from anser_ros.metal.scattering import UNIT, Shapes, both_phases
 from anser_ros.physics.constants import MU_0
 
 STEP = 1e-3
@@ -160,12 +148,10 @@ class StaticMetal(MetalAtRest):
         lattices = [(BODIES[kind](), body_sizes(kind)) for kind in SPACINGS]
         return Resting(term.theta[:3], [(multipoles(), body_sizes(COMPACT))], lattices)
 
-    def sources(
-        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
-    ) -> Dipoles | None:
+    def sources(self, term: Term, base: Dipoles, light: Dipoles, omega: Array) -> Dipoles | None:
         if not np.any(term.theta[3:]):
             return None
-        return multipoles().sources(term.theta[:3], self._couplings(term), illumination, omega)
+        return multipoles().sources(term.theta[:3], self._couplings(term), light, omega)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         total = multipoles().polarisability(self._couplings(term))
@@ -180,8 +166,8 @@ class StaticMetal(MetalAtRest):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        place = np.asarray(needed(record, 'position_m'), dtype=np.float64)
-        alpha = np.asarray(needed(record, 'groups'), dtype=np.float64) / UNIT
+        place = np.asarray(record.needed('position_m'), dtype=np.float64)
+        alpha = np.asarray(record.needed('groups'), dtype=np.float64) / UNIT
         return Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, alpha]))
 
 
@@ -245,12 +231,10 @@ class ConductivePlate(MetalAtRest):
         edge = float(term.theta[1])
         return Resting(term.theta[[2, 3, 0]], [(sheet_shapes(edge), sheet_sizes(edge))])
 
-    def sources(
-        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
-    ) -> Dipoles | None:
+    def sources(self, term: Term, base: Dipoles, light: Dipoles, omega: Array) -> Dipoles | None:
         z, edge, x, y, log_ohm = term.theta
         centre, edges = np.array([x, y, z]), np.array([edge, edge])
-        return sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, illumination, omega)
+        return sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, light, omega)
 
     def _flux(self, theta: Array, view: View) -> ComplexArray:
         added = self.sources(Term(self, {}, theta), view.dipoles, view.illumination, view.omega)
@@ -288,8 +272,8 @@ class ConductivePlate(MetalAtRest):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        x, y = (float(v) for v in needed(record, 'centre_m'))
-        z, edge, ohm = (float(needed(record, key)) for key in ('z_m', 'edge_m', 'sheet_ohm'))
+        x, y = (float(v) for v in record.needed('centre_m'))
+        z, edge, ohm = (float(record.needed(key)) for key in ('z_m', 'edge_m', 'sheet_ohm'))
         return Term(self, {}, np.array([z, edge, x, y, np.log(ohm)]))
 
 
@@ -416,11 +400,11 @@ class MetalRemainder(Effect[RemainderTerm]):
         return term.leftover.columns(view)
 
     def sources(
-        self, term: RemainderTerm, base: Dipoles, illumination: Dipoles, omega: Array
+        self, term: RemainderTerm, base: Dipoles, light: Dipoles, omega: Array
     ) -> Dipoles | None:
         if not np.any(term.theta):
             return None
-        return term.leftover.sources(term.theta, illumination, omega)
+        return term.leftover.sources(term.theta, light, omega)
 
     def record(self, term: RemainderTerm, covariance: Array) -> EffectRecord:
         """Record the size only; the parent's record names the metal."""

@@ -9,19 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.arrays import Array, ComplexArray, Integers, pairs_of
 from anser_ros.effects.base import Apparatus, View
-from anser_ros.effects.effect import (
-    FROZEN,
-    LARGEST,
-    BodyTerm,
-    Effect,
-    Family,
-    Remedy,
-    needed,
-    pairs_of,
-    sigmas,
-)
+from anser_ros.effects.effect import FROZEN, LARGEST, BodyTerm, Effect, Family, Remedy, sigmas
 from anser_ros.effects.metal_at_rest import STATIC_METAL
 from anser_ros.field.model import EffectRecord
 from anser_ros.metal.body import COMPACT, SPACINGS, ball_modes, centre_sigma
@@ -372,15 +362,15 @@ class MovingMetal(Effect[MovingTerm]):
 
     def term(self, record: EffectRecord) -> MovingTerm:
         """Make the term from path and couplings; every coupling is a mode of its own."""
-        knots = tuple(float(k) for k in needed(record, 'knots_s'))
-        course = np.asarray(needed(record, 'course'), dtype=np.float64)
-        couplings = np.asarray(needed(record, 'couplings_m3'), dtype=np.float64) / UNIT
+        knots = tuple(float(k) for k in record.needed('knots_s'))
+        course = np.asarray(record.needed('course'), dtype=np.float64)
+        couplings = np.asarray(record.needed('couplings_m3'), dtype=np.float64) / UNIT
         return MovingTerm(
             self, theta=np.concatenate([course, couplings.T.ravel()]),
-            kind=str(needed(record, 'body')), modes=np.eye(len(couplings)),
+            kind=str(record.needed('body')), modes=np.eye(len(couplings)),
             spread=np.full(len(couplings), LARGEST),
             path=FreePath(knots) if knots else StraightPath(),
-            duration=float(needed(record, 'path')['time_s'][-1]),
+            duration=float(record.needed('path')['time_s'][-1]),
         )  # fmt: skip
 
 

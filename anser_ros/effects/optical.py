@@ -2,23 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
-from anser_ros.effects.effect import (
-    Effect,
-    Remedy,
-    Site,
-    Term,
-    TermT,
-    needed,
-    recorded_site,
-    sigmas,
-)
+from anser_ros.effects.effect import Effect, Remedy, Site, Term, TermT, sigmas
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -30,11 +21,8 @@ class OpticalEffect(Effect[TermT]):
     typical: ClassVar[tuple[float, ...]]
 
     def candidates(self, apparatus: Apparatus) -> Sequence[TermT]:
-        return [self.zero(apparatus)] if apparatus.tools else []
-
-    def zero(self, apparatus: Apparatus) -> TermT:
-        """Return the term with parameters of zero."""
-        return Term(self, {}, np.zeros(len(self.typical)))  # type: ignore[return-value]
+        zero = cast(TermT, Term(self, {}, np.zeros(len(self.typical))))
+        return [zero] if apparatus.tools else []
 
     def columns(self, term: TermT, view: View) -> ComplexArray | None:
         """Return the derivative by a tool's motion, or None for references."""
@@ -184,12 +172,12 @@ class OpticalScale(OpticalEffect[Term]):
             shear = {'shear': values[1:-3].tolist()} if 'axis' in term.site else {}
             return {'scale': scale + float(values[0]), **shear, 'shift_m': values[-3:].tolist()}
 
-        parameters = {**figures(1.0, term.theta), **recorded_site(term)}
+        parameters = {**figures(1.0, term.theta), **term.recorded_site}
         return EffectRecord(self.name, parameters, figures(0.0, sigmas(covariance)))
 
     def term(self, record: EffectRecord) -> Term:
-        shift, given = needed(record, 'shift_m'), record.parameters
-        theta = [float(needed(record, 'scale')) - 1, *given.get('shear', ()), *shift]
+        shift, given = record.needed('shift_m'), record.parameters
+        theta = [float(record.needed('scale')) - 1, *given.get('shear', ()), *shift]
         axis = given.get('axis')
         site: Site = {} if axis is None else {'axis': tuple(float(value) for value in axis)}
         return Term(self, site, np.array(theta))
@@ -211,10 +199,10 @@ class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
     plausible = {'translation_m': (-0.05, 0.05), 'velocity_m_per_s': (-0.01, 0.01)}
     typical = (5e-3,) * 6
 
-    def zero(self, apparatus: Apparatus) -> RegistrationDriftTerm:
-        """Return no drift, over the session's time."""
+    def candidates(self, apparatus: Apparatus) -> Sequence[RegistrationDriftTerm]:
         duration = max(apparatus.duration, 1e-3)
-        return RegistrationDriftTerm(self, {}, np.zeros(6), duration=duration)
+        zero = RegistrationDriftTerm(self, {}, np.zeros(6), duration=duration)
+        return [zero] if apparatus.tools else []
 
     def amounts(self, term: RegistrationDriftTerm) -> Integers:
         """Return the growth's index alone: a constant shift is a registration's."""
@@ -240,9 +228,9 @@ class RegistrationDrift(OpticalEffect[RegistrationDriftTerm]):
         return EffectRecord(self.name, parameters, figures(sigmas(covariance)))
 
     def term(self, record: EffectRecord) -> RegistrationDriftTerm:
-        duration = float(needed(record, 'duration_s'))
-        start = np.asarray(needed(record, 'translation_m'), dtype=np.float64)
-        way = np.asarray(needed(record, 'velocity_m_per_s'), dtype=np.float64) * duration
+        duration = float(record.needed('duration_s'))
+        start = np.asarray(record.needed('translation_m'), dtype=np.float64)
+        way = np.asarray(record.needed('velocity_m_per_s'), dtype=np.float64) * duration
         return RegistrationDriftTerm(self, {}, np.concatenate([start, way]), duration=duration)
 
 

@@ -4,14 +4,14 @@ Plugs in wrong sockets are found before the search (`anser_ros.diagnosis.screeni
 outliers in what it leaves, with one number that says how much.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray, Integers
-from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term, needed, recorded_site
+from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
@@ -113,7 +113,7 @@ class BodyTurned(Wiring):
         return replace(sensors, position=place, axis=axis)
 
     def term(self, record: EffectRecord) -> Term:
-        turn = tuple(float(value) for value in needed(record, 'rotation_deg'))
+        turn = tuple(float(value) for value in record.needed('rotation_deg'))
         return Term(self, {**self.site_of(record), 'rotation_deg': turn})
 
 
@@ -134,16 +134,18 @@ class SeenEffect(Effect[SeenTerm]):
 
     family = Family.SEEN
 
-    @property
-    def _key(self) -> str:
-        return next(iter(self.units))
+    def __init__(
+        self, name: str, summary: str, units: Mapping[str, str], plausible: tuple[float, float]
+    ) -> None:
+        self.name, self.summary, self.units, self._key = name, summary, units, next(iter(units))
+        self.plausible = {self._key: plausible}
 
     def record(self, term: SeenTerm, covariance: Array) -> EffectRecord:
-        parameters = {self._key: term.amount, **recorded_site(term)}
+        parameters = {self._key: term.amount, **term.recorded_site}
         return EffectRecord(self.name, parameters, {self._key: term.sigma})
 
     def term(self, record: EffectRecord) -> SeenTerm:
-        return SeenTerm(self, amount=float(needed(record, self._key)))
+        return SeenTerm(self, amount=float(record.needed(self._key)))
 
     def seen(self, amount: float, sigma: float, channels: Sequence[int] = ()) -> SeenTerm:
         """Return the effect on some channels, or on all where none are named."""
@@ -151,32 +153,17 @@ class SeenEffect(Effect[SeenTerm]):
         return SeenTerm(self, site, amount=amount, sigma=sigma)
 
 
-class ExcessNoise(SeenEffect):
-    """Is found from the residuals' spread once they show no structure (`anser_ros.diagnosis`)."""
-
-    name = 'excess_noise'
-    summary = 'the noise is larger than it should be, and nothing else'
-    units = {'factor': '1', 'channels': '1'}
-    plausible = {'factor': (1.0, 1000.0)}
-
-
-class Outliers(SeenEffect):
-    """Is found as frames that stand out from their neighbours in time (`anser_ros.diagnosis`)."""
-
-    name = 'outliers'
-    summary = 'some frames fit no model'
-    units = {'fraction': '1', 'channels': '1'}
-    plausible = {'fraction': (0.0, 0.5)}
-
-
-class LooseContact(Outliers):
-    """Does what `Outliers` does, where always the same channels stand out."""
-
-    name = 'loose_contact'
-    summary = 'single readings of a channel fail now and then'
-
-
-EXCESS_NOISE, OUTLIERS, LOOSE_CONTACT = ExcessNoise(), Outliers(), LooseContact()
+EXCESS_NOISE = SeenEffect(
+    'excess_noise', 'the noise is larger than it should be, and nothing else',
+    {'factor': '1', 'channels': '1'}, (1.0, 1000.0),
+)  # fmt: skip
+OUTLIERS, LOOSE_CONTACT = (
+    SeenEffect(name, summary, {'fraction': '1', 'channels': '1'}, (0.0, 0.5))
+    for name, summary in (
+        ('outliers', 'some frames fit no model'),
+        ('loose_contact', 'single readings of a channel fail now and then'),
+    )
+)
 
 
 def known_share(records: Sequence[EffectRecord]) -> float:

@@ -9,17 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
-from anser_ros.effects.effect import (
-    Effect,
-    Family,
-    Remedy,
-    Site,
-    Term,
-    needed,
-    recorded_site,
-    sigmas,
-    whole_numbers,
-)
+from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term, sigmas, whole_numbers
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.rotations import tangents, tilted
@@ -45,17 +35,13 @@ class SensorAxis(Effect[SensorAxisTerm]):
     typical = 0.1  # tilts are some degrees
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
-        axes = {
-            int(c): tuple(float(v) for v in a)
-            for table in apparatus.tools
-            for c, a in zip(table.channel, table.axis, strict=True)
-        }
         terms = [
-            SensorAxisTerm(self, {'channel': c}, np.zeros(2), surveyed=axes[c])
-            for c in apparatus.tool_channels
+            SensorAxisTerm(self, {'channel': channel}, np.zeros(2), surveyed=tuple(axis))
+            for table in apparatus.tools
+            for channel, axis in zip(table.channel.tolist(), table.axis.tolist(), strict=True)
         ]
         # The turn of all that a tool has is hardly told from another frame of its poses.
-        return [*terms, *(t for t in self.anew(apparatus) if len(t.channels) < len(axes))]
+        return [*terms, *(t for t in self.anew(apparatus) if len(t.channels) < len(terms))]
 
     def anew(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
         return [SensorAxisTerm(self, {'channels': c}, np.zeros(3)) for c in apparatus.clusters()]
@@ -65,22 +51,17 @@ class SensorAxis(Effect[SensorAxisTerm]):
         if view.is_reference:
             return None
         out = view.columns(term.theta.size)
-        if 'channel' in term.site:
-            row = view.row(term.site['channel'])
+        for row in map(view.row, term.channels):
             if row is None:
                 return None
-            surveyed = np.array(term.surveyed)
-            pair, axis = tangents(surveyed[None])[0], self._tilted(term)
-            length = np.linalg.norm(surveyed + term.theta @ pair)
-            across = (pair - np.outer(pair @ axis, axis)) / length
+            if 'channel' in term.site:
+                surveyed = np.array(term.surveyed)
+                pair, axis = tangents(surveyed[None])[0], self._tilted(term)
+                length = np.linalg.norm(surveyed + term.theta @ pair)
+                across = (pair - np.outer(pair @ axis, axis)) / length
+            else:
+                across = np.cross(np.eye(3), view.sensors.axis[row])
             steps = np.einsum('fij,tj->fti', view.rotation, across)
-            out[:, row] = np.einsum('fik,fti->fkt', view.d_axis[:, row], steps)
-            return out
-        for row in map(view.row, term.site['channels']):
-            if row is None:
-                return None
-            axis = view.sensors.axis[row]
-            steps = np.einsum('fij,tj->fti', view.rotation, np.cross(np.eye(3), axis))
             out[:, row] = np.einsum('fik,fti->fkt', view.d_axis[:, row], steps)
         return out
 
@@ -102,7 +83,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
     def record(self, term: SensorAxisTerm, covariance: Array) -> EffectRecord:
         if 'channel' not in term.site:
             turn, sigma = (np.degrees(v).tolist() for v in (term.theta, sigmas(covariance)))
-            parameters = {**recorded_site(term), 'rotation_deg': turn}
+            parameters = {**term.recorded_site, 'rotation_deg': turn}
             return EffectRecord(self.name, parameters, {'rotation_deg': sigma})
         tilt = float(np.linalg.norm(term.theta))
         unit = term.theta / max(tilt, 1e-12)
@@ -119,11 +100,11 @@ class SensorAxis(Effect[SensorAxisTerm]):
 
     def term(self, record: EffectRecord) -> SensorAxisTerm:
         if 'channels' in record.parameters:
-            theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
+            theta = np.radians(np.asarray(record.needed('rotation_deg'), dtype=np.float64))
             channels = whole_numbers(record.parameters['channels'])
             return SensorAxisTerm(self, {'channels': channels}, theta)
-        surveyed = np.asarray(needed(record, 'surveyed_axis'), dtype=np.float64)
-        axis = np.asarray(needed(record, 'axis'), dtype=np.float64)
+        surveyed = np.asarray(record.needed('surveyed_axis'), dtype=np.float64)
+        axis = np.asarray(record.needed('axis'), dtype=np.float64)
         along = float(axis @ surveyed)
         if along <= 0:
             raise ModelFileError('model: sensor_axis turns an axis by a right angle or more')
@@ -140,13 +121,16 @@ class PlacedElsewhere(Effect[Term]):
     typical = 5e-3  # offsets are some millimetres
     recorded = {'offset_m': (3, 1.0)}
 
-    def rows(self, term: Term, sensors: SensorTable) -> Booleans:
-        """Return which sensors (S,) are shifted."""
-        raise NotImplementedError
+    @staticmethod
+    def _rows(term: Term, sensors: SensorTable) -> Booleans:
+        """Which sensors (S,) are shifted: those of the site's channels, or all of its body."""
+        if 'body' in term.site:
+            return np.array([body == term.site['body'] for body in sensors.body])
+        return np.isin(sensors.channel, term.site['channels'])
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return the derivative by the centres of those sensors, along the body's axes."""
-        rows = self.rows(term, view.sensors)
+        rows = self._rows(term, view.sensors)
         if view.is_reference or not rows.any():
             return None
         out = view.columns(3)
@@ -154,7 +138,7 @@ class PlacedElsewhere(Effect[Term]):
         return out
 
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
-        rows = self.rows(term, sensors)[:, None]
+        rows = self._rows(term, sensors)[:, None]
         return replace(sensors, position=sensors.position + rows * term.theta)
 
 
@@ -174,10 +158,6 @@ class SensorPosition(PlacedElsewhere):
                 groups += [g for g in apparatus.clusters() if own > set(g)]
         return [Term(self, {'channels': group}, np.zeros(3)) for group in groups]
 
-    def rows(self, term: Term, sensors: SensorTable) -> Booleans:
-        """Return the sensors of the site's channels."""
-        return np.isin(sensors.channel, term.site['channels'])
-
 
 class LeverArm(PlacedElsewhere):
     """Shifts all of a body's sensors."""
@@ -189,10 +169,6 @@ class LeverArm(PlacedElsewhere):
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         bodies = [table.body[0] for table in apparatus.tools if len(table)]
         return [Term(self, {'body': body}, np.zeros(3)) for body in bodies]
-
-    def rows(self, term: Term, sensors: SensorTable) -> Booleans:
-        """Return the sensors of the site's body."""
-        return np.array([body == term.site['body'] for body in sensors.body])
 
 
 SIZE_UNIT = 1e-4
@@ -270,7 +246,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         channels = self.site_of(record)['channels']
         surveyed = record.parameters.get('surveyed_length_m') or [0.0] * len(channels)
         base = float(np.mean(np.square(surveyed)))
-        theta = (float(needed(record, 'length_m')) ** 2 - base) / SIZE_UNIT
+        theta = (float(record.needed('length_m')) ** 2 - base) / SIZE_UNIT
         lengths = dict(zip(channels, (float(v) for v in surveyed), strict=True))
         return SensorSizeTerm(self, {}, np.array([theta]), surveyed=lengths)
 
@@ -339,7 +315,7 @@ class SensorSpread(Effect[SpreadTerm]):
 
     def term(self, record: EffectRecord) -> SpreadTerm:
         channels = self.site_of(record)['channels']
-        values = np.asarray(needed(record, 'values'), dtype=np.float64)
+        values = np.asarray(record.needed('values'), dtype=np.float64)
         width = len(self.faultless) or (values.shape[1] if values.ndim == 2 else 2)
         if values.shape != (len(channels), width) or len(set(channels)) != len(channels):
             raise ModelFileError(

@@ -137,7 +137,7 @@ def spread_along(base: Dipoles, emitter: int, axis: Array, second_moment_m2: flo
     )
 
 
-def size_parameters(
+def size_figures(
     second_moment_m2: float, sigma_m2: float
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return a second moment with the size of a source that has it, and their uncertainties.
@@ -267,6 +267,13 @@ class EffectRecord:
     # standard deviations of the parameters, under the same keys
     uncertainty: Mapping[str, Any] = field(default_factory=dict)
     evidence: Mapping[str, Any] = field(default_factory=dict)  # figures that support the effect
+
+    def needed(self, key: str) -> Any:
+        """Return a parameter; raises `ModelFileError` when it is missing."""
+        try:
+            return self.parameters[key]
+        except KeyError:
+            raise ModelFileError(f'model: the effect {self.name} lacks {key!r}') from None
 
 
 @dataclass(frozen=True)

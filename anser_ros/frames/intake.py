@@ -12,22 +12,87 @@ frames that follow one another with the same distance in time; odds of ``exp(h)`
 chance with a probability of ``exp(-h)`` at most (Ville's inequality), however many emitters there
 are and however long the run is. So with eight emitters one exact repetition is enough, and one
 emitter needs a few.
+
+A reading is one sensor's fluxes of all emitters in one frame. Its first fault in the order of
+`FAULTS` counts, with its name, state and reason. The flag bits are those of `wire.points`.
 """
 
 import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from anser_ros import pose_states as states
 from anser_ros.arrays import AnyArray, Booleans, ComplexArray, Integers
 from anser_ros.errors import AnserError, LayoutError
-from anser_ros.frames import faults
-from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.sensor import LARGEST_FLUX_T
 from anser_ros.stamps import JUMP_NS, NANO, Order, order_of
+from anser_ros.wire import points
+
+
+class Fault(NamedTuple):
+    """Describes one kind of fault by its name, state and reason."""
+
+    kind: str  # Its name in the counters: ``readings_<kind>``
+    state: str  # The state of a pose that the reading was for
+    reason: str  # What `/diagnostics` says of it
+
+
+GOOD = 0
+"""Code of a reading without a fault; the codes of faults are their places in `FAULTS`."""
+MISSING_CODE, SATURATED_CODE, STALE_CODE, DROPPED_CODE, FLAGGED_CODE = 1, 2, 3, 4, 5
+"""Codes of what the frame itself says: no such channel, or a flag."""
+FLAG_CODES = (
+    (points.SATURATED, SATURATED_CODE),
+    (points.STALE, STALE_CODE),
+    (points.DROPPED, DROPPED_CODE),
+)
+"""Flag bits and their codes; the first that is set counts. Any other bit is `FLAGGED_CODE`."""
+NOT_FINITE_CODE, ABSURD_CODE = 6, 7
+"""Codes of what the values say."""
+STUCK_CODE = 8
+"""Code of what earlier readings say: this one repeats one of them."""
+
+FAULTS: tuple[Fault | None, ...] = (
+    None,
+    Fault('missing', states.STALE, 'its channel is not in the frame'),
+    Fault('saturated', states.SATURATED, 'flagged saturated by the acquisition'),
+    Fault('stale', states.STALE, 'flagged stale by the acquisition'),
+    Fault('dropped', states.DROPPED, 'flagged dropped by the acquisition'),
+    Fault('flagged', states.NO_SIGNAL, 'flagged by the acquisition with an unknown bit'),
+    Fault('not_finite', states.NO_SIGNAL, 'the fluxes are not finite'),
+    Fault('absurd', states.NO_SIGNAL, f'fluxes beyond {LARGEST_FLUX_T:g} T are implausible'),
+    Fault('stuck', states.STALE, 'stuck: the same reading as before'),
+)
+
+
+def value_codes(flux: ComplexArray) -> Integers:
+    """Return what the values of readings (..., K), T, say about them.
+
+    Each is `GOOD`, `NOT_FINITE_CODE` or `ABSURD_CODE`.
+    """
+    with np.errstate(invalid='ignore'):
+        largest = np.maximum(np.abs(flux.real), np.abs(flux.imag)).max(axis=-1, initial=0.0)
+    codes = np.where(largest < LARGEST_FLUX_T, GOOD, ABSURD_CODE)
+    return np.where(np.isfinite(largest), codes, NOT_FINITE_CODE)
+
+
+def reading_codes(flux: ComplexArray, flags: NDArray[np.integer[Any]]) -> Integers:
+    """Return what is wrong with recorded readings, as `Intake` says it of live ones.
+
+    ``flux`` (..., K) in T and ``flags`` (...) of `wire.points`, where a channel that is not in its
+    frame has `STALE` and NaN, make places in `FAULTS`; `GOOD` for readings that can be used.
+    """
+    codes = np.where(flags == 0, value_codes(flux), FLAGGED_CODE)
+    for bit, code in reversed(FLAG_CODES):
+        codes[(flags & bit) != 0] = code
+    return codes
+
 
 Count = Callable[[str, int], None]
 """Takes a counter's name and by how much it rises."""
@@ -41,7 +106,7 @@ class Frame:
     channels: Integers  # (S,), channels in the table's order
     # (S, K), T; NaN where a channel is missing and in place of components that are not finite
     flux: ComplexArray
-    # (S,), what is wrong with each reading: places in `frames.faults.FAULTS`, 0 for nothing
+    # (S,), what is wrong with each reading: places in `FAULTS`, 0 for nothing
     codes: Integers
     # (K,), emitters that a usable sensor receives; None when all are received, or none at all
     living: Booleans | None = None
@@ -191,20 +256,20 @@ def fill_frame(given, marks, rows, largest, spares_dead, flux, codes, received):
     """Write a frame's fluxes (S, K) in a table's order, and what each reading is.
 
     ``rows`` (S,): each sensor's row of the frame, -1 for none. ``largest``: of a component, T.
-    ``codes`` (S,): places in `frames.faults.FAULTS`. ``received`` (K,), False on entry: emitters
+    ``codes`` (S,): places in `FAULTS`. ``received`` (K,), False on entry: emitters
     that a usable sensor receives. Returns whether some are received and some are not.
     """
     count, width = flux.shape
     for s in range(count):
         row = rows[s]
         if row < 0:
-            codes[s] = faults.MISSING_CODE
+            codes[s] = MISSING_CODE
             for k in range(width):
                 flux[s, k] = complex(math.nan, math.nan)
             continue
         bits = marks[row]
-        codes[s] = faults.FLAGGED_CODE if bits else GOOD
-        for bit, code in faults.FLAG_CODES:
+        codes[s] = FLAGGED_CODE if bits else GOOD
+        for bit, code in FLAG_CODES:
             if bits & bit:
                 codes[s] = code
                 break
@@ -237,7 +302,7 @@ def fill_frame(given, marks, rows, largest, spares_dead, flux, codes, received):
                 finite, imag = False, math.nan
             flux[s, k] = complex(real, imag)
         if codes[s] == GOOD and not sound:
-            codes[s] = faults.ABSURD_CODE if finite else faults.NOT_FINITE_CODE
+            codes[s] = ABSURD_CODE if finite else NOT_FINITE_CODE
     return some_dead
 
 

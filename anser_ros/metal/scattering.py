@@ -159,6 +159,11 @@ def as_parts(values: NDArray[np.inexact]) -> Array:
     return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
 
 
+def both_phases(unit: NDArray[np.inexact]) -> ComplexArray:
+    """Return columns (..., m) in phase, then in quadrature, (..., 2 m)."""
+    return np.concatenate([unit, 1j * unit], axis=-1)
+
+
 def tilt(omega: Array) -> Array:
     """Return the logarithm of each emitter's frequency, less the mean of all, shape (K,)."""
     logs = np.log(omega)

@@ -8,6 +8,13 @@ import os
 import signal
 import sys
 
+from anser_ros.parallel import ONE_THREAD
+
+# Before numpy is imported: the threads of BLAS wait busily for each other between small matrices,
+# which takes the second core from the other nodes, and a quarter of the windows with it.
+for variable in ONE_THREAD:
+    os.environ.setdefault(variable, '1')
+
 # Python names a program so while it looks for it, before the program itself imports anything: a
 # Ctrl-C in these seconds ends it as one later does, and not with the imports' traceback.
 if sys.argv[0] == '-m':

@@ -123,10 +123,8 @@ class Monitor(AnserNode):
         if self._first_s is None:
             self._first_s = time.monotonic()
         variance, stamp_s = message.pose.covariance, stamp_of(message) * NANO
-        pose = pose_numbers(message.pose.pose)
         trace.stamp_s.append(stamp_s)
-        trace.position.append(pose[:3])
-        trace.axis.append(_z_axis(*pose[3:]))
+        trace.position.append(pose_numbers(message.pose.pose)[:3])
         trace.sigma_m.append(float(np.sqrt(variance[0] + variance[7] + variance[14])))
         trace.latency_s.append(latency_of(now_s, stamp_s))
 
@@ -277,13 +275,11 @@ class Monitor(AnserNode):
             for index, trace in enumerate(traces):
                 optical = self._optical[trace.target.body].track()
                 key = f'{rank}_{index}'
-                away, angle = trace.errors(optical) if optical else (np.zeros(0), np.zeros(0))
                 arrays[f'stamp_{key}'] = np.array(trace.stamp_s)
                 arrays[f'position_{key}'] = np.array(trace.position, float).reshape(-1, 3)
                 arrays[f'sigma_{key}'] = np.array(trace.sigma_m)
                 arrays[f'latency_{key}'] = np.array(trace.latency_s)
-                arrays[f'error_{key}'] = away
-                arrays[f'angle_{key}'] = angle
+                arrays[f'error_{key}'] = trace.distances(optical) if optical else np.zeros(0)
         for body, seen in self._optical.items():
             arrays[f'optical_{body}'] = np.column_stack(
                 [np.array(seen.stamp_s), np.array(seen.position, float).reshape(-1, 3)]
@@ -305,11 +301,6 @@ def _check(path: Path) -> None:
         _part(path).unlink()
     except OSError as error:
         raise ParameterError(f'parameter output: {path}: {error.strerror}') from error
-
-
-def _z_axis(x: float, y: float, z: float, w: float) -> tuple[float, ...]:
-    """Axis of a pose: +z, as docs/interfaces.md has it, for sensors as for bodies."""
-    return 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
 
 
 def _mm(value_m: float, digits: int = 2) -> str:

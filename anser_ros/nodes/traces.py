@@ -1,7 +1,5 @@
 """Traces what came in for every sensor and body, and how far it is from the optical truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,7 +8,6 @@ import numpy as np
 
 from anser_ros.arrays import Array
 from anser_ros.physics.pose_track import PoseTrack
-from anser_ros.physics.rotations import axis_angles
 from anser_ros.stamps import LIVE_WITHIN_S
 from anser_ros.wire.setup import Setup
 
@@ -35,24 +32,19 @@ def middle(values: Sequence[float] | Array, of: Callable[[Array], Any] = np.medi
 
 @dataclass(frozen=True)
 class Target:
-    """Names a sensor or a body that is tracked, with its place and axis in the body's frame."""
+    """Names a sensor or a body that is tracked, with its place in the body's frame."""
 
     name: str
     body: str
     position_m: tuple[float, float, float]
-    axis: tuple[float, float, float]
 
 
 def targets_of(setup: Setup) -> list[Target]:
     """Return all tool sensors of a setup, and the bodies that carry more than one."""
-    sensors = [Target(s.name, s.body, s.position_m, s.axis) for s in setup.tool_sensors]
+    sensors = [Target(s.name, s.body, s.position_m) for s in setup.tool_sensors]
     carried = [sensor.body for sensor in sensors]
-    bodies = [
-        Target(body, body, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-        for body in setup.bodies
-        if carried.count(body) > 1
-    ]
-    return sensors + bodies
+    solid = [body for body in setup.bodies if carried.count(body) > 1]
+    return sensors + [Target(body, body, (0.0, 0.0, 0.0)) for body in solid]
 
 
 @dataclass
@@ -104,7 +96,6 @@ class PoseTrace:
     target: Target
     stamp_s: list[float] = field(default_factory=list)
     position: list[tuple[float, ...]] = field(default_factory=list)
-    axis: list[tuple[float, ...]] = field(default_factory=list)
     sigma_m: list[float] = field(default_factory=list)
     latency_s: list[float] = field(default_factory=list)
     forgotten: int = 0
@@ -113,27 +104,22 @@ class PoseTrace:
     def forget(self) -> None:
         """Keep only the poses that the next row needs."""
         gone = max(len(self.stamp_s) - OVERLAP, 0)
-        for values in (self.stamp_s, self.position, self.axis, self.sigma_m, self.latency_s):
+        for values in (self.stamp_s, self.position, self.sigma_m, self.latency_s):
             del values[:gone]
         self.forgotten += gone
         self._shown -= gone
 
-    def distances(self, optical: PoseTrack, since: int = 0) -> tuple[Array, Array]:
+    def distances(self, optical: PoseTrack, since: int = 0) -> Array:
         """Return distances (m) to the truth of the poses from number `since` on, NaN where the
-        optical track does not reach, and the true axes.
+        optical track does not reach.
         """
         stamps = np.array(self.stamp_s[since:])
         if not stamps.size:
-            return np.zeros(0), np.zeros((0, 3))
+            return np.zeros(0)
         position, rotation, _ = optical.at(stamps, LONGEST_OPTICAL_GAP_S)
         true_position = position + rotation @ np.array(self.target.position_m)
         away = np.linalg.norm(np.array(self.position[since:]) - true_position, axis=1)
-        return away, rotation @ np.array(self.target.axis)
-
-    def errors(self, optical: PoseTrack) -> tuple[Array, Array]:
-        """Return distances (m) and angles (rad) of all poses to the truth, as `distances`."""
-        away, axes = self.distances(optical)
-        return away, axis_angles(np.array(self.axis).reshape(-1, 3), axes)
+        return np.asarray(away)
 
     def row(self, optical: PoseTrack | None, elapsed_s: float) -> Row:
         since, self._shown = self._shown, len(self.stamp_s)
@@ -141,7 +127,7 @@ class PoseTrace:
         error = float('nan')
         if count and optical is not None:
             # the last poses may be newer than the last optical one
-            error = middle(self.distances(optical, max(0, since - OVERLAP))[0])
+            error = middle(self.distances(optical, max(0, since - OVERLAP)))
         position = self.position[-1] if count else (float('nan'),) * 3
         sigma, latency = middle(self.sigma_m[since:]), middle(self.latency_s[since:])
         return Row(self.target.name, position, sigma, error, count / elapsed_s, latency)

@@ -116,29 +116,16 @@ def quaternion_of_axis(axis: AnyArray) -> tuple[float, float, float, float]:
 
 def quaternion_of_rotation(matrix: AnyArray) -> tuple[float, float, float, float]:
     """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation matrix (Shepperd)."""
-    m = np.asarray(matrix, dtype=np.float64)
-    trace = float(np.trace(m))
-    squares = [1.0 + 2.0 * float(m[i, i]) - trace for i in range(3)] + [1.0 + trace]
-    best = int(np.argmax(squares))
-    q = np.zeros(4)
-    root = math.sqrt(squares[best])
-    q[best] = 0.5 * root
-    half = 0.5 / root
-    if best == 3:
-        q[0], q[1], q[2] = (
-            half * (m[2, 1] - m[1, 2]),
-            half * (m[0, 2] - m[2, 0]),
-            half * (m[1, 0] - m[0, 1]),
-        )
-    else:
-        j, k = (best + 1) % 3, (best + 2) % 3
-        q[j] = half * (m[j, best] + m[best, j])
-        q[k] = half * (m[k, best] + m[best, k])
-        q[3] = half * (m[k, j] - m[j, k])
-    if q[3] < 0:
-        q = -q
-    q /= math.sqrt(float(q @ q))
-    return float(q[0]), float(q[1]), float(q[2]), float(q[3])
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, dtype=np.float64).tolist()
+    rows = (  # four times the quaternion, times its x, y, z and w
+        (1.0 + a - e - i, b + d, c + g, h - f),
+        (b + d, 1.0 + e - a - i, f + h, c - g),
+        (c + g, f + h, 1.0 + i - a - e, d - b),
+        (h - f, c - g, d - b, 1.0 + a + e + i),
+    )
+    x, y, z, w = rows[max(range(4), key=lambda k: rows[k][k])]
+    norm = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), w or 1.0)
+    return x / norm, y / norm, z / norm, w / norm
 
 
 def rotation_of_quaternion(quaternion: AnyArray) -> Array:

@@ -52,19 +52,11 @@ class Windings:
 
 def joined_windings(tables: Sequence['SensorTable']) -> Windings | None:
     """Return the windings of several tables, one table after the other."""
-    given = [table.windings for table in tables]
-    most = max((w.weight.shape[1] for w in given if w is not None), default=0)
-    if most == 0:
-        return None
-    offset, weight = [], []
-    for table, own in zip(tables, given, strict=True):
-        points = np.zeros((len(table), most, 4))
-        if own is not None:
-            points[:, : own.weight.shape[1], :3] = own.offset
-            points[:, : own.weight.shape[1], 3] = own.weight
-        offset.append(points[:, :, :3])
-        weight.append(points[:, :, 3])
-    return Windings(np.concatenate(offset), np.concatenate(weight))
+    rows: list[Any] = []
+    for table in tables:
+        own = table.windings
+        rows += [()] * len(table) if own is None else [*np.dstack([own.offset, own.weight])]
+    return Windings.of(rows)
 
 
 ARRAYS, NAMES = ('channel', 'position', 'axis', 'length'), ('name', 'body')

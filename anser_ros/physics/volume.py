@@ -67,10 +67,8 @@ class TrackedVolume:
 
     def contains(self, position: Array) -> bool:
         """Return whether a position (m) lies in the box."""
-        (x, y, z), (low_x, low_y, low_z), (high_x, high_y, high_z) = (
-            position.tolist(), self.low, self.high,
-        )  # fmt: skip
-        return bool(low_x <= x <= high_x and low_y <= y <= high_y and low_z <= z <= high_z)
+        sides = zip(self.low, position.tolist(), self.high, strict=True)
+        return all(low <= place <= high for low, place, high in sides)
 
     def grown(self, margin_m: float) -> tuple[Array, Array]:
         """Return the corners with a margin around the box; the floor keeps half of its height.

@@ -14,8 +14,7 @@ import numpy as np
 from anser_ros.arrays import Array, Booleans, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
-from anser_ros.frames import faults
-from anser_ros.frames.intake import Frame
+from anser_ros.frames.intake import FAULTS, GOOD, Frame
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit import health
 from anser_ros.refit.posterior import median
@@ -137,8 +136,8 @@ def checked_baseline(
     return given
 
 
-SILENT_CODE, NO_BASELINE_CODE = len(faults.FAULTS), len(faults.FAULTS) + 1
-"""Codes of what only a baseline shows, after those of `frames.faults`."""
+SILENT_CODE, NO_BASELINE_CODE = len(FAULTS), len(FAULTS) + 1
+"""Codes of what only a baseline shows, after those of `frames.intake`."""
 _OF_KIND = {
     'missing': health.MISSING,
     'not_finite': health.NOT_FINITE,
@@ -147,7 +146,7 @@ _OF_KIND = {
 }
 _REASONS = (
     health.OK,
-    *(_OF_KIND.get(fault.kind, health.FLAGGED) for fault in faults.FAULTS if fault is not None),
+    *(_OF_KIND.get(fault.kind, health.FLAGGED) for fault in FAULTS if fault is not None),
     health.SILENT,
     health.NO_BASELINE,
 )
@@ -169,10 +168,10 @@ class BaselineCheck:
         """Return which readings (S,) of a frame can be used, and why not, if any cannot."""
         flux, codes = frame.flux, frame.codes
         is_silent = power_of(flux) < self._least
-        codes = np.where((codes == faults.GOOD) & is_silent, SILENT_CODE, codes)
+        codes = np.where((codes == GOOD) & is_silent, SILENT_CODE, codes)
         if self._lacks is not None:
             codes = np.where(self._lacks, NO_BASELINE_CODE, codes)
-        readable = codes == faults.GOOD
+        readable = codes == GOOD
         return readable, [] if readable.all() else [_REASONS[code] for code in codes.tolist()]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
-from anser_ros.frames.faults import GOOD, reading_codes
+from anser_ros.frames.intake import GOOD, reading_codes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable, Windings
 from anser_ros.sessions.plausibility import plausible_tools

@@ -1,6 +1,5 @@
 """Evaluates a recorded session: tracks it as live, and compares with the optical poses."""
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -75,7 +74,6 @@ def track(
     age_s = prepared.session.setup.refit.references_age_s
     chain = Chain(follower, TrackingHalf(tracker, age_s))
     frames = list(frames_of(prepared.session))
-    start = time.perf_counter()
     for count, frame in enumerate(frames, start=1):
         for estimate in chain.step(frame.in_phase() if in_phase else frame):
             estimates.setdefault(estimate.name, []).append(estimate)
@@ -85,13 +83,12 @@ def track(
                     further[observer.KIND].setdefault(body, []).append(estimate)
         if progress is not None:
             progress(count / len(frames))
-    seconds = (time.perf_counter() - start) / max(len(frames), 1)
     sensors, bodies = _compared(prepared, estimates)
     found_by = {one.KIND: one for one in observers if further[one.KIND]}
     others = {kind: one.compare(prepared, further[kind]) for kind, one in found_by.items()}
     others = {kind: series for kind, series in others.items() if series}
     summary = None if follower is None else follower.summary
-    return Evaluation(sensors, bodies, seconds, summary, others)
+    return Evaluation(sensors, bodies, summary, others)
 
 
 @dataclass(frozen=True)
@@ -161,14 +158,12 @@ def error_statistics(key: str, unit: str, errors: Array) -> dict[str, float | No
 class Evaluation:
     """Holds tracked poses and their errors, by the names of sensors, and of bodies in six degrees.
 
-    The seconds are the mean wall time of a frame; ``refit`` is what the refit did, None where the
-    model did not follow the references, and ``further`` what else was tracked, by kind and
-    name.
+    ``refit`` is what the refit did, None where the model did not follow the references, and
+    ``further`` what else was tracked, by kind and name.
     """
 
     sensors: dict[str, PoseSeries]
     bodies: dict[str, PoseSeries]
-    seconds_per_frame: float
     refit: RefitSummary | None = None
     further: dict[str, dict[str, PoseSeries]] = field(default_factory=dict)
 

@@ -5,8 +5,6 @@ turns the bytes of commands into the bytes of records. It has no clock: its owne
 elapsed time as a number of samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,27 +14,8 @@ from numpy.typing import NDArray
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.simulation.effects import RawEffect
 from anser_ros.simulation.world import World
+from anser_ros.wire import frames
 from anser_ros.wire.channel_calibration import ChannelCalibration
-from anser_ros.wire.frames import (
-    FULL_SCALE_CODE,
-    TYPE_OF,
-    Channel,
-    ChannelKind,
-    DeviceState,
-    DeviceStatus,
-    Hello,
-    Identify,
-    Record,
-    Reply,
-    ReplyCode,
-    SampleBlock,
-    SamplesFlag,
-    SetFrequencies,
-    Start,
-    StatusFlag,
-    Stop,
-    encode,
-)
 from anser_ros.wire.protocols import FrameReader
 
 OVERLOAD_GAIN = 1e4
@@ -155,10 +134,10 @@ class Sampler:
         codes = self._rng.standard_normal((len(volts), volts.shape[1] + 1), np.float32)
         codes[:, :-1] *= front.noise_codes
         codes[:, -1] *= front.current_noise_codes
-        codes[:, :-1] += volts * (FULL_SCALE_CODE / front.full_scale_v)
-        codes[:, -1] += current * (FULL_SCALE_CODE / front.full_scale_a)
+        codes[:, :-1] += volts * (frames.FULL_SCALE_CODE / front.full_scale_v)
+        codes[:, -1] += current * (frames.FULL_SCALE_CODE / front.full_scale_a)
         np.rint(codes, out=codes)
-        np.clip(codes, -FULL_SCALE_CODE, FULL_SCALE_CODE - 1, out=codes)
+        np.clip(codes, -frames.FULL_SCALE_CODE, frames.FULL_SCALE_CODE - 1, out=codes)
         return codes.astype('<i2')
 
 
@@ -168,7 +147,7 @@ TICK_HZ = 1e6
 """Rate of the device's timestamp counter, Hz: microseconds, as usual in microcontrollers."""
 BLOCK_SAMPLES = 40
 """Sampling instants a block, unless a setting says another: 1 ms at the usual rate."""
-_COMMANDS = (Identify, Start, Stop, SetFrequencies)
+_COMMANDS = (frames.Identify, frames.Start, frames.Stop, frames.SetFrequencies)
 
 
 @dataclass(frozen=True)
@@ -206,7 +185,7 @@ class ControlUnit:
         self.samples = 0
         self._stream_begin = 0
         self._sequence = 0
-        self._state = DeviceState.IDLE
+        self._state = frames.DeviceState.IDLE
         self._dropped = 0
         self._lost_before = False
         self._next_hello = 0
@@ -219,7 +198,7 @@ class ControlUnit:
     @property
     def streaming(self) -> bool:
         """Return whether the unit sends samples."""
-        return self._state is DeviceState.STREAMING
+        return self._state is frames.DeviceState.STREAMING
 
     def receive(self, data: bytes) -> list[Piece]:
         """Take bytes from the host and return the records that answer."""
@@ -253,7 +232,7 @@ class ControlUnit:
         pieces: list[Piece] = []
         if self.samples >= self._next_hello:
             self._next_hello = self.samples + int(self.sample_rate_hz)
-            pieces += [Piece(encode(self._hello)), Piece(encode(self._status()))]
+            pieces += [Piece(frames.encode(self._hello)), Piece(frames.encode(self._status()))]
         if self.streaming:
             pieces += self._blocks(samples)
         self.samples += samples
@@ -268,53 +247,53 @@ class ControlUnit:
         codes = self._sampler.codes(begin, count * block)
         pieces = []
         for rank in range(count):
-            part = SampleBlock(
+            part = frames.SampleBlock(
                 self._sequence % 2**32,
                 self._ticks(begin + rank * block),
                 codes[rank * block : (rank + 1) * block],
-                int(SamplesFlag.LOST_BEFORE) if self._lost_before else 0,
+                int(frames.SamplesFlag.LOST_BEFORE) if self._lost_before else 0,
             )
             self._lost_before = False
             self._sequence += 1
-            pieces.append(Piece(encode(part), True, begin + (rank + 1) * block))
+            pieces.append(Piece(frames.encode(part), True, begin + (rank + 1) * block))
         return pieces
 
-    def _obey(self, record: Record) -> list[Piece]:
+    def _obey(self, record: frames.Record) -> list[Piece]:
         command = record.payload
         if not isinstance(command, _COMMANDS):
             return []
-        code, text, more = ReplyCode.OK, '', []
-        if isinstance(command, Start):
-            self._state = DeviceState.STREAMING
+        code, text, more = frames.ReplyCode.OK, '', []
+        if isinstance(command, frames.Start):
+            self._state = frames.DeviceState.STREAMING
             self._stream_begin, self._sequence = self.samples, 0
             self._dropped, self._lost_before = 0, False
             self._sampler.drive(self.samples / self.sample_rate_hz)
-        elif isinstance(command, Stop):
-            self._state = DeviceState.IDLE
-        elif isinstance(command, Identify):
-            more = [Piece(encode(self._hello))]
+        elif isinstance(command, frames.Stop):
+            self._state = frames.DeviceState.IDLE
+        elif isinstance(command, frames.Identify):
+            more = [Piece(frames.encode(self._hello))]
         else:
             code, text = self._set_frequencies(command)
-            more = [Piece(encode(self._hello))] if code is ReplyCode.OK else []
-        reply = encode(Reply(TYPE_OF[type(command)], code, text), record.tag)
+            more = [Piece(frames.encode(self._hello))] if code is frames.ReplyCode.OK else []
+        reply = frames.encode(frames.Reply(frames.TYPE_OF[type(command)], code, text), record.tag)
         return [Piece(reply), *more]
 
-    def _set_frequencies(self, command: SetFrequencies) -> tuple[ReplyCode, str]:
+    def _set_frequencies(self, command: frames.SetFrequencies) -> tuple[frames.ReplyCode, str]:
         tones = command.frequencies_hz
         count = len(self._hello.frequencies_hz)
         if len(tones) != count:
-            return ReplyCode.BAD_ARGUMENT, f'{count} coils, {len(tones)} frequencies'
+            return frames.ReplyCode.BAD_ARGUMENT, f'{count} coils, {len(tones)} frequencies'
         if max(tones) >= self.sample_rate_hz / 2:
-            return ReplyCode.BAD_ARGUMENT, 'a frequency above half the sample rate'
+            return frames.ReplyCode.BAD_ARGUMENT, 'a frequency above half the sample rate'
         self._hello = replace(self._hello, frequencies_hz=tones)
         self._sampler.set_frequencies(np.array(tones))
-        return ReplyCode.OK, ''
+        return frames.ReplyCode.OK, ''
 
-    def _status(self) -> DeviceStatus:
+    def _status(self) -> frames.DeviceStatus:
         refused = self._reader.counters
-        return DeviceStatus(
+        return frames.DeviceStatus(
             self._state,
-            StatusFlag.OVERRUN if self._dropped else StatusFlag(0),
+            frames.StatusFlag.OVERRUN if self._dropped else frames.StatusFlag(0),
             self._ticks(self.samples),
             self._dropped,
             refused.bad_header + refused.bad_crc + refused.bad_payload + refused.unknown_type,
@@ -325,12 +304,12 @@ class ControlUnit:
         return round(sample / self.sample_rate_hz * TICK_HZ)
 
 
-def _hello(world: World, front: FrontEnd, block_samples: int, nominal_a: float) -> Hello:
+def _hello(world: World, front: FrontEnd, block_samples: int, nominal_a: float) -> frames.Hello:
     numbers = [sensor.channel for sensor in world.sensors]
-    channels = [Channel(n, ChannelKind.SENSE, front.full_scale_v) for n in numbers]
-    current = Channel(max(numbers) + 1, ChannelKind.CURRENT, front.full_scale_a)
+    channels = [frames.Channel(n, frames.ChannelKind.SENSE, front.full_scale_v) for n in numbers]
+    current = frames.Channel(max(numbers) + 1, frames.ChannelKind.CURRENT, front.full_scale_a)
     tones = world.setup.frequencies_hz
-    return Hello(
+    return frames.Hello(
         NAME,
         front.sample_rate_hz,
         TICK_HZ,

@@ -4,8 +4,6 @@ Times count from the first drive of the coils, s, except for the optical clock. 
 effect and its parameters at random, for tests that do not know the answer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Simulates the line between control unit and host: a pseudo-terminal, and its faults."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

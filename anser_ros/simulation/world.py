@@ -4,8 +4,6 @@ It gives the true flux of every sensor at any time. Metal is a rigid cloud of co
 permeable spheres; the board's field is that of all tracks of its coils.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 

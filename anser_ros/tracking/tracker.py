@@ -22,8 +22,7 @@ from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import FieldModel
-from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE, value_codes
-from anser_ros.frames.intake import Frame, Freshness, Intake
+from anser_ros.frames.intake import FAULTS, GOOD, STUCK_CODE, Frame, Freshness, Intake, value_codes
 from anser_ros.integrity.pose_checks import SurveyErrors, distances
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume

@@ -18,16 +18,7 @@ from pathlib import Path
 
 from anser_ros.simulation.control_unit import TICK_HZ, Piece
 from anser_ros.simulation.line import PseudoPort
-from anser_ros.wire.frames import (
-    CRC,
-    HEADER,
-    MAGIC,
-    OVERHEAD,
-    Hello,
-    SampleBlock,
-    decode_payload,
-    encode,
-)
+from anser_ros.wire import frames
 
 Tamper = Callable[[list[bytes], float], list[bytes]]
 """Takes the records that came and the time, s, that it has been on; gives what arrives."""
@@ -53,13 +44,15 @@ def kind(record: bytes) -> int:
 
 def opened(record: bytes) -> object:
     """Return what a record carries."""
-    return decode_payload(kind(record), memoryview(record)[HEADER.size : -CRC.size])
+    return frames.decode_payload(
+        kind(record), memoryview(record)[frames.HEADER.size : -frames.CRC.size]
+    )
 
 
 def inside(
     *,
-    hello: Callable[[Hello], Hello] = lambda given: given,
-    block: Callable[[SampleBlock], SampleBlock | None] = lambda given: given,
+    hello: Callable[[frames.Hello], frames.Hello] = lambda given: given,
+    block: Callable[[frames.SampleBlock], frames.SampleBlock | None] = lambda given: given,
 ) -> Tamper:
     """Return a tamper that changes hellos and blocks of samples, or swallows blocks.
 
@@ -75,7 +68,7 @@ def inside(
                 changed = changes[kind(record)](given)
                 if changed is None:
                     continue
-                record = record if changed is given else encode(changed)
+                record = record if changed is given else frames.encode(changed)
             out.append(record)
         return out
 
@@ -84,7 +77,7 @@ def inside(
 
 def with_crc(body: bytes) -> bytes:
     """Return a record whose last four bytes are its right checksum."""
-    return body[: -CRC.size] + CRC.pack(zlib.crc32(body[: -CRC.size]))
+    return body[: -frames.CRC.size] + frames.CRC.pack(zlib.crc32(body[: -frames.CRC.size]))
 
 
 class Line:
@@ -204,7 +197,7 @@ class Line:
         """Keep the least delay, by the unit's clock, of each slice of time."""
         for record in records:
             if kind(record) == SAMPLES:
-                _, ticks = struct.unpack_from('<IQ', record, HEADER.size)
+                _, ticks = struct.unpack_from('<IQ', record, frames.HEADER.size)
                 slice_ = int(now / SLICE_S)
                 delay = now - ticks / TICK_HZ
                 self._lateness[slice_] = min(delay, self._lateness.get(slice_, delay))
@@ -225,11 +218,11 @@ class Line:
         """Return whole records; the unit's own end of the line is never damaged."""
         data, records, place = self._rest + came, [], 0
         while True:
-            start = data.find(MAGIC, place)
-            if start < 0 or len(data) - start < HEADER.size:
+            start = data.find(frames.MAGIC, place)
+            if start < 0 or len(data) - start < frames.HEADER.size:
                 break
-            length = HEADER.unpack_from(data, start)[3]
-            end = start + OVERHEAD + length
+            length = frames.HEADER.unpack_from(data, start)[3]
+            end = start + frames.OVERHEAD + length
             if end > len(data):
                 break
             records.append(data[start:end])

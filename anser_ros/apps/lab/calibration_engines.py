@@ -35,7 +35,7 @@ from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import Dipoles, EffectRecord, FieldModel, size_parameters, spread_along
+from anser_ros.field.model import Dipoles, EffectRecord, FieldModel, size_figures, spread_along
 from anser_ros.physics.rotations import tilted
 from anser_ros.sessions.calibration import SCAN, Engine, at_constant_strength, generator_of
 from anser_ros.sessions.nominal_board import NominalBoard
@@ -116,7 +116,7 @@ def with_source_sizes(calibration: Calibration) -> Calibration:
     evidence = {'heldout_point_t': scores[POINT], 'heldout_sized_t': scores[SIZED]}
     records = []
     for k in np.flatnonzero(np.abs(sources.sizes_m2) > LEAST_SIGMAS * sigma).tolist():
-        figures, sigmas = size_parameters(float(sources.sizes_m2[k]), float(sigma[k]))
+        figures, sigmas = size_figures(float(sources.sizes_m2[k]), float(sigma[k]))
         records.append(EffectRecord('emitter_size', {'coil': k, **figures}, sigmas, evidence))
     scan = replace(scan, reported_effects=(*scan.reported_effects, *records))
     return replace(calibration, scan=scan)

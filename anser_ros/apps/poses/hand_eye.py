@@ -23,7 +23,7 @@ from anser_ros.apps.poses.search import PoseEvidence, frame_terms, with_noise
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, train_blocks
 from anser_ros.arrays import Array
-from anser_ros.effects.effect import needed, sigmas
+from anser_ros.effects.effect import sigmas
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
 
@@ -51,7 +51,7 @@ class PoseClock:
         self._shared = sum(map(_offset, shared))
         self._gain, self._first, self._last = 0.0, 0, 0
         if rate is not None and 'first_ns' in support:
-            gain = 1e-6 * float(needed(rate, 'rate_ppm'))
+            gain = 1e-6 * float(rate.needed('rate_ppm'))
             self._gain = gain / (1 + gain)
             self._first, self._last = int(support['first_ns']), int(support['last_ns'])
 
@@ -63,7 +63,7 @@ class PoseClock:
 
 
 def _offset(record: EffectRecord) -> float:
-    return float(needed(record, 'offset_s'))
+    return float(record.needed('offset_s'))
 
 
 def one_clock(records: Sequence[EffectRecord], duration: float) -> list[EffectRecord]:

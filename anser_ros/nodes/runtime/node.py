@@ -20,7 +20,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from anser_ros.errors import AnserError
+from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.runtime import incoming, parameters, qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status, Throttle, diagnostic_array
 
@@ -82,11 +82,12 @@ class AnserNode(Node):
         self.create_timer(DIAGNOSTICS_PERIOD_S, self.publish_diagnostics, clock=self.steady_clock)
         if self.HAS_KERNELS:
             # Numba is half of the start of a node that has none.
-            from anser_ros.kernel_cache import wait_for_kernels
+            from anser_ros.kernel_cache import compile_kernels
 
-            trouble = wait_for_kernels(self._say_starting)
-            if trouble:
-                self.warn('kernels_not_compiled', trouble)
+            try:
+                compile_kernels(self._say_starting, interval_s=DIAGNOSTICS_PERIOD_S)
+            except ParameterError as error:
+                self.warn('kernels_not_compiled', str(error))
 
     # What a node may override -------------------------------------------------------------
 

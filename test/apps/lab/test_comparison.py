@@ -110,7 +110,7 @@ def evaluation_of(found, state=OK):
     sizes[5] = np.nan
     if state != OK:
         sizes[:] = np.nan
-    return Evaluation({'a': PoseSeries('a', estimates, sizes, 2 * sizes)}, {}, 1e-3)
+    return Evaluation({'a': PoseSeries('a', estimates, sizes, 2 * sizes)}, {})
 
 
 def written(folder, found, state=OK):

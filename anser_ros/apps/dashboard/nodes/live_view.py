@@ -166,7 +166,7 @@ class LiveView:
         for number, recent in enumerate(self._recent):
             track = optical[recent.target.body]
             if track is not None:
-                found[number] = traces.middle(recent.distances(track)[0], _rms)
+                found[number] = traces.middle(recent.distances(track), _rms)
         self._recent = [traces.PoseTrace(target) for target in self.targets]
         return found
 

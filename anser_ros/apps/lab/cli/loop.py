@@ -34,10 +34,10 @@ from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.main import check_packages
 from anser_ros.cli.output import add_json, add_out, make_new_folder, say_written, write_files
 from anser_ros.cli.processes import LAST_DOMAIN, Supervisor, own_domain, tail
-from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import AnserError, DiagnosisError, ParameterError, SetupError
 from anser_ros.field.model import FieldModel
+from anser_ros.kernel_cache import compile_kernels
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import Session, load_session

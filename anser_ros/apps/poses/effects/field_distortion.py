@@ -21,7 +21,7 @@ from anser_ros.apps.poses.effect import (
 from anser_ros.arrays import Array, Integers
 from anser_ros.calibration.error_map import PositionMap, Shape
 from anser_ros.effects.base import Remedy
-from anser_ros.effects.effect import needed, sigmas
+from anser_ros.effects.effect import sigmas
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 
@@ -35,10 +35,10 @@ UNIT_M = 1e-3
 def _smooth_map(record: EffectRecord) -> PositionMap:
     """The map of a record: what is added to tracked positions."""
     places, errors = (
-        np.asarray(needed(record, key), dtype=np.float64).reshape(-1, 3)
+        np.asarray(record.needed(key), dtype=np.float64).reshape(-1, 3)
         for key in ('places_m', 'errors_m')
     )
-    trend, length, noise = (needed(record, key) for key in ('trend', 'length_m', 'noise'))
+    trend, length, noise = (record.needed(key) for key in ('trend', 'length_m', 'noise'))
     return PositionMap(places, errors, Shape(int(trend), float(length), float(noise)))
 
 
@@ -239,7 +239,7 @@ class FieldDistortion(PoseEffect):
     def term(self, record: EffectRecord) -> PoseTerm:
         keys = ('sensor', 'degree', 'lowest', 'centre_m', 'size_m')
         site = cast(PoseSite, {k: record.parameters[k] for k in keys if k in record.parameters})
-        theta = np.asarray(needed(record, 'coefficients_mm'), dtype=np.float64)
+        theta = np.asarray(record.needed('coefficients_mm'), dtype=np.float64)
         count = 3 * _count(site) if site['degree'] else 4
         if theta.size != count:
             raise ModelFileError(
