@@ -88,7 +88,10 @@ class Salvage:
 
     def topic_words(self) -> str:
         """Return which topics there are, with their types."""
-        return ', '.join(f'{topic} ({kind})' for topic, kind in self.topics.items()) or 'no topics'
+        return (
+            ', '.join(f'{topic} ({kind})' for topic, kind in sorted(self.topics.items()))
+            or 'no topics'
+        )
 
 
 def _indexed(stream: io.BufferedReader) -> Iterator[_Found] | None:
