@@ -1,6 +1,7 @@
 """The tests' own end of the graph, beside a tracker or a field_model in the same process."""
 
 import numpy as np
+from clouds_of import FluxCloud
 from conftest import wait
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -11,7 +12,7 @@ from std_msgs.msg import String
 from tracking_world import certain_model, flux_points, setup_of, triaxial_tool
 
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.streams.clouds import CloudMaker, FluxCloud
+from anser_ros.nodes.streams.clouds import cloud_of
 from anser_ros.nodes.tracker import TrackerNode
 from anser_ros.wire.points import DipolePoints, encode_field_model
 from anser_ros.wire.setup import SensorSpec, dump_setup
@@ -108,7 +109,7 @@ class Bench:
 
     def say_model(self, model, stamp_ns=5):
         packed = encode_field_model(DipolePoints(model.positions, model.directions, model.moments))
-        self.model.publish(CloudMaker().message(packed, 'fg', stamp_ns))
+        self.model.publish(cloud_of(packed, 'fg', stamp_ns))
 
     def say_flux(self, flux, flags=None, stamp_ns=None):
         self.stamp_ns += 20_000_000

@@ -1,6 +1,7 @@
 """A field_model node that refits, in the process of the test, fed by its callbacks."""
 
 import numpy as np
+from clouds_of import FluxCloud
 from conftest import wait
 from geometry_msgs.msg import PointStamped
 from rclpy.executors import SingleThreadedExecutor
@@ -13,7 +14,6 @@ from visualization_msgs.msg import MarkerArray
 
 from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.setup import dump_setup
 

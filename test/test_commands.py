@@ -165,22 +165,14 @@ def test_a_file_without_permission_is_one_line_and_exit_code_2(words, tmp_path):
     for name in ('secret.mcap', 'secret.csv', 'secret.yaml'):
         (tmp_path / name).touch(mode=0)
     (tmp_path / 'closed').mkdir(mode=0o555)
-    as_plain_user = []
+    call = [sys.executable, '-m', 'anser_ros.cli.main', *words]
+    call = [word.replace('BAGS', str(REPO / 'bags')) for word in call]
     if os.geteuid() == 0:  # who may do everything, unless that right is taken away
         for path in tmp_path.iterdir():
             os.chown(path, 1, 1)
-        as_plain_user = ['setpriv', '--bounding-set=-all']
-    call = [sys.executable, '-m', 'anser_ros.cli.main', *words]
-    call = [word.replace('BAGS', str(REPO / 'bags')) for word in call]
+        call = ['setpriv', '--bounding-set=-all', *call]
     search = {**os.environ, 'PYTHONPATH': str(REPO)}
-    done = subprocess.run(
-        [*as_plain_user, *call],
-        cwd=tmp_path,
-        env=search,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = subprocess.run(call, cwd=tmp_path, env=search, capture_output=True, text=True)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count('\n') == 1 and 'Permission denied' in done.stderr
     assert len(list(tmp_path.iterdir())) == 4, 'nothing is left behind'
@@ -204,10 +196,8 @@ def test_a_bag_of_another_form_or_with_other_names_is_refused_with_what_mends_it
 def test_an_export_says_what_the_bag_has_lost(tmp_path, capsys):
     whole = (REPO / 'bags' / 'moving.mcap').read_bytes()
     (tmp_path / 'half.mcap').write_bytes(whole[: 7 * len(whole) // 10])
-    assert (
-        main(['export', str(tmp_path / 'half.mcap'), '--out', str(tmp_path / 'out'), '--json'])
-        == 0
-    )
+    half, out = str(tmp_path / 'half.mcap'), str(tmp_path / 'out')
+    assert main(['export', half, '--out', out, '--json']) == 0
     said = capsys.readouterr()
     assert said.err.count('breaks off') == 1 and json.loads(said.out)['lost'] in said.err
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clouds_of import message_of
 from tracking_world import certain_model, setup_of, triaxial_tool
 
 from anser_ros.chain.order import MOST_LATE, AnsweredFrames
@@ -24,15 +25,15 @@ def messages(numbers):
     """Uncertainty and dipoles of some models, with the stamps of their numbers."""
     writer = ModelWriter()
     models = {n: writer.given(uncertain(n), FIRST_NS + n, True) for n in numbers}
-    errors = {n: writer.error(model, 'fg') for n, model in models.items()}
-    return errors, {n: writer.dipoles(model, 'fg') for n, model in models.items()}
+    errors = {n: message_of(writer.error(model, 'fg')) for n, model in models.items()}
+    return errors, {n: message_of(writer.dipoles(model, 'fg')) for n, model in models.items()}
 
 
 def taken(intake, maker, *of_model):
     """The model of two messages."""
     given = maker.given(*of_model)
-    intake.take_error(maker.error(given, 'fg'))
-    return intake.take(maker.dipoles(given, 'fg'))
+    intake.take_error(message_of(maker.error(given, 'fg')))
+    return intake.take(message_of(maker.dipoles(given, 'fg')))
 
 
 def size_of(given):
@@ -102,7 +103,7 @@ def test_published_models_become_answers_that_share_what_is_the_same():
     assert 'no reference readings yet, or too few' in answers[2].withheld.reason
     assert answers[3].withheld.state == 'references_doubtful'
     given = maker.given(MODEL, now + 4, True, 2)  # of the same uncertainty, so not said again
-    last = reader.answer(intake.take(maker.dipoles(given, 'fg')))
+    last = reader.answer(intake.take(message_of(maker.dipoles(given, 'fg'))))
     assert last.model is answers[3].model and last.name == str(now + 4)
 
 
@@ -151,6 +152,21 @@ def test_every_frame_gets_the_model_of_its_own_instant(order):
             models.add(int(event[1:]))
         assert log.tracked == [(n, n) for n in sorted(frames & models)]
         assert bool(log.queue.waiting) == bool(frames - models)
+    assert log.queue.late == 0
+
+
+@pytest.mark.parametrize('order', ORDERS.values(), ids=ORDERS)
+def test_a_live_frame_gets_the_model_of_the_instant_before(order):
+    log, frames, models = Log(), set(), set()
+    for event in order:
+        if isinstance(event, int):
+            log.queue.add_frame(FIRST_NS + event * STEP_NS, event, 0.0, WAIT_S, lags=True)
+            frames.add(event)
+        else:
+            log.say(int(event[1:]))
+            models.add(int(event[1:]))
+        ready = [n for n in sorted(frames) if max(n - 1, 0) in models]
+        assert log.tracked == [(n, max(n - 1, 0)) for n in ready], 'the first has its own'
     assert log.queue.late == 0
 
 

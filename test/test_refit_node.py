@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+from clouds_of import message_of
 from geometry_msgs.msg import PoseStamped
 from refit_rig import HEAD, STEP_NS, Rig, setup_text
 from refit_world import metal_block
@@ -277,8 +278,10 @@ def test_markers_of_nothing_and_of_one_source(ros):
 
 def test_lost_references_are_told_to_the_trackers_and_to_the_operator(make):
     rig, intake, given = make(references_age_s=2.0, refit_rate_hz=1000.0), ModelIntake(), []
-    rig.node._output.errors.publish = lambda message: intake.take_error(message)
-    rig.node._output.models.publish = lambda message: given.append(intake.take(message))
+    rig.node._output.errors.publish = lambda message: intake.take_error(message_of(message))
+    rig.node._output.models.publish = lambda message: given.append(
+        intake.take(message_of(message))
+    )
     rig.start()
     change = rig.world.metal(HEAD)
     for _ in range(3):

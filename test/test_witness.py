@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from clouds_of import FluxCloud
 from conftest import REPO
 from geometry_msgs.msg import PoseStamped
 from refit_world import NOISE_T, anser_world, metal_block, metal_flux
@@ -17,7 +18,6 @@ from anser_ros.cli.main import main
 from anser_ros.errors import BagError
 from anser_ros.nodes.field_model_io import ToolWitnesses
 from anser_ros.nodes.runtime.node import AnserNode
-from anser_ros.nodes.streams.clouds import FluxCloud
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.witness import (
     CONTRADICTION_S,

@@ -23,8 +23,8 @@ class AnsweredFrames:
     def __init__(self, use: Callable[[Any], object], track: Callable[[Any], object]) -> None:
         self._use, self._track = use, track
         self._models: deque[tuple[int, Any]] = deque(maxlen=MOST_WAITING)
-        # Each with the time until which it waits; None where it is not to wait.
-        self._frames: deque[tuple[int, Any, float | None]] = deque()
+        # Each with the time until which it waits, None where it is not to, and whether it lags.
+        self._frames: deque[tuple[int, Any, float | None, bool]] = deque()
         self._last_frame_ns = self._active_ns = self._in_vain = 0
         self.follows = False
         self.late = 0
@@ -36,28 +36,32 @@ class AnsweredFrames:
 
     def add_model(self, stamp_ns: int, model: Any, now_s: float) -> None:
         """Take a model, and what becomes possible by it."""
-        frames = (self._last_frame_ns, *(stamp for stamp, _, _ in self._frames))
+        frames = (self._last_frame_ns, *(stamp for stamp, *_ in self._frames))
         if stamp_ns in frames:
             self._in_vain = 0
         self._models.append((stamp_ns, model))
         self.work(now_s)
 
-    def add_frame(self, stamp_ns: int, frame: Any, now_s: float, longest_wait_s: float) -> None:
+    def add_frame(
+        self, stamp_ns: int, frame: Any, now_s: float, longest_wait_s: float, lags: bool = False
+    ) -> None:
         """Take a frame, and track it once its model is there, at most so much later.
 
-        A frame that should not wait, with 0, is not late.
+        It is the frame's own model or, where that ``lags``, that of the frame before. A frame that
+        should not wait, with 0, is not late.
         """
         until_s = now_s + longest_wait_s if longest_wait_s > 0 else None
-        self._frames.append((stamp_ns, frame, until_s))
+        self._frames.append((stamp_ns, frame, until_s, lags))
         self.work(now_s)
 
     def work(self, now_s: float) -> None:
         """Track the frames that need not wait any longer."""
         while self._frames:
-            stamp_ns, frame, until_s = self._frames[0]
-            self._use_models(stamp_ns)
+            stamp_ns, frame, until_s, lags = self._frames[0]
+            due_ns = (self._last_frame_ns if lags else 0) or stamp_ns
+            self._use_models(due_ns)
             # Its model is active, or a later one says that it has none.
-            is_answered = self._active_ns == stamp_ns or bool(self._models)
+            is_answered = self._active_ns == due_ns or bool(self._models)
             may_wait = self.follows and not is_answered and self._in_vain < MOST_LATE
             if may_wait and until_s is not None:
                 if now_s < until_s and len(self._frames) <= MOST_WAITING:

@@ -37,14 +37,10 @@ and 0.4 mrad each."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = 'example: anser bags --out bags/'
-    parser.add_argument(
-        '--setup', default='demo_setup.yaml',
-        help='setup document: a path, or a file of config/ (%(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--out', type=Path, default=Path('bags'), metavar='DIR',
-        help='folder for the bags, made if missing (%(default)s)',
-    )  # fmt: skip
+    words = 'setup document: a path, or a file of config/ (%(default)s)'
+    parser.add_argument('--setup', default='demo_setup.yaml', help=words)
+    words = 'folder for the bags, made if missing (%(default)s)'
+    parser.add_argument('--out', type=Path, default=Path('bags'), metavar='DIR', help=words)
     parser.add_argument('--seed', type=int, default=1, help='of board and noise (%(default)s)')
     add_json(parser, 'what was written as JSON')
 

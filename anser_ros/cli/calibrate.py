@@ -47,23 +47,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options that hold for every calibration."""
-    parser.add_argument(
-        '--force', action='store_true',
-        help="write the model even when its held-out error is worse than the nominal model's",
-    )  # fmt: skip
-    parser.add_argument(
-        '--dipoles', type=_layer, metavar='NxN',
-        help='use a layer of N x N z-dipoles on the board; chosen by held-out error by default',
-    )  # fmt: skip
+    words = "write the model even when its held-out error is worse than the nominal model's"
+    parser.add_argument('--force', action='store_true', help=words)
+    words = 'use a layer of N x N z-dipoles on the board; chosen by held-out error by default'
+    parser.add_argument('--dipoles', type=_layer, metavar='NxN', help=words)
     parser.add_argument(
         '--estimate', type=_kinds, default=KINDS, metavar='LIST',
         help='errors of sensors and clock to estimate together with the field, where the scan '
         f'supports them; "none" trusts the setup for all; by default {",".join(KINDS)}; '
         f'{",".join(named_kinds())} only when named',
     )  # fmt: skip
-    parser.add_argument(
-        '--damping', type=float, help='damping of the moments; chosen by held-out error by default'
-    )
+    words = 'damping of the moments; chosen by held-out error by default'
+    parser.add_argument('--damping', type=float, help=words)
     output.add_stated_values(parser, 'accuracy')
 
 

@@ -63,9 +63,8 @@ class Observation(NamedTuple):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = 'example: anser doctor --device /dev/ttyACM0'
     parser.add_argument('--device', help="the control unit's port; all usual ones by default")
-    parser.add_argument(
-        '--seconds', type=float, default=LOOK_S, help='how long to look at the graph, s'
-    )
+    words = 'how long to look at the graph, s'
+    parser.add_argument('--seconds', type=float, default=LOOK_S, help=words)
     add_json(parser, 'the findings as JSON')
 
 

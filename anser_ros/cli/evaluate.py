@@ -211,9 +211,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'example: anser evaluate bags/metal.mcap --model config/demo_model.yaml'
         ' --refit --baseline bags/scan.mcap --out refit/'
     )
-    parser.add_argument(
-        'sessions', nargs='+', metavar='BAG', help='bags to track (.mcap files or bag folders)'
-    )
+    words = 'bags to track (.mcap files or bag folders)'
+    parser.add_argument('sessions', nargs='+', metavar='BAG', help=words)
     parser.add_argument(
         '--out', required=True, type=Path,
         help='folder for the results, made if missing; with several bags each has a folder in '
@@ -226,13 +225,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options that hold for every session."""
     output.add_session_options(parser)
-    parser.add_argument(
-        '--refit', action='store_true', help='let the model follow the reference sensors'
-    )
-    parser.add_argument(
-        '--references', metavar='CHANNEL,...|none',
-        help='reference sensors that the refit may use; the others are ignored',
-    )  # fmt: skip
+    words = 'let the model follow the reference sensors'
+    parser.add_argument('--refit', action='store_true', help=words)
+    words = 'reference sensors that the refit may use; the others are ignored'
+    parser.add_argument('--references', metavar='CHANNEL,...|none', help=words)
     parser.add_argument(
         '--witnesses', action='store_true',
         help='let the refit also use contradictions among the coils of rigid tools; for few '
@@ -240,9 +236,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     for extension in extensions.loaded('EVALUATIONS'):
         extension.add_options(parser)
-    parser.add_argument(
-        '--in-phase', action='store_true', help="use in-phase fluxes only, the article's way"
-    )
+    words = "use in-phase fluxes only, the article's way"
+    parser.add_argument('--in-phase', action='store_true', help=words)
     parser.add_argument(
         '--gate', type=float, default=TrackerSettings().gate,
         help='largest residual of a pose, in units of the expected one; inf withholds none (only '

@@ -12,10 +12,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = 'example: anser export bags/moving.mcap --format tum --out poses/'
     parser.add_argument('bag', help='bag to read (.mcap file or bag folder)')
     add_out(parser)
-    parser.add_argument(
-        '--format', choices=FORMATS, default=CSV,
-        help='csv (default), tum (poses only, for evo) or mat (MATLAB)',
-    )  # fmt: skip
+    words = 'csv (default), tum (poses only, for evo) or mat (MATLAB)'
+    parser.add_argument('--format', choices=FORMATS, default=CSV, help=words)
     add_json(parser, 'the written files as JSON')
 
 

@@ -19,14 +19,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'another program: anser import rosbag2_folder/ --remap /em/flux:=/anser/tool/flux '
         '--setup board.yaml --out session.mcap'
     )
-    parser.add_argument(
-        'source', type=Path,
-        help='document (.yaml) that describes tables, or a bag: .db3, .mcap, or its folder',
-    )  # fmt: skip
-    parser.add_argument(
-        '--out', required=True, type=Path,
-        help='the .mcap file to write, which must not exist yet; its folder is made if missing',
-    )  # fmt: skip
+    words = 'document (.yaml) that describes tables, or a bag: .db3, .mcap, or its folder'
+    parser.add_argument('source', type=Path, help=words)
+    words = 'the .mcap file to write, which must not exist yet; its folder is made if missing'
+    parser.add_argument('--out', required=True, type=Path, help=words)
     words = 'new name of a topic of the bag; may be repeated'
     add_list(parser, '--remap', metavar='/FROM:=/TO', help=words)
     parser.add_argument('--setup', type=Path, help='setup document, in place of any in the bag')

@@ -373,10 +373,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     words = f'sensor coils: {",".join(SENSOR_COLUMNS)}[,length_mm]; may be repeated'
     output.add_list(parser, '--sensors', type=Path, metavar='CSV', help=words)
     parser.add_argument('--rate', type=float, default=50.0, help='flux windows a second (50)')
-    parser.add_argument(
-        '--volume', metavar='X,Y,Z,X,Y,Z',
-        help='two corners of the tracked volume, mm; by default above the board, by its size',
-    )  # fmt: skip
+    words = 'two corners of the tracked volume, mm; by default above the board, by its size'
+    parser.add_argument('--volume', metavar='X,Y,Z,X,Y,Z', help=words)
     output.add_stated_values(parser, 'accuracy', 'refit', 'tools')
     output.add_json(parser, 'the written files and the advice as JSON')
 

@@ -30,9 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('setup', help='setup document: a path, or a file of config/')
     add_out(parser)
     parser.add_argument('--namespace', default='anser', help='of the nodes (%(default)s)')
-    parser.add_argument(
-        '--optical', default='/optical', help='namespace of the optical poses (%(default)s)'
-    )
+    words = 'namespace of the optical poses (%(default)s)'
+    parser.add_argument('--optical', default='/optical', help=words)
     words = "the tracker's frame_prefix, if there are several boards"
     parser.add_argument('--frame-prefix', default='', help=words)
     add_json(parser, 'the written files as JSON')

@@ -155,32 +155,29 @@ def _with_motion(view: View, terms: Sequence[Term]) -> View:
 
 def _measured(view: View, terms: Sequence[Term]) -> View:
     """Emitters, channels, offsets and compression."""
-    linear, channels = view.linear, view.sensors.channel
+    channels = view.sensors.channel
     # The derivatives go the way that the flux goes.
-    slopes = [view.d_position, view.d_axis, view.d_turn]
+    values = [view.linear[:, :, None], view.d_position, view.d_axis, view.d_turn]
     for term in terms:
         matrix = term.effect.emitter_matrix(term, view.time, view.omega)
         if matrix is not None:
             mixed = np.broadcast_to(matrix, (view.time.size, *matrix.shape[1:]))
-            linear = np.einsum('fab,fsb->fsa', mixed, linear)
-            slopes = [np.einsum('fab,fsib->fsia', mixed, slope) for slope in slopes]
+            values = [np.einsum('fab,fsib->fsia', mixed, value) for value in values]
     for term in terms:
         mixing = term.effect.channel_matrix(term, channels)
         if mixing is not None:
-            linear = np.einsum('st,ftk->fsk', mixing, linear)
-            slopes = [np.einsum('st,ftik->fsik', mixing, slope) for slope in slopes]
+            values = [np.einsum('st,ftik->fsik', mixing, value) for value in values]
     for term in terms:
         factor = term.effect.response(term, channels, view.omega)
         if factor is not None:
-            linear = linear * factor
-            slopes = [slope * factor[:, None, :] for slope in slopes]
-    flux = linear
+            values = [value * factor[:, None, :] for value in values]
+    flux = linear = values[0][:, :, 0]
     for term in terms:
         added = term.effect.offset(term, channels, view.omega.size)
         flux = flux if added is None else flux + added
     for term in terms:
         flux = term.effect.compress(term, channels, flux)
-    d_position, d_axis, d_turn = slopes
+    _, d_position, d_axis, d_turn = values
     return replace(
         view, linear=linear, flux=flux, d_position=d_position, d_axis=d_axis, d_turn=d_turn
     )

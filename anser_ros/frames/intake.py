@@ -218,9 +218,8 @@ class Intake:
             raise self._error(f'a flux frame needs a positive stamp, got {stamp_ns} ns')
         given = np.ascontiguousarray(flux, dtype=np.complex128)
         number = np.asarray(channels, dtype=np.int64)
-        if flags is None:
-            marks = np.zeros(number.shape, dtype=np.int64)
-        else:
+        marks = np.zeros(number.shape, dtype=np.int64)
+        if flags is not None:
             marks = np.ascontiguousarray(flags, dtype=np.int64)
         if given.ndim != 2 or number.shape != given.shape[:1] or marks.shape != number.shape:
             raise self._error(

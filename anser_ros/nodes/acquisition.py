@@ -31,7 +31,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.runtime.process import TURN_S, main
-from anser_ros.nodes.streams.clouds import FluxCloud, readings_of
+from anser_ros.nodes.streams.clouds import flux_cloud, readings_of
 from anser_ros.nodes.streams.one_source import Backlog, too_slow
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.frames import (
@@ -130,7 +130,6 @@ class Acquisition(AnserNode):
         self._reference_publisher = self.create_publisher(
             PointCloud2, 'reference/flux', qos.STREAM
         )
-        self._cloud = FluxCloud(self._setup.frame_id)
         may_set = table.set_frequencies and PROTOCOLS[table.protocol].sets_tones
         self._control = StreamControl(self._setup.frequencies_hz, set_frequencies=may_set)
         self._hello: Hello | None = None
@@ -310,11 +309,10 @@ class Acquisition(AnserNode):
             )
             reference = None if late else reference
             self.chain.step(ChainFrame(stamp_ns, tools, reference))
-        # References first: their model is what a tracker in another process waits for.
-        publishers = self._reference_publisher, self._tool_publisher
-        for publisher, points in zip(publishers, (frame.reference, frame.tool), strict=True):
+        publishers = self._tool_publisher, self._reference_publisher  # poses come first
+        for publisher, points in zip(publishers, (frame.tool, frame.reference), strict=True):
             if len(points.channel) and publisher.get_subscription_count():
-                publisher.publish(self._cloud.packed(points, stamp_ns))
+                publisher.publish(flux_cloud(points, self._setup.frame_id, stamp_ns))
         self._frame = frame
         self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
         return reference is not None

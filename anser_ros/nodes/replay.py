@@ -156,13 +156,11 @@ class Replay(AnserNode):
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
         parser.add_argument('bag', help='the .mcap file, or the folder that holds it')
-        parser.add_argument(
-            '--rate', type=float, default=1.0, help='speed; 0: as fast as the subscribers take it'
-        )
+        words = 'speed; 0: as fast as the subscribers take it'
+        parser.add_argument('--rate', type=float, default=1.0, help=words)
         parser.add_argument('--loop', action='store_true', help='begin again at the end')
-        parser.add_argument(
-            '--all', dest='all_topics', action='store_true', help='poses and diagnostics as well'
-        )
+        words = 'poses and diagnostics as well'
+        parser.add_argument('--all', dest='all_topics', action='store_true', help=words)
         parser.add_argument(
             '--wait', type=float, default=WAIT_S,
             help='longest wait for subscribers, s (%(default)g, and up to five times that before '

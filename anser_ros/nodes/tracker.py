@@ -41,7 +41,7 @@ from anser_ros.pose_states import OK, TWO_SOURCES, Withheld
 from anser_ros.sessions.prepared import settings_for
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import check_emitters, model_of
-from anser_ros.stamps import SECOND_NS
+from anser_ros.stamps import SECOND_NS, is_live
 from anser_ros.tracking.estimate import NO_GATE, USUAL_GATE, PoseEstimate, Tip, TrackerSettings
 from anser_ros.tracking.tracker import Tracker, warm_up
 from anser_ros.wire.setup import Setup, parse_setup
@@ -123,7 +123,7 @@ class TrackerParameters:
     )
     model_wait_s: float = parameter(
         0.1,
-        'longest time that a frame waits for the model of its instant while field_model refits, s',
+        'longest time that a frame waits for its model while field_model refits, s',
         minimum=0.0,
         maximum=10.0,
         live=True,
@@ -195,7 +195,8 @@ class TrackerNode(AnserNode):
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
         self._given: GivenModel | None = None
-        self._frames = AnsweredFrames(self._use_model, self._track)
+        self._frames = AnsweredFrames(self._use_answer, self._track)
+        self._is_live = False
         self.use, self.step = self.given(self._take_given), self.given(self._take_frame)
         self._trouble = Trouble()
         self._solve_s = self._diagnosed_s = 0.0
@@ -315,6 +316,10 @@ class TrackerNode(AnserNode):
         except AnserError as error:
             self._refuse('models_refused', error)
 
+    def _use_answer(self, given: GivenModel) -> None:
+        """Use a model for its own frame or, of what is live, for the one after it."""
+        self._use_model(given, self._is_live)
+
     def _on_flux(self, message: PointCloud2, is_doubted: bool = False) -> None:
         """Track a frame when its model is there, or after so long; say at once of one that may be
         another sender's why it has no poses.
@@ -323,8 +328,8 @@ class TrackerNode(AnserNode):
         if frame is not None and is_doubted:
             self._track(frame)
         elif frame is not None:
-            wait_s = self.parameters.model_wait_s
-            self._frames.add_frame(frame[0], frame, time.monotonic(), wait_s)
+            wait_s, self._is_live = self.parameters.model_wait_s, is_live(frame[0], time.time_ns())
+            self._frames.add_frame(frame[0], frame, time.monotonic(), wait_s, self._is_live)
             if self._frames.waiting:
                 self._wait.reset()
 

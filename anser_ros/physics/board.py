@@ -147,17 +147,15 @@ def spiral_path(
     ]
     drop = thickness_m / (layers - 1) if layers > 1 else 0.0
     corners: list[tuple[float, float, float]] = []
-    for j, value in enumerate(insets):
+    last = len(insets)
+    for j in range(last + 1):
         # Track j begins where its line crosses that of the track before it.
-        before = insets[j - 1] if j else insets[0]
+        before, value = insets[max(j - 1, 0)], insets[min(j, last - 1)]
         x, y = _crossing(j, before, value, side_x_m, side_y_m)
-        layer = j // quarters
-        if j and j % quarters == 0:
+        layer = min(j // quarters, layers - 1)
+        if 0 < j < last and j % quarters == 0:
             corners.append((x, y, -drop * (layer - 1)))
         corners.append((x, y, -drop * layer))
-    last = len(insets)
-    x, y = _crossing(last, insets[-1], insets[-1], side_x_m, side_y_m)
-    corners.append((x, y, -drop * (layers - 1)))
     return np.array(corners)
 
 

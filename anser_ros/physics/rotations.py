@@ -86,18 +86,10 @@ def rotation_of_vector(vector: AnyArray) -> Array:
 
 def rotation_between(first: Array, second: Array) -> Array:
     """Return the rotation vector (3,), rad, in fg, that takes matrix ``first`` to ``second``."""
-    matrix = second @ first.T
-    vector = 0.5 * np.array(
-        [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
-    )
-    sine = math.sqrt(float(vector @ vector))
-    angle = math.atan2(sine, 0.5 * (float(np.trace(matrix)) - 1.0))
-    if sine > 1e-6:
-        return np.asarray(vector * (angle / sine))
-    if angle < 1.0:
-        return vector
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    return np.asarray(vectors[:, int(np.argmax(values))] * angle)
+    x, y, z, w = quaternion_of_rotation(second @ first.T)
+    sine = math.sqrt(x * x + y * y + z * z)  # of half the angle
+    factor = 2.0 * math.atan2(sine, w) / sine if sine > 0.0 else 2.0
+    return np.array([factor * x, factor * y, factor * z])
 
 
 def quaternion_of_axis(axis: AnyArray) -> tuple[float, float, float, float]:

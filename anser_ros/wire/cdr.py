@@ -11,6 +11,7 @@ Source: OMG Common Data Representation, as DDS-XTypes 1.3 (section 7.4.1) takes 
 
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 
 from anser_ros.errors import LayoutError
 from anser_ros.stamps import SECOND_NS
@@ -135,6 +136,20 @@ def pose_bytes(
     return out.done()
 
 
+@lru_cache(maxsize=32)
+def _fields_bytes(fields: tuple[PointFieldTuple, ...]) -> bytes:
+    """Serialise the fields of a cloud and its byte order, which begin and end at a whole word."""
+    out = _Bytes()
+    out.add('I', len(fields))
+    for name, offset, datatype, count in fields:
+        out.text(name)
+        out.add('I', offset)
+        out.add('B', datatype)
+        out.add('I', count)
+    out.add('B', 0)
+    return bytes(out.body) + bytes(-len(out.body) % 4)
+
+
 def cloud_bytes(
     stamp_ns: int,
     frame_id: str,
@@ -142,20 +157,19 @@ def cloud_bytes(
     point_step: int,
     width: int,
     data: bytes,
+    is_dense: bool = False,
 ) -> bytes:
-    """Serialise a ``sensor_msgs/PointCloud2`` of height 1."""
+    """Serialise a ``sensor_msgs/PointCloud2`` of height 1.
+
+    It is dense where no value is NaN; the position of a tool sensor is.
+    """
     out = _Bytes()
     out.header(stamp_ns, frame_id)
-    out.add('I', 1, width, len(fields))
-    for name, offset, datatype, count in fields:
-        out.text(name)
-        out.add('I', offset)
-        out.add('B', datatype)
-        out.add('I', count)
-    out.add('B', 0)
+    out.add('I', 1, width)
+    out.body += _fields_bytes(tuple(fields))
     out.add('I', point_step, point_step * width, len(data))
     out.body += data
-    out.add('B', 0)  # not dense: the position of a tool sensor is NaN
+    out.add('B', is_dense)
     return out.done()
 
 

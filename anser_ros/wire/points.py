@@ -261,7 +261,7 @@ def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, b
     if modes.ndim != 3 or max(modes.shape[:2]) > 0xFFFF:
         raise LayoutError(f'modes must be (R, N, K) with R, N below 65536, got {modes.shape}')
     fields, record = _layout(modes.shape[2])
-    mode, dipole = np.nonzero(np.abs(modes).max(axis=2, initial=0.0))
+    mode, dipole = np.nonzero((modes != 0.0).any(axis=2))
     if mode.size == 0:
         mode, dipole = np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp)
     out = np.zeros(mode.size, dtype=record)

@@ -131,10 +131,14 @@ def _models(change: Callable[[FieldModel], FieldModel]) -> Callable[..., Off]:
 
 
 def _cloud_of(model: FieldModel) -> Any:
+    from rclpy.serialization import deserialize_message
+    from sensor_msgs.msg import PointCloud2
+
     from anser_ros.nodes.streams.clouds import ModelWriter
 
     writer = ModelWriter()
-    return writer.dipoles(writer.given(model, time.time_ns(), False), 'fg')
+    cloud = writer.dipoles(writer.given(model, time.time_ns(), False), 'fg')
+    return deserialize_message(cloud, PointCloud2)
 
 
 def _models_of_nan(rig: Rig) -> Callable[[], Any]:

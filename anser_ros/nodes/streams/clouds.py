@@ -3,14 +3,12 @@ is refused and counted; the contents of a frame are judged by `frames.intake`. A
 messages: its dipoles and their uncertainty.
 """
 
-import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import PointCloud2
 
 from anser_ros.chain.frame import FrameReadings
 from anser_ros.effects.correction import needs_correction
@@ -18,7 +16,8 @@ from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Count
 from anser_ros.pose_states import state_of
-from anser_ros.stamps import SECOND_NS, pack_stamp, set_stamp, stamp_of
+from anser_ros.stamps import SECOND_NS, stamp_of
+from anser_ros.wire.cdr import cloud_bytes
 from anser_ros.wire.points import (
     DipolePoints,
     FluxPoints,
@@ -43,60 +42,23 @@ def without_measured(text: str) -> str:
     return '\n'.join(line for line in text.split('\n') if not line.startswith(keys))
 
 
-class CloudMaker:
-    """Makes point clouds; the fields of each layout are built once."""
+def cloud_of(
+    packed: tuple[Sequence[PointFieldTuple], int, bytes],
+    frame_id: str,
+    stamp_ns: int,
+    is_dense: bool = True,
+) -> bytes:
+    """Return the bytes of a cloud of packed points (fields, point_step, bytes).
 
-    def __init__(self) -> None:
-        self._fields: dict[tuple[PointFieldTuple, ...], list[PointField]] = {}
-
-    def message(
-        self, packed: tuple[Sequence[PointFieldTuple], int, bytes], frame_id: str, stamp_ns: int
-    ) -> PointCloud2:
-        """Return the message of packed points (fields, point_step, bytes)."""
-        fields, step, data = packed
-        key = tuple(fields)
-        if key not in self._fields:
-            self._fields[key] = [
-                PointField(name=name, offset=offset, datatype=datatype, count=count)
-                for name, offset, datatype, count in fields
-            ]
-        message = PointCloud2(height=1, width=len(data) // step, is_dense=True)
-        message.header.frame_id = frame_id
-        set_stamp(message.header.stamp, stamp_ns)
-        message.fields = self._fields[key]
-        message.point_step, message.row_step = step, len(data)
-        message.data = array.array('B', data)  # taken in microseconds; bytes are checked singly
-        return message
+    They are published in a fraction of the time that a message takes.
+    """
+    fields, step, data = packed
+    return cloud_bytes(stamp_ns, frame_id, fields, step, len(data) // step, data, is_dense)
 
 
-class FluxCloud:
-    """Makes the messages of flux topics; their fields are built once for all of them."""
-
-    def __init__(self, frame_id: str) -> None:
-        self._frame_id, self._maker = frame_id, CloudMaker()
-        # By the shape of the fluxes: the bytes of a message, and where those of its points begin.
-        self._packed: dict[tuple[int, ...], tuple[bytearray, int]] = {}
-
-    def message(self, points: FluxPoints, stamp_ns: int) -> PointCloud2:
-        """Return the message of a window by its middle, ns of the ROS clock, a row per sensor."""
-        message = self._maker.message(encode_flux(points), self._frame_id, stamp_ns)
-        message.is_dense = _is_dense(points)
-        return message
-
-    def packed(self, points: FluxPoints, stamp_ns: int) -> bytes:
-        """Return the bytes of that message, which are published in a fraction of the time."""
-        shape = points.flux.shape
-        if shape not in self._packed:
-            told = self.message(points, stamp_ns)
-            told.data = array.array('B', mark := b'\xff' * len(told.data))
-            whole = bytearray(serialize_message(told))
-            self._packed[shape] = whole, whole.rindex(mark)
-        whole, begin = self._packed[shape]
-        data = encode_flux(points)[2]
-        end = begin + len(data)
-        whole[begin:end], whole[end] = data, _is_dense(points)
-        pack_stamp(whole, stamp_ns)
-        return bytes(whole)
+def flux_cloud(points: FluxPoints, frame_id: str, stamp_ns: int) -> bytes:
+    """Return the cloud of a window by its middle, ns of the ROS clock, a point per sensor."""
+    return cloud_of(encode_flux(points), frame_id, stamp_ns, _is_dense(points))
 
 
 def _is_dense(points: FluxPoints) -> bool:
@@ -163,12 +125,10 @@ class GivenModel:
 
 
 class ModelWriter:
-    """Lays models out for their readers, and makes the two messages of each."""
+    """Lays models out for their readers, and makes the bytes of the two messages of each."""
 
     def __init__(self) -> None:
-        self._maker = CloudMaker()
         self._laid_out: tuple[FieldModel, DipolePoints] | None = None
-        self._encoded: tuple[DipolePoints, PointCloud2] | None = None
         self._uncertainty: tuple[tuple[Any, ...], ModelError] | None = None
         self._origin = '', 0
 
@@ -192,22 +152,14 @@ class ModelWriter:
             self._uncertainty = known = (model.modes, *now), error
         return GivenModel(stamp_ns, self._laid_out[1], known[1])
 
-    def dipoles(self, given: GivenModel, frame_id: str) -> PointCloud2:
-        """Return the ``field_model`` message; of the same dipoles, the last one renamed."""
-        points = given.points
-        if self._encoded is not None and self._encoded[0] is points:
-            message = self._encoded[1]
-            message.header.frame_id = frame_id
-            set_stamp(message.header.stamp, given.stamp_ns)
-            return message
-        message = self._maker.message(encode_field_model(points), frame_id, given.stamp_ns)
-        self._encoded = points, message
-        return message
+    def dipoles(self, given: GivenModel, frame_id: str) -> bytes:
+        """Return the ``field_model`` message."""
+        return cloud_of(encode_field_model(given.points), frame_id, given.stamp_ns)
 
-    def error(self, given: GivenModel, frame_id: str) -> PointCloud2:
+    def error(self, given: GivenModel, frame_id: str) -> bytes:
         """Return the ``field_model_error`` message."""
         assert given.error is not None
-        return self._maker.message(encode_model_error(given.error), frame_id, given.stamp_ns)
+        return cloud_of(encode_model_error(given.error), frame_id, given.stamp_ns)
 
 
 def read_dipoles(message: PointCloud2) -> DipolePoints:

@@ -14,7 +14,7 @@ from anser_ros.apps.dashboard.watch import LIVE, OPTICAL, RIGID, SlidingWindow, 
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
 from anser_ros.nodes.runtime.parameters import stated_by
-from anser_ros.nodes.streams.clouds import FluxCloud
+from anser_ros.nodes.streams.clouds import flux_cloud
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import empty_session, load_session
 from anser_ros.sessions.starting_model import load_model
@@ -229,7 +229,7 @@ def test_fluxes_of_another_frame_are_counted_and_not_looked_at(ros, moving):
                 (moving.tool, 'tool/flux'),
                 (moving.reference, 'reference/flux'),
             ):
-                cloud = FluxCloud(frame_id).message(points(stream, 0), int(stream.stamp_ns[0]))
+                cloud = flux_cloud(points(stream, 0), frame_id, int(stream.stamp_ns[0]))
                 streams.on_fluxes(topic, cloud)
             if frame_id == 'world':
                 assert streams.window.session() is None

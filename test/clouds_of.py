@@ -1,0 +1,20 @@
+"""Point clouds as messages, where a test reads or changes what nodes publish as bytes."""
+
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import PointCloud2
+
+from anser_ros.nodes.streams.clouds import flux_cloud
+
+
+def message_of(cloud: bytes) -> PointCloud2:
+    return deserialize_message(cloud, PointCloud2)
+
+
+class FluxCloud:
+    """Makes messages of fluxes in a frame."""
+
+    def __init__(self, frame_id):
+        self.frame_id = frame_id
+
+    def message(self, points, stamp_ns):
+        return message_of(flux_cloud(points, self.frame_id, stamp_ns))
