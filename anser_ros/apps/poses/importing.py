@@ -3,7 +3,7 @@
 import contextlib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -109,21 +109,18 @@ def read_form(path: Path) -> Found:
         return _plus(path), 0
     lines = [line for line in read_text(path, any_letters=True).splitlines() if line.strip()]
     lines = [line for line in lines if not line.lstrip().startswith('#')]
-    if not lines:
-        raise ParameterError(f'{path}: no rows')
-    known = ((i, _reader(line)) for i, line in enumerate(lines[:TITLE_LINES]))
-    first, reader = next((one for one in known if one[1]), (0, None))
-    rows, read = reader(lines[first:], path) if reader else (_table(path), len(lines))
+    for first, line in enumerate(lines[:TITLE_LINES]):
+        if line.startswith(('Tools\t', 'Tools,')):
+            rows, read = _tool_tracker(lines[first:])
+            break
+        if 'Position:' in line:
+            rows, read = _keyed(lines[first:], path)
+            break
+    else:
+        rows, read = _table(path), len(lines)
     if not any(one.rows for one in rows.values()):
         raise ParameterError(f'{path}: no row that is a pose')
     return rows, len(lines) - read
-
-
-def _reader(line: str) -> Callable[[Sequence[str], Path], Found] | None:
-    """What reads the form that a line is of, or None: it is a table, or its title."""
-    if line.startswith(('Tools\t', 'Tools,')):
-        return _tool_tracker
-    return _keyed if 'Position:' in line else None
 
 
 def _number(text: str) -> float:
@@ -133,7 +130,7 @@ def _number(text: str) -> float:
         return float('nan')
 
 
-def _tool_tracker(lines: Sequence[str], path: Path) -> Found:
+def _tool_tracker(lines: Sequence[str]) -> Found:
     """NDI ToolTracker: a group of columns a port; scalar first; states in words."""
     rows: dict[str, RawRows] = {}
     read, separator = 0, lines[0][len('Tools')]
@@ -222,21 +219,18 @@ def _table(path: Path) -> dict[str, RawRows]:
     stated = next(
         (u for row in table.titles for k, u in pairwise(row) if 'length unit' in k.lower()), ''
     )
-    by_name = {name.casefold(): name for name in table.names}
     label, valid = (
-        next((by_name[n] for n in known if n in by_name), '') for known in (LABELS, VALID)
+        next((n for n in table.names if n.casefold() in known), '') for known in (LABELS, VALID)
     )
-    gone = np.zeros(len(table.cells), dtype=bool)
-    if valid:
-        gone = np.array([cell.casefold() in NOT_VALID for cell in table.words(valid)])
-    whose = table.words(label) if label else [''] * len(table.cells)
+    whose = np.array(table.words(label) if label else [''] * len(table.cells))
     rows: dict[str, RawRows] = {}
     for body, columns in bodies.items():
-        cells = [table.array(table.names[column]) for column in (*columns.place, *columns.turn)]
-        pose = np.stack(cells, axis=1).astype(np.float64)
-        pose[gone] = np.nan
-        for name in dict.fromkeys(whose):
-            here = np.array([one == name for one in whose])
+        cells = [table.names[column] for column in (*columns.place, *columns.turn)]
+        pose = table.numbers(cells, with_gaps=True)
+        if valid:
+            pose[table.words(valid).str.casefold().isin(NOT_VALID)] = np.nan
+        for name in dict.fromkeys(whose.tolist()):
+            here = whose == name
             _check_times(path, time[here])
             lines = np.column_stack([time[here], np.full(here.sum(), np.nan), pose[here]])
             called = '_'.join(filter(None, (name, body))) if name or len(bodies) > 1 else path.stem
