@@ -4,7 +4,6 @@ The document names the files, their columns, units, the order of quaternions and
 `docs/howto/import.md` has every key with examples.
 """
 
-import csv
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -19,7 +18,7 @@ import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
-from anser_ros.sessions.plausibility import LENGTH_M
+from anser_ros.stamps import stamp_fault
 from anser_ros.wire.bag_writer import FLUX_TOPICS, SessionWriter
 from anser_ros.wire.recorded import (
     BODY,
@@ -33,27 +32,33 @@ from anser_ros.wire.recorded import (
 )
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
+from anser_ros.wire.table_names import LENGTH_M, TIME_NS
+from anser_ros.wire.tables import Table, read_table
 from anser_ros.wire.text_files import read_text, read_yaml
 
 Array = NDArray[Any]
 
 REFERENCE = re.compile(r'^\s*([^\[\]]+?)\s*(?:\[([\d\s,]+)\])?\s*$')
 """A column: a name, and where that is an array of more dimensions, the further indices."""
-ENDINGS = ('.csv', '.npy', '.npz', '.mat')
+TEXTS = ('.csv', '.tsv', '.txt', '.tum')
+ENDINGS = (*TEXTS, '.npy', '.npz', '.mat')
 
 
 @dataclass(frozen=True)
 class NumberTable:
     """Holds the arrays of one file by name; the first index of each counts rows.
 
-    A CSV file has one for each column, a ``.npy`` file one called ``data``.
+    A text has one for each column, a ``.npy`` file one called ``data``.
     """
 
     path: Path
     arrays: Mapping[str, NDArray[Any]]
+    table: Table | None = None  # of a text, whose columns are read as they are asked for
 
     def array(self, name: str) -> NDArray[Any]:
         """Return the whole array of a name; `ParameterError` where there is none."""
+        if self.table is not None:
+            return self.table.array(name)
         if name not in self.arrays:
             known = ', '.join(list(self.arrays)[:20])
             raise ParameterError(f'{self.path}: no {name!r}; there are: {known}')
@@ -77,20 +82,27 @@ class NumberTable:
         index: tuple[Any, ...] = (slice(None), *rest)
         return np.asarray(found[index])
 
-    def columns(self, references: Any, count: int, what: str) -> NDArray[Any]:
-        """Return several columns as an array of shape (N, count)."""
+    def columns(self, references: Any, count: int, what: str, beside: Any) -> NDArray[Any]:
+        """Return several columns (N, count), as long as another one; raises `ParameterError`."""
         if not isinstance(references, list) or len(references) != count:
             raise ParameterError(f'{self.path}: {what} needs a list of {count} columns')
+        many = len(self.column(beside))
+        for reference in references:
+            if (found := len(self.column(reference))) != many:
+                words = f'{beside} has {many} rows, {reference} {found}'
+                if many in self.array(str(reference).partition('[')[0].strip()).shape[1:]:
+                    words += f'; its rows are {many} along the other axis: transpose it'
+                raise ParameterError(f'{self.path}: {words}')
         return np.stack([self.column(reference) for reference in references], axis=1)
 
 
-def read_table(path: Path) -> NumberTable:
+def read_arrays(path: Path) -> NumberTable:
     """Read a file, MATLAB's of version 7.3 (HDF5) by h5py; raises `ParameterError`."""
     if not path.is_file():
         raise ParameterError(f'{path}: {"is a folder" if path.is_dir() else "no such file"}')
     try:
-        if path.suffix == '.csv':
-            return NumberTable(path, _csv(path))
+        if path.suffix.lower() in TEXTS:
+            return NumberTable(path, {}, read_table(path))
         if path.suffix == '.npy':
             return NumberTable(path, {'data': np.load(path, allow_pickle=False)})
         if path.suffix == '.npz':
@@ -103,27 +115,6 @@ def read_table(path: Path) -> NumberTable:
             raise ParameterError(f'{path}: no arrays of numbers') from error
         raise ParameterError(f'{path}: cannot be read: {" ".join(str(error).split())}') from error
     raise ParameterError(f'{path}: ends with none of {", ".join(ENDINGS)}')
-
-
-def _csv(path: Path) -> dict[str, NDArray[Any]]:
-    with path.open(encoding='utf-8-sig', newline='') as stream:
-        reader = csv.reader(stream)
-        head = [name.strip() for name in next(reader, [])]
-        rows = [row for row in reader if row]
-    for number, row in enumerate(rows, start=2):
-        if len(row) != len(head):
-            raise ValueError(f'row {number} has {len(row)} cells, the head {len(head)}')
-    return {name: _numbers([row[i].strip() for row in rows]) for i, name in enumerate(head)}
-
-
-def _numbers(cells: list[str]) -> NDArray[Any]:
-    """Whole numbers as such: stamps in ns have more digits than a float keeps."""
-    if all(re.fullmatch(r'[+-]?\d+', cell) for cell in cells):
-        return np.array([int(cell) for cell in cells], dtype=np.int64)
-    try:
-        return np.array([float(cell) if cell else np.nan for cell in cells])
-    except ValueError:
-        return np.array(cells)  # words; who asks for numbers of them gets an error
 
 
 def _mat(path: Path) -> dict[str, NDArray[Any]]:
@@ -146,16 +137,14 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
 
 
 SCHEMA = 'anser_import/1'
-TIME_NS = {'s': 1e9, 'ms': 1e6, 'us': 1e3, 'ns': 1.0}
-"""Nanoseconds in a unit of time."""
 FLUX_T = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'pT': 1e-12}
 """Tesla in a unit of flux density."""
 ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
 """Where x, y, z, w stand in a quaternion of that order."""
 
 
-def import_tables(document: Path, out: Path) -> dict[str, int]:
-    """Write the session that a document, beside its files, describes; return messages by topic.
+def import_tables(document: Path, out: Path) -> tuple[dict[str, int], list[str]]:
+    """Write the session that a document describes; return messages by topic, and what lacks.
 
     Raises `ParameterError`, `SetupError`, `BagError` with the file's name.
     """
@@ -165,7 +154,8 @@ def import_tables(document: Path, out: Path) -> dict[str, int]:
     except yaml.YAMLError as error:
         raise ParameterError(f'{document}: {" ".join(str(error).split())}') from error
     try:
-        return _Import(_mapping(spec, 'the document'), document.parent).write(out)
+        made = _Import(_mapping(spec, 'the document'), document.parent)
+        return made.write(out), made.notes
     except ParameterError as error:
         text = str(error)
         message = text if str(document.parent) in text else f'{document}: {text}'
@@ -197,6 +187,7 @@ class _Import:
         self._entries: list[tuple[int, Callable[..., None]]] = []
         self._tables: dict[Path, NumberTable] = {}
         self._messages: Counter[str] = Counter()
+        self.notes: list[str] = []
         for key, entries in tables.items():
             for number, entry in enumerate(entries):
                 what = f'{key}[{number}]'
@@ -227,7 +218,7 @@ class _Import:
     def _table(self, entry: Mapping[str, Any], what: str) -> NumberTable:
         path = self._folder / str(_needed(entry, 'file', what))
         if path not in self._tables:
-            self._tables[path] = read_table(path)
+            self._tables[path] = read_arrays(path)
         return self._tables[path]
 
     def _stamps(self, table: NumberTable, entry: Mapping[str, Any], what: str) -> list[int]:
@@ -242,8 +233,9 @@ class _Import:
             stamps = [start_ns + round(v * unit_ns) for v in values.tolist()]
         if not stamps:
             raise ParameterError(f'{table.path}: no rows')
-        if min(stamps) <= 0:
-            raise ParameterError(f'{table.path}: a stamp is not after 1970; is start_ns missing?')
+        if fault := stamp_fault(min(stamps), max(stamps)) or '1970' * (min(stamps) <= 0):
+            fault = fault if min(stamps) > 0 else 'a stamp is not after 1970; is start_ns missing?'
+            raise ParameterError(f'{table.path}: {fault}')
         if len(set(stamps)) < len(stamps):
             raise ParameterError(f'{table.path}: the same stamp twice; is the unit of time right?')
         return stamps
@@ -273,7 +265,9 @@ class _Import:
                 )
         else:
             columns = _mapping(given, f'{what}: sensors')
-            flux = np.stack([_phasors(table, columns[n], emitters, n) for n in names], axis=1)
+            beside = entry['stamp']
+            parts = [_phasors(table, columns[n], emitters, n, beside) for n in names]
+            flux = np.stack(parts, axis=1)
         flux = scale * np.asarray(flux, dtype=np.complex128)
         sensors = [by_name[name] for name in names]
         for stamp, values in zip(stamps, flux, strict=True):
@@ -298,20 +292,26 @@ class _Import:
         if order not in ORDERS:
             raise ParameterError(f'{what}: order must be {" or ".join(ORDERS)}, got {order!r}')
         stamps = self._stamps(table, entry, what)
-        position = scale * _real(
-            table.columns(entry.get('position'), 3, f'{what}: position'), table, 'position'
+        position, quaternion = (
+            _real(table.columns(entry.get(k), n, f'{what}: {k}', entry['stamp']), table, k)
+            for k, n in (('position', 3), ('quaternion', 4))
         )
-        quaternion = _real(
-            table.columns(entry.get('quaternion'), 4, f'{what}: quaternion'), table, 'quaternion'
-        )[:, ORDERS[order]]
+        quaternion = quaternion[:, ORDERS[order]]
         good = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1)
-        quaternion[good] = unit_quaternions(quaternion[good])
-        if not np.isfinite(quaternion[good]).all():
+        unit = np.isfinite(unit_quaternions(quaternion)).all(axis=1)
+        none = good & (quaternion == 0.0).all(axis=1)
+        if 2 * np.count_nonzero(none) > len(stamps) or (good & ~unit & ~none).any():
             raise ParameterError(f'{table.path}: quaternions are not of unit length')
+        good &= unit
+        quaternion[good] = unit_quaternions(quaternion[good])
+        if lacking := len(stamps) - int(good.sum()):
+            words = f'{lacking} pose{"s" * (lacking > 1)} without numbers or rotation left out'
+            self.notes.append(f'{table.path}: {words}')
         for row in np.flatnonzero(good).tolist():
             put = partial(
                 SessionWriter.write_pose, topic=topic, stamp_ns=stamps[row],
-                position=position[row].tolist(), quaternion_xyzw=quaternion[row].tolist(),
+                position=(scale * position[row]).tolist(),
+                quaternion_xyzw=quaternion[row].tolist(),
             )  # fmt: skip
             self._entries.append((stamps[row], put))
         self._messages[topic] += int(good.sum())
@@ -327,16 +327,16 @@ def _time_base(holder: Mapping[str, Any], what: str) -> tuple[float, int]:
     return _choice(time, 'unit', TIME_NS, 's', what), start_ns
 
 
-def _phasors(table: NumberTable, given: Any, emitters: int, name: str) -> Array:
+def _phasors(table: NumberTable, given: Any, emitters: int, name: str, beside: Any) -> Array:
     """Fluxes of one sensor, shape (F, K): complex columns, or those of ``re`` and ``im``."""
     if isinstance(given, dict):
         _known(given, ('re', 'im'), name)
         parts = [
-            _real(table.columns(given.get(part), emitters, f'{name}: {part}'), table, name)
+            _real(table.columns(given.get(part), emitters, f'{name}: {part}', beside), table, name)
             for part in ('re', 'im')
         ]
         return np.asarray(parts[0] + 1j * parts[1])
-    found = table.columns(given, emitters, name)
+    found = table.columns(given, emitters, name, beside)
     if found.dtype.kind not in 'fiuc':
         raise ParameterError(f'{table.path}: {name} has cells that are not numbers')
     return found

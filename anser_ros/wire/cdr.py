@@ -30,7 +30,26 @@ MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
-# Field lists of the three types, in the form in which MCAP carries definitions (`ros2msg`).
+_PARTS = {
+    'Pose': 'Point position\nQuaternion orientation\n',
+    'Point': 'float64 x\nfloat64 y\nfloat64 z\n',
+    'Vector3': 'float64 x\nfloat64 y\nfloat64 z\n',
+    'Quaternion': 'float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n',
+    'PoseWithCovariance': 'Pose pose\nfloat64[36] covariance\n',
+    'TwistWithCovariance': 'Twist twist\nfloat64[36] covariance\n',
+    'Twist': 'Vector3 linear\nVector3 angular\n',
+    'Transform': 'Vector3 translation\nQuaternion rotation\n',
+    'TransformStamped': 'std_msgs/Header header\nstring child_frame_id\nTransform transform\n',
+}
+
+
+def _definition(fields: str, *parts: str) -> str:
+    """The definition of a type with types of geometry_msgs in it."""
+    inner = (f'\n{80 * "="}\nMSG: geometry_msgs/{part}\n{_PARTS[part]}' for part in parts)
+    return ''.join([fields, *inner, _HEADER])
+
+
+# Field lists of the types, in the form in which MCAP carries definitions (`ros2msg`).
 DEFINITIONS = {
     'std_msgs/msg/String': 'string data\n',
     'sensor_msgs/msg/PointCloud2': f"""std_msgs/Header header
@@ -50,28 +69,27 @@ uint32 offset
 uint8 datatype
 uint32 count
 {_HEADER}""",
-    'geometry_msgs/msg/PoseStamped': f"""std_msgs/Header header
-Pose pose
-
-================================================================================
-MSG: geometry_msgs/Pose
-Point position
-Quaternion orientation
-
-================================================================================
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-{_HEADER}""",
-}
+    'geometry_msgs/msg/PoseStamped': _definition(
+        'std_msgs/Header header\nPose pose\n', 'Pose', 'Point', 'Quaternion'
+    ),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': _definition(
+        'std_msgs/Header header\nPoseWithCovariance pose\n',
+        'PoseWithCovariance', 'Pose', 'Point', 'Quaternion',
+    ),
+    'geometry_msgs/msg/TransformStamped': _definition(
+        _PARTS['TransformStamped'], 'Transform', 'Vector3', 'Quaternion'
+    ),
+    'tf2_msgs/msg/TFMessage': _definition(
+        'geometry_msgs/TransformStamped[] transforms\n',
+        'TransformStamped', 'Transform', 'Vector3', 'Quaternion',
+    ),
+    'nav_msgs/msg/Odometry': _definition(
+        'std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n'
+        'geometry_msgs/TwistWithCovariance twist\n',
+        'PoseWithCovariance', 'Pose', 'Point', 'Quaternion', 'TwistWithCovariance', 'Twist',
+        'Vector3',
+    ),
+}  # fmt: skip
 
 
 class _Bytes:

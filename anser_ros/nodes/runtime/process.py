@@ -290,7 +290,7 @@ def _complain(nodes: Sequence[AnserNode], arguments: Sequence[str]) -> None:
         for name in names_for(arguments, node.get_name()):
             if not parameters.is_known(node.PARAMETERS, name):
                 raise ParameterError(f'{node.get_name()} has no parameter {name}')
-    refusals = [complaints(arguments, node.get_name()) for node in nodes]
+    refusals = [complaints(arguments, node.get_fully_qualified_name()) for node in nodes]
     if all(refusals):
         for text in refusals[-1]:
             nodes[-1].get_logger().warning(text)

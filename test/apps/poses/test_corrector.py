@@ -9,6 +9,7 @@ from conftest import spin_until
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from pose_world import World
 from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.corrector import (
@@ -158,7 +159,7 @@ def test_the_node_corrects_what_comes_and_tells_what_does_not(ros, bent, tmp_pat
     other.create_subscription(
         PoseWithCovarianceStamped, '/anser/corrected/sensor_0/pose_with_covariance', got.append, 10
     )
-    sender = other.create_publisher(PoseStamped, '/tracked/sensor_0/pose', 10)
+    sender = other.create_publisher(PoseStamped, '/tracked/sensor_0/pose', qos_profile_sensor_data)
     message = PoseStamped()
     message.header.stamp.sec = 5
     message.pose.position.x, message.pose.position.z = 0.05, -0.3

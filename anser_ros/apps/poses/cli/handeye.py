@@ -8,7 +8,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.assessment.source import PoseSource, is_bag, read_poses
 from anser_ros.apps.poses.cli.import_poses import add_form_options
@@ -33,7 +32,6 @@ from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 
 SCHEMA = 'anser_handeye/1'
-Array = NDArray[np.float64]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,7 +106,7 @@ def _session(args: argparse.Namespace) -> PoseSession:
         raise ParameterError('--tracked, --model and --optical need a bag')
     return import_poses(
         args.tracked, args.reference, stamps=args.stamps, unit=args.unit,
-        quaternion=args.quaternion,
+        quaternion=args.quaternion, shift_s=(args.shift, args.shift_reference),
     )  # fmt: skip
 
 
