@@ -292,13 +292,22 @@ class TestStream:
         """While one waits it is looked after with every block."""
         stream = new_stream()
         assert len(self.frames(stream, 100)) == 5
-        assert stream.blocks_wanted == 20
+        assert stream.blocks_wanted == 16
         assert not any(self.push(stream, k, 50) for k in range(100, 120))
         assert stream._waiting and stream.blocks_wanted == 1
         (frame,) = self.push(stream, 120)
         assert frame.host_ns == pytest.approx(10**12 + 110 * 10**6, abs=10**5)
         assert not any(self.push(stream, k, 900) for k in range(121, 1000))
         assert stream.withheld > 20 and stream.clock.wants_answer
+
+    def test_most_of_a_window_is_looked_at_before_its_end(self):
+        """What repeats itself is searched for while the last blocks are still to come."""
+        stream = new_stream()
+        assert len(self.frames(stream, 100)) == 5
+        assert not any(self.push(stream, k) for k in range(100, 100 + stream.blocks_wanted))
+        assert stream.blocks_wanted == 4
+        assert stream._watch._searched == stream._watch.position
+        assert len([frame for k in range(116, 120) for frame in self.push(stream, k)]) == 1
 
     def test_windows_that_are_skipped_are_counted_and_cost_no_later_one(self):
         """A too slow computer takes the newest; what it passes over is not demodulated."""

@@ -199,6 +199,7 @@ class Recorder(AnserNode):
     NAME = 'recorder'
     EXAMPLE = '--ros-args -p directory:=recordings -p name:=scan'
     PARAMETERS = RecorderParameters
+    PAUSE_S = 0.05  # the middleware notes when each message came, and the poses' readers wait less
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -271,7 +271,7 @@ def _on_other_sides(frame: BodyFrame, fit: BodyFit) -> list[BodyFit]:
     place, found = solution.position + solution.rotation @ lever - middle, []
     for signs in OTHER_SIDES:
         across, away = middle + signs * place, (signs - 1.0) * place
-        if np.linalg.norm(away) > SAME_PLACE_M and frame.settings.box.contains(across):
+        if frame.settings.box.contains(across) and np.linalg.norm(away) > SAME_PLACE_M:
             rotation = -signs[:, None] * solution.rotation
             found.append(_solve(frame, fit.used, (across - rotation @ lever, rotation)))
     return found

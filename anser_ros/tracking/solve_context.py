@@ -290,7 +290,7 @@ class SolveContext:
 
     def make_ready(self) -> None:
         """Work out what a warm solve needs of the field and its uncertainty."""
-        _ = self.readings, self.symmetry, self.arrays
+        _ = self.readings, self.symmetry, self.arrays, self.middle
 
     def errors_at(self, points: Array, axes: Array, lengths: Array) -> Array:
         """Return flux errors (S, R, 2K), T, of coils at poses; see `fill_model_errors`.

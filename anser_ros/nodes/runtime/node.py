@@ -63,6 +63,8 @@ class AnserNode(Node):
     PARAMETERS: ClassVar[type] = NoParameters
     HAS_KERNELS: ClassVar[bool] = False
     """Whether the node calculates with compiled kernels, and waits until all are there."""
+    PAUSE_S: ClassVar[float] = 0.0
+    """Time, s, in which messages gather before they are looked at, where nobody waits for it."""
 
     def __init__(self, beside: Sequence[type['AnserNode']] = (), **options: Any) -> None:
         # The base class already creates services, so what guards them must be there first.
