@@ -38,7 +38,7 @@ from anser_ros.sessions.prepared import PreparedSession, settings_for
 from anser_ros.sessions.session import tracking_noise
 from anser_ros.settings import ToolSettings
 from anser_ros.stamps import NANO
-from anser_ros.tracking.estimate import NO_GATE, PoseEstimate, TrackerSettings
+from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
 SPACING_M = 0.08
@@ -297,7 +297,7 @@ class KnownMetalModels(FrameModels):
             prepared.volume, tracking_noise(session.setup),
         )  # fmt: skip
         # Where a pose is withheld, a tracker that withholds none shows where the tool is, nearly.
-        settings = settings_for(session.setup, TrackerSettings(gate=NO_GATE))
+        settings = settings_for(session.setup, TrackerSettings(gate=math.inf))
         self._rough = Tracker(
             prepared.model, prepared.sensors, replace(settings, volume=prepared.volume)
         )
