@@ -289,7 +289,7 @@ def _by_distance(state: PoseState, before: PoseState, after: PoseState) -> Html:
     for parts in zip(before.parts, after.parts, state.parts, strict=True):
         distances, whole = [_size(1e3 * part.view.measured) for part in parts], parts[-1]
         speed = _size(whole.view.velocity[:, :3])
-        is_fast = speed > np.median(speed[whole.used])
+        is_fast = speed > np.median(speed)
         edges = np.quantile(distances[-1], np.linspace(0, 1, 1 + SLICES))
         for low, high in pairwise(edges):
             near = [
@@ -313,6 +313,8 @@ def _arrows(before: PoseState, after: PoseState) -> Figure:
         2, SLICES, figsize=(9, 6), layout='constrained', sharex=True, sharey=True
     )
     every = 1e3 * np.concatenate([p.view.measured[p.used] for p in before.parts])
+    if not len(every):
+        return figure
     low, high = np.percentile(every, [1, 99], axis=0)
     cell = max(float(np.max(high - low)) / CELLS, 1e-3)
     levels, longest = np.quantile(every[:, 2], np.linspace(0, 1, 1 + SLICES)), 0.0
