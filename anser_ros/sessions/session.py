@@ -40,6 +40,10 @@ class Session:
     reference: Measurements | None
     lost: str = ''
 
+    def __repr__(self) -> str:
+        tools = (f'{tool.body}: {tool.time.size} frames' for tool in self.tools)
+        return f'Session({self.path}, {", ".join(tools) or "no tools"})'
+
     @property
     def sensors(self) -> SensorTable:
         """Return all tool sensors, one body after the other."""
