@@ -26,6 +26,12 @@ from anser_ros.parallel import shared_among
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.starting_model import SNAPSHOT, is_snapshot
 
+OF_FLUXES = {
+    'model': 'model', 'baseline': 'baseline', 'resurveyed': 'resurveyed', 'set': 'stated',
+    'refit': 'refit', 'references': 'references', 'witnesses': 'witnesses', 'in-phase': 'in_phase',
+}  # fmt: skip
+"""Options of sessions of fluxes, and where their values are."""
+
 
 def add_session_kinds(parser: argparse.ArgumentParser) -> None:
     """Declare an option for each kind of session, and the options that it has."""
@@ -35,11 +41,20 @@ def add_session_kinds(parser: argparse.ArgumentParser) -> None:
 
 
 def named_kind(args: argparse.Namespace) -> ModuleType | None:
-    """Return the module of the kind of session that the options name, None for one of fluxes."""
+    """Return the module of the kind of session that the options name, None for one of fluxes.
+
+    Raises `ParameterError` for an option that has no effect there.
+    """
+    chosen = None
     for name, (module, _) in SESSION_KINDS.items():
-        if getattr(args, name):
-            return importlib.import_module(module)
-    return None
+        kind = importlib.import_module(module)
+        is_chosen = getattr(args, name)
+        for option, key in (OF_FLUXES if is_chosen else kind.OPTIONS).items():
+            if getattr(args, key, None):
+                words = f'with --{name}' if is_chosen else f'without --{name}'
+                raise ParameterError(f'--{option} has no effect {words}')
+        chosen = kind if is_chosen else chosen
+    return chosen
 
 
 def need_model(args: argparse.Namespace) -> None:

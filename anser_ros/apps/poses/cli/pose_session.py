@@ -358,6 +358,9 @@ def _bland_altman(state: PoseState) -> Figure:
     return figure
 
 
+OPTIONS = {'tracked': 'topics', 'optical': 'optical'}  # of this kind of session alone
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of a session of poses."""
     add_topic_options(parser, 'sensor', 'with --poses: ')
