@@ -70,6 +70,7 @@ def is_live(stamp_ns: int, now_ns: int) -> bool:
 
 LATEST_NS = 2**31 * SECOND_NS - 1
 """Latest stamp, ns, that a ROS message holds: of 2038-01-19."""
+LAST_DAY_S = 253_402_214_400  # 9999-12-31, the last that a date can be
 EPOCHS = {
     '1904 (LabVIEW)': -2_082_844_800, '1900 (NTP)': -2_208_988_800,
     '1601 (Windows)': -11_644_473_600, 'the year 1 (.NET)': -62_135_596_800,
@@ -86,11 +87,8 @@ def stamp_fault(first_ns: int, last_ns: int) -> str:
     if first_ns < 0:
         words = 'cannot be stamps of a bag: before 1970; start_ns or --shift adds a start'
         return f'times of {first_ns * NANO:g} s {words}'
-    try:
-        day = f'{datetime.fromtimestamp(first_ns * NANO, UTC):%Y-%m-%d}'
-    except (ValueError, OverflowError, OSError):
-        day = f'{first_ns * NANO:.3g} s'
-    words = f'times of {day}, beyond what a ROS stamp holds (2038-01-19)'
+    day = datetime.fromtimestamp(min(first_ns // SECOND_NS, LAST_DAY_S), UTC)
+    words = f'times of {day:%Y-%m-%d}, beyond what a ROS stamp holds (2038-01-19)'
     for name, start_s in EPOCHS.items():
         start_ns = start_s * SECOND_NS
         if first_ns + start_ns >= RECENT_NS and last_ns + start_ns <= LATEST_NS:

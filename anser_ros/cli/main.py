@@ -6,9 +6,11 @@ that is not installed, ROS among them, says so in a line.
 """
 
 import argparse
+import contextlib
 import importlib
 import io
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -92,6 +94,8 @@ def exec_node(name: str, arguments: Sequence[str]) -> NoReturn:
 
 def run_verb(name: str, arguments: Sequence[str]) -> int:
     """Run one offline command in this process and return the exit code."""
+    with contextlib.suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # it ends as by Ctrl-C
     from anser_ros.cli.output import remove_empty_folders  # imports what no node needs
 
     def work() -> int:

@@ -22,7 +22,7 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.pose_states import OK
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, metrics
-from anser_ros.wire.tables import read_table
+from anser_ros.wire.tables import Table, read_table
 from anser_ros.wire.text_files import read_text
 
 SCHEMA = 'anser_evaluation/1'
@@ -173,35 +173,32 @@ def _recording(folder: Path) -> str:
 
 def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
     """Return errors of position (m) and orientation (rad) by stamp and name; `ParameterError`."""
-    _, _, *kinds = ERROR_COLUMNS
-    errors = [_read(folder, ERRORS_FILE, ERROR_COLUMNS, itemgetter(kind)) for kind in kinds]
-    return {'position': errors[0], 'orientation': errors[1]}
+    keys, table = _read(folder, ERRORS_FILE, ERROR_COLUMNS)
+    return {
+        kind.partition('_')[0]: dict(zip(keys, table.array(kind).tolist(), strict=True))
+        for kind in ERROR_COLUMNS[2:]
+    }
 
 
 def read_states(folder: Path) -> dict[Key, float]:
     """Return whether there is a pose, 1 or 0, by stamp and name; raises `ParameterError`."""
-    tables = ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS))
     found: dict[Key, float] = {}
-    for name, columns in tables:
-        found |= _read(folder, name, columns, lambda row: row['status'] == OK)
+    for name, columns in ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS)):
+        keys, table = _read(folder, name, columns)
+        found |= zip(keys, map(float, table.words('status') == OK), strict=True)
     return found
 
 
-def _read(
-    folder: Path, name: str, columns: tuple[str, ...], value: Callable[[dict[str, str]], Any]
-) -> dict[Key, float]:
-    """A value of each row of a table, by stamp and by the name in its second column."""
+def _read(folder: Path, name: str, columns: tuple[str, ...]) -> tuple[list[Key], Table]:
+    """A table, and the stamp and the name in its second column of each row."""
     path = folder / name
     if not path.is_file():
         raise ParameterError(f'{folder}: no {name}; is it a folder of anser evaluate?')
     table = read_table(path, as_text=True)
-    try:
-        if table.names != columns:
-            raise ValueError(f'columns must be {", ".join(columns)}')
-        rows = table.cells.to_dict('records')
-        return {(int(row['stamp_ns']), row[columns[1]]): float(value(row)) for row in rows}
-    except (ValueError, TypeError) as error:
-        raise ParameterError(f'{path}: {error}') from error
+    if table.names != columns:
+        raise ParameterError(f'{path}: columns must be {", ".join(columns)}')
+    stamps = table.array('stamp_ns').tolist()
+    return list(zip(stamps, table.words(columns[1]), strict=True)), table
 
 
 def compare(

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.bag import SETUP_TYPE, Salvage, iter_messages, published_poses, read_fluxes
+from anser_ros.wire.bag import Salvage, iter_messages, published_poses, read_fluxes
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.recorded import PoseStream, RecordedFluxes
+from anser_ros.wire.recorded import SETUP_TYPE, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import BagError
@@ -19,8 +18,6 @@ from anser_ros.stamps import NANO
 from anser_ros.wire.points import STALE
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
-
-ComplexArray = NDArray[np.complex128]
 
 MOST_NOISE_T = 1e-3
 """Noise, T, from which on a setup's statement is a mistake: emitters make microtesla at most."""
@@ -42,6 +39,10 @@ class Session:
     tools: tuple[Measurements, ...]
     reference: Measurements | None
     lost: str = ''
+
+    def __repr__(self) -> str:
+        tools = (f'{tool.body}: {tool.time.size} frames' for tool in self.tools)
+        return f'Session({self.path}, {", ".join(tools) or "no tools"})'
 
     @property
     def sensors(self) -> SensorTable:

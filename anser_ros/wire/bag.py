@@ -44,8 +44,6 @@ _BROKEN = (
 _RECORD_LIMIT = 256 * 2**20
 """Largest record, and unpacked chunk, that is read, bytes: more is damage, or hostile."""
 
-FLUX_TYPE = 'sensor_msgs/msg/PointCloud2'
-SETUP_TYPE = 'std_msgs/msg/String'
 PAGE = 4096
 """Bytes that sqlite3 writes as one, by default."""
 LOGS = ('-wal', '-journal')
@@ -88,10 +86,8 @@ class Salvage:
 
     def topic_words(self) -> str:
         """Return which topics there are, with their types."""
-        return (
-            ', '.join(f'{topic} ({kind})' for topic, kind in sorted(self.topics.items()))
-            or 'no topics'
-        )
+        words = (f'{topic} ({kind})' for topic, kind in sorted(self.topics.items()))
+        return ', '.join(words) or 'no topics'
 
 
 def _indexed(stream: io.BufferedReader) -> Iterator[_Found] | None:
@@ -252,7 +248,7 @@ class _Collector:
 
     def add(self, raw: RawMessage) -> None:
         try:
-            if raw.topic.endswith('/setup') and raw.type_name == SETUP_TYPE:
+            if raw.topic.endswith('/setup') and raw.type_name == recorded.SETUP_TYPE:
                 self.setups.append(str(self.decoder.decode(raw).data))
             elif raw.topic.endswith(('/tool/flux', '/reference/flux')):
                 self._add_flux(raw)
@@ -262,8 +258,8 @@ class _Collector:
             self.refused[f'{raw.topic}: {error}'] += 1
 
     def _add_flux(self, raw: RawMessage) -> None:
-        if raw.type_name != FLUX_TYPE:
-            raise LayoutError(f'type {raw.type_name} where {FLUX_TYPE} belongs')
+        if raw.type_name != recorded.FLUX_TYPE:
+            raise LayoutError(f'type {raw.type_name} where {recorded.FLUX_TYPE} belongs')
         cloud = self.decoder.decode(raw)
         fields = [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields]
         width = int(cloud.width) * int(cloud.height)
@@ -320,7 +316,9 @@ class _Collector:
 def _rename_words(topics: Mapping[str, str]) -> str:
     """Return which topics of a bag may be fluxes under another name, and what renames them."""
     known = ('/tool/flux', '/reference/flux', '/field_model', '/field_model_error')
-    others = [t for t, kind in topics.items() if kind == FLUX_TYPE and not t.endswith(known)]
+    others = [
+        t for t, kind in topics.items() if kind == recorded.FLUX_TYPE and not t.endswith(known)
+    ]
     if not others:
         return ''
     words = f'anser import BAG --remap {others[0]}:=/anser/tool/flux --out session.mcap'

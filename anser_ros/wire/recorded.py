@@ -33,6 +33,7 @@ def pose_numbers(pose: Any) -> tuple[float, ...]:
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
+FLUX_TYPE, SETUP_TYPE = 'sensor_msgs/msg/PointCloud2', 'std_msgs/msg/String'
 POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
 POSE_TYPES = (
     POSE_TYPE, 'geometry_msgs/msg/PoseWithCovarianceStamped', 'geometry_msgs/msg/TransformStamped',

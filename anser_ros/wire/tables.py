@@ -32,6 +32,7 @@ TITLE_LINES = 60
 GAPS = ('', '-', '--', 'na', 'n/a', '#n/a', 'nan', 'null', 'none')
 """Words for no number."""
 _NUMBER, _WHOLE = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?', r'[-+]?\d{1,18}|1\d{18}'
+_IS_NUMBER = re.compile(_NUMBER, re.IGNORECASE).fullmatch
 _COMMA = re.compile(r'(?<=\d),(?=\d+(?:e[-+]?\d+)?$)', re.IGNORECASE)  # of a decimal
 
 
@@ -113,10 +114,8 @@ def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
     of a name, or a row of another length than its header, with its line.
     """
     name = os.fspath(path)
-    every = [
-        (n, line.strip(' '))
-        for n, line in enumerate(read_text(path, any_letters=True).splitlines(), 1)
-    ]
+    text = read_text(path, any_letters=True)
+    every = [(n, line.strip(' ')) for n, line in enumerate(text.splitlines(), 1)]
     lines = [one for one in every if one[1].strip('\t ,;') and not one[1].startswith(COMMENTS)]
     texts = [line for _, line in lines]
     if not lines:
@@ -182,7 +181,7 @@ def _find_rows(lines: list[str]) -> tuple[str | None, int]:
         cells = _cells(line, separator)
         if separator != ',':
             cells = [_COMMA.sub('.', cell) for cell in cells]
-        return sum(_is_number(cell) for cell in cells)
+        return sum(map(bool, map(_IS_NUMBER, cells)))
 
     sample = lines[len(lines) // 2 :][:20]
     separator = max(SEPARATORS, key=lambda s: sum(count(line, s) for line in sample))
@@ -194,10 +193,6 @@ def _find_rows(lines: list[str]) -> tuple[str | None, int]:
     while first and counts[first - 1] and len(_cells(lines[first - 1], separator)) == width:
         first -= 1
     return separator, first
-
-
-def _is_number(cell: str) -> bool:
-    return re.fullmatch(_NUMBER, cell, re.IGNORECASE) is not None
 
 
 def _header(above: list[list[str]], width: int) -> tuple[list[str], list[str]]:
@@ -213,7 +208,7 @@ def _header(above: list[list[str]], width: int) -> tuple[list[str], list[str]]:
     if len(set(named)) < len(named):  # bodies and kinds stand above the axes
         same = [
             row[: len(head)] for row in above[:-1]
-            if len(row) >= len(head) and not any(map(_is_number, row))
+            if len(row) >= len(head) and not any(map(_IS_NUMBER, row))
         ]  # fmt: skip
         head = [' '.join(filter(None, column)) for column in zip(*same, head, strict=True)]
     return head, units

@@ -96,16 +96,12 @@ def _check(text: str) -> None:
 
 def read_document(path: str | os.PathLike[str]) -> Any:
     """Parse a model file; raises `ModelFileError` when it can't be read or is no YAML."""
-    name = os.fspath(path)
+    text = read_text(path, ModelFileError)
     try:
-        with open(name, encoding='utf-8') as stream:
-            return read_yaml(stream.read(MOST_CHARACTERS + 1))
-    except OSError as error:
-        raise ModelFileError(f'{name}: {error.strerror}') from error
-    except UnicodeError as error:
-        raise ModelFileError(f'{name}: not a text: {error}') from error
+        return read_yaml(text)
     except (yaml.YAMLError, ValueError) as error:
-        raise ModelFileError(f'{name}: not YAML: {" ".join(str(error).split())}') from error
+        words = ' '.join(str(error).split())
+        raise ModelFileError(f'{os.fspath(path)}: not YAML: {words}') from error
 
 
 def write_document(path: str | os.PathLike[str], document: Any) -> None:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,8 +19,8 @@ from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.sessions.tracked_session import track_session
 from anser_ros.stamps import NANO
-from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
-from anser_ros.wire.recorded import ENDING, OPTICAL, POSE_TYPE, POSE_TYPES, optical_topic, poses_in
+from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages, published_poses
+from anser_ros.wire.recorded import ENDING, OPTICAL, POSE_TYPE, optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 BAGS = ('.mcap', '.db3', '.zstd', '.bag')  # endings; a folder is a bag too
@@ -94,22 +95,13 @@ def pose_topics(path: str | os.PathLike[str]) -> tuple[list[str], Setup | None, 
     """Return topics of poses in a bag, its setup document where it is one of a board, and which
     topics there are at all; poses of other types than PoseStamped count where there are none.
     """
-    topics: dict[bool, set[str]] = {True: set(), False: set()}
-    setup, salvage = None, Salvage()
-    decoder = MessageDecoder()
+    setup, salvage, decoder = None, Salvage(), MessageDecoder()
     for raw in iter_messages(path, salvage):
-        if raw.type_name in POSE_TYPES:
-            is_plain = raw.type_name == POSE_TYPE
-            names = [raw.topic]
-            if not (is_plain or topics[True]):
-                names = [topic for topic, *_ in poses_in(raw.topic, decoder.decode(raw))]
-            topics[is_plain].update(names)
-        elif setup is None and raw.topic.endswith('/setup'):
-            try:
+        if setup is None and raw.topic.endswith('/setup'):
+            with suppress(AnserError):  # a document of another schema tells no bodies
                 setup = parse_setup(decoder.decode(raw).data)
-            except AnserError:  # a document of another schema tells no bodies
-                continue
-    return sorted(topics[True] or topics[False]), setup, salvage.topic_words()
+    plain = [topic for topic, kind in salvage.topics.items() if kind == POSE_TYPE]
+    return sorted(plain or published_poses(path)), setup, salvage.topic_words()
 
 
 def _recorded(path: str | os.PathLike[str], wanted: PoseSource) -> AssessedPoses:

@@ -371,6 +371,9 @@ def _agreement(state: PoseState) -> Html:
     return table(['axis', 'lower limit, mm', 'mean difference, mm', 'upper limit, mm'], rows)
 
 
+OPTIONS = {'tracked': 'topics', 'optical': 'optical'}  # of this kind of session alone
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of a session of poses."""
     add_topic_options(parser, 'sensor', 'with --poses: ')
