@@ -33,7 +33,7 @@ MOST_KEPT = 16
 
 
 @dataclass(frozen=True)
-class _Known:
+class _Slide:
     """What depends on a hypothesis and the noise alone, for A strengths: X in its eigenvectors
     (n, 6), ``(1 + M)^-1`` (A, 6, 6), and half of ``log |1 + M|`` (A,).
     """
@@ -54,7 +54,7 @@ class FrameMotion:
 
     def __init__(self, field: FieldFunction, references: SensorTable, noise_t: float) -> None:
         self._points, self._last_ns = references.position, 0
-        self._known: dict[tuple[object, ...], _Known] = {}
+        self._known: dict[tuple[object, ...], _Slide] = {}
         self.forget()
         columns = []
         for unit in np.eye(6):
@@ -113,7 +113,7 @@ class FrameMotion:
             f'({words} along x, y, z)'
         )
 
-    def _known_of(self, bank: Bank, hypothesis: int, noise: float) -> _Known:
+    def _known_of(self, bank: Bank, hypothesis: int, noise: float) -> _Slide:
         key = (bank.rows.tobytes(), bank.names[hypothesis], noise)
         if key not in self._known:
             columns = bank.bases[hypothesis].T @ self._columns[bank.rows]
@@ -121,5 +121,5 @@ class FrameMotion:
             inside = np.eye(6) + (precision[:, None] * columns.T) @ columns
             make_room(self._known, MOST_KEPT)
             half = 0.5 * np.linalg.slogdet(inside)[1]
-            self._known[key] = _Known(columns, np.linalg.inv(inside), half)
+            self._known[key] = _Slide(columns, np.linalg.inv(inside), half)
         return self._known[key]

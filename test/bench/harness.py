@@ -66,7 +66,7 @@ def calibrated(scan: Session, **options: Any) -> FieldModel:
     from anser_ros.calibration.layouts import Layout
     from anser_ros.sessions.calibration import calibrate_sessions
 
-    layout = Layout('coils', 3, 1.0, 0.0, prior='nominal', moved=True)
+    layout = Layout('drawing', 144, 1.0, 0.0, prior='nominal', moved=True)
     return calibrate_sessions(
         [scan], Options(**{'layout': layout, **(options or {'damping': 1e-6})})
     ).model
