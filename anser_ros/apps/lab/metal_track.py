@@ -104,7 +104,7 @@ class Scene:
         tools: ToolSettings,
         noise_t: float,
     ) -> None:
-        self.known, self.model, self.noise_t = known, model, noise_t
+        self.known, self.model, self.noise_t, self.tools = known, model, noise_t, tools
         self.setting = Setting(excitation, known.lattice.tilt(model.frequencies_hz))
         self.turn = excitation.phase.conj() / noise_t
         self.noise = math.hypot(noise_t, model.flux_error_t) / noise_t
