@@ -238,11 +238,8 @@ def _covariance(frame: _SourceFrame, solution: BodySolution) -> Array:
     """Covariance (6, 6) of place and turn of the source, body's frame; its roll is unknown."""
     away, axis = frame.axis.point - solution.position, frame.axis.direction
     # A turn w of the body moves the place seen by (away x w), and turns the axis seen by -w.
-    cross = np.array(
-        [[0.0, -away[2], away[1]], [away[2], 0.0, -away[0]], [-away[1], away[0], 0.0]]
-    )
     jacobian = np.zeros((6, 6))
-    jacobian[:3, :3], jacobian[:3, 3:] = -np.eye(3), cross
+    jacobian[:3, :3], jacobian[:3, 3:] = -np.eye(3), np.cross(away, np.eye(3)).T
     jacobian[3:, 3:] = -(np.eye(3) - np.outer(axis, axis))
     # The open turn is taken out before the inverse: nothing of it reaches what is seen.
     free = np.concatenate([np.cross(axis, -away), axis])
