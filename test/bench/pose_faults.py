@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from pose_world import World
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 MIDDLE = np.array([0.05, 0.02, -0.3])
@@ -212,15 +213,25 @@ def at_rest(world: World, size: float) -> Truth:
     return {}
 
 
+def _lasting(world: World, duration: float) -> None:
+    """Move as a hand does for so many seconds."""
+    knots = np.arange(-2.0, duration + 3.0, 0.7)
+    spread = (0.06, 0.25)
+    world.follow(*(CubicSpline(knots, world.rng.normal(0, s, (knots.size, 3))) for s in spread))
+    world.duration = duration
+
+
 def paused(world: World, size: float) -> Truth:
-    middle, world.duration = world.duration / 2, world.duration + size
+    middle = world.duration / 2
+    _lasting(world, world.duration + size)
     _cut(world, lambda time: (time < middle) | (time > middle + size))
     return {}
 
 
 def turned(world: World, size: float) -> Truth:
     """From four fifths on, turns of some degrees and a millimetre, beside stamps that jitter."""
-    late, world.rate, world.jitter, world.duration = 68.0, 5.0, 0.017, 86.0
+    late, world.rate, world.jitter = 68.0, 5.0, 0.017
+    _lasting(world, 86.0)
 
     def change(name: str, rows: Stream) -> None:
         share = (1.0, 0.4, 0.3, 0.3)[int(name[-1])] * np.deg2rad(size) * (rows[0] > late)
@@ -234,13 +245,13 @@ def turned(world: World, size: float) -> Truth:
 
 def passed(world: World, size: float) -> Truth:
     """Metal of 3 cm reach at one place, that a hand comes back to four times."""
-    spot, hand = world.rng.normal(0, 0.03, 3) + [0.1, 0, 0], world._place
-    world.rate, world.duration = 5.0, 90.0
+    _lasting(world, 90.0)
+    spot, hand, world.rate = world.rng.normal(0, 0.03, 3) + [0.1, 0, 0], world._place, 5.0
 
     def place(time: np.ndarray) -> np.ndarray:
         far = np.min(np.abs(np.subtract.outer(time, [15, 34, 55, 76])), axis=1)
         near = 1 / (1 + np.exp((far - 2) / 0.2))[:, None]
-        return hand(np.clip(time, -2, 25)) * (1 - near) + near * (spot + 0.2 * hand(time % 25))
+        return hand(time) * (1 - near) + near * (spot + 0.2 * hand(time))
 
     def change(name: str, rows: Stream) -> None:
         away = np.linalg.norm(world.body(rows[0])[0] - spot - MIDDLE, axis=1)
