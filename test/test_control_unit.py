@@ -279,6 +279,6 @@ def test_config_files_are_found_or_named(tmp_path):
     with pytest.raises(SetupError, match='no file nothing'):
         config_path('nothing.yaml')
     binary = tmp_path / 'binary.yaml'
-    binary.write_bytes(b'\xff\xfe')
+    binary.write_bytes(b'\xff\x00\x80')
     with pytest.raises(SetupError, match='not a text'):
         read_config(str(binary))

@@ -182,7 +182,7 @@ def test_commands_say_it_in_one_line(tmp_path, capsys):
         ['calibrate', str(path), *out],
         ['evaluate', str(path), '--model', str(MODEL), *out],
         ['diagnose', str(path), '--model', str(MODEL), *out],
-        ['evaluate', str(REPO / 'bags' / 'moving.mcap'), '--model', str(MODEL), *out,
+        ['evaluate', str(REPO / 'bags' / 'moving.mcap'), '--model', str(MODEL), *out, '--refit',
          '--baseline', str(path)],
     ):  # fmt: skip
         assert main(command) == 2

@@ -261,6 +261,8 @@ class Effect(BaseEffect[TermT]):
     gregarious: ClassVar[bool] = False
     # whether it is how a part is installed: installed anew, parts are a rival of metal at rest
     installed: ClassVar[bool] = False
+    # whether its record is how the optical frame lies, as `rotation_deg` and `translation_m`
+    is_frame: ClassVar[bool] = False
     # relative error of what it changes at a reference, beyond the survey's, where the field's
     # gradient close to an emitter is known less well than the field
     gradient_error: ClassVar[float] = 0.0

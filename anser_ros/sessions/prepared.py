@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.result import residuals
 from anser_ros.effects.correction import Correction
+from anser_ros.effects.effect import effect_named
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import SESSION, FieldModel
 from anser_ros.physics.sensor import SensorTable
@@ -133,7 +134,7 @@ def _stood(model: FieldModel, name: str) -> FieldModel:
         given = dict(effect.parameters)
         if given.pop(SESSION, name) != name:
             continue
-        if effect.name == 'registration' and SESSION in effect.parameters:
+        if SESSION in effect.parameters and effect_named(effect.name).is_frame:
             turn = Rotation.from_rotvec(given['rotation_deg'], degrees=True)
             model = model.turned(turn, np.array(given['translation_m']))
         else:

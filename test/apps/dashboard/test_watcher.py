@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from clouds_of import message_of
 from conftest import REPO, diagnostics, spin_until
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -230,7 +231,7 @@ def test_fluxes_of_another_frame_are_counted_and_not_looked_at(ros, moving):
                 (moving.reference, 'reference/flux'),
             ):
                 cloud = flux_cloud(points(stream, 0), frame_id, int(stream.stamp_ns[0]))
-                streams.on_fluxes(topic, cloud)
+                streams.on_fluxes(topic, message_of(cloud))
             if frame_id == 'world':
                 assert streams.window.session() is None
                 assert node.counters['fluxes_other_frame_id'] == 2

@@ -12,7 +12,7 @@ from anser_ros.apps.lab.measured import anser_board
 from anser_ros.apps.lab.measured.recipe import Recipe, ReportRow
 from anser_ros.calibration.error_map import LEAST_GAIN_SIGMAS, learn_error_map
 from anser_ros.cli.main import main
-from anser_ros.errors import BagError, FitError
+from anser_ros.errors import FitError, ParameterError
 
 
 def test_unknown_data_set_and_missing_folder(capsys, tmp_path):
@@ -85,7 +85,7 @@ def test_broken_lists_are_one_line(tmp_path):
     with pytest.raises(FitError, match=r'few\.fcsv: 41 fiducials expected, got 1'):
         anser_board.load(tmp_path)
     (tmp_path / 'few.fcsv').write_text('id,1,x,3\n')
-    with pytest.raises(BagError, match='no table of fiducials'):
+    with pytest.raises(ParameterError, match=r"few\.fcsv: line 1: 3 is 'x'"):
         anser_board.load(tmp_path)
 
 

@@ -1,5 +1,6 @@
 """A pose model applied: errors fall on poses that it has not seen, and it says where it can't."""
 
+import copy
 import json
 
 import numpy as np
@@ -221,8 +222,9 @@ def test_a_model_corrects_and_judges_another_session(bent, tmp_path, capsys):
         assert main(['diagnose', *plain, *extra]) != 0
     assert main(['evaluate', *plain, '--baseline', str(bag)]) == 2
     assert 'leave out: --baseline' in capsys.readouterr().err
-    model['effects'][0]['parameters']['sensor'] = 'tip'
-    path.write_text(yaml.safe_dump(model), encoding='utf-8')
+    other_sensor = copy.deepcopy(model)
+    other_sensor['effects'][0]['parameters']['sensor'] = 'tip'
+    path.write_text(yaml.safe_dump(other_sensor), encoding='utf-8')
     assert main(['evaluate', *plain, '--model', str(path)]) != 0
     assert 'the model knows tip, the session sensor_0' in capsys.readouterr().err
 

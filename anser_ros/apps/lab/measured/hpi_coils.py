@@ -217,4 +217,9 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     ]  # fmt: skip
 
 
-RECIPE = Recipe(NAME, write_sessions, lambda bags, out: calibrations(bags[0], out), rows)
+def commands(bags: list[Path], out: Path) -> list[list[str]]:
+    """Return the commands that calibrate the recording."""
+    return calibrations(bags[0], out)
+
+
+RECIPE = Recipe(NAME, write_sessions, commands, rows)

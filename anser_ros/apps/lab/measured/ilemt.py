@@ -46,7 +46,7 @@ SETS = {
 PAPER = {'dipole': (0.272, 0.210), 'concentric': (0.416, 0.273), 'turned': (3.60, 1.49)}
 """Errors of the makers' own calibration, mm and degrees rms, on data of the same source."""
 KEYS = 'position_rmse_m', 'orientation_rmse_rad', 'tracked_fraction'
-SCALES = 1e3, np.degrees(1.0), 100.0
+SCALES = 1e3, np.degrees(1.0), 100.0  # to mm, degrees, per cent
 TESLA = 1e-5  # T of a unit of the readings: nominal, cancels in all errors
 STATED = {'flux_noise_t': 2e-10, 'optical_position_m': 6.2e-5, 'optical_rotation_rad': 1.7e-3}
 BEFORE, AROUND = ((-0.09, -0.11, 0.14), (0.12, 0.11, 0.35)), ((-0.35,) * 3, (0.35,) * 3)  # m
