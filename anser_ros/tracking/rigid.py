@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from anser_ros.arrays import Array
 from anser_ros.errors import TrackingError
@@ -116,7 +117,7 @@ def descend_body(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Find the least chi-square near a pose, whose arrays are written over.
 
-    Returns chi-square, evaluations used, whether it converged; position and rotation; residual,
+    Returns chi-square, whether it converged; position and rotation; residual,
     whitened residual with derivatives, and information as `_look` fills them at its last pose.
     """
     basis, size = np.empty((flux.shape[0], 7, dipoles.shape[1])), flux.size
@@ -160,7 +161,7 @@ def descend_body(  # type: ignore[no-untyped-def]
             chi2 -= promised
             converged, place = True, trial[:2]
             break
-    return chi2, used, converged, place[0], place[1], pose[2], pose[3], pose[4]
+    return chi2, converged, place[0], place[1], pose[2], pose[3], pose[4]
 
 
 @kernel
@@ -263,33 +264,7 @@ class BodySolution:
     information: Array  # (6, 6), inverse covariance of (position, rotation vector), both in fg
     residual: Array  # (S, 2K), measured minus modelled flux, T
     coil_chi2: Array  # (S,), each coil's squared residual in units of its own noise
-    evaluations: int
     converged: bool
-
-
-@kernel
-def _common(modes, inverse_sigma, out):  # type: ignore[no-untyped-def]
-    """Write what `common_factor` returns; False where the modes are not finite."""
-    coils, count, width = modes.shape
-    for s in range(coils):
-        for r in range(count):
-            for k in range(width):
-                out[r, s * width + k] = modes[s, r, k] * inverse_sigma[s, k]
-    factor = np.dot(out, out.T)
-    for i in range(count):
-        for j in range(i + 1):
-            total = factor[i, j] + (i == j)
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if not math.isfinite(total):
-                return False
-            factor[i, j] = total / factor[j, j] if j < i else math.sqrt(total)
-        for k in range(i):
-            for m in range(out.shape[1]):
-                out[i, m] -= factor[i, k] * out[k, m]
-        for m in range(out.shape[1]):
-            out[i, m] /= factor[i, i]
-    return True
 
 
 def common_factor(modes: Array, inverse_sigma: Array) -> Array:
@@ -298,10 +273,13 @@ def common_factor(modes: Array, inverse_sigma: Array) -> Array:
     ``modes`` (S, R, 2K) are flux errors of one standard deviation each that several coils share,
     T; ``inverse_sigma`` (S, 2K) is in 1/T. Raises `TrackingError` when the modes are not finite.
     """
-    common = np.empty((modes.shape[1], inverse_sigma.size))
-    if not _common(modes, inverse_sigma, common):
+    white = (modes * inverse_sigma[:, None]).swapaxes(0, 1).reshape(-1, inverse_sigma.size)
+    covariance = np.eye(len(white)) + white @ white.T
+    if not np.isfinite(covariance).all():
         raise TrackingError('the model covariance must be finite')
-    return common
+    factor = np.linalg.cholesky(covariance)
+    common: Array = solve_triangular(factor, white, lower=True, check_finite=False)
+    return np.ascontiguousarray(common)
 
 
 def solve_body(
@@ -327,12 +305,12 @@ def solve_body(
         raise TrackingError(f'{count} coils and {width} components, got flux {flux.shape}')
 
     r, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
-    chi2, used, converged, r, turn, residual, white, information = descend_body(
+    chi2, converged, r, turn, residual, white, information = descend_body(
         r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma, common,
         field.columns, field.moments, low, high, MAX_EVALUATIONS,
     )  # fmt: skip
     coil_chi2 = (white[0].reshape(count, width) ** 2).sum(axis=1)
-    return BodySolution(r, turn, chi2, information, residual, coil_chi2, used, converged)
+    return BodySolution(r, turn, chi2, information, residual, coil_chi2, converged)
 
 
 def start_from_coils(
