@@ -12,6 +12,7 @@ RUN apt-get update && apt-get install -y --no-install-recommends \
     python3-matplotlib \
     python3-numba \
     python3-numpy \
+    python3-pandas \
     python3-pip \
     python3-rich \
     python3-scipy \

@@ -37,6 +37,7 @@ setup(
     install_requires=[
         'setuptools',
         'numpy>=1.26',
+        'pandas>=2.1',
         'scipy>=1.11',
         'h5py>=3.10',
         'numba>=0.59',

@@ -31,6 +31,8 @@ OTHER_MODEL = 'other_model'
 """The active model was made for another board, or is not the one whose effects are undone."""
 UNCALIBRATED = 'uncalibrated'
 """The model is the nominal one, and its use has not been allowed."""
+OTHER_PLACE = 'other_place'
+"""The frame of the references, or the board, has moved: they are no longer where they were."""
 TWO_SOURCES = 'two_sources'
 """More than one node publishes the fluxes, the setup or the model; the tracker finds this."""
 
@@ -41,7 +43,7 @@ UNCONFIRMED = 'unconfirmed'
 MODEL_DOUBTFUL = 'model_doubtful'
 """Nearly everything that is measured contradicts the field model."""
 
-OF_MODEL = (REFERENCES_LOST, REFERENCES_DOUBTFUL, OTHER_MODEL, UNCALIBRATED)
+OF_MODEL = (REFERENCES_LOST, REFERENCES_DOUBTFUL, OTHER_MODEL, UNCALIBRATED, OTHER_PLACE)
 """States for which the model's server withholds all poses. Their places, from 1, are their codes
 in `field_model_error`, so a new one is added at the end."""
 STATES = (

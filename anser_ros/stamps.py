@@ -1,6 +1,7 @@
 """Converts stamps: whole nanoseconds, from a ROS message and back, and what makes them seconds."""
 
 import struct
+from datetime import UTC, datetime
 from enum import Enum
 from typing import Any
 
@@ -65,3 +66,32 @@ def pack_stamp(message: bytearray, stamp_ns: int) -> None:
 def is_live(stamp_ns: int, now_ns: int) -> bool:
     """Return whether a stamp, ns, is of now by the host's clock, and not a recording's."""
     return abs(now_ns - stamp_ns) < LIVE_WITHIN_S * SECOND_NS
+
+
+LATEST_NS = 2**31 * SECOND_NS - 1
+"""Latest stamp, ns, that a ROS message holds: of 2038-01-19."""
+LAST_DAY_S = 253_402_214_400  # 9999-12-31, the last that a date can be
+EPOCHS = {
+    '1904 (LabVIEW)': -2_082_844_800, '1900 (NTP)': -2_208_988_800,
+    '1601 (Windows)': -11_644_473_600, 'the year 1 (.NET)': -62_135_596_800,
+}  # fmt: skip
+"""Where other programs begin to count seconds, s, by the usual zero of 1970."""
+RECENT_NS = 946_684_800 * SECOND_NS
+"""Start of the year 2000, ns: a recording's stamps are not before."""
+
+
+def stamp_fault(first_ns: int, last_ns: int) -> str:
+    """Return why times, ns, cannot be stamps, and what mends it; empty where they can."""
+    if first_ns >= 0 and last_ns <= LATEST_NS:
+        return ''
+    if first_ns < 0:
+        words = 'cannot be stamps of a bag: before 1970; start_ns or --shift adds a start'
+        return f'times of {first_ns * NANO:g} s {words}'
+    day = datetime.fromtimestamp(min(first_ns // SECOND_NS, LAST_DAY_S), UTC)
+    words = f'times of {day:%Y-%m-%d}, beyond what a ROS stamp holds (2038-01-19)'
+    for name, start_s in EPOCHS.items():
+        start_ns = start_s * SECOND_NS
+        if first_ns + start_ns >= RECENT_NS and last_ns + start_ns <= LATEST_NS:
+            remedy = f'start_ns: {start_ns}, or import_poses --shift {start_s}'
+            return f'{words}: seconds since {name}? {remedy}'
+    return f'{words}; they cannot be stamps of a bag: is the unit of time right?'

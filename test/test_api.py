@@ -148,14 +148,23 @@ def test_what_is_none_is_refused(tmp_path):
         load_setup(tmp_path / 'none.yaml')
     with pytest.raises(FitError, match='at least one session'):
         anser_ros.calibrate([])
-    with pytest.raises(ParameterError, match='must both be'):
-        Model.nominal(SETUP).flux([[0.0, 0.0, 0.1]], [0.0, 0.0, 1.0])
+    for axis, said in (([0.0, 0.0, 1.0], 'must both be'), ([[0.0, 0.0, 2.0]], 'unit vectors')):
+        with pytest.raises(ParameterError, match=said):
+            Model.nominal(SETUP).flux([[0.0, 0.0, 0.1]], axis)
+    with pytest.raises(SetupError, match=r'none\.yaml: No such file'):
+        load_setup(str(tmp_path / 'none.yaml'))
+    assert load_setup(str(REPO / 'config/demo_setup.yaml')).bodies == ('tool_a',)
 
 
 def test_tracks_are_saved_as_arrays(tmp_path):
     session = load_session(REPO / 'bags' / 'moving.mcap')
     result = track(session, Model.load(REPO / 'config' / 'demo_model.yaml'))
-    result.save(tmp_path / 'poses.npz')
+    result.save(str(tmp_path / 'poses.npz'))
+    assert len(repr(result)) < 2000 and 'tool_a: 200 of 200 frames' in repr(result)
+    assert len(repr(session)) < 200 and dict(result).keys() == set(result)
+    table = result['tool_a'].to_dataframe()
+    np.testing.assert_array_equal(table['position_z_m'], result['tool_a'].position[:, 2])
+    assert len(table) == 200 and set(table['state']) == {'ok'}
     with np.load(tmp_path / 'poses.npz') as saved:
         np.testing.assert_array_equal(saved['tool_a:position'], result['tool_a'].position)
         assert set(saved['tool_a/0/x:state']) == {'ok'}

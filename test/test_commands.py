@@ -185,7 +185,7 @@ def test_a_bag_of_another_form_or_with_other_names_is_refused_with_what_mends_it
     (tmp_path / 'other').mkdir()
     (tmp_path / 'other' / 'other.db3').touch()
     assert main(['export', 'other', '--out', 'out']) == 2
-    assert 'found 0; make one of it by: anser import other --out' in capsys.readouterr().err
+    assert 'other.db3: not a bag in sqlite3' in capsys.readouterr().err
     names = ['/anser/tool/flux:=/em/flux', '/anser/reference/flux:=/em/still']
     remaps = [word for name in names for word in ('--remap', name)]
     assert main(['import', str(REPO / 'bags/moving.mcap'), *remaps, '--out', 'a.mcap']) == 0

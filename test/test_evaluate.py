@@ -199,10 +199,18 @@ def test_without_enough_references_there_is_no_pose_near_metal(metal):
         assert 'residual' in states and 'ok' not in states, 'metal is noticed without references'
 
 
-def test_references_without_a_refit_are_bad_usage(tmp_path, capsys):
-    arguments = ['evaluate', str(METAL), '--model', str(MODEL), '--references', 'none']
-    assert main([*arguments, '--out', str(tmp_path)]) == 2
-    assert '--refit' in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ('options', 'said'),
+    [
+        ('--model nominal --references none', '--references is of a refit; it needs --refit'),
+        ('--model nominal --baseline x.mcap', '--baseline is of a refit; it needs --refit'),
+        ('--poses --refit', 'without effect on a session of poses, leave out: --refit'),
+        ('--model nominal --optical /x', '--optical has no effect without --poses'),
+    ],
+)
+def test_options_without_effect_are_bad_usage(tmp_path, capsys, options, said):
+    assert main(['evaluate', str(METAL), *options.split(), '--out', str(tmp_path)]) == 2
+    assert said in capsys.readouterr().err
 
 
 FRAMES = 200

@@ -10,15 +10,19 @@ from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
 from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layouts import CLUSTER, FREE_KINDS, Generator, clusters, fit_clusters
 from anser_ros.calibration.population import alike_sigma_m
+from anser_ros.calibration.result import residuals
 from anser_ros.calibration.selection import COAXIAL
 from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters, has_turned
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import ModelFileError
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import Dipoles, EffectRecord
+from anser_ros.field.model import SESSION, Dipoles, EffectRecord
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.sessions.prepared import correct, prepare
+from anser_ros.sessions.session import Session
 from anser_ros.settings import Accuracy
+from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 TONES = (7500.0, 10500.0, 13500.0)
 X, _, Z = np.eye(3)
@@ -172,3 +176,50 @@ def test_sessions_that_turn_about_one_axis_each_determine_a_lever_arm_together()
     assert not has_turned(about[:1]) and has_turned(about)
     assert 'lever_arm' not in SensorParameters(about[:1], KINDS).kinds
     assert 'lever_arm' in SensorParameters(about, KINDS).kinds
+
+
+def stood(measured, frame, mount, session):
+    """A session's poses, of (turn, shift) frames as the optics say, on a mount of its own."""
+    turn, held = (Rotation.from_rotvec(part[:3]) for part in (frame, mount))
+    # Where it is said to be, and how, so that its coils are where they are.
+    rotation = measured.rotation @ held.as_matrix().T
+    position = measured.position - rotation @ mount[3:]
+    rotation, position = turn.as_matrix().T @ rotation, turn.inv().apply(position - frame[3:])
+    return replace(measured, rotation=rotation, position=position, session=session)
+
+
+@pytest.mark.parametrize('size', [0.0, 1.0])
+def test_sessions_stand_by_themselves_and_share_field_and_sensors(size):
+    rng = np.random.default_rng(9)
+    whole, names = scan(rng, shapeless(rng), 450), ('a.mcap', 'b.mcap', 'c.mcap')
+    generator = Generator(CENTRES, np.zeros(3), 0.05, ('a', 'b', 'c'), TONES)
+    unit = size * np.array([8e-3, 8e-3, 8e-3, 2e-3, 2e-3, 2e-3])
+    frames, mounts = (unit * rng.normal(size=(3, 6)) for _ in range(2))
+    parts = [
+        stood(whole.frames(np.arange(i, 450, 3)), frames[i], mounts[i] / 2, name)
+        for i, name in enumerate(names)
+    ]
+    options = Options(ACCURACY, estimate=KINDS)
+    corrected = correct_scan(parts, generator, options)
+    model = fit_scan(corrected, names, generator, options).model
+    records = [record for record in model.effects if SESSION in record.parameters]
+    assert sorted(r.name for r in records) == sorted(
+        ['registration', 'body_turned', 'lever_arm'] * 3 if size else []
+    )
+    coils = tuple(
+        Coil(name, tuple(place), 0.0, tone)
+        for name, place, tone in zip('abc', CENTRES.tolist(), TONES, strict=True)
+    )
+    table = body()
+    sensors = tuple(
+        SensorSpec(k, table.name[k], 'tool', (0.0, 0.0, 0.0), tuple(axis), 0.0)
+        for k, axis in enumerate(table.axis.tolist())
+    )
+    setup = Setup('fg', 1.0, Emitter('free', {}, coils), sensors, None, {})
+    for part, name in zip(parts, names, strict=True):
+        session = Session(name, setup, 0, (part,), None)
+        prepared = prepare(session, model)
+        assert not any(SESSION in record.parameters for record in prepared.model.effects)
+        (tool,) = correct(prepared).session.tools
+        left = residuals([tool], prepared.model)
+        assert left.unexplained < 4e-3, name

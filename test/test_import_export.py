@@ -280,8 +280,8 @@ def test_export_of_poses_and_fluxes(tmp_path, moving, capsys):
 
 def test_tables_of_tracked_poses_become_a_session_of_poses(tmp_path, capsys):
     """No setup and no fluxes: what `diagnose --poses` takes."""
-    rows = [f'{0.05 * k},{k},0,100,1,0,0,0' for k in range(1, 30)]
-    (tmp_path / 'em.csv').write_text('\n'.join(['t,x,y,z,qw,qx,qy,qz', *rows]))
+    rows = [f'{0.05 * k},{k},0,100,1,0,0,0,seen' for k in range(1, 30)]
+    (tmp_path / 'em.csv').write_text('\n'.join(['t,x,y,z,qw,qx,qy,qz,state', *rows]))
     table = {
         'file': 'em.csv', 'stamp': 't', 'position': ['x', 'y', 'z'], 'unit': 'mm',
         'quaternion': ['qw', 'qx', 'qy', 'qz'], 'order': 'wxyz',

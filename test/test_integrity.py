@@ -115,6 +115,51 @@ def test_swapped_columns_give_no_pose_and_their_body_goes_on(rng):
     assert 'from its place in the body' in found[-1]['tool_a/1/z'].reason
 
 
+@pytest.mark.parametrize('moved', [range(3), range(6), (0, 1, 2, 6, 7, 8)])
+@pytest.mark.parametrize('aside_m', [1.5e-3, 6e-3])
+def test_parts_of_a_bent_tool_contradict_each_other_and_none_is_believed(rng, moved, aside_m):
+    """Most coils may be in the part that has moved, so their number says nothing."""
+    bent, tracker = TOOL.position.copy(), Tracker(MODEL, TOOL)
+    bent[list(moved)] += [0.6 * aside_m, 0.8 * aside_m, 0.0]
+    for i, (stamp, position, rotation) in enumerate(path(60)):
+        real = TOOL if i < FAULT else replace(TOOL, position=bent)
+        found = tracker.update(stamp, CHANNELS, fluxes(MODEL, real, position, rotation, rng))
+        assert wrong_and_ok(found, position, rotation) == [], i
+    assert {e.state for e in found} <= {'inconsistent', 'residual'}
+
+
+def test_clusters_that_are_permuted_now_and_then_give_no_pose(rng):
+    def permute(i, seen):
+        turned = i >= FAULT and i % 5 == 0
+        return np.roll(seen[i], -3, axis=0) if turned else seen[i]
+
+    found = track_with(permute, rng)
+    assert {e.state for e in found[FAULT + 1].values()} == {'ok'}
+
+
+@pytest.mark.parametrize('gate', [8.0, 100.0, 1e6])
+def test_a_wide_gate_of_residuals_leaves_rigidity_and_continuity(rng, gate):
+    def swap(i, seen):
+        return seen[i][[4, 1, 2, 3, 0, 5, 6, 7, 8]] if i >= FAULT else seen[i]
+
+    found = track_with(swap, rng, settings=TrackerSettings(gate=gate))
+    assert 'ok' not in {found[-1][name].state for name in ('tool_a/0/x', 'tool_a/1/y')}
+
+
+@pytest.mark.parametrize('gain', [0.98, 1.01, 1.02])
+def test_a_gain_that_all_coils_have_in_common_is_in_every_sigma(rng, gain):
+    """High up it looks like a distance to each coil; the body tells it, whatever the gate."""
+    tracker, sigma = Tracker(MODEL, TOOL, TrackerSettings(gate=50.0)), {}
+    for now in (1.0, gain):
+        for stamp, position, rotation in path(120):
+            place = position + [0.0, 0.0, 0.1]
+            flux = now * fluxes(MODEL, TOOL, place, rotation, rng)
+            found = tracker.update(stamp + round(1e12 * now), CHANNELS, flux)
+            assert wrong_and_ok(found, place, rotation) == []
+            sigma[now] = found[-1].sigma_position_m
+    assert sigma[1.0] < 1e-4 and sigma[gain] > 5e-4
+
+
 def test_a_survey_as_wrong_as_is_stated_contradicts_nothing(rng):
     """Places 0.12 mm, axes 0.5 degrees and gains 0.2 % off, as the settings have them."""
     off = 0.12e-3 * rng.normal(size=(9, 3))

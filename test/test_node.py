@@ -12,11 +12,12 @@ import pytest
 from conftest import Process, spin_until, wait
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import ParameterError, SetupError
-from anser_ros.nodes.runtime import parameters
+from anser_ros.nodes.runtime import parameters, qos
 from anser_ros.nodes.runtime import process as processes
 from anser_ros.nodes.runtime.diagnostics import Throttle
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
@@ -79,19 +80,22 @@ class TestParameterTable:
 
 
 class TestParameterFiles:
-    @pytest.mark.parametrize('key', ['sample', '/anser/sample', '/**/sample', '/**', '/anser/*'])
+    @pytest.mark.parametrize(
+        'key', ['/anser/sample', '/**/sample', '/**', '/anser/*', '/*/sample', '/anser/**', '/*/*']
+    )
     def test_a_section_that_reaches_the_node_is_fine(self, tmp_path, key):
         file = tmp_path / 'a.yaml'
         file.write_text(f'{key}:\n  ros__parameters: {{}}\n')
         arguments = ['sample', '--ros-args', '--params-file', str(file)]
-        assert complaints(arguments, 'sample') == []
+        assert complaints(arguments, '/anser/sample') == []
 
     def test_sections_may_be_nested_by_namespace(self, tmp_path):
         file = tmp_path / 'a.yaml'
         file.write_text('anser:\n  sample:\n    ros__parameters: {}\n')
-        assert complaints(['--params-file', str(file)], 'sample') == []
-        (complaint,) = complaints(['--params-file', str(file)], 'other')
-        assert complaint == f'{file} has nothing for other; it has: anser/sample'
+        assert complaints(['--params-file', str(file)], '/anser/sample') == []
+        for node in ('/anser/other', '/sample', '/a/anser/sample', '/anser/a/sample'):
+            (complaint,) = complaints(['--params-file', str(file)], node)
+            assert complaint.startswith(f'{file} has parameters of anser/sample, none of {node}')
 
     def test_what_rcl_refuses_itself_is_left_to_it(self, tmp_path):
         file = tmp_path / 'a.yaml'
@@ -204,7 +208,7 @@ class TestProcess:
         file = tmp_path / 'parameters.yaml'
         file.write_text('/anser/smaple:\n  ros__parameters:\n    rate_hz: 50.0\n')
         process = run('--ros-args', '--params-file', str(file))
-        process.wait_for("nothing for sample; is '/anser/smaple' meant?")
+        process.wait_for('parameters of /anser/smaple, none of /anser/sample: write /anser/sample')
         process.wait_for('rate 25.0')
 
 
@@ -269,6 +273,19 @@ class TestGraph:
         (done,) = node.set_parameters([Parameter('depth', value=5)])
         assert not done.successful
         assert node.parameters.rate_hz == 50.0 and node.parameters.depth == 3
+
+    def test_qos_overrides_are_honoured(self, ros):
+        given = {
+            'in.subscription.reliability': 'best_effort',
+            'out.publisher.durability': 'volatile',
+        }
+        pairs = [Parameter(f'qos_overrides./anser/{key}', value=v) for key, v in given.items()]
+        node = type('Sample', (AnserNode,), {'NAME': 'sample'})(parameter_overrides=pairs)
+        taken = node.create_subscription(String, 'in', print, qos.STREAM)
+        out = node.create_publisher(String, 'out', qos.LATCHED)
+        assert taken.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        assert out.qos_profile.durability == DurabilityPolicy.VOLATILE
+        node.destroy_node()
 
 
 def test_the_executor_is_the_one_told_of_events_where_rclpy_has_it(monkeypatch):

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -136,12 +137,15 @@ class TestConsole:
             (BagError('a bag\nthat is none'), 2, 'anser sample: a bag that is none\n'),
             (FileNotFoundError(2, 'No file', 'x.yaml'), 2, 'anser sample: x.yaml: No file\n'),
             (KeyboardInterrupt(), 2, 'anser sample: interrupted\n'),
+            (signal.SIGTERM, 2, 'anser sample: interrupted\n'),
             (ZeroDivisionError('defect'), 1, 'Traceback'),
             (OSError('no file in it'), 1, 'Traceback'),
         ],
     )
     def test_bad_input_is_one_line_a_defect_its_traceback(self, verb, capsys, error, code, said):
         def run(_args):
+            if isinstance(error, signal.Signals):
+                signal.raise_signal(error)
             raise error
 
         verb(run)

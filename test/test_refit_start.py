@@ -210,7 +210,9 @@ def test_tables_are_read_as_they_were_written(tmp_path):
     for folder, model in ((None, world.model), (tmp_path, None), (tmp_path, stronger)):
         assert ReadAhead(folder, model)._read is None, 'nothing is read in vain'
     whole = path.read_bytes()
-    for damaged in (whole[:-8], whole[:-1] + bytes([whole[-1] ^ 1]), whole[:100], b''):
+    middle = bytearray(whole)
+    middle[len(whole) // 2] ^= 1
+    for damaged in (whole[:-8], bytes(middle), whole[:100], b''):
         path.write_bytes(damaged)
         assert kept.read() is None
         ahead = ReadAhead(tmp_path, world.model)

@@ -23,7 +23,8 @@ OPTIONAL = {'tf2_msgs', 'launch', 'launch_ros'}
 SETUPTOOLS = 'setuptools'
 """Is needed by colcon's build of a Python package, by no import."""
 ROSDEP = {
-    'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'pyyaml': 'python3-yaml',
+    'numpy': 'python3-numpy', 'pandas': 'python3-pandas', 'scipy': 'python3-scipy',
+    'pyyaml': 'python3-yaml',
     'pyserial': 'python3-serial', 'matplotlib': 'python3-matplotlib', 'h5py': 'python3-h5py',
     'numba': 'python3-numba', 'rich': 'python3-rich',
 }  # fmt: skip
@@ -113,6 +114,13 @@ def test_what_rosdep_does_not_know_is_asked_for_where_it_is_needed(monkeypatch, 
     assert cli.main(['evaluate']) == 2
     said = capsys.readouterr().err
     assert said == 'anser evaluate: mcap is not installed: pip install mcap\n'
+
+    def read(name):
+        raise ModuleNotFoundError('No module named pandas', name='pandas')
+
+    monkeypatch.setattr(cli.importlib, 'import_module', read)
+    assert cli.main(['pivot', 'poses.csv']) == 2
+    assert 'pandas is not installed: pip install pandas' in capsys.readouterr().err
 
 
 # Imports modules as where some packages are not.

@@ -137,6 +137,8 @@ class TestStating:
         assert tracking_noise(quiet) == Accuracy.flux_noise_t
         stated = told.with_stated({'flux_noise_t': 5e-11})
         assert (measured_noise(stated), tracking_noise(stated)) == (0.0, 5e-11)
+        found = [tracking_noise(one, 7e-12) for one in (told, setup_with(), stated)]
+        assert found == [2e-10, 7e-12, 5e-11], 'what a calibration found is before a document'
 
     def test_the_stamps_error_that_was_measured_gives_way_to_what_is_stated(self):
         assert stamp_sigma(setup_with()) == Accuracy.stamp_sigma_s

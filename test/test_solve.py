@@ -326,6 +326,9 @@ def test_grid_covers_the_volume_widens_with_height_and_stays_above_the_board():
     assert volume.contains(np.array([0.0, 0.0, 0.1]))
     assert not volume.contains(np.array([0.0, 0.0, 0.31]))
     assert not volume.contains(np.full(3, np.nan))
+    around = grid_points(TrackedVolume((-0.3, -0.3, 0.1), (0.3, 0.3, 0.7)), 0.03, [0.0, 0.0, 0.4])
+    for middle in np.array([[0.0, 0.0, 0.3], [0.0, 0.2, 0.4], [0.2, 0.1, 0.55]]):
+        assert np.linalg.norm(around - middle, axis=1).min() < 0.04
     low, high = TrackedVolume((-0.1, -0.1, 0.02), (0.1, 0.1, 0.3)).grown(0.05)
     assert low[2] == pytest.approx(0.01)
     np.testing.assert_allclose(high, [0.15, 0.15, 0.35])

@@ -34,6 +34,9 @@ class CalibrationResult:
     flux_error_t: float
     figures: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        return f'CalibrationResult({self.model}, held out {self.heldout_flux_rmse_t:.3g} T)'
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of ``calibration.json`` (``docs/interfaces.md``)."""
         return dict(self.figures)

@@ -27,6 +27,9 @@ class DiagnosisResult:
     effects: tuple[str, ...]
     figures: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        return f'DiagnosisResult({", ".join(self.effects) or "no effect"}; {self.model})'
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of ``diagnosis.json`` (``docs/interfaces.md``)."""
         return dict(self.figures)

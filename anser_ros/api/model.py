@@ -13,6 +13,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.sessions.starting_model import load_model, save_model
+from anser_ros.wire.setup_values import AXIS_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,11 @@ class Model:
     """
 
     field: FieldModel
+
+    def __repr__(self) -> str:
+        effects = f', effects: {", ".join(self.effects)}' if self.effects else ''
+        count = len(self.field.positions)
+        return f'Model({count} dipoles of {len(self.emitters)} emitters{effects})'
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -97,11 +103,14 @@ class Model:
         Raises
         ------
         ParameterError
-            When the two shapes differ, or do not end in 3.
+            When the two shapes differ, or do not end in 3, or an axis is not a unit vector.
         """
         points, axes = np.asarray(position, dtype=float), np.asarray(axis, dtype=float)
         if points.shape != axes.shape or points.shape[-1:] != (3,):
             raise ParameterError(
                 f'positions and axes must both be (..., 3), got {points.shape} and {axes.shape}'
             )
+        length = np.linalg.norm(axes, axis=-1)
+        if not (np.abs(length - 1.0) <= AXIS_TOLERANCE).all():
+            raise ParameterError(f'axes must be unit vectors, got length {length.max():.4g}')
         return self.field.flux(points, axes)

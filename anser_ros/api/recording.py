@@ -27,7 +27,8 @@ def load_setup(source: SetupSource) -> Setup:
     Parameters
     ----------
     source : Setup, mapping, str or path
-        The document as plain data, as YAML text, or a `pathlib.Path` of a file that holds it.
+        The document as plain data, as YAML text, or the path of a file that holds it (a text of
+        one line that ends with .yaml or .yml is one).
 
     Raises
     ------
@@ -46,7 +47,7 @@ def load_setup(source: SetupSource) -> Setup:
         return source
     if isinstance(source, Mapping):
         return parse_setup(yaml.safe_dump(dict(source), sort_keys=False))
-    if isinstance(source, str):
+    if isinstance(source, str) and ('\n' in source or not source.endswith(('.yaml', '.yml'))):
         return parse_setup(source)
     return parse_setup(read_text(source, SetupError))
 

@@ -1,7 +1,7 @@
 """Offers tracking as a function: a session and a model in, arrays of poses out."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,6 +67,20 @@ class TrackedPoses:
         """Return the mask (F,) of the frames that have a pose."""
         return np.asarray(self.state == OK)
 
+    def __repr__(self) -> str:
+        return f'TrackedPoses({self.name}: {self.ok.sum()} of {self.ok.size} frames have a pose)'
+
+    def to_dataframe(self) -> Any:
+        """Return a data frame of pandas with a row for each frame, columns named with units."""
+        import pandas  # late: it takes half a second
+
+        table = {'stamp_ns': self.stamp_ns, 'time_s': self.time, 'state': self.state}
+        for kind, ending in (('position', '_m'), ('axis', '')):
+            columns = getattr(self, kind).T
+            table |= {f'{kind}_{a}{ending}': v for a, v in zip('xyz', columns, strict=True)}
+        names = 'sigma_position_m', 'residual_t', 'position_error_m', 'orientation_error_rad'
+        return pandas.DataFrame(table | {name: getattr(self, name) for name in names})
+
 
 @dataclass(frozen=True)
 class TrackingResult:
@@ -87,6 +101,16 @@ class TrackingResult:
     def __getitem__(self, name: str) -> TrackedPoses:
         """Poses of a body or, where no body has that name, of a sensor; raises KeyError."""
         return self.bodies[name] if name in self.bodies else self.sensors[name]
+
+    def keys(self) -> tuple[str, ...]:
+        """Return the names of bodies and sensors, so that ``dict(result)`` works."""
+        return (*self.bodies, *self.sensors)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.keys())
+
+    def __repr__(self) -> str:
+        return f'TrackingResult({", ".join(map(repr, (self[name] for name in self)))})'
 
     def to_dict(self) -> dict[str, Any]:
         """Return the errors against the optical poses, as in ``evaluation.json``."""

@@ -14,7 +14,7 @@ from anser_ros.arrays import Booleans, Integers
 from anser_ros.calibration.held_out import HeldOut, gaps_of, predict_held_out
 from anser_ros.calibration.layout_fit import LayoutFit, LayoutFitter
 from anser_ros.calibration.layouts import FREE_KINDS, Generator, Layout, place
-from anser_ros.calibration.moments import Progress
+from anser_ros.calibration.moments import SMALLEST_NOISE_T, Progress
 from anser_ros.calibration.readings import (
     check_agreement,
     check_kept,
@@ -93,7 +93,7 @@ def correct_scan(
         optical_position_m=float(root * found.optical.position_m),
         optical_rotation_rad=float(root * found.optical.rotation_rad),
     )
-    corrected = tuple(with_pose(found.errors_of(m.body).apply(m)) for m in sound)
+    corrected = tuple(with_pose(found.errors_of(m.body, m.session).apply(m)) for m in sound)
     reported = reported_effects(found, measurements)
     return Scan(corrected, accuracy, corrections(found), reported, found)
 
@@ -124,16 +124,22 @@ def fit_scan(
     if not _is_explained(scan):
         check_agreement(posed, names, whole.fit.noise_t, alone)
     sensors = scan.sensor_fit
+    flux_error = float(np.hypot(held_out.flux_error_t, scan.field_sigma_t))
+    missed = max(whole.fit.noise_t**2 - flux_error**2, 0.0)
+    # Only the quadrature tells noise from the model's error, and a constant field has none.
+    is_told = held_out.flux_noise_t > 2.0 * SMALLEST_NOISE_T
     model = FieldModel(
         positions=whole.dipoles.positions,
         directions=whole.dipoles.directions,
         moments=whole.fit.moments,
         emitters=generator.emitters,
         frequencies_hz=generator.frequencies_hz,
-        flux_error_t=float(np.hypot(held_out.flux_error_t, scan.field_sigma_t)),
+        flux_error_t=flux_error,
+        noise_t=max(held_out.flux_noise_t, float(np.sqrt(missed))) if is_told else 0.0,
+        error_share=held_out.error_share if is_told else 0.0,
         shift_sigma_m=0.0 if sensors is None else sensors.shift_sigma_m,
         effects=scan.corrections,
-        gaps=None if layout.local else gaps_of(whole, damping, posed, held_out.gap_factor),
+        gaps=gaps_of(whole, damping, posed, held_out.gap_factor),
     )
     calibration = Calibration(
         model=model,
@@ -185,8 +191,7 @@ def _winner(
         def fit(fold: int) -> LayoutFit:
             return _fitted(fitters[fold], candidate)
 
-        alike = None if candidate.layout.local else candidate.damping
-        return predict_held_out(thin, folds, fit, accuracy, reference, alike)
+        return predict_held_out(thin, folds, fit, accuracy, reference, candidate.damping)
 
     finalists = list(selection.finalists)
     if damping is not None:

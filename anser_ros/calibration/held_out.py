@@ -29,7 +29,7 @@ from anser_ros.calibration.readings import (
     usable_weights,
     with_pose,
 )
-from anser_ros.field.measurements import Measurements
+from anser_ros.field.measurements import Measurements, frame_power
 from anser_ros.field.model import ScanGaps
 from anser_ros.parallel import in_order
 from anser_ros.physics.dipole import flux_basis
@@ -128,6 +128,7 @@ class HeldOut:
     # by which errors are larger than the covariance of the fitted moments makes them; one where
     # they were not compared
     gap_factor: float = 1.0
+    error_share: float = 0.0  # of a strong flux, by which the field errs more than elsewhere
 
     @property
     def score_t(self) -> float:
@@ -161,7 +162,7 @@ def predict_held_out(
                 part = test.frames(block)
                 terms = pose_terms(part, part_fit.dipoles, part_fit.fit.moments)
                 expected = None if left is None else expected_power(left, part_fit.dipoles, part)
-                tally.add(terms, usable_weights(part), part.position, expected)
+                tally.add(terms, usable_weights(part), part.position, expected, part.flux)
     return tally.result()
 
 
@@ -176,9 +177,17 @@ class HeldOutTally:
         self._parts: list[tuple[Array, ...]] = []
 
     def add(
-        self, terms: PoseTerms, weights: Array, place: Array, expected: Array | None = None
+        self,
+        terms: PoseTerms,
+        weights: Array,
+        place: Array,
+        expected: Array | None = None,
+        flux: ComplexArray | None = None,
     ) -> None:
-        """Take in frames at places (F, 3), m, whose errors should have the power (F,), T^2."""
+        """Take in frames at places (F, 3), m, whose errors should have the power (F,), T^2.
+
+        ``flux`` (F, S, K), T: what was read there.
+        """
         residual = terms.residual
         if residual.shape[0] == 0:
             return
@@ -194,14 +203,19 @@ class HeldOutTally:
                 place,
                 power.sum(axis=1) / np.maximum(used.sum(axis=1), 1),
                 np.zeros(0) if expected is None else expected,
+                np.zeros(0) if flux is None else frame_power(flux),
             )
         )
 
     def result(self) -> HeldOut:
         """Return the figures of all frames that were taken in."""
-        error, left, chi, excess, place, power, expected = map(
+        error, left, chi, excess, place, power, expected, read = map(
             np.concatenate, zip(*self._parts, strict=True)
         )
+        typical = max(float(np.median(excess)), 0.0)
+        strong, share = read > np.median(read) if read.size else np.zeros(0, dtype=bool), 0.0
+        if strong.sum() >= FEWEST_HELD_OUT_FRAMES:
+            share = float(np.median((excess[strong] - typical) / read[strong]))
         return HeldOut(
             error=as_complex(error),
             left_over=as_complex(left),
@@ -209,11 +223,12 @@ class HeldOutTally:
             noise_t=self.noise_t,
             flux_noise_t=self.flux_noise_t,
             # The median leaves out outliers and the frames beyond the edge of what was fitted.
-            flux_error_t=float(np.sqrt(max(float(np.median(excess)), 0.0))),
+            flux_error_t=float(np.sqrt(typical)),
             n_dipoles=self.n_dipoles,
             place=place,
             frame_rmse_t=np.sqrt(power),
             gap_factor=factor_of(expected, excess) if expected.size else 1.0,
+            error_share=float(np.sqrt(max(share, 0.0))),
         )
 
 

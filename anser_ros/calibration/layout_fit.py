@@ -2,9 +2,8 @@
 
 The nominal model is first scaled by one complex gain per emitter and expressed by the layout's
 dipoles (`ScaledNominal`); the damping pulls towards these moments, so that moments which the data
-do not determine stay as drawn. Dipoles may then be moved (`LayoutPlacer`), and overlapping regions
-of the volume get moments of their own, blended into one finer layer, which is free of sources
-again (`join_regions`). `LayoutFitter` does what several fits have in common once.
+do not determine stay as drawn. Dipoles may then be moved (`LayoutPlacer`). `LayoutFitter` does
+what several fits have in common once.
 """
 
 from collections.abc import Sequence
@@ -25,15 +24,8 @@ from anser_ros.calibration.layouts import (
 )
 from anser_ros.calibration.least_squares import GramFactor, as_complex, as_real
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
-from anser_ros.calibration.placement import CoilPlacer, PositionFitter
-from anser_ros.calibration.readings import (
-    DipoleSites,
-    basis_rows,
-    frame_blocks,
-    usable_readings,
-    usable_weights,
-    with_pose,
-)
+from anser_ros.calibration.placement import CoilPlacer
+from anser_ros.calibration.readings import DipoleSites, usable_readings, usable_weights, with_pose
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
@@ -98,70 +90,6 @@ def emitter_gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> 
     return np.asarray(above / np.maximum(below, 1e-300))
 
 
-OVERLAP = 0.5
-"""Width of the blend between two regions, as a fraction of the volume's extent."""
-LONG_SIDE = 0.5
-"""Fraction of the longest side below which one is not divided: its regions would be flat."""
-
-
-class Regions:
-    """Divides the volume of points (P, 3), m, smoothly: all regions' weights add up to one."""
-
-    def __init__(self, points: Array) -> None:
-        low, high = points.min(axis=0), points.max(axis=0)
-        self.middle, self.extent = (low + high) / 2.0, np.maximum(high - low, 1e-9)
-        self.divided = np.flatnonzero(self.extent >= LONG_SIDE * self.extent.max())
-
-    def __len__(self) -> int:
-        return int(2**self.divided.size)
-
-    def shares(self, points: Array) -> Array:
-        """Return the weight of each region at each point, shape (P, R); a row adds up to one."""
-        out = np.ones((len(points), 1))
-        for axis in self.divided:
-            along = (points[:, axis] - self.middle[axis]) / (OVERLAP * self.extent[axis])
-            right = 0.5 + 0.5 * np.sin(np.pi * np.clip(along, -0.5, 0.5))
-            out = np.concatenate([out * (1.0 - right)[:, None], out * right[:, None]], axis=1)
-        return out
-
-
-def join_regions(
-    measurements: Sequence[Measurements],
-    dipoles: DipoleSites,
-    fit: MomentFit,
-    damping: float,
-    layer: DipoleSites,
-) -> ComplexArray:
-    """Return the moments of a finer layer that make the blended field of the regions.
-
-    ``fit``: the common fit: its poses and weights are kept, and the damping pulls the regions'
-    moments towards its moments. ``layer``: the N' dipoles to express the blended field by.
-    Returns (N', K): moments, A m^2.
-    """
-    regions = Regions(
-        np.concatenate(
-            [m.placed()[0][w > 0.0] for m, w in zip(fit.measurements, fit.weights, strict=True)]
-        )
-    )
-    common = as_real(fit.moments)
-    factors = [GramFactor(len(dipoles), common.shape[1]) for _ in range(len(regions))]
-    for m, weights in zip(fit.measurements, fit.weights, strict=True):
-        for block in frame_blocks(*weights.shape):
-            part = m.frames(block)
-            matrix = basis_rows(part, dipoles)
-            right = as_real(part.flux).reshape(len(matrix), -1)
-            shares = regions.shares(part.placed()[0].reshape(-1, 3))
-            for factor, share in zip(factors, shares.T, strict=True):
-                root = np.sqrt(share * weights[block].ravel())[:, None]
-                factor.add(root * matrix, root * right)
-    moments = [factor.spectrum().solve(damping, common) for factor in factors]
-    points, axes = volume_lattice(measurements)
-    basis = flux_basis(points, axes, None, dipoles.positions, dipoles.directions)
-    shares = regions.shares(points)
-    blended = sum(share[:, None] * (basis @ m) for share, m in zip(shares.T, moments, strict=True))
-    return _moments_of_field(points, axes, np.asarray(blended), layer)
-
-
 def _moments_of_field(
     points: Array, axes: Array, flux: Array, dipoles: DipoleSites
 ) -> ComplexArray:
@@ -180,8 +108,6 @@ RICH_SPACING = 0.4
 height the field is that of single dipoles."""
 RICH_DAMPING = 1e-5
 """Damping of its moments: small, so as not to bias the field, and enough for a Gram matrix."""
-MOVING_DAMPING = 1e-4
-"""Damping while dipoles are moved: it keeps two that come close from growing huge moments."""
 MOST_MOVING_ROWS = 6000
 """Readings by which dipoles are moved at most: some hundred positions need no more."""
 AS_GOOD = 1.5
@@ -278,7 +204,7 @@ class LayoutPlacer:
     ) -> tuple[DipoleSites, ComplexArray | None]:
         """Return a layout's dipoles where they explain measurements at corrected poses best.
 
-        Those on an axis stay on it, those of a drawn coil move together, others by themselves.
+        Those on an axis stay on it, those of a drawn coil or of a cluster move together.
         """
         rows = sum(m.flux.shape[0] * m.flux.shape[1] for m in corrected)
         step = max(1, -(-rows // MOST_MOVING_ROWS))
@@ -289,11 +215,8 @@ class LayoutPlacer:
         if layout.kind in FREE_KINDS:
             found = fit_clusters(thin, shares, self.generator.centres)
             return found if layout.kind == 'cluster' else found.shared, None
-        dipoles, prior = self.placed(layout)
-        if layout.kind == 'coaxial':
-            found = fit_coaxial(thin, shares, dipoles, layout.count)
-        else:
-            found = PositionFitter(thin, shares, dipoles, MOVING_DAMPING, prior).fit()
+        start, _ = self.placed(layout)
+        found = fit_coaxial(thin, shares, start, layout.count)
         return found, self._prior(layout, found)
 
 
@@ -320,11 +243,7 @@ class LayoutFitter:
         fitter = MomentFitter(self.measurements, dipoles, damping, self.accuracy, prior)
         if layout.moved:
             fitter.start_at(self.rich[0])
-        fit = fitter.fit(alternations, progress, exact)
-        if not layout.local:
-            return LayoutFit(dipoles, fit)
-        moments = join_regions(self.measurements, dipoles, fit, damping, self._layer)
-        return LayoutFit(self._layer, replace(fit, moments=moments))
+        return LayoutFit(dipoles, fitter.fit(alternations, progress, exact))
 
     def _sites(self, layout: Layout) -> tuple[DipoleSites, ComplexArray | None]:
         if layout not in self._placed:
@@ -337,12 +256,9 @@ class LayoutFitter:
         return self._placed[layout]
 
     @cached_property
-    def _layer(self) -> DipoleSites:
-        generator = self.placer.generator
-        return place(rich_layout(self.measurements, generator), generator)
-
-    @cached_property
     def rich(self) -> tuple[MomentFitter, MomentFit]:
         """Return the fit at whose poses dipoles are moved."""
-        bases = [self._layer, *free_bases(self.measurements, self.placer.generator)]
+        generator = self.placer.generator
+        layer = place(rich_layout(self.measurements, generator), generator)
+        bases = [layer, *free_bases(self.measurements, generator)]
         return rich_fit(self.measurements, bases, self.accuracy)

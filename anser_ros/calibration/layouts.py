@@ -214,7 +214,6 @@ class Layout:
     depth_m: float  # depth of the layer below the coils, m
     prior: str = 'none'  # what the damping pulls the moments to: 'none' (zero) or 'nominal'
     moved: bool = False  # whether the dipoles are then moved to where they explain the data best
-    local: bool = False  # whether overlapping regions get separate moments
     words: str = ''  # for a report, where the rule is none of these
 
     def describe(self) -> str:
@@ -229,8 +228,6 @@ class Layout:
         if self.kind == 'drawing':
             return f'{self.count} of the drawn coils, each coil placed where it fits, pulled to it'
         more = ', pulled to the drawn board' if self.prior == 'nominal' else ''
-        more += ', positions optimised' if self.moved else ''
-        more += ', in overlapping regions' if self.local else ''
         if self.kind == 'coils':
             return f'{self.count}x{self.count} z-dipoles on every coil{more}'
         parts = 'z-dipoles' if self.kind == 'layer' else 'three-component dipoles'

@@ -19,6 +19,7 @@ from anser_ros.calibration.sensor_parameters import (
     POPULATIONS,
     PRIOR,
     SHARED_SHIFT,
+    STANDS,
     SURVEYED_M,
     USEFUL,
     SensorParameters,
@@ -27,7 +28,8 @@ from anser_ros.field.measurements import Measurements
 
 WIDTH_STEPS = 40
 """Fixed-point steps of the widths; they settle within some ten."""
-NARROWEST = {'gains': 1e-6, 'delays': 1e-12, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9}
+NARROWEST = {'gains': 1e-6, 'delays': 1e-12, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9,
+             **dict.fromkeys(STANDS, 1e-7)}  # fmt: skip
 """Least width of a population, in its own unit: no spread at all."""
 LEAST_EVIDENCE = 5.0
 """Gain of the log probability for which a kind of error is kept: odds of 150 to 1."""
@@ -180,7 +182,8 @@ class Population:
     def undetermined(self, likelihood: Likelihood) -> dict[str, float]:
         """Return the kinds that the data do not usefully determine, with their uncertainty."""
         sigmas = self._data_sigmas(likelihood)
-        return {kind: size for kind, size in sigmas.items() if size > USEFUL[kind]}
+        # What a turn about one axis leaves open between frame and mount does the same as either.
+        return {k: s for k, s in sigmas.items() if s > USEFUL[k] and k not in STANDS}
 
     def _data_sigmas(self, likelihood: Likelihood) -> dict[str, float]:
         """How far the data determine each kind, whatever it is: its typical standard deviation.

@@ -150,9 +150,10 @@ of a flat volume would otherwise hold frames of the same places."""
 def fold_of_frames(positions: Sequence[Array]) -> list[Integers]:
     """Return the fold of every frame.
 
-    Space is cut into equal cells, `CELLS_ALONG` along the longest direction. Cell (i, j, k) goes
-    to fold (i + 2 j + 3 k) mod `FOLDS`, so that a fold is spread over the volume and its cells
-    do not touch. All frames of a cell are held out together, never a single point.
+    Space is cut into equal cells, `CELLS_ALONG` along the longest direction of a session: those on
+    other sides of a source would else be held out whole. Cell (i, j, k) goes to fold
+    (i + 2 j + 3 k) mod `FOLDS`, so that a fold is spread over the volume and its cells do not
+    touch. All frames of a cell are held out together, never a single point.
 
     ``positions`` (F, 3) are the bodies', m, one array per body and session.
     Returns (F,): folds of the frames, one array per body and session.
@@ -161,11 +162,13 @@ def fold_of_frames(positions: Sequence[Array]) -> list[Integers]:
     everywhere = np.concatenate(positions)
     low, high = everywhere.min(axis=0), everywhere.max(axis=0)
     extent = high - low
-    size = max(float(extent.max()) / CELLS_ALONG, 1e-9)
+    own = max(float(np.ptp(where, axis=0).max()) for where in positions if len(where))
+    size = max(own / CELLS_ALONG, 1e-9)
+    most = np.maximum(np.ceil(extent / size).astype(int), 1) - 1
     out = []
     for where in positions:
         cell = np.floor((where - low) / size).astype(np.int64)
-        cell = np.minimum(cell, CELLS_ALONG - 1)
+        cell = np.minimum(cell, most)
         cell[:, extent < SMALLEST_SHARE * extent.max()] = 0
         out.append(np.asarray(cell @ np.array([1, 2, 3]) % FOLDS, dtype=np.int64))
     used = np.unique(np.concatenate(out))

@@ -4,9 +4,11 @@ a joint fit of sensors found, some is corrected by the model, and some only repo
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.disturbances import spans_of
@@ -19,7 +21,7 @@ from anser_ros.calibration.readings import FEWEST_SCAN_FRAMES, usable_readings
 from anser_ros.calibration.selection import LayoutCandidate
 from anser_ros.calibration.sensor_fit import SensorFit
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import EffectRecord, FieldModel, plain
+from anser_ros.field.model import SESSION, EffectRecord, FieldModel, plain
 from anser_ros.physics.rotations import tilted
 from anser_ros.settings import Accuracy
 
@@ -36,7 +38,7 @@ FEWEST_REFLECTED = 1e-3
 UNITS = {
     'gains': (100.0, '%'), 'delays': (1e6, 'us'), 'axes': (1e3, 'mrad'), 'places': (1e3, 'mm'),
     'lever_arm': (1e3, 'mm'), 'time_offset': (1e3, 'ms'), 'clock_rate': (1e6, 'ppm'),
-    'offsets': (100.0, '% of the fluxes'),
+    'offsets': (100.0, '% of the fluxes'), 'registration': (1e3, 'mm'), 'mount': (1e3, 'mm'),
 }  # fmt: skip
 """Factor and unit in which each kind of parameter is shown to people."""
 
@@ -104,7 +106,7 @@ def corrections(result: SensorFit) -> tuple[EffectRecord, ...]:
                     _evidence(result, 'lever_arm'),
                 )
             )
-    records += _clock(result)
+    records += [*_stands(result), *_clock(result)]
     # Wrong poses of the optical tracker, which it will have in other sessions as well.
     if result.reflected > FEWEST_REFLECTED:
         sigma = float(np.sqrt(result.reflected / max(result.optical.poses, 1.0)))
@@ -116,6 +118,34 @@ def corrections(result: SensorFit) -> tuple[EffectRecord, ...]:
 
 def _evidence(result: SensorFit, kind: str) -> dict[str, float]:
     return {'log_probability': result.evidence[kind]}
+
+
+def _stands(result: SensorFit) -> list[EffectRecord]:
+    """How each session's frame, and each body in it, stands about what all have in common."""
+    parameters, out = result.parameters, list[EffectRecord]()
+
+    def add(kind: str, name: str, session: str, **stated: Any) -> None:
+        stated[SESSION] = Path(session).name
+        out.append(EffectRecord(name, stated, {}, _evidence(result, kind)))
+
+    def stand(kind: str, body: str, session: str) -> list[Array]:
+        return np.split(parameters.stand(kind, body, session, result.posterior.values), 2)
+
+    if 'registration' in result.evidence:
+        for session in parameters.sessions['']:
+            turn, shift = stand('registration', '', session)
+            moved = -Rotation.from_rotvec(-turn).apply(shift)
+            turned = np.degrees(-turn).tolist()
+            add('registration', 'registration', session,
+                rotation_deg=turned, translation_m=moved.tolist())  # fmt: skip
+    for body, table in zip(parameters.bodies, parameters.tables, strict=True):
+        for session in parameters.sessions[body] if 'mount' in result.evidence else ():
+            turn, shift = stand('mount', body, session)
+            turned = np.degrees(turn).tolist()
+            channels = table.channel.tolist()
+            add('mount', 'body_turned', session, channels=channels, rotation_deg=turned)
+            add('mount', 'lever_arm', session, offset_m=shift.tolist(), body=body)
+    return out
 
 
 def _clock(result: SensorFit) -> list[EffectRecord]:

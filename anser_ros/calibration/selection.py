@@ -6,8 +6,8 @@ matrix, those of the other folds are added up, and the eigenvectors of the sum g
 for all dampings. The score is the predictive chi-square of the held-out frames with their poses
 marginalised, so that the jitter of the poses, much larger than the flux noise, does not hide the
 differences. The search (`choose_layout`) goes from coarse to fine layers and then varies their
-size, their depth and the kind of the dipoles. Its result, dipoles that are moved and overlapping
-regions are the finalists, among which a complete fit decides (`fit_scan`).
+size, their depth and the kind of the dipoles. Its result and dipoles that are moved are the
+finalists, among which a complete fit decides (`fit_scan`).
 """
 
 from collections.abc import Sequence
@@ -225,22 +225,10 @@ ALWAYS_AFFORDABLE = COUNTS[3] ** 2
 """Dipoles that a layer may have however few readings there are: the 12 x 12 of the article."""
 MOST_ROWS = 12_000
 """Readings that the choice looks at; fewer make held-out errors less certain than differences."""
-MOVING = (
-    Layout('coils', 2, 1.0, 0.0),
-    Layout('coils', 3, 1.0, 0.0),
-    Layout('layer', 8, 1.25, 0.01),
-)
-"""Layouts from which dipoles are moved; one does the work of several fixed ones."""
 COAXIAL = tuple(Layout('coaxial', n, 1.0, 0.0, moved=True) for n in (1, 3, 5))
 """Layouts for emitters of unknown geometry: see `coaxial`."""
 FREE = tuple(Layout(kind, 7, 1.0, 0.0, moved=True) for kind in FREE_KINDS)
 """The same, of any shape: see `clusters`."""
-LOCAL_COUNT = 10
-"""Dipoles along a side of the layer that every region of a local model has."""
-LOCAL_READINGS = 24
-"""Readings a dipole that local models need: about six in each of four overlapping regions."""
-MOVING_READINGS = 12
-"""Fewest readings for each moved dipole: three times its three coordinates and its moment."""
 LEAST_GAIN = 0.08
 """Fraction by which more dipoles must lower the predictive error to be chosen: below the noise it
 changes no pose, while tracking takes time in proportion to the dipoles."""
@@ -297,7 +285,7 @@ def choose_layout(
         finalists = [search.score(asked)]
     else:
         best = search.best_layout(affordable, lowest_height(measurements, generator))
-        finalists = [search.leanest(best), *search.other_finalists(best, rows)]
+        finalists = [search.leanest(best), *search.other_finalists()]
     return Selection(tuple(finalists), tuple(search.tried.values()), scorer.reference)
 
 
@@ -341,13 +329,9 @@ class _Search:
             others.append(replace(layer, prior='none'))
         return [o for o in others if len(place(o, self.generator)) <= MOST_DIPOLES]
 
-    def other_finalists(self, best: LayoutCandidate, rows: int) -> list[LayoutCandidate]:
-        """Return moved dipoles, coils and a local model, where the readings suffice for them."""
+    def other_finalists(self) -> list[LayoutCandidate]:
+        """Return the drawn coils, or what stands for those without a drawing, moved."""
         found = []
-        moving = [replace(layout, prior=self.prior, moved=True) for layout in MOVING]
-        moving = [m for m in moving if MOVING_READINGS * len(place(m, self.generator)) <= rows]
-        if moving:
-            found.append(min(map(self.score, moving), key=lambda c: c.score))
         if self.generator.nominal is None:
             # A few dipoles more cost a tracker nothing: the best of them, not the leanest.
             straight, free = (
@@ -362,10 +346,6 @@ class _Search:
                 found.append(
                     self.score(Layout('drawing', len(coils.sites), 1.0, 0.0, self.prior, True))
                 )
-        if rows >= LOCAL_READINGS * LOCAL_COUNT**2:
-            depth = max(best.layout.depth_m, 0.0)
-            common = self.score(Layout('layer', LOCAL_COUNT, EXTENSIONS[1], depth, self.prior))
-            found.append(replace(common, layout=replace(common.layout, local=True)))
         return found
 
     def climb(self, start: Layout, counts: Sequence[int]) -> LayoutCandidate:

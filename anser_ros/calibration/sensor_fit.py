@@ -75,6 +75,7 @@ from anser_ros.calibration.sensor_parameters import (
     CLOCKS,
     EACH,
     PRIOR,
+    STANDS,
     USEFUL,
     BodyErrors,
     SensorParameters,
@@ -124,7 +125,7 @@ def contradictions(
     change, covariance = posterior.values, posterior.covariance
     worst: dict[tuple[str, str], Contradiction] = {}
     same = [(i, j) for i, j in combinations(range(len(bodies)), 2) if bodies[i] == bodies[j]]
-    for (i, j), kind in product(same, parameters.kinds):
+    for (i, j), kind in product(same, (k for k in parameters.kinds if k not in STANDS)):
         for name, one, other in _pairs(parameters, kind, i, j):
             difference = change[one] - change[other]
             variance = covariance[one, one] + covariance[other, other]
@@ -180,9 +181,9 @@ class SensorFit:
     # of which parameters two sessions say different things
     contradictions: tuple[Contradiction, ...] = ()
 
-    def errors_of(self, body: str) -> BodyErrors:
-        """Return the errors of a body's sensors."""
-        return self.parameters.errors_of(body, self.posterior.values)
+    def errors_of(self, body: str, session: str = '') -> BodyErrors:
+        """Return the errors of a body's sensors in a session."""
+        return self.parameters.errors_of(body, self.posterior.values, session)
 
 
 COARSE_ROWS = 5000
@@ -411,8 +412,9 @@ class SensorFitter:
 
     def _corrected(self, tool: _Tool) -> Measurements:
         """A tool's frames by the present estimate; those without a pose lose their weight."""
-        errors = self.parameters.errors_of(tool.measured.body, self.values)
-        out = errors.apply(tool.measured)
+        measured = tool.measured
+        errors = self.parameters.errors_of(measured.body, self.values, measured.session)
+        out = errors.apply(measured)
         lost: Booleans = np.asarray(~np.isfinite(out.position).all(axis=1))
         if lost.any():
             tool.weights[lost] = 0.0

@@ -20,25 +20,33 @@ from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.rotations import tangents, tilted
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
-KINDS = ('gains', 'delays', 'axes', 'places', 'lever_arm', 'time_offset', 'clock_rate')
+KINDS = (
+    'gains', 'delays', 'axes', 'places', 'lever_arm', 'time_offset', 'clock_rate', 'registration',
+    'mount',
+)  # fmt: skip
 EXTRA_KINDS = ('offsets',)
 """Kinds that are estimated only when asked for: constant phasors of every channel, such as the
 field of the surroundings in magnetometers."""
-POPULATIONS = ('gains', 'delays', 'axes', 'places', 'offsets')
-"""Kinds that every sensor has a value of: one population with one spread."""
+STANDS = ('registration', 'mount')
+"""Kinds that every session has a value of, where there are several: how its poses' frame stands to
+the emitters', and how each body stands to what gives its poses, about what all have in common."""
+POPULATIONS = ('gains', 'delays', 'axes', 'places', 'offsets', *STANDS)
+"""Kinds that every sensor, or session, has a value of: one population with one spread."""
 CLOCKS = ('time_offset', 'clock_rate')
 """Kinds that all bodies share."""
-EACH = {'gains': 2, 'delays': 1, 'axes': 2, 'places': 3}
-"""Parameters a sensor; offsets have the two parts of every emitter's phasor."""
+EACH = {'gains': 2, 'delays': 1, 'axes': 2, 'places': 3, **dict.fromkeys(STANDS, 6)}
+"""Parameters a sensor, or session; offsets have the two parts of every emitter's phasor."""
+ARM_M = 0.25
+"""Distance, m, at which a turn is told by the way that it makes: 5 mm then stand for 20 mrad."""
 PRIOR = {
     'gains': 0.05, 'delays': 1e-5, 'axes': 0.05, 'places': 5e-3, 'lever_arm': 5e-3,
-    'time_offset': 0.1, 'clock_rate': 3e-3, 'offsets': 0.3,
+    'time_offset': 0.1, 'clock_rate': 3e-3, 'offsets': 0.3, 'registration': 5e-3, 'mount': 5e-3,
 }  # fmt: skip
 """Standard deviation of each parameter before any data: relative, s, rad, m, m, s, s a second,
 relative to the fluxes' root mean square. Wide, for they only hold what the data leave open."""
 USEFUL = {
     'gains': 2e-3, 'delays': 1e-7, 'axes': 5e-3, 'places': 2e-4, 'lever_arm': 2e-4,
-    'time_offset': 1e-3, 'clock_rate': 1e-4, 'offsets': 2e-3,
+    'time_offset': 1e-3, 'clock_rate': 1e-4, 'offsets': 2e-3, 'registration': 2e-4, 'mount': 2e-4,
 }  # fmt: skip
 """Standard deviation, in the parameters' own units, beyond which a scan does not determine them:
 that much makes errors of some tenths of a millimetre, as a tool that was not calibrated has."""
@@ -72,20 +80,35 @@ class BodyErrors:
     # offset_s, rate: an optical stamp t counts as ``t (1 + rate) + offset_s``
     offset_s: float
     rate: float
+    # turn (rad) and shift (m), (6,) each: of the poses' frame about fg's origin, and of the body
+    # as its sensors have it about its own
+    registration: Array
+    mount: Array
 
     def track(self, track: PoseTrack) -> PoseTrack:
         """Return an optical track on the clock of the fluxes."""
-        return replace(track, time=track.time * (1.0 + self.rate) + self.offset_s)
+        turn = Rotation.from_rotvec(self.registration[:3])
+        quaternion = track.quaternion
+        if self.registration.any():
+            quaternion = (turn * Rotation.from_quat(quaternion)).as_quat()
+        return replace(
+            track,
+            time=track.time * (1.0 + self.rate) + self.offset_s,
+            position=turn.apply(track.position) + self.registration[3:],
+            quaternion=quaternion,
+        )
 
     def apply(self, measurements: Measurements) -> Measurements:
         """Return the measurements as ideal sensors and an ideal clock would have given them."""
-        sensors = measurements.sensors
+        sensors, turn = measurements.sensors, Rotation.from_rotvec(self.registration[:3])
+        mount = Rotation.from_rotvec(self.mount[:3])
+        place = mount.apply(sensors.position + self.place + self.lever_arm) + self.mount[3:]
         out = replace(
             measurements,
             flux=(measurements.flux - self.pickup) / (self.gain[:, None] * self.turn),
-            sensors=replace(
-                sensors, position=sensors.position + self.place + self.lever_arm, axis=self.axis
-            ),
+            sensors=replace(sensors, position=place, axis=mount.apply(self.axis)),
+            position=turn.apply(measurements.position) + self.registration[3:],
+            rotation=turn.as_matrix() @ measurements.rotation,
         )
         if measurements.track is None or (self.offset_s == 0.0 and self.rate == 0.0):
             return out
@@ -115,6 +138,14 @@ def velocity_of(measurements: Measurements) -> Array:
     return np.zeros((len(time), 6)) if track is None else track.velocity(time)
 
 
+def _rigid(
+    by_place: ComplexArray, by_axis: ComplexArray, arms: Array, axes: Array
+) -> ComplexArray:
+    """Derivatives (F, S, 6, K) by a turn, times `ARM_M`, and a shift of all sensors."""
+    turn = np.cross(arms[..., None], by_place, axis=2) + np.cross(axes[..., None], by_axis, axis=2)
+    return np.asarray(np.concatenate([turn / ARM_M, by_place], axis=2))
+
+
 class SensorParameters:
     """Orders the parameters in their vector, and knows what they do to fluxes."""
 
@@ -134,7 +165,13 @@ class SensorParameters:
             estimated -= {SHARED_SHIFT}
         if not self.omega.any():
             estimated -= {'delays'}
-        known = (*KINDS, *EXTRA_KINDS)
+        # Of all bodies, and of each.
+        self.sessions = {
+            body: list(dict.fromkeys(m.session for m in measurements if body in ('', m.body)))
+            for body in ('', *bodies)
+        }
+        alone = () if len(self.sessions['']) > 1 else STANDS
+        known = tuple(kind for kind in (*KINDS, *EXTRA_KINDS) if kind not in alone)
         self.asked = tuple(kind for kind in known if kind in kinds)
         self.kinds = tuple(kind for kind in known if kind in estimated)
         self.emitters = int(measurements[0].flux.shape[2])
@@ -146,13 +183,18 @@ class SensorParameters:
         self.tables: list[SensorTable] = [tables[body] for body in self.bodies]
         times = [m.time for m in measurements if len(m.time)]
         self.middle_s = float(np.mean(np.concatenate(times))) if times else 0.0
+        places = [m.position[m.has_pose] for m in measurements]
+        self.pivot = np.concatenate(places).mean(axis=0)  # m, about which frames are turned
         self.slices: dict[tuple[str, str], slice] = {}
         self._size = 0
         for body, table in zip(self.bodies, self.tables, strict=True):
-            for kind in (kind for kind in self.kinds if kind not in CLOCKS):
+            for kind in (kind for kind in self.kinds if kind not in (*CLOCKS, *STANDS)):
                 self._add(kind, body, self.each[kind] * len(table) if kind in self.each else 3)
         for kind in (kind for kind in self.kinds if kind in CLOCKS):
             self._add(kind, '', 1)
+        for kind, body in (('registration', ''), *(('mount', body) for body in self.bodies)):
+            if kind in self.kinds and len(self.sessions[body]) > 1:
+                self._add(kind, body, 6 * len(self.sessions[body]))
 
     def fixed(self) -> 'SensorParameters':
         """Return the same, none of which is estimated."""
@@ -173,11 +215,14 @@ class SensorParameters:
         return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
 
     def groups(self) -> list[tuple[str, Integers]]:
-        """Return parameters that share a prior's width: a kind's, with gain and phase apart."""
+        """Return parameters that share a prior's width: a kind's, but for phases and turns."""
         out = []
         for kind in self.kinds:
-            rows = self.rows(kind)
-            out += [(kind, rows[0::2]), (kind, rows[1::2])] if kind == 'gains' else [(kind, rows)]
+            rows = self.rows(kind).reshape(-1, self.each.get(kind, 1))
+            parts = [rows]
+            if kind == 'gains' or kind in STANDS:
+                parts = np.split(rows, 2, axis=1)
+            out += [(kind, part.ravel()) for part in parts]
         return out
 
     def prior_width(self) -> Array:
@@ -198,13 +243,14 @@ class SensorParameters:
     def rule(self) -> Array:
         """Return the information (Q, Q) of the rule for what no data determine.
 
-        The mean of all gains is one; those of all delays and of a body's places are zero.
+        The mean of all gains is one; those of all delays, of a body's places and of what sessions
+        stand by are zero.
         """
         out = np.zeros((len(self), len(self)))
         groups = [rows for kind, rows in self.groups() if kind in ('gains', 'delays')]
         for (kind, _), own in self.slices.items():
-            if kind == 'places':
-                groups += [np.arange(own.start + j, own.stop, 3) for j in range(3)]
+            if kind == 'places' or kind in STANDS:
+                groups += list(np.arange(own.start, own.stop).reshape(-1, EACH[kind]).T)
         for rows in groups:
             out[np.ix_(rows, rows)] += 1.0 / (rows.size * BY_RULE**2)
         return out
@@ -231,8 +277,19 @@ class SensorParameters:
         part = values[self.slices[kind, body]]
         return part.reshape(-1, self.each[kind]) if kind in self.each else part
 
-    def errors_of(self, body: str, values: Array) -> BodyErrors:
-        """Return the errors of a body's sensors for all parameters, shape (Q,)."""
+    def stand(self, kind: str, body: str, session: str, values: Array) -> Array:
+        """Return turn (rad) and shift (m), (6,), of a kind that sessions have, of one of them."""
+        body = body if kind == 'mount' else ''
+        found = self.of(kind, body, values)
+        if found is None or session not in self.sessions[body]:
+            return np.zeros(6)
+        turn, shift = np.split(found[self.sessions[body].index(session)], 2)
+        if kind == 'registration':
+            shift = shift + self.pivot - Rotation.from_rotvec(turn / ARM_M).apply(self.pivot)
+        return np.concatenate([turn / ARM_M, shift])
+
+    def errors_of(self, body: str, values: Array, session: str = '') -> BodyErrors:
+        """Return the errors of a body's sensors in a session for all parameters, shape (Q,)."""
         table = self.tables[self.bodies.index(body)]
 
         def part(kind: str, *shape: int) -> Array:
@@ -248,7 +305,15 @@ class SensorParameters:
         place, lever = part('places', count, 3), part('lever_arm', 3)
         clock = [float(part(kind, 1)[0]) for kind in CLOCKS]
         return BodyErrors(
-            gain, turn, axis, place, lever, pickup, clock[0] - clock[1] * self.middle_s, clock[1]
+            gain,
+            turn,
+            axis,
+            place,
+            lever,
+            pickup,
+            clock[0] - clock[1] * self.middle_s,
+            clock[1],
+            *(self.stand(kind, body, session, values) for kind in STANDS),
         )
 
     def derivatives(
@@ -287,9 +352,17 @@ class SensorParameters:
                 out[:, each, own.start + 3 * each + j] = along[:, :, j]
         if (own := self.slices.get(('lever_arm', part.body))) is not None:
             out[:, :, own] = along
-        if not any(kind in self.kinds for kind in CLOCKS):
-            return out
         points, axes = part.placed()
+        if (own := self.slices.get(('registration', ''))) is not None:
+            first = own.start + 6 * self.sessions[''].index(part.session)
+            moved = _rigid(by_place, by_axis, points - self.pivot, axes)
+            out[:, :, first : first + 6] = moved
+        if (own := self.slices.get(('mount', part.body))) is not None:
+            first = own.start + 6 * self.sessions[part.body].index(part.session)
+            tilt = np.einsum('fsik,fij->fsjk', by_axis, part.rotation, optimize=True)
+            own_arms, own_axes = part.sensors.position[None], part.sensors.axis[None]
+            moved = _rigid(along, tilt, own_arms, own_axes)
+            out[:, :, first : first + 6] = moved
         arms = points - part.position[:, None, :]
         moving = velocity[:, None, :3] + np.cross(velocity[:, None, 3:], arms)
         rate = np.einsum('fsik,fsi->fsk', by_place, moving)

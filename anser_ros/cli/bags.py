@@ -1,7 +1,6 @@
 """Records the small simulated sessions of the folder bags/."""
 
 import argparse
-import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from anser_ros.simulation.world import (
     manufactured,
     steel_disc,
 )
-from anser_ros.wire.bag import bag_file
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import read_config
 
@@ -73,14 +71,12 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     for rank, (name, world, count, rate, optical_rate, errors) in enumerate(sessions):
         tell('recording', rank / len(sessions))
         file = args.out / f'{name}.mcap'
-        with contextlib.suppress(FileNotFoundError):
-            file.unlink()
+        file.unlink(missing_ok=True)
         record(
             str(file), world, frames=count, rate_hz=rate, optical_rate_hz=optical_rate,
             errors=errors, rng=rng,
         )  # fmt: skip
-        size = file.stat().st_size
-        written.append({'file': str(bag_file(file)), 'frames': count, 'bytes': size})
+        written.append({'file': str(file), 'frames': count, 'bytes': file.stat().st_size})
     shown = tuple(
         f'{one["file"]}: {one["frames"]} frames, {one["bytes"] / 1e6:.2f} MB, simulated'
         for one in written

@@ -3,7 +3,6 @@
 import argparse
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -249,8 +248,7 @@ def choice_figure(calibration: Calibration) -> Figure | None:
     """
     if not calibration.candidates:
         return None
-    layout = replace(calibration.layout, local=False)
-    picked = next(one for one in calibration.candidates if one.layout == layout)
+    picked = next(one for one in calibration.candidates if one.layout == calibration.layout)
     factor, unit = flux_unit(picked.score)
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5.4), layout='constrained')
     for mark, name, moved in (('o', 'placed', False), ('^', 'positions optimised', True)):

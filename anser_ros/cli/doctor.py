@@ -31,7 +31,7 @@ GOOD, NOTE, BAD = 'ok', 'note', 'problem'
 COLOURS = {GOOD: 'green', NOTE: 'yellow', BAD: 'red'}
 TESTED = ((3, 11), (3, 12))
 """Versions of Python that the tests run with."""
-MODULES = ('numpy', 'scipy', 'numba', 'yaml', 'serial', 'rich', 'matplotlib', 'h5py')
+MODULES = ('numpy', 'pandas', 'scipy', 'numba', 'yaml', 'serial', 'rich', 'matplotlib', 'h5py')
 """Modules that come by rosdep or pip; those of `PYPI` by pip only."""
 DISTRIBUTIONS = {'yaml': 'PyYAML', 'serial': 'pyserial', **PYPI}
 """What the distribution of a module is called where that is another name."""

@@ -269,11 +269,10 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         return done
     sessions.need_model(args)
     session = load_session(args.session).with_stated(output.stated_values(args))
-    if args.witnesses and not args.refit:
-        raise ParameterError('--witnesses extends the refit; it needs --refit')
+    for name in ('witnesses', 'references', 'baseline'):
+        if getattr(args, name) and not args.refit:
+            raise ParameterError(f'--{name} is of a refit; it needs --refit')
     if args.references is not None:
-        if not args.refit:
-            raise ParameterError('--references chooses those of a refit; it needs --refit')
         session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None

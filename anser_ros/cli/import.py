@@ -38,12 +38,12 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     lost, left_out = '', {}
     tell(f'reading {args.source}')
     if is_document:
-        counts = import_tables(args.source, args.out)
+        counts, notes = import_tables(args.source, args.out)
     else:
         setup = None if args.setup is None else read_text(args.setup)
         bag = import_bag(args.source, args.out, parse_remaps(args.remap), setup)
         counts, lost, left_out = bag.messages, bag.lost, bag.left_out
-    notes = [f'{count} messages of {topic} left out' for topic, count in left_out.items()]
+        notes = [f'{count} messages of {topic} left out' for topic, count in left_out.items()]
     return Result(
         {'schema': SCHEMA, 'messages': counts, 'left_out': left_out, 'lost': lost},
         (*loss_notes(str(args.source), lost), *notes),

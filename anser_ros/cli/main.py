@@ -6,8 +6,11 @@ that is not installed, ROS among them, says so in a line.
 """
 
 import argparse
+import contextlib
 import importlib
+import io
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -32,6 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb with its arguments, by default those of the process; return the exit code."""
     for variable in ONE_THREAD:  # before anything imports numpy
         os.environ.setdefault(variable, '1')
+    for stream in (sys.stdout, sys.stderr):  # a terminal may not know every letter
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='replace')
     try:
         code = _dispatch(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()
@@ -88,6 +94,8 @@ def exec_node(name: str, arguments: Sequence[str]) -> NoReturn:
 
 def run_verb(name: str, arguments: Sequence[str]) -> int:
     """Run one offline command in this process and return the exit code."""
+    with contextlib.suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # it ends as by Ctrl-C
     from anser_ros.cli.output import remove_empty_folders  # imports what no node needs
 
     def work() -> int:
@@ -136,7 +144,8 @@ def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
     except BrokenPipeError:
         raise
     except Exception as error:  # noqa: BLE001 - the outermost place: whatever is left is a defect
-        if isinstance(error, ModuleNotFoundError) and str(error.name).split('.')[0] in PYPI:
+        name = str(getattr(error, 'name', '')).split('.')[0]
+        if isinstance(error, ModuleNotFoundError) and name in (*PYPI, 'pandas'):
             return EXIT_BAD_INPUT, None, missing_words(str(error.name))
         # A file that is not there or can't be written is the caller's input, not a defect.
         if isinstance(error, OSError) and error.filename is not None:

@@ -1,8 +1,6 @@
 """Propose places and axes of reference coils, and say what error each number of them leaves."""
 
 import argparse
-import csv
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +18,8 @@ from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
 from anser_ros.sessions.plausibility import LENGTH_UNITS, unit_words
 from anser_ros.sessions.session import sensor_table
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
-from anser_ros.wire.text_files import numbers_of, read_config, read_rows
+from anser_ros.wire.tables import read_table
+from anser_ros.wire.text_files import read_config
 
 SCHEMA = 'anser_places/1'
 DOCUMENT, TABLE, FIGURE = 'places.json', 'places.csv', 'places.png'
@@ -204,18 +203,16 @@ def _coils(places: Array, axes: Array, length_m: float | Array) -> SensorTable:
 
 def _read(path: Path) -> SensorTable:
     """Return the coils of a list of places."""
-    _, rows = read_rows(path)
-    if not rows:
-        raise ParameterError(f'{path}: no rows')
-    places = numbers_of(path, rows, ('x_m', 'y_m', 'z_m'))
-    if 'ax' not in rows[0]:
+    table = read_table(path)
+    places = table.positions()
+    if 'ax' not in table.names:
         return _every_axis(places)
-    axes = numbers_of(path, rows, ('ax', 'ay', 'az'))
+    axes = table.numbers(('ax', 'ay', 'az'))
     if not (np.linalg.norm(axes, axis=1) > 0.0).all():
         raise ParameterError(f'{path}: an axis has zero length')
     length: float | Array = LENGTH_M
-    if 'length_m' in rows[0]:
-        length = numbers_of(path, rows, ('length_m',))[:, 0]
+    if 'length_m' in table.names:
+        length = table.numbers(('length_m',))[:, 0]
     return _coils(places, axes, length)
 
 
@@ -274,6 +271,4 @@ def _rows(document: dict[str, Any]) -> list[list[str]]:
 def _table_of(places: list[dict[str, Any]]) -> str:
     rows = [(row['name'], *row['position_m'], *row['axis'], row['length_m']) for row in places]
     head = ('name', 'x_m', 'y_m', 'z_m', 'ax', 'ay', 'az', 'length_m')
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator='\n').writerows([head, *rows])
-    return stream.getvalue()
+    return ''.join(','.join(map(str, row)) + '\n' for row in (head, *rows))

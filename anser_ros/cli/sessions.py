@@ -35,11 +35,20 @@ def add_session_kinds(parser: argparse.ArgumentParser) -> None:
 
 
 def named_kind(args: argparse.Namespace) -> ModuleType | None:
-    """Return the module of the kind of session that the options name, None for one of fluxes."""
+    """Return the module of the kind of session that the options name, None for one of fluxes.
+
+    Raises `ParameterError` for an option that has no effect there.
+    """
+    chosen = None
     for name, (module, _) in SESSION_KINDS.items():
+        kind = importlib.import_module(module)
         if getattr(args, name):
-            return importlib.import_module(module)
-    return None
+            chosen = kind
+            continue
+        for option, key in kind.OPTIONS.items():
+            if getattr(args, key, None):
+                raise ParameterError(f'--{option} has no effect without --{name}')
+    return chosen
 
 
 def need_model(args: argparse.Namespace) -> None:

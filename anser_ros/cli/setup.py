@@ -17,7 +17,8 @@ from anser_ros.errors import AnserError, ParameterError
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.settings import sections_of
 from anser_ros.wire.setup import FIELD_GENERATOR, SCHEMA, Setup, parse_setup
-from anser_ros.wire.text_files import read_config, read_rows, read_yaml
+from anser_ros.wire.tables import read_table
+from anser_ros.wire.text_files import read_config, read_yaml
 
 ANSER, ANSER_FILE = 'anser', 'demo_setup.yaml'
 """The board that is known by name, and the file of `config/` that has it."""
@@ -132,17 +133,16 @@ def axis_of(text: str, what: str) -> list[float]:
 
 def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
     """Return the rows of a CSV file with a head, each as the text that is typed for it."""
-    names, found_rows = read_rows(path)
-    extra = [name for name in names if name == 'length_mm']
-    found = [name for name in names if name not in extra]
-    if set(found) != set(columns):
-        raise ParameterError(f'{path}: columns must be {",".join(columns)}, got {",".join(found)}')
-    rows = [
-        ','.join((row[name] or '').strip() for name in (*columns, *extra)) for row in found_rows
-    ]
+    table = read_table(path, as_text=True)
+    found = [name.casefold() for name in table.names]
+    extra = [name for name in found if name == 'length_mm']
+    if set(found) - set(extra) != set(columns):
+        got = ','.join(table.names)
+        raise ParameterError(f'{path}: columns must be {",".join(columns)}, got {got}')
+    rows = table.cells.set_axis(found, axis=1)[[*columns, *extra]].to_numpy().tolist()
     if not rows:
         raise ParameterError(f'{path}: no rows')
-    return [row.rstrip(',') for row in rows]
+    return [','.join(row).rstrip(',') for row in rows]
 
 
 def document_of(

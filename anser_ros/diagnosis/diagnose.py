@@ -299,11 +299,8 @@ def conclude(
     expected = expected_rms(after)
     # Residuals that are no noise must not make the floor that they are measured by.
     grown = screening.noise_t(after) > decisions.LEAST_NOISE_GROWTH * cleaned.spread.noise_t
-    scale = (
-        min(screening.noise_scale(after), 1.0)
-        if grown and depending
-        else screening.noise_scale(after)
-    )
+    scale = screening.noise_scale(after)
+    scale = min(scale, 1.0) if grown and depending else scale
     floor = min(scale * expected, rms(after))
     tests = tuple(screening.structure_tests(after))
     excess = max(rms(after) ** 2 - floor**2, 0.0)

@@ -17,7 +17,7 @@ from anser_ros.effects.base import View
 from anser_ros.effects.effect import Effect, Remedy, Term, effect_named
 from anser_ros.errors import ModelFileError
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import Dipoles, EffectRecord
+from anser_ros.field.model import SESSION, Dipoles, EffectRecord
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
@@ -227,8 +227,12 @@ class Correction:
     def of(
         records: Sequence[EffectRecord], sensors: SensorTable, frequencies: Sequence[float]
     ) -> 'Correction':
-        """Make the corrections of a model's records; raises `ModelFileError` on an unknown one."""
-        named = [(effect_named(record.name), record) for record in records]
+        """Make the corrections of a model's records, but for those of one session alone.
+
+        Raises `ModelFileError` on an unknown one.
+        """
+        held = [record for record in records if SESSION not in record.parameters]
+        named = [(effect_named(record.name), record) for record in held]
         undone = [pair for pair in named if pair[0].remedy in (*LIVE, Remedy.OPTICAL)]
         omega = 2 * np.pi * np.asarray(frequencies, dtype=np.float64)
         return Correction(tuple(_term(*pair) for pair in undone), sensors, omega)

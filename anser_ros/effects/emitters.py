@@ -276,6 +276,12 @@ class CoilTurnedTerm(Term):
     """Holds an emitter that turns about a point."""
 
     centre: tuple[float, ...]  # (3,), m, frame fg
+    axis: tuple[float, ...] = (0.0, 0.0, 0.0)  # of its moment, a turn about which nobody sees
+
+    @property
+    def seen(self) -> Array:
+        """Return what takes the turn about that axis off a rotation vector, (3, 3)."""
+        return np.eye(3) - np.outer(self.axis, self.axis)
 
 
 def _spatial(vector: Array) -> Array:
@@ -299,10 +305,16 @@ class CoilTurned(CoilMoved):
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         light = apparatus.illumination
         weight = np.abs(light.moments) / np.maximum(np.abs(light.moments).sum(axis=0), 1e-300)
+        whole = (light.moments.real.T @ light.directions).tolist()
         return [
-            CoilTurnedTerm(self, {'coil': k}, np.zeros(3), centre=tuple(centre))
-            for k, centre in enumerate((weight.T @ light.positions).tolist())
-        ]
+            CoilTurnedTerm(
+                self, {'coil': k}, np.zeros(3), centre=tuple(centre),
+                axis=tuple(np.array(moment) / max(np.linalg.norm(moment), 1e-300)),
+            )
+            for k, (centre, moment) in enumerate(
+                zip((weight.T @ light.positions).tolist(), whole, strict=True)
+            )
+        ]  # fmt: skip
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Turn the sensors the other way, which does the same as turning the source."""
@@ -313,17 +325,18 @@ class CoilTurned(CoilMoved):
             view.axes, view.d_axis[..., coil]
         )
         out = view.columns(3)
-        out[:, :, coil] = -turn @ _spatial(term.theta)
+        out[:, :, coil] = -turn @ _spatial(term.seen @ term.theta) @ term.seen
         return out
 
     def _moved(self, term: Term, place: Array, direction: Array) -> tuple[Array, Array]:
         assert isinstance(term, CoilTurnedTerm)
-        turn = Rotation.from_rotvec(term.theta).as_matrix()
+        turn = Rotation.from_rotvec(term.seen @ term.theta).as_matrix()
         return (place - term.centre) @ turn.T + term.centre, direction @ turn.T
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         assert isinstance(term, CoilTurnedTerm)
-        figures = {'rotation_deg': np.degrees(term.theta).tolist(), 'centre_m': list(term.centre)}
+        turn = np.degrees(term.seen @ term.theta).tolist()
+        figures = {'rotation_deg': turn, 'centre_m': list(term.centre)}
         deviation = {'rotation_deg': np.degrees(sigmas(covariance)).tolist()}
         return EffectRecord(self.name, {**term.recorded_site, **figures}, deviation)
 

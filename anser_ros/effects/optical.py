@@ -132,6 +132,10 @@ class OpticalScale(OpticalEffect[Term]):
     def prior(self, term: Term) -> Array:
         return np.concatenate([np.full(term.theta.size - 3, 0.01), np.full(3, 5e-3)])
 
+    def complexity(self, term: Term) -> int:
+        """Return that of a registration and its own: a frame that stands elsewhere goes before."""
+        return 6 + term.theta.size if 'axis' in term.site else super().complexity(term)
+
     def amounts(self, term: Term) -> Integers:
         """Return the scale's index alone: a shift is a registration's."""
         return np.array([0])

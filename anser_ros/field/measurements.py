@@ -27,6 +27,7 @@ class Measurements:
     has_pose: Booleans
     # the stream of poses on the same time axis, for effects that shift the clocks
     track: PoseTrack | None = None
+    session: str = ''  # whose frame the poses are in, and whose mount the body is on
 
     @property
     def usable(self) -> Booleans:
@@ -58,3 +59,8 @@ class Measurements:
     def placed(self) -> tuple[Array, Array]:
         """Return the sensors' centres (m) and axes in fg, each of shape (F, S, 3)."""
         return self.sensors.placed(self.position, self.rotation)
+
+
+def frame_power(flux: ComplexArray) -> Array:
+    """Return the mean square of a phasor component in each frame of fluxes (F, S, K), T^2."""
+    return np.asarray(np.nanmean(np.abs(flux) ** 2, axis=(1, 2)) / 2.0)

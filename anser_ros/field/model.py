@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import ModelFileError
@@ -255,6 +256,8 @@ def parse_gaps(document: Any) -> ScanGaps:
 
 
 SCHEMA = 'anser_model/1'
+SESSION = 'session'
+"""Parameter of an effect that holds in one of several sessions alone: its name."""
 
 
 @dataclass(frozen=True)
@@ -311,6 +314,12 @@ class FieldModel:
     # by how much the field may be off where the scan has gaps, beyond ``flux_error_t``. Only a
     # diagnosis reads it; no pose follows from it
     gaps: ScanGaps | None = None
+    # noise of a phasor component that the calibration found, with what its fit misses beyond that
+    # error, T; 0 if none was
+    noise_t: float = 0.0
+    # by which share of a strong flux the field errs beyond ``flux_error_t``, which is typical:
+    # only a diagnosis reads it
+    error_share: float = 0.0
 
     def __post_init__(self) -> None:
         n, k = self.positions.shape[0], len(self.emitters)
@@ -335,7 +344,7 @@ class FieldModel:
                 self.positions, self.directions, self.moments, self.emitters, self.frequencies_hz,
                 self.flux_error_t, self.modes,
                 [[effect.name, plain(dict(effect.parameters))] for effect in self.effects],
-                *([self.shift_sigma_m] if self.shift_sigma_m else []),
+                *(value for value in (self.shift_sigma_m, self.noise_t) if value),
             ]
         )  # fmt: skip
 
@@ -349,6 +358,16 @@ class FieldModel:
     def dipoles(self) -> Dipoles:
         """Return the dipoles alone."""
         return Dipoles(self.positions, self.directions, self.moments)
+
+    def turned(self, turn: Rotation, shift: Array) -> 'FieldModel':
+        """Return this model where its field is turned about fg's origin, then shifted (3,), m."""
+
+        def stands(one: Any) -> Any:
+            place, direction = turn.apply(one.positions) + shift, turn.apply(one.directions)
+            return replace(one, positions=place, directions=direction)
+
+        whole: FieldModel = stands(self)
+        return whole if self.gaps is None else replace(whole, gaps=stands(self.gaps))
 
     def with_dipoles(
         self, positions: Array, directions: Array, moments: ComplexArray
@@ -384,6 +403,8 @@ def to_document(model: FieldModel) -> dict[str, Any]:
         'provenance': dict(model.provenance),
         'flux_error_t': model.flux_error_t,
         'shift_sigma_m': model.shift_sigma_m,
+        'noise_t': model.noise_t,
+        'error_share': model.error_share,
         'effects': [plain(asdict(effect)) for effect in model.effects],
         'columns': ['x', 'y', 'z', 'ux', 'uy', 'uz']
         + [f'm{k}_{part}' for k in range(len(model.emitters)) for part in ('re', 'im')],
@@ -443,9 +464,10 @@ def from_document(document: Any) -> FieldModel:
         frequencies = tuple(float(item['frequency_hz']) for item in emitters)
         flux_error = float(document.get('flux_error_t', 0.0))
         shift_sigma = float(document.get('shift_sigma_m', 0.0))
+        noise, share = (float(document.get(key, 0.0)) for key in ('noise_t', 'error_share'))
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(
-            f'model: an emitter, flux_error_t or shift_sigma_m is malformed: {error}'
+            f'model: an emitter, flux_error_t, noise_t or shift_sigma_m is malformed: {error}'
         ) from error
     k = len(names)
     table = _table(document.get('dipoles'), 6 + 2 * k, 'dipoles')
@@ -473,6 +495,8 @@ def from_document(document: Any) -> FieldModel:
         frequencies_hz=frequencies,
         flux_error_t=flux_error,
         shift_sigma_m=shift_sigma,
+        noise_t=noise,
+        error_share=share,
         modes=modes,
         effects=tuple(_effect(item) for item in effects),
         provenance=provenance,

@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.field.model import FieldModel
+from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import REFERENCES_LOST, Withheld
@@ -54,6 +56,8 @@ class ModelAge:
         self._points, self._axes = along_each_axis(volume.samples(*SAMPLES))
         self._answers: deque[tuple[int, FieldModel]] = deque()
         self._aged: tuple[int, FieldModel] | None = None
+        # Positions and directions of dipoles, and the flux that each makes in the volume.
+        self._fluxes: tuple[Array, Array, Array] | None = None
 
     @property
     def newest_ns(self) -> int:
@@ -123,6 +127,14 @@ class ModelAge:
             model = grown
         mode = (share * change)[None]
         modes = mode if model.modes is None else np.concatenate([model.modes, mode])
-        moved = replace(model, moments=mode[0]).flux(self._points, self._axes)
+        moved = self._flux_of(model, mode[0])
         rest = ELSEWHERE * float(np.sqrt(0.5 * (np.abs(moved) ** 2).mean()))
         return replace(model, modes=modes, flux_error_t=math.hypot(model.flux_error_t, rest))
+
+    def _flux_of(self, model: FieldModel, moments: ComplexArray) -> ComplexArray:
+        """Return what moments (N, K), A m^2, of a model's dipoles make in the volume, T."""
+        known, places = self._fluxes, (model.positions, model.directions)
+        if known is None or not all(map(np.array_equal, known, places)):
+            basis = flux_basis(self._points, self._axes, None, *places)
+            self._fluxes = known = *places, basis
+        return np.asarray(known[2] @ moments)

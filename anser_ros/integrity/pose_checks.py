@@ -169,6 +169,26 @@ def allowed_m(sigma_m: float, survey_m: float) -> float:
     return max(BODY_SIGMAS * sigma_m, HARMFUL_M, SURVEYS * survey_m)
 
 
+APART_M = 1e-3
+"""Coils nearer to each other than this, m, are at one place of a tool, and no bend parts them."""
+FAILS_ALONE, IS_BENT = 1e-2, 1e-4
+"""Probability that a coil fails by itself (its gain, a turn, its plug), and that a tool is bent or
+parts of it are plugged in for each other. So one coil against the rest is at fault, by 100 to 1;
+several would have to fail alike, which is less likely than a bend, and of a bend either part may
+be the one that moved: the coils of a body do not say which."""
+
+
+def is_part(offsets: Array, against: Sequence[int], others: Sequence[int]) -> bool:
+    """Return whether coils that contradict the others may be a part of the tool that is bent.
+
+    ``offsets`` (S, 3), m, are all coils' in the body; ``against`` and ``others`` are some of them.
+    """
+    if not against or not others or FAILS_ALONE ** len(against) > IS_BENT:
+        return False
+    apart = offsets[list(against)][:, None] - offsets[list(others)]
+    return bool(((apart**2).sum(axis=2) > APART_M**2).all())
+
+
 @dataclass(frozen=True)
 class SurveyErrors:
     """Says how well a tool is known: its coils' places, m an axis, their axes, rad, and gains.

@@ -106,6 +106,8 @@ class AcquisitionParameters:
 AUTO = 'auto'
 ASK_NS = 50_000_000
 """Time (50 ms) between questions about the device's time, while windows wait for its answer."""
+START_S = 3.0
+"""Time, s, that a port has to be there: a simulator is started at the same time."""
 WAIT_S = 0.1
 """Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
 
@@ -388,7 +390,9 @@ class Acquisition(AnserNode):
         if port.state is not PortState.RECEIVING:
             reason = f': {port.reason}' if port.reason else ''
             words = [f'{port.state.value}{reason}', self._faults.words]
-            return Level.ERROR, '; '.join(filter(None, words))
+            is_new = time.monotonic() - self.started_s < START_S and not port.counters.opens
+            level = Level.WARN if is_new else Level.ERROR
+            return level, '; '.join(filter(None, words))
         frames = interval.frames
         if interval.repeats == frames and max(frames, rises.get('duplicate_blocks', 0)) > 0:
             return Level.ERROR, 'the control unit keeps sending the same samples'

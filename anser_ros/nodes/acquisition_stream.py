@@ -28,6 +28,8 @@ from anser_ros.wire.frames import FULL_SCALE_CODE, ChannelKind, Hello, SampleBlo
 from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, Setup
 
+LAST_S = 4e-3
+"""Time, s, before the end of a window at which the samples that are there are looked at."""
 PATIENCE_NS = 300_000_000
 """Host time (0.3 s) that a frame waits for its stamp to be confirmed: the host stalls for less."""
 
@@ -133,10 +135,14 @@ class FluxStream:
 
     @property
     def blocks_wanted(self) -> int:
-        """Return how many blocks until a frame may be ready: one while frames wait for it."""
+        """Return how many blocks until a frame may be ready, one while frames wait for it; or
+        until `LAST_S` before that, so that little is left to be done when the last ones come.
+        """
         if self._waiting:
             return 1
-        return -(-self._cutter.samples_wanted // self._block_samples)
+        wanted = -(-self._cutter.samples_wanted // self._block_samples)
+        last = math.ceil(LAST_S / self.block_s)
+        return wanted - last if wanted > 2 * last else wanted
 
     def restart(self, sent_ns: int | None) -> None:
         """Start again: the device has answered a start, sent at a host time, with sample 0."""
@@ -173,6 +179,8 @@ class FluxStream:
         codes = np.concatenate([b.codes for b in blocks]) if len(blocks) > 1 else first.codes
         ticks = [block.timestamp_ticks for block in blocks]
         windows = self._cutter.push(first.sequence, ticks, codes)
+        if not windows:
+            self._watch.search()  # while the rest of the window is still to come
         self._repeats = self._watch.repeats
         if self.counters.restarts != restarts:
             self._end_stream()

@@ -114,7 +114,7 @@ class Monitor(AnserNode):
                 topic = '/'.join(filter(None, (chain, stem, 'pose_with_covariance')))
                 wanted.append((PoseWithCovarianceStamped, topic, partial(self._on_pose, trace)))
         self._pose_subscriptions = [
-            self.create_subscription(kind, topic, callback, qos.STREAM)
+            self.create_subscription(kind, topic, callback, qos.OTHERS)
             for kind, topic, callback in wanted
         ]
 

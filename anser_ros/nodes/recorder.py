@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -198,12 +199,15 @@ class Recorder(AnserNode):
     NAME = 'recorder'
     EXAMPLE = '--ros-args -p directory:=recordings -p name:=scan'
     PARAMETERS = RecorderParameters
+    PAUSE_S = 0.05  # the middleware notes when each message came, and the poses' readers wait less
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._bag: BagWriter | None = None
         self._logs: dict[str, TopicLog] = {}
         self._topic_subscriptions: dict[str, Any] = {}
+        self._subscribe: dict[str, partial[Any]] = {}  # makes a subscription to a topic
+        self._counts: dict[str, int] = {}  # publishers of a topic now
         self._error = self._last_report = ''
         self._described_s = 0.0
         self.create_service(Trigger, 'recorder/start', self._on_start)
@@ -249,6 +253,7 @@ class Recorder(AnserNode):
         for subscription in filter(None, self._topic_subscriptions.values()):
             self.destroy_subscription(subscription)
         self._topic_subscriptions.clear()
+        self._counts.clear()
         try:
             bag.close()
             write_metadata(bag.path, bag.record, ROS_DISTRO)
@@ -304,8 +309,11 @@ class Recorder(AnserNode):
         added = False
         for topic, type_names in self.get_topic_names_and_types():
             if topic in self._topic_subscriptions:
-                log = self._logs[topic]
-                log.n_publishers = max(log.n_publishers, self.count_publishers(topic))
+                log, count = self._logs[topic], self.count_publishers(topic)
+                log.n_publishers = max(log.n_publishers, count)
+                if self._counts.get(topic) != count:
+                    self._counts[topic] = count
+                    self._match(topic)
             elif self._wanted(topic) and len(type_names) == 1:
                 added = self._add(topic, type_names[0]) or added
         if added:
@@ -356,10 +364,19 @@ class Recorder(AnserNode):
             stamp_ns = _stamp_ns(data) if is_stamped else None
             log.add(info.get('publication_sequence_number'), stamp_ns)
 
-        self._topic_subscriptions[topic] = self.create_subscription(
-            message, topic, write, _matching(offered), raw=True
-        )
+        self._subscribe[topic] = partial(self.create_subscription, message, topic, write, raw=True)
+        self._topic_subscriptions[topic] = self._subscribe[topic](qos_profile=_matching(offered))
         return True
+
+    def _match(self, topic: str) -> None:
+        """Subscribe anew where a publisher has come that the subscription does not match."""
+        known = self._topic_subscriptions[topic]
+        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        if known is not None and offered:
+            wanted, had = _matching(offered), known.qos_profile  # what asks for more is less
+            if wanted.reliability > had.reliability or wanted.durability > had.durability:
+                self.destroy_subscription(known)
+                self._topic_subscriptions[topic] = self._subscribe[topic](qos_profile=wanted)
 
     def _new_folder(self) -> Path:
         parent = Path(self.parameters.directory).expanduser()

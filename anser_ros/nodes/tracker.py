@@ -236,7 +236,7 @@ class TrackerNode(AnserNode):
                 self._measure_anew(message.data, setup)
                 return
             sensors = sensor_table(setup.tool_sensors)
-            settings = settings_for(setup, self._settings)
+            settings = settings_for(setup, self._settings, self._file_model)
             tracker = Tracker(None, sensors, settings)
             if self._file_model is not None:
                 check_emitters(setup, self._file_model)
@@ -269,7 +269,7 @@ class TrackerNode(AnserNode):
         self._trouble.forget()
         if self._half is not None:
             same = replace(self._settings, volume=self._half.tracker.settings.volume)
-            self._half.set_up(settings_for(setup, same))
+            self._half.set_up(settings_for(setup, same, self._file_model))
 
     def _take_model(self, take: Callable[[Any], GivenModel | None], message: PointCloud2) -> None:
         try:
@@ -407,7 +407,7 @@ class TrackerNode(AnserNode):
             self._exchange(model_of(new.model_file))
         self._settings = settings_of(new)
         if self._half is not None and self._setup is not None:
-            self._half.set_up(settings_for(self._setup, self._settings))
+            self._half.set_up(settings_for(self._setup, self._settings, self._file_model))
 
     def _exchange(self, file_model: FieldModel | None) -> None:
         """Undo the effects of another model; until that is served too, state other_model."""

@@ -21,7 +21,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Freshness, Intake
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.pose_states import REFERENCES_DOUBTFUL
+from anser_ros.pose_states import OTHER_PLACE, REFERENCES_DOUBTFUL
 from anser_ros.refit import health
 from anser_ros.refit import tables as refit_tables
 from anser_ros.refit.clouds import FieldFunction
@@ -51,6 +51,7 @@ from anser_ros.refit.model import (
     RefitResult,
     locate_metal,
 )
+from anser_ros.refit.moved import FrameMotion
 from anser_ros.refit.posterior import Bank, FrameEvidence, median
 from anser_ros.refit.witness import ToolReading, Witness
 from anser_ros.settings import RefitSettings
@@ -117,6 +118,7 @@ class LiveRefit:
         self._intake = Intake(self.references.channel, error=FitError)
         self._baseline_check = BaselineCheck(self.baseline)
         self._assembly = self._new_assembly()
+        self._motion = FrameMotion(self._tables.excitation.field, self.references, noise_t)
 
     def _new_assembly(self) -> Assembly:
         phase, settings = self._tables.excitation.phase, self.settings
@@ -131,6 +133,7 @@ class LiveRefit:
         self._freshness = Freshness()
         self._courses = Courses(*self.baseline.shape)
         self._belief = Belief(1 + len(self._tables.priors) + SLOTS, settings.persistence)
+        self._motion.forget()
         self._banks.forget()
         self._assembly.forget()
         if self._witness is not None:
@@ -255,6 +258,7 @@ class LiveRefit:
 
     def _result(self, stamp_ns: int, bank: Bank, seen: FrameEvidence, level: float) -> RefitResult:
         self._belief.update(seen.log_evidence)
+        self._motion.look(stamp_ns, bank, seen)
         weights, moving = self._belief.weights, self._belief.may_have_changed
         best = int(weights.argmax())
         typical = median(self._distance) / (2 * bank.width)
@@ -278,6 +282,8 @@ class LiveRefit:
             reason = (
                 f'{self._watch.reason.count(health.DISAGREES)} of {self._watch.count} disagree'
             )
+        elif self._motion.reason:
+            state, reason = OTHER_PLACE, self._motion.reason
         elif moving and typical > POOR:
             state = POOR_FIT
             reason = f'readings deviate {np.sqrt(typical):.1f} times as much as expected'

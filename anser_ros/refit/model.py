@@ -11,7 +11,7 @@ import numpy as np
 
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.field.model import FieldModel
-from anser_ros.pose_states import REFERENCES_DOUBTFUL, REFERENCES_LOST
+from anser_ros.pose_states import OTHER_PLACE, REFERENCES_DOUBTFUL, REFERENCES_LOST
 from anser_ros.refit import health
 from anser_ros.refit.health import ReferenceHealth
 from anser_ros.refit.hypotheses import BackgroundTask
@@ -274,8 +274,9 @@ FROZEN = 'frozen'
 REFIT = 'refit'
 FEW_REFERENCES = 'few_references'
 POOR_FIT = 'poor_fit'
-STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT, REFERENCES_DOUBTFUL)
-"""Nothing changed; followed; too few references; unexplained; most references jumped."""
+STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT, REFERENCES_DOUBTFUL, OTHER_PLACE)
+"""Nothing changed; followed; too few references; unexplained; most references jumped; all of them
+moved as one."""
 
 POOR = 4.0
 """Typical left-out distance from which on the state is `POOR_FIT`."""
@@ -284,6 +285,7 @@ WITHHELD = {
     FEW_REFERENCES: REFERENCES_LOST,
     POOR_FIT: REFERENCES_DOUBTFUL,
     REFERENCES_DOUBTFUL: REFERENCES_DOUBTFUL,
+    OTHER_PLACE: OTHER_PLACE,
 }
 """State that trackers receive in states whose model is none to give poses by."""
 

@@ -190,8 +190,9 @@ def _problem(
     baseline = np.full(steady.shape[1:], np.nan, dtype=np.complex128)
     baseline[known] = np.nanmean(steady[:, known], axis=0)
     learnt = cKDTree(np.concatenate([m.placed()[0].reshape(-1, 3) for m in scan.measurements]))
+    errors_of = scan.sensor_fit.errors_of
     tools = [
-        _near(learnt, _between(scan.sensor_fit.errors_of(tool.body).apply(tool), begin, end))
+        _near(learnt, _between(errors_of(tool.body, tool.session).apply(tool), begin, end))
         for tool in session.tools
     ]
     accuracy = replace(scan.accuracy, flux_noise_t=scan.sensor_fit.noise_t)

@@ -67,7 +67,7 @@ def diagnose_session(
     say = progress or (lambda text: None)
     prepared = prepare(session, model, baseline)
     problem = problem_of(correct(prepared))
-    found = diagnose(problem, model, progress=say)
+    found = diagnose(problem, prepared.model, progress=say)
     dated = date_drifts(found.model, session)
     found = replace(found, model=made_for(dated, session.setup))
     say('tracking the held-out part')

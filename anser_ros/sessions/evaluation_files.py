@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from math import isfinite
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,7 +22,8 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.pose_states import OK
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, metrics
-from anser_ros.wire.text_files import read_rows, read_text
+from anser_ros.wire.tables import Table, read_table
+from anser_ros.wire.text_files import read_text
 
 SCHEMA = 'anser_evaluation/1'
 """Name of the document's layout, which stands in every such document."""
@@ -122,45 +123,31 @@ FEWEST_BLOCKS = 5
 
 
 @dataclass(frozen=True)
-class Difference:
-    """Holds the interval of a difference, second less first; NaN where stretches are too few."""
+class Compared:
+    """Compares errors, m or rad, or shares of frames with a pose, 0 to 1, of one coil or body.
+
+    ``low`` and ``high`` are the interval of the difference, second less first, NaN where stretches
+    are too few. ``n`` frames are those of both; those that only one of the two has are counted.
+    """
 
     low: float
     high: float
-
-    MORE_IS_BETTER: ClassVar = False
+    n: int
+    only_a: int
+    only_b: int
+    a: float  # root mean square error, or share
+    b: float
+    are_shares: bool
 
     @property
     def verdict(self) -> str:
         """Return which is better, ``a`` or ``b``; ``neither`` where both may be."""
-        return {0: 'neither', 1 if self.MORE_IS_BETTER else -1: 'b'}.get(self.sign, 'a')
+        return {0: 'neither', 1 if self.are_shares else -1: 'b'}.get(self.sign, 'a')
 
     @property
     def sign(self) -> int:
         """Return the sign of the difference where the whole interval has one, else 0."""
         return int(self.low > 0) - int(self.high < 0)
-
-
-@dataclass(frozen=True)
-class Compared(Difference):
-    """Compares ``n`` pairs of errors, m or rad, and counts frames that only one of the two has."""
-
-    n: int
-    only_a: int
-    only_b: int
-    rmse_a: float
-    rmse_b: float
-
-
-@dataclass(frozen=True)
-class ComparedShares(Difference):
-    """Compares the shares, 0 to 1, of ``n`` frames with a pose, of one coil or body."""
-
-    MORE_IS_BETTER = True
-
-    n: int
-    share_a: float
-    share_b: float
 
 
 def check_same_recording(first: Path, second: Path) -> None:
@@ -186,80 +173,58 @@ def _recording(folder: Path) -> str:
 
 def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
     """Return errors of position (m) and orientation (rad) by stamp and name; `ParameterError`."""
-    _, _, *kinds = ERROR_COLUMNS
-    errors = [_read(folder, ERRORS_FILE, ERROR_COLUMNS, itemgetter(kind)) for kind in kinds]
-    return {'position': errors[0], 'orientation': errors[1]}
+    keys, table = _read(folder, ERRORS_FILE, ERROR_COLUMNS)
+    return {
+        kind.partition('_')[0]: dict(zip(keys, table.array(kind).tolist(), strict=True))
+        for kind in ERROR_COLUMNS[2:]
+    }
 
 
 def read_states(folder: Path) -> dict[Key, float]:
     """Return whether there is a pose, 1 or 0, by stamp and name; raises `ParameterError`."""
-    tables = ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS))
     found: dict[Key, float] = {}
-    for name, columns in tables:
-        found |= _read(folder, name, columns, lambda row: row['status'] == OK)
+    for name, columns in ((POSES_FILE, POSE_COLUMNS), (BODIES_FILE, BODY_COLUMNS)):
+        keys, table = _read(folder, name, columns)
+        found |= zip(keys, map(float, table.words('status') == OK), strict=True)
     return found
 
 
-def _read(
-    folder: Path, name: str, columns: tuple[str, ...], value: Callable[[dict[str, str]], Any]
-) -> dict[Key, float]:
-    """A value of each row of a table, by stamp and by the name in its second column."""
+def _read(folder: Path, name: str, columns: tuple[str, ...]) -> tuple[list[Key], Table]:
+    """A table, and the stamp and the name in its second column of each row."""
     path = folder / name
     if not path.is_file():
         raise ParameterError(f'{folder}: no {name}; is it a folder of anser evaluate?')
-    names, rows = read_rows(path)
-    try:
-        if tuple(names) != columns:
-            raise ValueError(f'columns must be {", ".join(columns)}')
-        return {(int(row['stamp_ns']), row[columns[1]]): float(value(row)) for row in rows}
-    except (ValueError, TypeError) as error:
-        raise ParameterError(f'{path}: {error}') from error
+    table = read_table(path, as_text=True)
+    if table.names != columns:
+        raise ParameterError(f'{path}: columns must be {", ".join(columns)}')
+    stamps = table.array('stamp_ns').tolist()
+    return list(zip(stamps, table.words(columns[1]), strict=True)), table
 
 
-def compare_errors(
-    first: dict[Key, float], second: dict[Key, float], rng: np.random.Generator
+def compare(
+    first: Mapping[Key, float],
+    second: Mapping[Key, float],
+    rng: np.random.Generator,
+    *,
+    are_shares: bool = False,
 ) -> dict[str, Compared]:
-    """Compare two evaluations by name; errors of one kind by stamp and name."""
-    found = {}
-    for name in _names(first, second):
-        one, two = (sum(other == name for _, other in errors) for errors in (first, second))
-        both, pairs = _paired(first, second, name)
-        low, high = _interval(both, pairs**2, rng, np.sqrt)
-        root = np.sqrt((pairs**2).mean(axis=1)) if both.size else np.full(2, np.nan)
-        alone = one - both.size, two - both.size
-        found[name] = Compared(low, high, both.size, *alone, float(root[0]), float(root[1]))
-    return found
+    """Compare errors of one kind by stamp and name, or whether there is a pose (`read_states`).
 
-
-def compare_shares(
-    first: dict[Key, float], second: dict[Key, float], rng: np.random.Generator
-) -> dict[str, ComparedShares]:
-    """Compare how often two evaluations have a pose; states by stamp and name (`read_states`).
-
-    Raises `ParameterError` when no frame is in both.
+    Raises `ParameterError` when no frame of whole sessions is in both.
     """
-    if not first.keys() & second.keys():
+    if are_shares and not first.keys() & second.keys():
         raise ParameterError('the two have no frame in common: are they of the same session?')
-    found = {}
-    for name in _names(first, second):
-        stamps, pairs = _paired(first, second, name)
-        low, high = _interval(stamps, pairs, rng, np.asarray)
-        shares = pairs.mean(axis=1) if stamps.size else np.full(2, np.nan)
-        found[name] = ComparedShares(low, high, stamps.size, float(shares[0]), float(shares[1]))
+    shown, found = np.asarray if are_shares else np.sqrt, {}
+    for name in dict.fromkeys(name for _, name in (*first, *second)):
+        one, two = ({t: v for (t, n), v in side.items() if n == name} for side in (first, second))
+        both = sorted(one.keys() & two.keys())
+        pairs = np.array([[side[stamp] for stamp in both] for side in (one, two)])
+        pairs = pairs if are_shares else pairs**2
+        low, high = _interval(np.array(both, dtype=np.int64), pairs, rng, shown)
+        a, b = shown(pairs.mean(axis=1)).tolist() if both else (np.nan, np.nan)
+        alone = len(one) - len(both), len(two) - len(both)
+        found[name] = Compared(low, high, len(both), *alone, a, b, are_shares)
     return found
-
-
-def _names(first: dict[Key, float], second: dict[Key, float]) -> list[str]:
-    return list(dict.fromkeys(name for _, name in (*first, *second)))
-
-
-def _paired(
-    first: dict[Key, float], second: dict[Key, float], name: str
-) -> tuple[Integers, Array]:
-    """Stamps (n,) that both have of a name, and their values (2, n)."""
-    both = sorted(stamp for stamp, other in first if other == name and (stamp, name) in second)
-    pairs = [[values[stamp, name] for stamp in both] for values in (first, second)]
-    return np.array(both, dtype=np.int64), np.array(pairs).reshape(2, -1)
 
 
 def _interval(

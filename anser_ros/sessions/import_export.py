@@ -1,9 +1,8 @@
 """Makes a session of somebody else's bag, and files that other programs read of a session."""
 
-import csv
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,9 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire import cdr
-from anser_ros.wire.bag import Salvage, published_poses, read_fluxes, read_foreign
-from anser_ros.wire.bag_writer import SETUP_TYPE, SessionWriter
-from anser_ros.wire.recorded import PoseStream, RecordedFluxes
+from anser_ros.wire.bag import Salvage, iter_messages, published_poses, read_fluxes
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.recorded import SETUP_TYPE, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
 
 
@@ -63,7 +61,7 @@ def import_bag(
     types: dict[str, str] = {}
     seen: set[str] = set()
     with SessionWriter(out) as writer:
-        for message in read_foreign(path, salvage):
+        for message in iter_messages(path, salvage):
             if setup_text is not None and not seen:
                 writer.write_setup(setup_text, message.log_time_ns)
             seen.add(message.topic)
@@ -74,7 +72,7 @@ def import_bag(
             if types.setdefault(topic, type_name) != type_name:
                 clash = f'{topic} would have {types[topic]} and {type_name}'
                 raise BagError(f'{os.fspath(path)}: {clash}')
-            if type_name not in cdr.DEFINITIONS and not message.definition:
+            if not message.definition:
                 left_out[f'{message.topic} ({type_name})'] += 1
                 continue
             channel = writer.channel(topic, type_name, message.definition)
@@ -82,8 +80,8 @@ def import_bag(
             written[topic] += 1
         missing = sorted(set(names) - seen)
         if missing or not written:
-            what = f'no topic {", ".join(missing)}; there are: {", ".join(sorted(seen))}'
-            raise BagError(f'{os.fspath(path)}: {what if missing else "no message can be read"}')
+            what = f'no topic {", ".join(missing)}' if missing else 'no type is known'
+            raise BagError(f'{os.fspath(path)}: {what}; there are: {salvage.topic_words()}')
     return ImportedBag(dict(written), dict(left_out), salvage.lost)
 
 
@@ -118,24 +116,21 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBa
             _write_fluxes(out / name, fluxes, form)
             written[name] = int(fluxes.stamp_ns.size)
     if not written:
-        raise BagError(f'{os.fspath(path)}: nothing to export as {form}')
+        words = f'nothing to export as {form}; there are: {salvage.topic_words()}'
+        raise BagError(f'{os.fspath(path)}: {words}')
     return ExportedBag(written, salvage.lost)
 
 
 def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
     """A table of stamps, positions, m, and quaternions."""
-    numbers = np.column_stack([poses.position, poses.quaternion]).tolist()
-    rows = zip(poses.stamp_ns.tolist(), numbers, strict=True)
     if form == MAT:
         stamps, places, turns = poses.stamp_ns, poses.position, poses.quaternion
         _write_mat(path, stamp_ns=stamps, position_m=places, quaternion_xyzw=turns)
-    elif form == TUM:
-        with path.open('w', encoding='utf-8') as stream:
-            for stamp, row in rows:
-                words = ' '.join(f'{value:.9g}' for value in row)
-                stream.write(f'{stamp // SECOND_NS}.{stamp % SECOND_NS:09d} {words}\n')
-    else:
-        _write_csv(path, POSE_COLUMNS, ([s, *(f'{v:.9g}' for v in row)] for s, row in rows))
+        return
+    parts = poses.stamp_ns // SECOND_NS, poses.stamp_ns % SECOND_NS
+    seconds = [f'{s}.{ns:09d}' for s, ns in zip(*parts, strict=True)]
+    numbers = np.column_stack([poses.position, poses.quaternion])
+    _write_text(path, [seconds if form == TUM else poses.stamp_ns, *numbers.T], POSE_COLUMNS, form)
 
 
 def _write_fluxes(path: Path, fluxes: RecordedFluxes, form: str) -> None:
@@ -144,24 +139,21 @@ def _write_fluxes(path: Path, fluxes: RecordedFluxes, form: str) -> None:
         flux = {'flags': fluxes.flags, 'flux_t': fluxes.flux}
         _write_mat(path, stamp_ns=fluxes.stamp_ns, channel=fluxes.channel, **flux)
         return
-    columns = [f'coil{k}_{part}_t' for k in range(fluxes.flux.shape[2]) for part in ('re', 'im')]
-    _write_csv(path, ('stamp_ns', 'channel', 'flags', *columns), _flux_rows(fluxes))
+    frames, channels, coils = fluxes.flux.shape
+    parts = np.ascontiguousarray(fluxes.flux).view(np.float64).reshape(-1, 2 * coils)
+    names = [f'coil{k}_{part}_t' for k in range(coils) for part in ('re', 'im')]
+    stamps, channel = fluxes.stamp_ns.repeat(channels), np.tile(fluxes.channel, frames)
+    columns = [stamps, channel, fluxes.flags.ravel(), *parts.T]
+    _write_text(path, columns, ('stamp_ns', 'channel', 'flags', *names), form)
 
 
-def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[list[object]]) -> None:
-    with path.open('w', encoding='utf-8', newline='') as stream:
-        writer = csv.writer(stream)
-        writer.writerow(columns)
-        writer.writerows(rows)
+def _write_text(path: Path, columns: Sequence[Any], names: Sequence[str], form: str) -> None:
+    """A table with commas and a header, or of TUM with neither."""
+    import pandas  # late: it takes half a second
 
-
-def _flux_rows(fluxes: RecordedFluxes) -> Iterator[list[object]]:
-    for stamp, flags, frame in zip(
-        fluxes.stamp_ns.tolist(), fluxes.flags.tolist(), fluxes.flux, strict=True
-    ):
-        for channel, flag, values in zip(fluxes.channel.tolist(), flags, frame, strict=True):
-            parts = np.ascontiguousarray(values).view(np.float64).tolist()
-            yield [stamp, channel, flag, *(f'{value:.9g}' for value in parts)]
+    layout = {'sep': ' ', 'header': False} if form == TUM else {'lineterminator': '\r\n'}
+    frame = pandas.DataFrame(dict(zip(names, columns, strict=True)))
+    frame.to_csv(path, index=False, float_format='%.9g', na_rep='nan', **layout)
 
 
 def _write_mat(path: Path, **arrays: NDArray[Any]) -> None:

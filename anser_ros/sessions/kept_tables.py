@@ -1,13 +1,12 @@
 """Keeps tables of refits, seconds of work, on disk while model, setup and code are the same."""
 
-import json
 import os
-import zlib
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +24,8 @@ TABLES = 'refit_tables_'
 """How the names of files with tables begin; the model's fingerprint follows."""
 MOST_TABLES = 3
 """Files of tables that are kept, the last used: each has about 140 MB."""
-DAMAGED = (OSError, ValueError, KeyError, TypeError, FitError)
+DAMAGED = (OSError, EOFError, ValueError, KeyError, TypeError, FitError, BadZipFile)
 """What the reading of a file raises that is not there, cut, or another one's."""
-LONGEST_HEAD = 1_000_000
-"""Bytes of the first line, which lists the arrays: tables have 500."""
-ALIGNED = 64
-"""Multiple of bytes at which each array begins, for the processor's sake."""
 
 
 def kept_folder(is_wanted: bool = True) -> Path | None:
@@ -122,35 +117,18 @@ def used_s(path: Path) -> float:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file, which share one memory; raises what `DAMAGED` lists."""
-    with path.open('rb') as file:
-        head = json.loads(file.readline(LONGEST_HEAD))
-        data = np.fromfile(file, dtype=np.uint8)
-    if zlib.crc32(data.data) != head['crc32']:
-        raise ValueError(f'{path} is damaged')
-    return {
-        name: data[begin : begin + size].view(np.dtype(kind)).reshape(shape)
-        for name, (kind, shape, begin, size) in head['arrays'].items()
-    }
+    """Return the arrays of a file; raises what `DAMAGED` lists."""
+    with path.open('rb') as file, np.load(file) as arrays:
+        return dict(arrays)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write a file that is whole or not there; raises `OSError`."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    rows, parts, begin = {}, [], 0
-    for name, array in arrays.items():
-        raw = array.tobytes()
-        rows[name] = array.dtype.str, array.shape, begin, len(raw)
-        parts.append(raw + bytes(-len(raw) % ALIGNED))
-        begin += len(parts[-1])
-    data = b''.join(parts)
-    head = json.dumps({'arrays': rows, 'crc32': zlib.crc32(data)}).encode()
-    head += b' ' * (-(len(head) + 1) % ALIGNED) + b'\n'
     part = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
         with part.open('wb') as file:
-            file.write(head)
-            file.write(data)
+            np.savez(file, **arrays)  # type: ignore[arg-type]
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

@@ -22,8 +22,6 @@ from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.wire.recorded import optical_stem
 from anser_ros.wire.setup import Setup, topic_of
 
-LENGTH_M = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'inch': 0.0254}
-"""Metres in a unit of length."""
 LENGTH_UNITS: Mapping[str, float] = {'millimetres': 1e3, 'centimetres': 1e2, 'inches': 1 / 0.0254}
 """Units of length that stand where metres belong: how many there are in a metre."""
 FLUX_UNITS: Mapping[str, float] = {

@@ -3,10 +3,13 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from anser_ros.calibration.readings import with_pose
+from anser_ros.calibration.result import residuals
 from anser_ros.effects.correction import Correction
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import SESSION, FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.baseline import Baseline, clean_flux
@@ -17,11 +20,16 @@ from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.wire.setup import Setup
 
 
-def settings_for(setup: Setup, settings: TrackerSettings) -> TrackerSettings:
-    """Return settings with what the setup states or measured, and its volume if they have none."""
+def settings_for(
+    setup: Setup, settings: TrackerSettings, model: FieldModel | None = None
+) -> TrackerSettings:
+    """Return settings with what the setup states or measured, and its volume if they have none.
+
+    The noise is that which the model was calibrated with, unless it was measured or said since.
+    """
     return replace(
         settings,
-        flux_noise_t=tracking_noise(setup),
+        flux_noise_t=tracking_noise(setup, 0.0 if model is None else model.noise_t),
         stamp_sigma_s=stamp_sigma(setup),
         tools=setup.refit.tools,
         volume=settings.volume or tracked_volume(setup),
@@ -78,6 +86,7 @@ def prepare(
     there is metal in it.
     """
     check_fits(model, session)
+    model = as_it_stood(model, session)
     clean = None
     if baseline is not None:
         check_fits(model, baseline)
@@ -96,6 +105,42 @@ def prepare(
     )
 
 
+def as_it_stood(model: FieldModel, session: Session) -> FieldModel:
+    """Return a model of several sessions in the frame of the one that a session stands like.
+
+    That one leaves least of the fluxes at the session's poses. Without any, and where the model
+    knows no such difference, it stands in between, as it was written.
+    """
+    every = list(dict.fromkeys(filter(None, (e.parameters.get(SESSION) for e in model.effects))))
+    tools = [tool for tool in map(with_pose, session.tools) if len(tool.time)]
+    if not every or not tools:
+        return model
+    stood = [_stood(model, name) for name in every]
+    whole = replace(session, tools=tuple(tools))
+
+    def left(one: FieldModel) -> float:
+        correction, recorded = _correction(one, session), is_recorded(one, session)
+        found = [_corrected(correction, recorded, tool) for tool in whole.tools]
+        return residuals(found, one).unexplained
+
+    return min(stood, key=left)
+
+
+def _stood(model: FieldModel, name: str) -> FieldModel:
+    """A model as it was in one of its sessions."""
+    effects = []
+    for effect in model.effects:
+        given = dict(effect.parameters)
+        if given.pop(SESSION, name) != name:
+            continue
+        if effect.name == 'registration' and SESSION in effect.parameters:
+            turn = Rotation.from_rotvec(given['rotation_deg'], degrees=True)
+            model = model.turned(turn, np.array(given['translation_m']))
+        else:
+            effects.append(replace(effect, parameters=given))
+    return replace(model, effects=tuple(effects))
+
+
 def _correction(model: FieldModel, session: Session) -> Correction:
     return Correction.of(model.effects, session.sensors, model.frequencies_hz)
 
@@ -107,19 +152,20 @@ def correct(prepared: PreparedSession) -> PreparedSession:
     truly are, and optical poses are on the fluxes' clock and in the frame fg.
     """
     session = prepared.session
-    tools = tuple(_corrected(prepared, tool) for tool in session.tools)
+    how = prepared.correction, prepared.recorded_drift
+    tools = tuple(_corrected(*how, tool) for tool in session.tools)
     reference = session.reference
     if reference is not None:
-        reference = _corrected(prepared, reference)
+        reference = _corrected(*how, reference)
     return prepared.with_session(replace(session, tools=tools, reference=reference))
 
 
-def _corrected(prepared: PreparedSession, measurements: Measurements) -> Measurements:
-    correction, flux = prepared.correction, measurements.flux
+def _corrected(correction: Correction, recorded: bool, measurements: Measurements) -> Measurements:
+    flux = measurements.flux
     if not correction.terms:
         return measurements
     if correction.changes_flux:
-        channels, recorded = measurements.sensors.channel, prepared.recorded_drift
+        channels = measurements.sensors.channel
         rows = zip(measurements.time.tolist(), flux, strict=True)
         flux = np.array(
             [correction.flux(time, channels, frame, recorded=recorded) for time, frame in rows]

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import BagError
@@ -19,8 +18,6 @@ from anser_ros.stamps import NANO
 from anser_ros.wire.points import STALE
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
-
-ComplexArray = NDArray[np.complex128]
 
 MOST_NOISE_T = 1e-3
 """Noise, T, from which on a setup's statement is a mistake: emitters make microtesla at most."""
@@ -42,6 +39,10 @@ class Session:
     tools: tuple[Measurements, ...]
     reference: Measurements | None
     lost: str = ''
+
+    def __repr__(self) -> str:
+        tools = (f'{tool.body}: {tool.time.size} frames' for tool in self.tools)
+        return f'Session({self.path}, {", ".join(tools) or "no tools"})'
 
     @property
     def sensors(self) -> SensorTable:
@@ -80,9 +81,15 @@ def measured_noise(setup: Setup) -> float:
     return measured if 0.0 < measured < MOST_NOISE_T else 0.0
 
 
-def tracking_noise(setup: Setup) -> float:
-    """Return the noise that tracking starts from, T: what is stated, or was measured if larger."""
-    return max(setup.accuracy.flux_noise_t, measured_noise(setup))
+def tracking_noise(setup: Setup, found_t: float = 0.0) -> float:
+    """Return the noise that tracking starts from, T: what is stated, or was measured if larger.
+
+    What a calibration found goes before what a document states, where nothing was measured since.
+    """
+    measured, stated = measured_noise(setup), setup.accuracy.flux_noise_t
+    if found_t > 0.0 and measured == 0.0 and 'flux_noise_t' not in setup.said:
+        return found_t
+    return max(stated, measured)
 
 
 def stamp_sigma(setup: Setup) -> float:
@@ -102,6 +109,7 @@ def _measurements(
     sensors: SensorTable,
     start: int,
     body: str,
+    session: str,
     optical: PoseStream | None = None,
 ) -> Measurements:
     """Fluxes in the order of the sensor table, with the body's poses; the board does not move."""
@@ -125,7 +133,7 @@ def _measurements(
         position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
         has_pose = np.zeros(count, dtype=bool)
     return Measurements(
-        body, sensors, time, flux, valid, flags, position, rotation, has_pose, track
+        body, sensors, time, flux, valid, flags, position, rotation, has_pose, track, session
     )
 
 
@@ -153,10 +161,10 @@ def session_of(bag: Bag) -> Session:
     if bag.tool is not None:
         for body in bag.setup.bodies:
             sensors, poses = table.of_body(body), bag.optical.get(body)
-            tools.append(_measurements(bag.tool, sensors, start, body, poses))
+            tools.append(_measurements(bag.tool, sensors, start, body, bag.path, poses))
     if bag.reference is not None and bag.setup.reference_sensors:
         sensors = sensor_table(bag.setup.reference_sensors)
-        reference = _measurements(bag.reference, sensors, start, FIELD_GENERATOR)
+        reference = _measurements(bag.reference, sensors, start, FIELD_GENERATOR, bag.path)
     return Session(bag.path, bag.setup, start, tuple(tools), reference, bag.lost)
 
 

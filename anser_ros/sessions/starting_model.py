@@ -79,14 +79,14 @@ def starting_model(setup: Setup, given: FieldModel | None) -> FieldModel:
     return given
 
 
-def check_emitters(setup: Setup, given: FieldModel) -> None:
+def check_emitters(setup: Setup, given: FieldModel, where: str = 'the setup') -> None:
     """Raise `ModelFileError` when a model's emitters are not the setup's, or it is of another."""
     if given.emitters != setup.emitter_names:
         raise ModelFileError(
             f'the model has the emitters {", ".join(given.emitters)}; '
-            f'the setup {", ".join(setup.emitter_names)}'
+            f'{where} has {", ".join(setup.emitter_names)}'
         )
-    check_made_for(given, setup, 'the setup')
+    check_made_for(given, setup, where)
 
 
 def model_for(
@@ -183,18 +183,12 @@ def _bodies_of(model: FieldModel, setup: Setup) -> set[str]:
 
 def check_fits(model: FieldModel, session: Session) -> None:
     """Raise `ModelFileError` when a model is not of a session's emitters; see `check_made_for`."""
-    names = session.setup.emitter_names
-    if model.emitters != names:
+    ours, theirs = model.frequencies_hz, session.setup.frequencies_hz
+    if len(ours) == len(theirs) and not np.allclose(ours, theirs, rtol=1e-3):
         raise ModelFileError(
-            f'the model has the emitters {", ".join(model.emitters)}; '
-            f'the session {session.path} has {", ".join(names)}'
+            f'the model drives at {list(ours)} Hz; the session {session.path} at {list(theirs)} Hz'
         )
-    if not np.allclose(model.frequencies_hz, session.setup.frequencies_hz, rtol=1e-3):
-        raise ModelFileError(
-            f'the model drives at {list(model.frequencies_hz)} Hz; '
-            f'the session {session.path} at {list(session.setup.frequencies_hz)} Hz'
-        )
-    check_made_for(model, session.setup, f'the session {session.path}')
+    check_emitters(session.setup, model, f'the session {session.path}')
 
 
 FOUND_ON = 'session_start_ns'

@@ -4,7 +4,6 @@ The document names the files, their columns, units, the order of quaternions and
 `docs/howto/import.md` has every key with examples.
 """
 
-import csv
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -19,7 +18,7 @@ import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
-from anser_ros.sessions.plausibility import LENGTH_M
+from anser_ros.stamps import stamp_fault
 from anser_ros.wire.bag_writer import FLUX_TOPICS, SessionWriter
 from anser_ros.wire.recorded import (
     BODY,
@@ -33,27 +32,33 @@ from anser_ros.wire.recorded import (
 )
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
+from anser_ros.wire.table_names import LENGTH_M, TIME_NS
+from anser_ros.wire.tables import Table, read_table
 from anser_ros.wire.text_files import read_text, read_yaml
 
 Array = NDArray[Any]
 
 REFERENCE = re.compile(r'^\s*([^\[\]]+?)\s*(?:\[([\d\s,]+)\])?\s*$')
 """A column: a name, and where that is an array of more dimensions, the further indices."""
-ENDINGS = ('.csv', '.npy', '.npz', '.mat')
+TEXTS = ('.csv', '.tsv', '.txt', '.tum')
+ENDINGS = (*TEXTS, '.npy', '.npz', '.mat')
 
 
 @dataclass(frozen=True)
 class NumberTable:
     """Holds the arrays of one file by name; the first index of each counts rows.
 
-    A CSV file has one for each column, a ``.npy`` file one called ``data``.
+    A text has one for each column, a ``.npy`` file one called ``data``.
     """
 
     path: Path
     arrays: Mapping[str, NDArray[Any]]
+    table: Table | None = None  # of a text, whose columns are read as they are asked for
 
     def array(self, name: str) -> NDArray[Any]:
         """Return the whole array of a name; `ParameterError` where there is none."""
+        if self.table is not None:
+            return self.table.array(name)
         if name not in self.arrays:
             known = ', '.join(list(self.arrays)[:20])
             raise ParameterError(f'{self.path}: no {name!r}; there are: {known}')
@@ -77,20 +82,27 @@ class NumberTable:
         index: tuple[Any, ...] = (slice(None), *rest)
         return np.asarray(found[index])
 
-    def columns(self, references: Any, count: int, what: str) -> NDArray[Any]:
-        """Return several columns as an array of shape (N, count)."""
+    def columns(self, references: Any, count: int, what: str, beside: Any) -> NDArray[Any]:
+        """Return several columns (N, count), as long as another one; raises `ParameterError`."""
         if not isinstance(references, list) or len(references) != count:
             raise ParameterError(f'{self.path}: {what} needs a list of {count} columns')
+        many = len(self.column(beside))
+        for reference in references:
+            if (found := len(self.column(reference))) != many:
+                words = f'{beside} has {many} rows, {reference} {found}'
+                if many in self.array(str(reference).partition('[')[0].strip()).shape[1:]:
+                    words += f'; its rows are {many} along the other axis: transpose it'
+                raise ParameterError(f'{self.path}: {words}')
         return np.stack([self.column(reference) for reference in references], axis=1)
 
 
-def read_table(path: Path) -> NumberTable:
+def read_arrays(path: Path) -> NumberTable:
     """Read a file, MATLAB's of version 7.3 (HDF5) by h5py; raises `ParameterError`."""
     if not path.is_file():
         raise ParameterError(f'{path}: {"is a folder" if path.is_dir() else "no such file"}')
     try:
-        if path.suffix == '.csv':
-            return NumberTable(path, _csv(path))
+        if path.suffix.lower() in TEXTS:
+            return NumberTable(path, {}, read_table(path))
         if path.suffix == '.npy':
             return NumberTable(path, {'data': np.load(path, allow_pickle=False)})
         if path.suffix == '.npz':
@@ -103,27 +115,6 @@ def read_table(path: Path) -> NumberTable:
             raise ParameterError(f'{path}: no arrays of numbers') from error
         raise ParameterError(f'{path}: cannot be read: {" ".join(str(error).split())}') from error
     raise ParameterError(f'{path}: ends with none of {", ".join(ENDINGS)}')
-
-
-def _csv(path: Path) -> dict[str, NDArray[Any]]:
-    with path.open(encoding='utf-8-sig', newline='') as stream:
-        reader = csv.reader(stream)
-        head = [name.strip() for name in next(reader, [])]
-        rows = [row for row in reader if row]
-    for number, row in enumerate(rows, start=2):
-        if len(row) != len(head):
-            raise ValueError(f'row {number} has {len(row)} cells, the head {len(head)}')
-    return {name: _numbers([row[i].strip() for row in rows]) for i, name in enumerate(head)}
-
-
-def _numbers(cells: list[str]) -> NDArray[Any]:
-    """Whole numbers as such: stamps in ns have more digits than a float keeps."""
-    if all(re.fullmatch(r'[+-]?\d+', cell) for cell in cells):
-        return np.array([int(cell) for cell in cells], dtype=np.int64)
-    try:
-        return np.array([float(cell) if cell else np.nan for cell in cells])
-    except ValueError:
-        return np.array(cells)  # words; who asks for numbers of them gets an error
 
 
 def _mat(path: Path) -> dict[str, NDArray[Any]]:
@@ -146,16 +137,14 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
 
 
 SCHEMA = 'anser_import/1'
-TIME_NS = {'s': 1e9, 'ms': 1e6, 'us': 1e3, 'ns': 1.0}
-"""Nanoseconds in a unit of time."""
 FLUX_T = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'pT': 1e-12}
 """Tesla in a unit of flux density."""
 ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
 """Where x, y, z, w stand in a quaternion of that order."""
 
 
-def import_tables(document: Path, out: Path) -> dict[str, int]:
-    """Write the session that a document, beside its files, describes; return messages by topic.
+def import_tables(document: Path, out: Path) -> tuple[dict[str, int], list[str]]:
+    """Write the session that a document describes; return messages by topic, and what lacks.
 
     Raises `ParameterError`, `SetupError`, `BagError` with the file's name.
     """
@@ -165,22 +154,50 @@ def import_tables(document: Path, out: Path) -> dict[str, int]:
     except yaml.YAMLError as error:
         raise ParameterError(f'{document}: {" ".join(str(error).split())}') from error
     try:
-        return _Import(_mapping(spec, 'the document'), document.parent).write(out)
+        made = _Import(spec, document.parent)
+        return made.write(out), made.notes
     except ParameterError as error:
         text = str(error)
         message = text if str(document.parent) in text else f'{document}: {text}'
         raise ParameterError(message) from error
 
 
+class _Spec:
+    """A mapping in the document, what it is called, and values of its keys, which are known."""
+
+    def __init__(self, values: Any, what: str, *keys: str) -> None:
+        if not isinstance(values, dict):
+            raise ParameterError(f'{what} must be a mapping')
+        if unknown := sorted(str(key) for key in values if key not in keys):
+            words = f'no key {", ".join(unknown)}; there are: {", ".join(keys)}'
+            raise ParameterError(f'{what}: {words}')
+        self.what, self.get = what, values.get
+
+    def needed(self, key: str) -> Any:
+        if self.get(key) is None:
+            raise ParameterError(f'{self.what} lacks {key}')
+        return self.get(key)
+
+    def choice(self, key: str, known: Mapping[str, float], usual: str) -> float:
+        given = self.get(key, usual)
+        if given not in known:
+            words = f'{key} must be among {", ".join(known)}, got {given!r}'
+            raise ParameterError(f'{self.what}: {words}')
+        return known[given]
+
+
 class _Import:
     """One document's import."""
 
-    def __init__(self, spec: Mapping[str, Any], folder: Path) -> None:
+    def __init__(self, document: Any, folder: Path) -> None:
+        kinds = 'fluxes', 'tracked', 'poses'
+        spec = _Spec(document, 'the document', 'schema', 'setup', 'time', *kinds)
         if spec.get('schema') != SCHEMA:
             raise ParameterError(f'schema must be {SCHEMA}, got {spec.get("schema")!r}')
-        _known(spec, ('schema', 'setup', 'time', 'fluxes', 'tracked', 'poses'), 'the document')
         self._folder = folder
-        tables = {key: _tables(spec, key) for key in ('fluxes', 'tracked', 'poses')}
+        tables = {key: spec.get(key) or [] for key in kinds}
+        if not all(isinstance(entries, list) for entries in tables.values()):
+            raise ParameterError(f'{", ".join(kinds)} must be lists of tables')
         if bool(tables['fluxes']) == bool(tables['tracked']):
             raise ParameterError(
                 'needs fluxes (tables of a board with a setup), or tracked (tables of a tracker '
@@ -189,21 +206,22 @@ class _Import:
         self._setup: Setup | None = None
         self._setup_text = ''
         if tables['fluxes']:
-            self._setup_text = read_text(folder / str(_needed(spec, 'setup', 'the document')))
+            self._setup_text = read_text(folder / str(spec.needed('setup')))
             self._setup = parse_setup(self._setup_text)
-        elif 'setup' in spec:
+        elif spec.get('setup') is not None:
             raise ParameterError('a setup describes fluxes; tracked poses have none')
-        self._time = _time_base(spec, 'time')
+        self._time = _time_base(spec.get('time', {}), 'time')
         self._entries: list[tuple[int, Callable[..., None]]] = []
         self._tables: dict[Path, NumberTable] = {}
         self._messages: Counter[str] = Counter()
+        self.notes: list[str] = []
         for key, entries in tables.items():
             for number, entry in enumerate(entries):
                 what = f'{key}[{number}]'
-                if key == 'fluxes':
-                    self._add_fluxes(_mapping(entry, what), what, self._setup)
+                if self._setup is not None and key == 'fluxes':
+                    self._add_fluxes(entry, what, self._setup)
                 else:
-                    self._add_poses(_mapping(entry, what), what, is_tracked=key == 'tracked')
+                    self._add_poses(entry, what, is_tracked=key == 'tracked')
         if not self._entries:
             raise ParameterError('the tables have no complete row')
         if self._setup is None:
@@ -224,38 +242,38 @@ class _Import:
                 put(writer)
         return dict(self._messages)
 
-    def _table(self, entry: Mapping[str, Any], what: str) -> NumberTable:
-        path = self._folder / str(_needed(entry, 'file', what))
+    def _table(self, entry: _Spec) -> NumberTable:
+        path = self._folder / str(entry.needed('file'))
         if path not in self._tables:
-            self._tables[path] = read_table(path)
+            self._tables[path] = read_arrays(path)
         return self._tables[path]
 
-    def _stamps(self, table: NumberTable, entry: Mapping[str, Any], what: str) -> list[int]:
-        column = table.column(_needed(entry, 'stamp', what))
-        unit_ns, start_ns = _time_base(entry, f'{what}: time') if 'time' in entry else self._time
+    def _stamps(self, table: NumberTable, entry: _Spec) -> list[int]:
+        column, time = table.column(entry.needed('stamp')), entry.get('time')
+        base = self._time if time is None else _time_base(time, f'{entry.what}: time')
+        unit_ns, start_ns = base
         if column.dtype.kind in 'iu':  # exact, as nanoseconds since 1970 have 19 digits
             stamps = [start_ns + int(v) * int(unit_ns) for v in column.tolist()]
         else:
-            values = _real(column, table, str(entry['stamp']))
+            values = _real(column, table, str(entry.get('stamp')))
             if not np.isfinite(values).all():
-                raise ParameterError(f'{table.path}: {entry["stamp"]} has values not finite')
+                raise ParameterError(f'{table.path}: {entry.get("stamp")} has values not finite')
             stamps = [start_ns + round(v * unit_ns) for v in values.tolist()]
         if not stamps:
             raise ParameterError(f'{table.path}: no rows')
-        if min(stamps) <= 0:
-            raise ParameterError(f'{table.path}: a stamp is not after 1970; is start_ns missing?')
+        if fault := stamp_fault(min(stamps), max(stamps)) or '1970' * (min(stamps) <= 0):
+            fault = fault if min(stamps) > 0 else 'a stamp is not after 1970; is start_ns missing?'
+            raise ParameterError(f'{table.path}: {fault}')
         if len(set(stamps)) < len(stamps):
             raise ParameterError(f'{table.path}: the same stamp twice; is the unit of time right?')
         return stamps
 
-    def _add_fluxes(self, entry: Mapping[str, Any], what: str, setup: Setup | None) -> None:
-        assert setup is not None
-        _known(entry, ('file', 'stamp', 'time', 'unit', 'sensors', 'array'), what)
-        table = self._table(entry, what)
-        scale = _choice(entry, 'unit', FLUX_T, 'T', what)
-        stamps = self._stamps(table, entry, what)
+    def _add_fluxes(self, given_entry: Any, what: str, setup: Setup) -> None:
+        entry = _Spec(given_entry, what, 'file', 'stamp', 'time', 'unit', 'sensors', 'array')
+        table, scale = self._table(entry), entry.choice('unit', FLUX_T, 'T')
+        stamps = self._stamps(table, entry)
         by_name = {sensor.name: sensor for sensor in setup.sensors}
-        given = _needed(entry, 'sensors', what)
+        given = entry.needed('sensors')
         names = list(given)
         unknown = [name for name in names if name not in by_name]
         if unknown or not names:
@@ -263,17 +281,19 @@ class _Import:
                 f'{what}: the setup has no sensor {", ".join(map(str, unknown)) or "named here"}'
             )
         emitters = len(setup.emitter.coils)
-        if 'array' in entry:
-            flux = table.array(str(entry['array']))
+        if array := entry.get('array'):
+            flux = table.array(str(array))
             wanted = (len(stamps), len(names), emitters)
             if flux.shape != wanted:
                 raise ParameterError(
-                    f'{table.path}: {entry["array"]} has shape {flux.shape}, not frames x sensors '
+                    f'{table.path}: {array} has shape {flux.shape}, not frames x sensors '
                     f'x emitters, which is {wanted}'
                 )
         else:
-            columns = _mapping(given, f'{what}: sensors')
-            flux = np.stack([_phasors(table, columns[n], emitters, n) for n in names], axis=1)
+            columns = _Spec(given, f'{what}: sensors', *names)
+            beside = entry.get('stamp')
+            parts = [_phasors(table, columns.get(n), emitters, n, beside) for n in names]
+            flux = np.stack(parts, axis=1)
         flux = scale * np.asarray(flux, dtype=np.complex128)
         sensors = [by_name[name] for name in names]
         for stamp, values in zip(stamps, flux, strict=True):
@@ -285,58 +305,62 @@ class _Import:
             if any((s.body == FIELD_GENERATOR) == fixed for s in sensors):
                 self._messages[topic] += len(stamps)
 
-    def _add_poses(self, entry: Mapping[str, Any], what: str, *, is_tracked: bool) -> None:
+    def _add_poses(self, given: Any, what: str, *, is_tracked: bool) -> None:
         key = 'sensor' if is_tracked else 'body'
-        others = ('position', 'unit', 'quaternion', 'order')
-        _known(entry, ('file', 'stamp', 'time', key, *others), what)
-        table, name = self._table(entry, what), read_name(_needed(entry, key, what), what)
+        others = 'position', 'unit', 'quaternion', 'order'
+        entry = _Spec(given, what, 'file', 'stamp', 'time', key, *others)
+        table, name = self._table(entry), read_name(entry.needed(key), what)
         if self._setup is not None and name not in self._setup.bodies:
             raise ParameterError(f'{what}: the setup has no body {name}')
         topic = tracked_topic(name) if is_tracked else optical_topic(name)
-        scale = _choice(entry, 'unit', LENGTH_M, 'm', what)
-        order = entry.get('order')
+        scale, order = entry.choice('unit', LENGTH_M, 'm'), entry.get('order')
         if order not in ORDERS:
             raise ParameterError(f'{what}: order must be {" or ".join(ORDERS)}, got {order!r}')
-        stamps = self._stamps(table, entry, what)
-        position = scale * _real(
-            table.columns(entry.get('position'), 3, f'{what}: position'), table, 'position'
+        stamps = self._stamps(table, entry)
+        position, quaternion = (
+            _real(table.columns(entry.get(k), n, f'{what}: {k}', entry.get('stamp')), table, k)
+            for k, n in (('position', 3), ('quaternion', 4))
         )
-        quaternion = _real(
-            table.columns(entry.get('quaternion'), 4, f'{what}: quaternion'), table, 'quaternion'
-        )[:, ORDERS[order]]
+        quaternion = quaternion[:, ORDERS[order]]
         good = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1)
-        quaternion[good] = unit_quaternions(quaternion[good])
-        if not np.isfinite(quaternion[good]).all():
+        unit = np.isfinite(unit_quaternions(quaternion)).all(axis=1)
+        none = good & (quaternion == 0.0).all(axis=1)
+        if 2 * np.count_nonzero(none) > len(stamps) or (good & ~unit & ~none).any():
             raise ParameterError(f'{table.path}: quaternions are not of unit length')
+        good &= unit
+        quaternion[good] = unit_quaternions(quaternion[good])
+        if lacking := len(stamps) - int(good.sum()):
+            words = f'{lacking} pose{"s" * (lacking > 1)} without numbers or rotation left out'
+            self.notes.append(f'{table.path}: {words}')
         for row in np.flatnonzero(good).tolist():
             put = partial(
                 SessionWriter.write_pose, topic=topic, stamp_ns=stamps[row],
-                position=position[row].tolist(), quaternion_xyzw=quaternion[row].tolist(),
+                position=(scale * position[row]).tolist(),
+                quaternion_xyzw=quaternion[row].tolist(),
             )  # fmt: skip
             self._entries.append((stamps[row], put))
         self._messages[topic] += int(good.sum())
 
 
-def _time_base(holder: Mapping[str, Any], what: str) -> tuple[float, int]:
+def _time_base(given: Any, what: str) -> tuple[float, int]:
     """The unit of a column of stamps, ns, and the stamp of its zero."""
-    time = _mapping(holder.get('time', {}), what)
-    _known(time, ('unit', 'start_ns'), what)
+    time = _Spec(given, what, 'unit', 'start_ns')
     start_ns = time.get('start_ns', 0)
     if not isinstance(start_ns, int) or isinstance(start_ns, bool):
         raise ParameterError(f'{what}: start_ns must be a whole number, got {start_ns!r}')
-    return _choice(time, 'unit', TIME_NS, 's', what), start_ns
+    return time.choice('unit', TIME_NS, 's'), start_ns
 
 
-def _phasors(table: NumberTable, given: Any, emitters: int, name: str) -> Array:
+def _phasors(table: NumberTable, given: Any, emitters: int, name: str, beside: Any) -> Array:
     """Fluxes of one sensor, shape (F, K): complex columns, or those of ``re`` and ``im``."""
     if isinstance(given, dict):
-        _known(given, ('re', 'im'), name)
+        spec = _Spec(given, name, 're', 'im')
         parts = [
-            _real(table.columns(given.get(part), emitters, f'{name}: {part}'), table, name)
+            _real(table.columns(spec.get(part), emitters, f'{name}: {part}', beside), table, name)
             for part in ('re', 'im')
         ]
         return np.asarray(parts[0] + 1j * parts[1])
-    found = table.columns(given, emitters, name)
+    found = table.columns(given, emitters, name, beside)
     if found.dtype.kind not in 'fiuc':
         raise ParameterError(f'{table.path}: {name} has cells that are not numbers')
     return found
@@ -346,37 +370,3 @@ def _real(values: Array, table: NumberTable, name: str) -> Array:
     if values.dtype.kind not in 'fiu':
         raise ParameterError(f'{table.path}: {name} has cells that are not real numbers')
     return np.asarray(values, dtype=np.float64)
-
-
-def _tables(spec: Mapping[str, Any], key: str) -> list[Any]:
-    tables = spec.get(key) or []
-    if not isinstance(tables, list):
-        raise ParameterError(f'{key} must be a list of tables')
-    return tables
-
-
-def _mapping(value: Any, what: str) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        raise ParameterError(f'{what} must be a mapping')
-    return value
-
-
-def _needed(spec: Mapping[str, Any], key: str, what: str) -> Any:
-    if spec.get(key) is None:
-        raise ParameterError(f'{what} lacks {key}')
-    return spec[key]
-
-
-def _known(spec: Mapping[str, Any], keys: tuple[str, ...], what: str) -> None:
-    unknown = sorted(str(key) for key in spec if key not in keys)
-    if unknown:
-        raise ParameterError(f'{what}: no key {", ".join(unknown)}; there are: {", ".join(keys)}')
-
-
-def _choice(
-    spec: Mapping[str, Any], key: str, known: Mapping[str, float], usual: str, what: str
-) -> float:
-    given = spec.get(key, usual)
-    if given not in known:
-        raise ParameterError(f'{what}: {key} must be among {", ".join(known)}, got {given!r}')
-    return known[given]

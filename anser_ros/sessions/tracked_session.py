@@ -64,7 +64,7 @@ def track(
     observers: list[SessionObserver] = [make() for make in extensions.loaded('OBSERVERS')]
     settings = settings or TrackerSettings()
     settings = replace(settings, volume=settings.volume or prepared.volume)
-    settings = settings_for(prepared.session.setup, settings)
+    settings = settings_for(prepared.session.setup, settings, prepared.model)
     # A drift's recorded course is used if nothing follows it.
     course = prepared.recorded_drift and not isinstance(follower, ModelFollower)
     settings = replace(settings, recorded_drift=course)

@@ -45,7 +45,7 @@ shorter than one of these it comes again for certain; longer ones have anchors (
 
 
 @kernel
-def search(  # type: ignore[no-untyped-def]
+def find_repeated(  # type: ignore[no-untyped-def]
     history, first, count, position, contiguous, fingerprint, probes, probed_at, slots, needed,
     lag, run, until, age,
 ):  # fmt: skip
@@ -219,11 +219,11 @@ class RepetitionWatch:
             history[: count - step] = codes[step:]
         self.position += count
         if self.position - self._searched >= _LONGEST_STEP:
-            self._search()
+            self.search()
 
     def skip(self, samples: int) -> None:
         """Leave a hole for samples that were lost."""
-        self._search()
+        self.search()
         rows = len(self._history)
         cleared = min(samples, rows)
         self._history[(self.position + samples - cleared + np.arange(cleared)) % rows] = 0
@@ -237,7 +237,7 @@ class RepetitionWatch:
         It is 0 for a column whose samples are all new, otherwise the time since it had the same
         samples.
         """
-        self._search()
+        self.search()
         return np.where(self._until > first, self._age, 0)
 
     def matches_history(self, position: int, codes: NDArray[np.int16]) -> bool | None:
@@ -250,7 +250,7 @@ class RepetitionWatch:
             return None
         return bool(np.array_equal(known, codes))
 
-    def _search(self) -> None:
+    def search(self) -> None:
         """Look at the samples that have come since the last look."""
         rows = len(self._history)
         while self._searched < self.position:
@@ -259,7 +259,7 @@ class RepetitionWatch:
             until_judged = _JUDGED_SAMPLES - at % _JUDGED_SAMPLES
             count = min(self.position - at, rows - first, until_judged)
             contiguous = at - self._contiguous_from
-            search(
+            find_repeated(
                 self._history, first, count, at, contiguous, self._fingerprint, self._probes,
                 self._probed_at, self._slots, self.needed, self._lag, self._run, self._until,
                 self._age,

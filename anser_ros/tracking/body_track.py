@@ -115,10 +115,15 @@ class BodyFit:
 
 @dataclass(frozen=True)
 class BodyResult:
-    """Holds an estimate with the fit behind it; None where nothing was solved."""
+    """Holds an estimate with the fit behind it; None where nothing was solved.
+
+    ``gain`` is what all coils' gain may be off by, see `BodySolution.gain`; 0 where that is known
+    of none.
+    """
 
     estimate: PoseEstimate
     fit: BodyFit | None = None
+    gain: float = 0.0
 
 
 @dataclass
@@ -238,14 +243,14 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     fits += _on_other_sides(frame, fits[0])
     fits.sort(key=lambda candidate: candidate.ratio)
     fit = fits[0]
-    result = _judge(track, frame, fit, fits[1:])
+    result, gain = _judge(track, frame, fit, fits[1:])
     if result.state == states.OK:
         track.remember(fit.solution, frame.stamp_ns)
         track.noise.add(fit.ratio)
         left_out = frozenset(used.tolist()) - frozenset(fit.used.tolist())
         if left_out != track.left_out:
             track.left_out, track.again_ns = left_out, frame.stamp_ns + round(LEFT_OUT_S / NANO)
-    return BodyResult(result, fit)
+    return BodyResult(result, fit, gain)
 
 
 OTHER_SIDES = -np.ones(3), np.array([1.0, 1.0, -1.0])
@@ -263,7 +268,7 @@ def _on_other_sides(frame: BodyFrame, fit: BodyFit) -> list[BodyFit]:
     place, found = solution.position + solution.rotation @ lever - middle, []
     for signs in OTHER_SIDES:
         across, away = middle + signs * place, (signs - 1.0) * place
-        if np.linalg.norm(away) > SAME_PLACE_M and frame.settings.box.contains(across):
+        if frame.settings.box.contains(across) and np.linalg.norm(away) > SAME_PLACE_M:
             rotation = -signs[:, None] * solution.rotation
             found.append(_solve(frame, fit.used, (across - rotation @ lever, rotation)))
     return found
@@ -289,8 +294,12 @@ def _from_good(track: BodyTrack, frame: BodyFrame, used: Integers) -> list[BodyF
 
 def _judge(
     track: BodyTrack, frame: BodyFrame, fit: BodyFit, rivals: list[BodyFit]
-) -> PoseEstimate:
+) -> tuple[PoseEstimate, float]:
+    """The estimate, and by how much a common gain may be off, the error of which it has too."""
     solution = fit.solution
+    covariance = bounded_inverse(solution.information)
+    gain, carried = solution.gain(covariance)
+    by_gain = np.outer(gain * carried, gain * carried)
     position, rotation = solution.position, solution.rotation
     others = (
         (rival.solution.chi2, 'another pose')
@@ -300,14 +309,14 @@ def _judge(
     estimate = frame.estimate(
         track.noise, solution, Freedom(fit.freedom, UNKNOWNS, RARE),
         (position, rotation[:, 2].copy(), rotation),
-        lambda _: bounded_inverse(solution.information), others,
+        lambda scale: covariance + by_gain / scale, others,
         position + rotation @ frame.coils.subset(fit.used).offsets.mean(axis=0),
     )  # fmt: skip
     left_out = len(frame.single) - len(fit.used)
     if estimate.state == states.OK and left_out:
         reason = f'{left_out} of {len(frame.single)} coils left out'
         estimate = replace(estimate, reason=reason)
-    return estimate
+    return estimate, gain
 
 
 def _apart(one: rigid.BodySolution, other: rigid.BodySolution) -> bool:

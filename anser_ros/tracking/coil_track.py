@@ -192,7 +192,8 @@ def track_coil(frame: CoilFrame, followed: coil_step.Followed) -> CoilResult:
         reason = f'flux is {signal:.2g} times the noise'
         return CoilResult(frame.no_pose(states.NO_SIGNAL, reason), None)
     if context.readings < coil_step.UNKNOWNS:
-        reason = f'{context.readings} readings are too few for the {coil_step.UNKNOWNS} unknowns of a pose'
+        few = f'{context.readings} readings are too few'
+        reason = f'{few} for the {coil_step.UNKNOWNS} unknowns of a pose'
         return CoilResult(frame.no_pose(states.AMBIGUOUS, reason), None, is_received=True)
     if scans.suspect is not None and frame.stamp_ns < scans.retry_ns:
         solution = _descend(frame, scans.suspect.position, scans.suspect.axis)
@@ -266,8 +267,8 @@ def _judge(
         if rival.converged and settings.box.contains(rival.position)
     )
     return frame.estimate(
-        frame.tracks.noise[frame.row], solution, Freedom(frame.freedom, coil_step.UNKNOWNS, coil_step.SELDOM),
-        (position, axis, None),
+        frame.tracks.noise[frame.row], solution,
+        Freedom(frame.freedom, coil_step.UNKNOWNS, coil_step.SELDOM), (position, axis, None),
         lambda scale: coil_covariance(solution.normal, axis, settings.roll_variance / scale),
         others, position, in_metal=frame.among_metal,
     )  # fmt: skip

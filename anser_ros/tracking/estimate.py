@@ -17,7 +17,7 @@ USUAL_GATE = 4.0
 and poses are lost to the model's own small errors; larger, and distorted poses pass."""
 
 NO_GATE = 1e6
-"""A gate of so much or more is no gate: no pose is refused for what it contradicts."""
+"""A gate of so much or more is no gate: no pose is refused for its residual."""
 
 DEFAULT_VOLUME = TrackedVolume()
 
@@ -53,7 +53,7 @@ class TrackerSettings:
     volume: TrackedVolume | None = None
     grid_spacing_m: float = 0.035  # Spacing of the cold start's grid at 0.1 m height
     # A pose whose residual is more than so many times the expected one is refused; from `NO_GATE`
-    # on no pose is refused for what it contradicts (to measure what that costs, never for use)
+    # on none is (to measure what that costs, never for use), see `judges`
     gate: float = USUAL_GATE
     # A second pose that is more likely than one to so many makes the first ambiguous
     odds: float = 1000.0
@@ -85,8 +85,17 @@ class TrackerSettings:
 
     @property
     def has_gate(self) -> bool:
-        """Return whether poses are refused for what they contradict."""
+        """Return whether poses are refused for their residuals."""
         return self.gate < NO_GATE
+
+    @property
+    def judges(self) -> bool:
+        """Return whether poses are compared with their body and their past.
+
+        A wide gate of residuals does not end that, only one that is infinite, or that of a tracker
+        which takes its noise as stated: these give whatever is found.
+        """
+        return self.has_gate or (self.adaptive and math.isfinite(self.gate))
 
     @property
     def box(self) -> TrackedVolume:

@@ -27,7 +27,7 @@ from anser_ros.tracking.body_track import BodyResult
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils
-from anser_ros.tracking.solve import add_motion
+from anser_ros.tracking.solve import add_motion, coil_covariance
 
 Estimates = list[PoseEstimate]
 
@@ -131,11 +131,14 @@ class Judgement:
     ) -> Estimates:
         """Return the estimates of a frame, sensors first, with what the checks say of them."""
         found = [result.estimate for result in coils]
-        if settings.has_gate:
-            for body in bodies:
-                _judge_coils(found, body, settings)
-        found += [body.result.estimate for body in bodies]
-        if settings.has_gate:
+        for body in bodies:
+            if body.result.gain > 0.0:
+                _add_gain_error(found, coils, body)
+        of_bodies = [body.result.estimate for body in bodies]
+        if settings.judges:
+            of_bodies = [_judged_by_coils(found, body, settings) for body in bodies]
+        found += of_bodies
+        if settings.judges:
             self._add_to_record(stamp_ns, found[: len(coils)])
             found = [self._judged_in_time(estimate, settings) for estimate in found]
         return [self._with_stamp_error(e, settings) if e.state == states.OK else e for e in found]
@@ -183,26 +186,61 @@ class Judgement:
         return estimate.with_sigma(sigma)
 
 
-def _judge_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -> None:
-    """Withhold, in ``found``, the poses of coils that contradict their body.
+def _add_gain_error(found: Estimates, coils: Sequence[CoilResult], body: RigidBody) -> None:
+    """Add to the coils' covariances, in ``found``, what the gain does that they have in common.
+
+    A coil alone takes a gain for another distance. With the free axis vector n that the normal
+    matrix has, a gain is a change of n along itself.
+    """
+    for row in body.rows.tolist():
+        one, solution = found[row], coils[row].solution
+        if one.state != states.OK or solution is None:
+            continue
+        own = coil_covariance(solution.normal, solution.axis, 0.0)
+        pull = solution.normal[:, 3:] @ solution.axis
+        pull[3:] = np.cross(solution.axis, pull[3:])
+        moved = body.result.gain * (own @ pull)
+        one.covariance[:] += np.outer(moved, moved)  # the estimate's own matrix
+        found[row] = one.with_sigma(math.sqrt(float(np.trace(one.covariance[:3, :3]))))
+
+
+def _judged_by_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -> PoseEstimate:
+    """Return a body's estimate; withhold, in ``found``, the poses of coils that contradict it.
 
     If all coils together fit the model in no pose, even without those that disagree most, it is
-    unknown which of them are right: a smooth distortion can look like a pose to each.
+    unknown which of them are right: a smooth distortion can look like a pose to each. So it is
+    where one part of the tool contradicts the other, see `pose_checks.is_part`.
     """
     estimate, fit = body.result.estimate, body.result.fit
     members = [i for i, row in enumerate(body.rows.tolist()) if found[row].state == states.OK]
-    if fit is not None and estimate.state == states.RESIDUAL:
-        reason = f"the body's coils fit no pose together: {estimate.reason}"
-        for row in body.rows[members].tolist():
-            found[row] = replace(found[row], state=states.INCONSISTENT, reason=reason)
-        return
-    if fit is None or estimate.state not in (states.OK, states.OUTSIDE_VOLUME) or not members:
-        return
-    rows = body.rows[members].tolist()
-    own = [found[row] for row in rows]
-    used = set(fit.used.tolist())
-    coils = body.coils.subset(np.array(members))
-    tools = settings.tools
+    if fit is None or not members:
+        return estimate
+    against: dict[int, str] = {}
+    if estimate.state == states.RESIDUAL:
+        why = f"the body's coils fit no pose together: {estimate.reason}"
+        against = dict.fromkeys(members, why)
+    elif estimate.state in (states.OK, states.OUTSIDE_VOLUME):
+        against = _contradictions(found, body, members, settings)
+        others = [i for i in members if i not in against]
+        if pose_checks.is_part(body.coils.offsets, list(against), others):
+            words = next(iter(against.values()))
+            why = f'{len(against)} of {len(members)} coils contradict the others: {words}'
+            against = dict.fromkeys(members, why)
+            estimate = replace(estimate, state=states.INCONSISTENT, reason=why)
+    for i, why in against.items():
+        row = int(body.rows[i])
+        found[row] = replace(found[row], state=states.INCONSISTENT, reason=why)
+    return estimate
+
+
+def _contradictions(
+    found: Estimates, body: RigidBody, members: list[int], settings: TrackerSettings
+) -> dict[int, str]:
+    """Return why some coils of a body, ``members`` by their numbers in it, contradict its pose."""
+    estimate, fit, tools = body.result.estimate, body.result.fit, settings.tools
+    assert fit is not None
+    own = [found[row] for row in body.rows[members].tolist()]
+    coils, used = body.coils.subset(np.array(members)), set(fit.used.tolist())
     away = pose_checks.distances(
         (estimate.position, fit.solution.rotation, estimate.covariance),
         coils.offsets, coils.axes,
@@ -213,8 +251,9 @@ def _judge_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -
         np.array([i in used for i in members]),
         SurveyErrors(tools.tool_coil_position_m, tools.tool_coil_axis_rad, tools.tool_coil_gain),
     )  # fmt: skip
-    for row, one, (distance, away_m, angle) in zip(rows, own, away.T.tolist(), strict=True):
+    against = {}
+    for i, one, (distance, away_m, angle) in zip(members, own, away.T.tolist(), strict=True):
         allowed_m = pose_checks.allowed_m(one.sigma_position_m, tools.tool_coil_position_m)
         if not (distance <= pose_checks.GATE and away_m <= allowed_m):
-            reason = pose_checks.reason(distance, away_m, angle)
-            found[row] = replace(one, state=states.INCONSISTENT, reason=reason)
+            against[i] = pose_checks.reason(distance, away_m, angle)
+    return against

@@ -264,19 +264,22 @@ CLOSEST_M = 5e-3
 """Distance (m) from the field's dipoles within which no start pose is: nothing fits between."""
 
 
-def grid_points(volume: TrackedVolume, spacing_m: float) -> Array:
+def grid_points(volume: TrackedVolume, spacing_m: float, source: Array | None = None) -> Array:
     """Return points of a grid that covers a volume, shape (G, 3), m.
 
     The field changes over a length that grows with the height, so does the spacing: ``spacing_m``
-    holds at 0.1 m height and grows in proportion above it. Raises `TrackingError` when the spacing
-    is not positive, or the grid would have more than 100,000 points.
+    holds at 0.1 m height and grows in proportion above it. Around a ``source`` (3,), m, in the
+    volume it is that of half the way from there to the nearest side everywhere. Raises
+    `TrackingError` when the spacing is not positive, or the grid would have more than 100,000
+    points.
     """
     if not (math.isfinite(spacing_m) and spacing_m > 0):
         raise TrackingError(f'grid spacing must be positive, got {spacing_m}')
     low, high = np.array(volume.low), np.array(volume.high)
+    way = 0.0 if source is None else float(min((high - source).min(), (source - low).min()))
     layers, z, total = [], float(low[2]), 0
     while True:
-        step = spacing_m * max(abs(z), 0.05) / 0.1
+        step = spacing_m * max(way / 2.0 if way > 0.0 else abs(z), 0.05) / 0.1
         sides = [
             np.linspace(low[i], high[i], max(2, math.ceil((high[i] - low[i]) / step) + 1))
             for i in range(2)
@@ -298,7 +301,7 @@ def build_grid(
 
     Raises `TrackingError` when the spacing doesn't suit the volume, see `grid_points`.
     """
-    points = grid_points(volume, spacing_m)
+    points = grid_points(volume, spacing_m, field.positions.mean(axis=0))
     if volume.low[2] <= field.positions[:, 2].max():  # it reaches around the dipoles
         apart = np.linalg.norm(points[:, None] - field.positions, axis=2).min(axis=1)
         points = np.ascontiguousarray(points[apart > CLOSEST_M])

@@ -226,6 +226,11 @@ class ModelArrays(NamedTuple):
     share: float
 
 
+LEAST_READING = 0.01
+"""Least share of a field that tells places apart, of the strongest component: errors of gains and
+of the model are some thousandths, and a pose that followed from less would be theirs."""
+
+
 @dataclass(frozen=True)
 class SolveContext:
     """Holds what every solve of a frame shares."""
@@ -255,8 +260,13 @@ class SolveContext:
 
     @cached_property
     def readings(self) -> int:
-        """Return how many flux components the field makes: a constant one has no quadrature."""
-        return int((self.field.moments != 0.0).any(axis=0).sum())
+        """Return how many independent components of the flux the field makes.
+
+        A constant field has no quadrature, and one whose phase is everywhere alike none besides.
+        """
+        flux = self.starts.landmarks(self.field)[1]
+        size = np.linalg.svd(flux[np.isfinite(flux).all(axis=1)], compute_uv=False)
+        return int((size > LEAST_READING * size[0]).sum())
 
     @cached_property
     def symmetry(self) -> SymmetryAxis | None:
@@ -290,7 +300,7 @@ class SolveContext:
 
     def make_ready(self) -> None:
         """Work out what a warm solve needs of the field and its uncertainty."""
-        _ = self.readings, self.symmetry, self.arrays
+        _ = self.readings, self.symmetry, self.arrays, self.middle
 
     def errors_at(self, points: Array, axes: Array, lengths: Array) -> Array:
         """Return flux errors (S, R, 2K), T, of coils at poses; see `fill_model_errors`.

@@ -1,12 +1,9 @@
-"""Reads MCAP bags without ROS: raw messages for replay, and whole sessions as arrays.
+"""Reads bags without ROS: raw messages for replay, and whole sessions as arrays.
 
-A bag that is complete is read through its index, in the order of its log times. A bag that was cut
-(a crash, a full disk) has no index: it is read chunk by chunk as far as it goes, every complete
-chunk is kept, and `Bag.lost` states in words what is lost.
-
-Bags that other programs wrote may be in sqlite3, split, compressed by file or by message. What
-rosbag2 describes in ``metadata.yaml`` is followed; a folder without one is taken file by file in
-the order of their names.
+A bag is a file in MCAP or sqlite3, also packed by zstd, or a folder of such files, with rosbag2's
+``metadata.yaml`` or without. One that is complete is read through its index, in the order of its
+log times. Of one that was cut (a crash, a full disk) or damaged all is kept that can be read, and
+`Salvage.lost` states in words what is lost, of what the description counts too.
 """
 
 import io
@@ -17,8 +14,9 @@ import struct
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
-from dataclasses import dataclass
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +32,7 @@ from mcap_ros2.decoder import DecoderFactory
 from anser_ros.errors import BagError, LayoutError, SetupError
 from anser_ros.stamps import stamp_of
 from anser_ros.wire import recorded
+from anser_ros.wire.cdr import DEFINITIONS
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import read_yaml
@@ -45,8 +44,16 @@ _BROKEN = (
 _RECORD_LIMIT = 256 * 2**20
 """Largest record, and unpacked chunk, that is read, bytes: more is damage, or hostile."""
 
-FLUX_TYPE = 'sensor_msgs/msg/PointCloud2'
-POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
+PAGE = 4096
+"""Bytes that sqlite3 writes as one, by default."""
+LOGS = ('-wal', '-journal')
+"""Endings of files with what sqlite3 has not yet written, or may have to take back."""
+ZSTD, _ZSTD_MAGIC = '.zstd', b'\x28\xb5\x2f\xfd'
+"""Ending of a file that rosbag2 has compressed as a whole, and how compressed bytes begin."""
+
+
+_Found = tuple[Schema | None, Channel, int, bytes]
+"""Type, channel, time of recording, ns, and bytes of a message."""
 
 
 class RawMessage(NamedTuple):
@@ -62,42 +69,28 @@ class RawMessage(NamedTuple):
     @property
     def definition(self) -> str:
         """Return the text of its type and of all types in it; empty where it is not known."""
-        is_known = self.schema.encoding == 'ros2msg'
-        return self.schema.data.decode('utf-8', 'replace') if is_known else ''
+        text = self.schema.data.decode('utf-8', 'replace').strip()
+        return text if self.schema.encoding == 'ros2msg' and text != self.type_name else ''
 
 
 @dataclass
 class Salvage:
-    """Counts the losses of a reader, filled in while the messages are iterated."""
+    """Holds what a reader has met and lost, filled in while the messages are iterated."""
 
     lost: str = ''
-    bad_chunks: int = 0
+    topics: dict[str, str] = field(default_factory=dict)  # types by topic
+
+    def add(self, words: str) -> None:
+        """State a further loss."""
+        self.lost = '; '.join(filter(None, (self.lost, words)))
+
+    def topic_words(self) -> str:
+        """Return which topics there are, with their types."""
+        words = (f'{topic} ({kind})' for topic, kind in sorted(self.topics.items()))
+        return ', '.join(words) or 'no topics'
 
 
-def _import_words(name: str) -> str:
-    """Return how a bag of another form becomes one of this form, where it is such a bag."""
-    is_folder = os.path.isdir(name)
-    files = os.listdir(name) if is_folder else [name]
-    ends = ('.db3', '.zstd', '.mcap') if is_folder else ('.db3', '.zstd')
-    is_other = any(file.endswith(ends) for file in files)
-    return f'; make one of it by: anser import {name} --out session.mcap' if is_other else ''
-
-
-def bag_file(path: str | os.PathLike[str]) -> str:
-    """Return the MCAP file that ``path`` names, itself or alone in a folder; raises `BagError`."""
-    name = os.fspath(path)
-    if os.path.isdir(name):
-        files = sorted(f for f in os.listdir(name) if f.endswith('.mcap'))
-        if len(files) != 1:
-            words = f'a bag folder holds one .mcap file, found {len(files)}'
-            raise BagError(f'{name}: {words}{_import_words(name)}')
-        name = os.path.join(name, files[0])
-    if not os.path.isfile(name):
-        raise BagError(f'{name}: no such bag')
-    return name
-
-
-def _indexed(stream: io.BufferedReader) -> Iterator[RawMessage] | None:
+def _indexed(stream: io.BufferedReader) -> Iterator[_Found] | None:
     """Return a complete bag's messages in log time order, or None where the index is missing."""
     reader = make_reader(stream, validate_crcs=True)
     try:
@@ -112,90 +105,115 @@ def _indexed(stream: io.BufferedReader) -> Iterator[RawMessage] | None:
     ):
         return None  # what is whole is found chunk by chunk
     return (
-        _raw(schema, channel, message)
+        (schema, channel, message.log_time, message.data)
         for schema, channel, message in reader.iter_messages(log_time_order=True)
-        if schema is not None
     )
 
 
-def _raw(schema: Schema, channel: Channel, message: Message) -> RawMessage:
-    return RawMessage(channel.topic, schema.name, message.log_time, message.data, channel, schema)
-
-
-def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator[Any]:
-    """Yield the records of a bag without index, chunk by chunk, as far as it can be read."""
-    reader = StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
-    whole = 0
+def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[_Found]:
+    """The messages of a bag without index, chunk by chunk, as far as it can be read."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    messages, whole, bad_chunks = [], 0, 0
     try:
+        reader = StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
         for record in reader.records:
             whole = stream.tell()
             if isinstance(record, DataEnd):
                 break
-            if not isinstance(record, Chunk):
-                yield record
-                continue
-            if record.uncompressed_size > _RECORD_LIMIT:
-                salvage.bad_chunks += 1
-                continue
-            try:
-                inner = breakup_chunk(record, validate_crc=True)
-            except _BROKEN:
-                salvage.bad_chunks += 1
-                continue
-            yield from inner
+            inner, bad = _unchunked(record)
+            bad_chunks += bad
+            for one in inner:
+                if isinstance(one, Schema):
+                    schemas[one.id] = one
+                elif isinstance(one, Channel):
+                    channels[one.id] = one
+                elif isinstance(one, Message) and one.channel_id in channels:
+                    channel = channels[one.channel_id]
+                    schema = schemas.get(channel.schema_id)
+                    messages.append((schema, channel, one.log_time, one.data))
     except _BROKEN as error:
         why = ': '.join(filter(None, (type(error).__name__, ' '.join(str(error).split())[:120])))
-        salvage.lost = f'the bag breaks off after {whole} of {size} bytes ({why})'
-    if salvage.bad_chunks:
-        text = f'{salvage.bad_chunks} chunks with a bad checksum or size left out'
-        salvage.lost = f'{salvage.lost}; {text}' if salvage.lost else text
+        salvage.add(f'the bag breaks off after {whole} of {size} bytes ({why})')
+    if bad_chunks:
+        salvage.add(f'{bad_chunks} chunks with a bad checksum or size left out')
+    return sorted(messages, key=itemgetter(2))
 
 
-def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[RawMessage]:
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    messages = []
-    for record in _records(stream, salvage, size):
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, Message) and record.channel_id in channels:
-            channel = channels[record.channel_id]
-            schema = schemas.get(channel.schema_id)
-            if schema is not None:
-                messages.append(_raw(schema, channel, record))
-    messages.sort(key=lambda message: message.log_time_ns)
-    return messages
+def _unchunked(record: Any) -> tuple[list[Any], bool]:
+    """What is in a record, and whether it is a chunk that is damaged."""
+    if not isinstance(record, Chunk):
+        return [record], False
+    try:
+        if record.uncompressed_size > _RECORD_LIMIT:
+            return [], True
+        return breakup_chunk(record, validate_crc=True), False
+    except _BROKEN:
+        return [], True
 
 
-def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[RawMessage]:
-    """Yield the messages of a bag, or of its folder, by ascending log time.
-
-    What could not be read is filled into ``salvage``. Raises `BagError` when there is no such
-    file, it is no MCAP file, or no message can be read.
-    """
-    name = bag_file(path)
-    with open(name, 'rb') as stream:
+def _mcap(path: Path, salvage: Salvage) -> Iterator[_Found]:
+    """Yield the messages of a file; raises `BagError` when it is no MCAP file."""
+    with path.open('rb') as stream:
         if stream.read(8) != b'\x89MCAP0\r\n':
-            words = 'not an MCAP file' if os.path.getsize(name) else 'the file is empty'
-            raise BagError(f'{name}: {words}{_import_words(name)}')
+            words = 'not an MCAP file' if path.stat().st_size else 'the file is empty'
+            raise BagError(f'{path}: {words}')
         stream.seek(0)
         last, messages = -1, _indexed(stream)
         try:
             for message in messages or ():
                 yield message
-                last = message.log_time_ns
+                last = message[2]
             if messages is not None:
                 return
         except _BROKEN as error:
-            salvage.lost = f'{type(error).__name__}: {error}'
+            salvage.add(f'{type(error).__name__}: {error}')
         stream.seek(0)
-        rest = _streamed(stream, salvage, os.path.getsize(name))
-        rest = [message for message in rest if message.log_time_ns > last]
-        if not rest and last < 0:
-            raise BagError(f'{name}: no message can be read ({salvage.lost or "empty bag"})')
-        yield from rest
+        rest = _streamed(stream, salvage, path.stat().st_size)
+        yield from (message for message in rest if message[2] > last)
+
+
+def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[RawMessage]:
+    """Yield the messages of a bag, one file after the other, each by ascending log time.
+
+    What could not be read is filled into ``salvage``. Raises `BagError` when there is no such
+    bag, or no message of it can be read.
+    """
+    name, schemas = Path(path), dict[tuple[str, bytes], Schema]()
+    files, counted = _parts(name, salvage)
+    other, read = Counter[str](), 0
+    for file in files:
+        try:
+            with ExitStack() as stack:
+                for schema, channel, time, data in _file(file, stack, salvage):
+                    read += 1
+                    kind = '' if schema is None else schema.name
+                    salvage.topics.setdefault(channel.topic, kind or channel.message_encoding)
+                    if schema is None or channel.message_encoding != 'cdr':
+                        words = (channel.message_encoding or 'unknown').upper()
+                        other[f'messages of {channel.topic} are {words}, not CDR'] += 1
+                        continue
+                    if (kind, schema.data) not in schemas:
+                        schemas[kind, schema.data] = _known(schema, len(schemas))
+                    known = schemas[kind, schema.data]
+                    yield RawMessage(channel.topic, kind, time, _unpack(data), channel, known)
+        except BagError as error:
+            if len(files) == 1:
+                raise
+            salvage.add(str(error))
+    for words, count in other.items():
+        salvage.add(f'{count} {words}')
+    if read < counted:
+        salvage.add(f'{read} of the {counted} messages that metadata.yaml counts are there')
+    if read == other.total():
+        raise BagError(f'{name}: no message can be read ({salvage.lost or "empty bag"})')
+
+
+def _known(schema: Schema, number: int) -> Schema:
+    """A type with our definition of it, where the package has one; bags lack or garble theirs."""
+    text = DEFINITIONS.get(schema.name)
+    data, form = (text.encode(), 'ros2msg') if text else (schema.data, schema.encoding)
+    return Schema(id=number + 1, name=schema.name, data=data, encoding=form)
 
 
 class MessageDecoder(DecoderFactory):  # type: ignore[misc]
@@ -203,6 +221,10 @@ class MessageDecoder(DecoderFactory):  # type: ignore[misc]
 
     def decode(self, message: RawMessage) -> Any:
         """Decode one message; raises `BagError` when its bytes don't fit its schema."""
+        if not message.definition:
+            raise BagError(
+                f'{message.topic}: neither the bag nor this package defines {message.type_name}'
+            )
         try:
             decoder = self.decoder_for(message.channel.message_encoding, message.schema)
             if decoder is not None:
@@ -223,23 +245,21 @@ class _Collector:
         self.flux: dict[str, list[tuple[int, FluxPoints]]] = {'tool': [], 'reference': []}
         self.poses: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         self.refused: Counter[str] = Counter()
-        self.topics: dict[str, str] = {}
 
     def add(self, raw: RawMessage) -> None:
-        self.topics[raw.topic] = raw.type_name
         try:
-            if raw.topic.endswith('/setup') and raw.type_name == 'std_msgs/msg/String':
+            if raw.topic.endswith('/setup') and raw.type_name == recorded.SETUP_TYPE:
                 self.setups.append(str(self.decoder.decode(raw).data))
             elif raw.topic.endswith(('/tool/flux', '/reference/flux')):
                 self._add_flux(raw)
-            elif recorded.optical_stem(raw.topic) and raw.type_name == POSE_TYPE:
+            elif recorded.optical_stem(raw.topic) and raw.type_name == recorded.POSE_TYPE:
                 self._add_pose(raw)
         except (BagError, LayoutError, AttributeError, TypeError, ValueError) as error:
             self.refused[f'{raw.topic}: {error}'] += 1
 
     def _add_flux(self, raw: RawMessage) -> None:
-        if raw.type_name != FLUX_TYPE:
-            raise LayoutError(f'type {raw.type_name} where {FLUX_TYPE} belongs')
+        if raw.type_name != recorded.FLUX_TYPE:
+            raise LayoutError(f'type {raw.type_name} where {recorded.FLUX_TYPE} belongs')
         cloud = self.decoder.decode(raw)
         fields = [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields]
         width = int(cloud.width) * int(cloud.height)
@@ -296,7 +316,9 @@ class _Collector:
 def _rename_words(topics: Mapping[str, str]) -> str:
     """Return which topics of a bag may be fluxes under another name, and what renames them."""
     known = ('/tool/flux', '/reference/flux', '/field_model', '/field_model_error')
-    others = [t for t, kind in topics.items() if kind == FLUX_TYPE and not t.endswith(known)]
+    others = [
+        t for t, kind in topics.items() if kind == recorded.FLUX_TYPE and not t.endswith(known)
+    ]
     if not others:
         return ''
     words = f'anser import BAG --remap {others[0]}:=/anser/tool/flux --out session.mcap'
@@ -318,7 +340,7 @@ def read_bag(path: str | os.PathLike[str]) -> recorded.Bag:
     tool, reference = collector.flux_stream('tool'), collector.flux_stream('reference')
     if tool is None and reference is None:
         reasons = ''.join(f'; {text}' for text in list(collector.refused)[:1])
-        reasons = reasons or _rename_words(collector.topics)
+        reasons = reasons or _rename_words(salvage.topics)
         raise BagError(f'{os.fspath(path)}: the bag has no readable flux{reasons}')
     return recorded.Bag(
         os.fspath(path), setup, text, tool, reference, collector.pose_streams(),
@@ -336,121 +358,151 @@ def read_fluxes(path: str | os.PathLike[str]) -> dict[str, recorded.RecordedFlux
     return {which: fluxes for which, fluxes in found.items() if fluxes is not None}
 
 
-ZSTD = '.zstd'
-"""Ending of a file that rosbag2 has compressed as a whole."""
-
-
-def read_foreign(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[RawMessage]:
-    """Yield the messages of a bag, one file after the other, each by its times of recording.
-
-    The path is of a ``.db3`` or ``.mcap`` file, also with ``.zstd`` behind it, or of a bag's
-    folder. What could not be read is filled into ``salvage``. Raises `BagError` when there is no
-    such bag, or a file of it is no bag or cannot be unpacked.
-    """
-    files, by_message = _parts(Path(path))
-    for file in files:
-        with tempfile.TemporaryDirectory() as folder:
-            plain = _unpacked(file, Path(folder))
-            messages = _sqlite(plain) if plain.suffix == '.db3' else iter_messages(plain, salvage)
-            try:
-                for message in messages:
-                    data = _unpack(message, file) if by_message else message.data
-                    yield message._replace(data=data)
-            except BagError as error:  # about what was unpacked, which nobody knows
-                raise BagError(str(error).replace(str(plain), str(file))) from error
-
-
-def _parts(path: Path) -> tuple[list[Path], bool]:
-    """The files of a bag, in order, and whether each message is compressed by itself."""
+def _parts(path: Path, salvage: Salvage) -> tuple[list[Path], int]:
+    """The files of a bag, in order, and how many messages its description counts."""
     if path.is_file():
-        return [path], False
+        return [path], 0
     if not path.is_dir():
         raise BagError(f'{path}: no such bag')
+    there = sorted(f for f in path.iterdir() if _kind(f) in ('.db3', '.mcap'))
+    names, counted = [f.name for f in there], 0
     described = path / 'metadata.yaml'
-    if not described.is_file():
-        found = sorted(f for f in path.iterdir() if _kind(f) in ('.db3', '.mcap'))
-        if not found:
-            raise BagError(f'{path}: a folder without metadata.yaml, .db3 and .mcap files')
-        return found, False
     try:
-        about = read_yaml(described.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
-        names = [str(name) for name in about['relative_file_paths']]
-        mode = str(about.get('compression_mode') or '').upper()
-        form = str(about.get('compression_format') or '').lower()
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError, KeyError, AttributeError) as e:
-        raise BagError(f'{described}: not the description of a bag ({type(e).__name__})') from e
-    if form not in ('', 'zstd'):
-        raise BagError(f'{described}: compressed by {form}, of which only zstd is read')
+        if described.is_file():
+            about = read_yaml(described.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
+            counted = int(about.get('message_count') or 0)
+            # Older versions of rosbag2 write the folder too.
+            names = [Path(str(name)).name for name in about['relative_file_paths']]
+    except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, AttributeError):
+        salvage.add('metadata.yaml cannot be read, and its files are taken by name')
     files = []
     for name in names:
-        file = path / Path(name).name  # older versions of rosbag2 write the folder too
-        packed = file.with_name(file.name + ZSTD)
-        files.append(packed if packed.is_file() and not file.is_file() else file)
-        if not files[-1].is_file():
-            raise BagError(f'{path}: {files[-1].name} of the bag is missing')
-    return files, mode == 'MESSAGE'
+        near = [f for f in there if f.name.removesuffix(ZSTD) == name.removesuffix(ZSTD)]
+        files += near[:1]
+        if not near:
+            salvage.add(f'{name} of the bag is missing')
+    if not files:
+        lost = salvage.lost or 'a folder without .db3 and .mcap files'
+        raise BagError(f'{path}: {lost}')
+    return files, counted
 
 
 def _kind(path: Path) -> str:
     return Path(path.name.removesuffix(ZSTD)).suffix
 
 
-def _unpacked(path: Path, folder: Path) -> Path:
-    """The file itself, or what is in a compressed one, unpacked into a folder."""
+def _file(path: Path, stack: ExitStack, salvage: Salvage) -> Iterator[_Found]:
+    """The messages of a file, which is unpacked if need be."""
     if _kind(path) not in ('.db3', '.mcap'):
-        raise BagError(f'{path}: neither .db3 nor .mcap')
-    if path.suffix != ZSTD:
-        return path
-    plain = folder / path.name.removesuffix(ZSTD)
+        remedy = '; rosbags-convert turns bags of ROS 1 into those' * (path.suffix == '.bag')
+        raise BagError(f'{path}: neither .db3 nor .mcap{remedy}')
+    logs = [log for end in LOGS if (log := Path(f'{path}{end}')).is_file()]
+    plain, size = path, 0 if _kind(path) == '.mcap' else _stated_size(path)
+    if path.suffix == ZSTD or (size and (logs or size > path.stat().st_size)):
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        plain = folder / path.name.removesuffix(ZSTD)
+        for log in logs:  # sqlite3 takes in what it has not yet written into the file itself
+            shutil.copyfile(log, folder / log.name)
+        if path.suffix == ZSTD:
+            _unzip(path, plain, salvage)
+        else:
+            shutil.copyfile(path, plain)
+        if (whole := plain.stat().st_size // PAGE * PAGE) < size:
+            # sqlite3 reads nothing at all of a file that was cut; bytes of ones are no page.
+            with plain.open('r+b') as stream:
+                stream.seek(whole)
+                stream.write(b'\xff' * (size - whole))
     try:
-        with (
-            path.open('rb') as packed,
-            plain.open('wb') as out,
-            zstandard.ZstdDecompressor().stream_reader(packed) as reader,
-        ):
-            shutil.copyfileobj(reader, out)
-    except zstandard.ZstdError as error:
-        raise BagError(f'{path}: cannot be unpacked: {error}') from error
-    return plain
+        yield from _sqlite(plain, salvage) if plain.suffix == '.db3' else _mcap(plain, salvage)
+    except BagError as error:  # about what was unpacked, which nobody knows
+        raise BagError(str(error).replace(str(plain), str(path))) from error
 
 
-def _unpack(message: RawMessage, path: Path) -> bytes:
+def _stated_size(path: Path) -> int:
+    """How long a file of sqlite3 is by its own header, bytes; 0 for another one."""
+    with path.open('rb') as stream:
+        head = stream.read(32)
+    if not head.startswith(b'SQLite format 3\0'):
+        return 0
+    pages, size = int.from_bytes(head[28:32], 'big'), int.from_bytes(head[16:18], 'big')
+    return min(pages * (65536 if size == 1 else size), path.stat().st_size + _RECORD_LIMIT)
+
+
+def _unzip(path: Path, plain: Path, salvage: Salvage) -> None:
+    """Unpack a file as far as it goes; raises `BagError` when nothing can be unpacked."""
+    unzip = zstandard.ZstdDecompressor().decompressobj()
+    why = 'it breaks off'
+    with path.open('rb') as packed, plain.open('wb') as out:
+        try:
+            while block := packed.read(1 << 16):
+                out.write(unzip.decompress(block))
+        except zstandard.ZstdError as error:
+            why = str(error)
+    if not plain.stat().st_size:
+        raise BagError(f'{path}: cannot be unpacked: {why}')
+    if not unzip.eof:
+        salvage.add(f'{path.name} is unpacked in part only: {why}')
+
+
+def _unpack(data: bytes) -> bytes:
+    """A message that rosbag2 may have compressed by itself."""
+    if not data.startswith(_ZSTD_MAGIC):  # as no message in CDR does
+        return bytes(data)
     try:
-        with zstandard.ZstdDecompressor().stream_reader(message.data) as reader:
-            data = reader.read(_RECORD_LIMIT + 1)
+        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+            found = reader.read(_RECORD_LIMIT + 1)
     except zstandard.ZstdError as error:
-        raise BagError(f'{path}: a message of {message.topic} cannot be unpacked') from error
-    if len(data) > _RECORD_LIMIT:
-        raise BagError(f'{path}: a message of {message.topic} has more than {_RECORD_LIMIT} bytes')
-    return bytes(data)
+        raise BagError(f'a message cannot be unpacked: {error}') from error
+    if len(found) > _RECORD_LIMIT:
+        raise BagError(f'a message has more than {_RECORD_LIMIT} bytes')
+    return bytes(found)
 
 
-def _sqlite(path: Path) -> Iterator[RawMessage]:
-    address = f'{path.resolve().as_uri()}?mode=ro&immutable=1'
+def _sqlite(path: Path, salvage: Salvage) -> Iterator[_Found]:
+    # A log beside it has to be taken in, for which the copy may be written.
+    is_copy = any(Path(f'{path}{end}').is_file() for end in LOGS)
+    address = path.resolve().as_uri() + ('' if is_copy else '?mode=ro&immutable=1')
     try:
         with closing(sqlite3.connect(address, uri=True)) as base:
             rows: list[tuple[Any, ...]] = base.execute(
                 'SELECT id, name, type, serialization_format FROM topics'
             ).fetchall()
-            other = sorted({str(row[3]) for row in rows} - {'cdr'})
-            if other:
-                raise BagError(f'{path}: messages are written as {", ".join(other)}, not as CDR')
             texts = _definitions(base)
             topics = {
                 number: (
-                    Channel(number, str(name), 'cdr', {}, number),
                     Schema(number, texts.get(str(kind), '').encode(), 'ros2msg', str(kind)),
+                    Channel(number, str(name), str(form), {}, number),
                 )
-                for number, name, kind, _ in rows
+                for number, name, kind, form in rows
             }
-            order = 'SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id'
-            for topic_id, stamp, data in base.execute(order):
-                channel, schema = topics[topic_id]
-                yield RawMessage(
-                    channel.topic, schema.name, int(stamp), bytes(data), channel, schema
-                )
+            for topic_id, stamp, data in _stored(base, salvage):
+                yield *topics[topic_id], int(stamp), bytes(data)
     except (sqlite3.Error, KeyError) as error:
         raise BagError(f'{path}: not a bag in sqlite3: {error}') from error
+
+
+def _stored(base: sqlite3.Connection, salvage: Salvage) -> Iterator[tuple[int, int, bytes]]:
+    """The messages of a file by their times; of a damaged one those before and behind the gap."""
+    select = 'SELECT topic_id, timestamp, data, id FROM messages ORDER BY'
+    done: set[int] = set()
+    try:
+        for row in base.execute(f'{select} timestamp, id'):
+            if None not in row:
+                yield row[:3]
+                done.add(row[3])
+        return
+    except sqlite3.DatabaseError as error:
+        why = str(error)
+    rest: dict[int, tuple[int, int, bytes]] = {}
+    for order in ('id', 'id DESC'):
+        with suppress(sqlite3.DatabaseError):
+            for row in base.execute(f'{select} {order}'):
+                if row[3] in rest:
+                    break
+                rest[row[3]] = row[:3]
+    rest = {n: row for n, row in rest.items() if n not in done and None not in row}
+    salvage.add(f'{len(done) + len(rest)} messages of a damaged file are read ({why})')
+    yield from sorted(rest.values(), key=itemgetter(1))
 
 
 def _definitions(base: sqlite3.Connection) -> dict[str, str]:
@@ -470,21 +522,33 @@ def published_poses(
     topics: Sequence[str] | None = None,
     salvage: Salvage | None = None,
 ) -> dict[str, recorded.PoseStream]:
-    """Return what each PoseStamped topic of a bag carries, of some topics or of all.
+    """Return what each topic of poses of a bag carries, of some topics or of all.
 
-    ``salvage`` takes what could not be read.
+    Of all, those of `geometry_msgs/PoseStamped` are meant, and where there are none, those of
+    other types that hold poses. ``salvage`` takes what could not be read.
     """
-    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics or ()}
-    stamps: dict[str, list[int]] = {topic: [] for topic in topics or ()}
-    decoder = MessageDecoder()
-    for raw in iter_messages(path, salvage or Salvage()):
-        if raw.type_name == POSE_TYPE and (topics is None or raw.topic in rows):
-            message = decoder.decode(raw)
-            stamps.setdefault(raw.topic, []).append(stamp_of(message))
-            rows.setdefault(raw.topic, []).append(recorded.pose_numbers(message.pose))
+    salvage, decoder, plain = salvage or Salvage(), MessageDecoder(), set[str]()
+    rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = {t: [] for t in topics or ()}
+    for raw in iter_messages(path, salvage):
+        is_plain = raw.type_name == recorded.POSE_TYPE
+        may_hold = raw.topic in rows or raw.type_name == recorded.POSE_TYPES[-1]
+        if topics is None:
+            may_hold = is_plain or not plain
+        if raw.type_name not in recorded.POSE_TYPES or not may_hold:
+            continue
+        plain.update([raw.topic] if is_plain else [])
+        for topic, stamp, numbers in recorded.poses_in(raw.topic, decoder.decode(raw)):
+            if topics is None or topic in rows:
+                rows.setdefault(topic, []).append((stamp, raw.log_time_ns, numbers))
     found = {}
-    for topic, values in rows.items():
-        table = np.array(values, dtype=np.float64).reshape(-1, 7)
-        stamp = np.array(stamps[topic], dtype=np.int64)
-        found[topic] = recorded.PoseStream(stamp, table[:, :3], table[:, 3:])
+    for topic in [t for t in rows if topics is not None or not plain or t in plain]:
+        table = np.array([numbers for *_, numbers in rows[topic]]).reshape(-1, 7)
+        times = np.array([row[:2] for row in rows[topic]], dtype=np.int64).reshape(-1, 2)
+        is_unset = len(times) > 1 and not times[:, 0].any()
+        if is_unset:
+            salvage.add(
+                f'all {len(times)} stamps of {topic} are 0: the driver does not set header.stamp, '
+                'and the times of recording stand in'
+            )
+        found[topic] = recorded.PoseStream(times[:, int(is_unset)], table[:, :3], table[:, 3:])
     return found

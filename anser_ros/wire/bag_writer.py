@@ -24,6 +24,7 @@ from anser_ros.arrays import ComplexArray
 from anser_ros.errors import BagError
 from anser_ros.wire import cdr
 from anser_ros.wire.points import STALE, FluxPoints, PointFieldTuple, encode_flux
+from anser_ros.wire.recorded import FLUX_TYPE, POSE_TYPE, SETUP_TYPE
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec
 from anser_ros.wire.text_files import DUMPER, read_yaml
 
@@ -338,7 +339,6 @@ class BagWriter:
         return descriptor
 
 
-SETUP_TOPIC, SETUP_TYPE = '/anser/setup', 'std_msgs/msg/String'
 FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
 """Topics of a session's fluxes, and whether their sensors are fixed to the field generator."""
 
@@ -353,7 +353,7 @@ class SessionWriter(BagWriter):
 
     def write_setup(self, text: str, stamp_ns: int) -> None:
         """Write the setup document."""
-        channel = self.channel(SETUP_TOPIC, SETUP_TYPE)
+        channel = self.channel('/anser/setup', SETUP_TYPE)
         self.write(channel, stamp_ns, cdr.string_bytes(text))
 
     def write_readings(
@@ -381,7 +381,7 @@ class SessionWriter(BagWriter):
         data: bytes,
     ) -> None:
         """Write one window's cloud, as `anser_ros.wire.points.encode_flux` packs it."""
-        channel = self.channel(topic, 'sensor_msgs/msg/PointCloud2')
+        channel = self.channel(topic, FLUX_TYPE)
         frame = self._frame_id
         message = cdr.cloud_bytes(stamp_ns, frame, fields, point_step, width, data)
         self.write(channel, stamp_ns, message)
@@ -394,7 +394,7 @@ class SessionWriter(BagWriter):
         quaternion_xyzw: Sequence[float],
     ) -> None:
         """Write one pose: position in m, unit quaternion."""
-        channel = self.channel(topic, 'geometry_msgs/msg/PoseStamped')
+        channel = self.channel(topic, POSE_TYPE)
         message = cdr.pose_bytes(stamp_ns, self._frame_id, position, quaternion_xyzw)
         self.write(channel, stamp_ns, message)
 

@@ -19,59 +19,51 @@ from anser_ros.wire.points import PointFieldTuple
 
 HEADER = b'\x00\x01\x00\x00'
 
-_HEADER = """
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-# Field lists of the three types, in the form in which MCAP carries definitions (`ros2msg`).
-DEFINITIONS = {
-    'std_msgs/msg/String': 'string data\n',
-    'sensor_msgs/msg/PointCloud2': f"""std_msgs/Header header
-uint32 height
-uint32 width
-PointField[] fields
-bool is_bigendian
-uint32 point_step
-uint32 row_step
-uint8[] data
-bool is_dense
-
-================================================================================
-MSG: sensor_msgs/PointField
-string name
-uint32 offset
-uint8 datatype
-uint32 count
-{_HEADER}""",
-    'geometry_msgs/msg/PoseStamped': f"""std_msgs/Header header
-Pose pose
-
-================================================================================
-MSG: geometry_msgs/Pose
-Point position
-Quaternion orientation
-
-================================================================================
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-{_HEADER}""",
+_TYPES = {
+    'std_msgs/String': 'string data',
+    'std_msgs/Header': 'builtin_interfaces/Time stamp, string frame_id',
+    'builtin_interfaces/Time': 'int32 sec, uint32 nanosec',
+    'sensor_msgs/PointCloud2': 'std_msgs/Header header, uint32 height, uint32 width, '
+    'PointField[] fields, bool is_bigendian, uint32 point_step, uint32 row_step, uint8[] data, '
+    'bool is_dense',
+    'sensor_msgs/PointField': 'string name, uint32 offset, uint8 datatype, uint32 count',
+    'geometry_msgs/Point': 'float64 x, float64 y, float64 z',
+    'geometry_msgs/Vector3': 'float64 x, float64 y, float64 z',
+    'geometry_msgs/Quaternion': 'float64 x, float64 y, float64 z, float64 w',
+    'geometry_msgs/Pose': 'Point position, Quaternion orientation',
+    'geometry_msgs/PoseStamped': 'std_msgs/Header header, Pose pose',
+    'geometry_msgs/PoseWithCovariance': 'Pose pose, float64[36] covariance',
+    'geometry_msgs/PoseWithCovarianceStamped': 'std_msgs/Header header, PoseWithCovariance pose',
+    'geometry_msgs/Transform': 'Vector3 translation, Quaternion rotation',
+    'geometry_msgs/TransformStamped': 'std_msgs/Header header, string child_frame_id, '
+    'Transform transform',
+    'geometry_msgs/Twist': 'Vector3 linear, Vector3 angular',
+    'geometry_msgs/TwistWithCovariance': 'Twist twist, float64[36] covariance',
+    'tf2_msgs/TFMessage': 'geometry_msgs/TransformStamped[] transforms',
+    'nav_msgs/Odometry': 'std_msgs/Header header, string child_frame_id, '
+    'geometry_msgs/PoseWithCovariance pose, geometry_msgs/TwistWithCovariance twist',
 }
+"""Fields of types."""
+
+
+def _definition(name: str) -> str:
+    """The fields of a type, and of all types in it."""
+    parts, names = list[str](), [name]
+    for current in names:  # which grows meanwhile
+        fields = _TYPES[current].split(', ')
+        title = [f'\n{80 * "="}\nMSG: {current}'] if parts else []
+        parts += [*title, *fields]
+        for kind in (field.split()[0].partition('[')[0] for field in fields):
+            whole = kind if '/' in kind else f'{current.split("/")[0]}/{kind}'
+            names += [whole] if whole in _TYPES and whole not in names else []
+    return '\n'.join([*parts, ''])
+
+
+DEFINITIONS = {
+    name.replace('/', '/msg/'): _definition(name)
+    for name in _TYPES if name.endswith(('String', 'Cloud2', 'Stamped', 'TFMessage', 'Odometry'))
+}  # fmt: skip
+"""Definitions of whole messages, in the form in which MCAP carries them (`ros2msg`)."""
 
 
 class _Bytes:

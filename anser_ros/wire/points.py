@@ -6,7 +6,7 @@ name and offset, so others may lie between them; the uncertainty has one layout 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -53,8 +53,9 @@ class DipolePoints:
     moments: ComplexArray
 
 
+@lru_cache(maxsize=8)  # a stream's clouds are all alike
 def _record_type(
-    fields: Sequence[PointFieldTuple], point_step: int, big_endian: bool
+    fields: tuple[PointFieldTuple, ...], point_step: int, big_endian: bool
 ) -> np.dtype[np.void]:
     names, formats, offsets = [], [], []
     order = '>' if big_endian else '<'
@@ -92,7 +93,8 @@ def _records(
         raise LayoutError(
             f'{width} points of {point_step} bytes need {point_step * width} bytes, got {size}'
         )
-    return np.frombuffer(data, dtype=_record_type(fields, point_step, big_endian), count=width)
+    record = _record_type(tuple(fields), point_step, big_endian)
+    return np.frombuffer(data, dtype=record, count=width)
 
 
 def _columns(records: NDArray[np.void], names: Sequence[str]) -> Array:

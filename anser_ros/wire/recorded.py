@@ -1,5 +1,7 @@
 """Holds a recorded session as arrays, names topics of poses, and judges quaternions."""
 
+import re
+import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.stamps import stamp_of
 from anser_ros.wire.setup import Setup, topic_of
 
 LENGTH_TOLERANCE = 1e-2
@@ -30,6 +33,30 @@ def pose_numbers(pose: Any) -> tuple[float, ...]:
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
+FLUX_TYPE, SETUP_TYPE = 'sensor_msgs/msg/PointCloud2', 'std_msgs/msg/String'
+POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
+POSE_TYPES = (
+    POSE_TYPE, 'geometry_msgs/msg/PoseWithCovarianceStamped', 'geometry_msgs/msg/TransformStamped',
+    'nav_msgs/msg/Odometry', 'tf2_msgs/msg/TFMessage',
+)  # fmt: skip
+"""Types of messages that hold poses."""
+
+
+def poses_in(topic: str, message: Any) -> list[tuple[str, int, tuple[float, ...]]]:
+    """Return topic, stamp, ns, and x y z, quaternion x y z w of each pose in a message.
+
+    Of transforms of `/tf` each child counts as a topic below it: ``/tf/pen``.
+    """
+    if hasattr(message, 'transforms'):
+        parts = ((f'{topic}/{one.child_frame_id}', one) for one in message.transforms)
+        return [pose for name, one in parts for pose in poses_in(name, one)]
+    if hasattr(message, 'transform'):
+        p, q = message.transform.translation, message.transform.rotation
+        return [(topic, stamp_of(message), (p.x, p.y, p.z, q.x, q.y, q.z, q.w))]
+    pose = message.pose if hasattr(message.pose, 'position') else message.pose.pose
+    return [(topic, stamp_of(message), pose_numbers(pose))]
+
+
 TRACKED, OPTICAL = '/tracked/', '/optical/'
 """What the topics of tracked and of optical poses begin with."""
 ENDING = '/pose'
@@ -38,6 +65,12 @@ BODY = 'body'
 """What a body is called without a name."""
 SCHEMA = 'anser_poses/1'
 """Schema of the setup document of a session of poses."""
+
+
+def legal_name(text: str) -> str:
+    """Return a name as near to a text as a topic can have: ``EM run-1`` is EM_run_1."""
+    plain = unicodedata.normalize('NFKD', text).encode('ascii', 'ignore').decode()
+    return topic_of(re.sub('[^a-zA-Z0-9_/]+', '_', plain).strip('_/') or BODY)
 
 
 def tracked_topic(sensor: str) -> str:

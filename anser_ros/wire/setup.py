@@ -116,6 +116,7 @@ class Setup:
     stated: Mapping[str, float] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
     tips: Mapping[str, TipSpec] = field(default_factory=dict)
+    said: frozenset[str] = frozenset()  # names of values that were stated over the document's
 
     @cached_property
     def refit(self) -> RefitSettings:
@@ -131,7 +132,7 @@ class Setup:
         """Return the setup with values stated before its own; raises `ParameterError`."""
         together = {**self.stated, **stated}
         settings_from(together)
-        return replace(self, stated=together)
+        return replace(self, stated=together, said=self.said | stated.keys())
 
     def with_tips(self, tips: Mapping[str, TipSpec]) -> 'Setup':
         """Return the setup with tips before its own; raises `SetupError` for no body."""

@@ -1,77 +1,40 @@
-"""Reads files from anybody: text, tables, points, YAML within bounds, model files.
+"""Reads files from anybody: text, YAML within bounds, model files.
 
 A file that cannot be read, or is no text of its kind, is one clear line.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
-from anser_ros.arrays import Array
-from anser_ros.errors import AnserError, BagError, ModelFileError, ParameterError, SetupError
+from anser_ros.errors import AnserError, ModelFileError, ParameterError, SetupError
 
 
-def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterError) -> str:
-    """Return the text (UTF-8, with or without its mark) of a file; raises an error of a kind."""
+def read_text(
+    path: str | os.PathLike[str],
+    kind: type[AnserError] = ParameterError,
+    *,
+    any_letters: bool = False,
+) -> str:
+    """Return the text (UTF-8, UTF-16) of a file, or if wanted Windows' letters; raises a kind."""
     try:
-        return Path(path).read_text(encoding='utf-8-sig')
+        data = Path(path).read_bytes()
+        is_wide = data[:2] in (b'\xff\xfe', b'\xfe\xff') or (
+            len(data) > 2 and not data[1:64:2].strip(b'\0')
+        )
+        text = data.decode('utf-16' if is_wide else 'utf-8-sig')
     except OSError as error:
         raise kind(f'{os.fspath(path)}: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise kind(f'{os.fspath(path)}: not a text in UTF-8') from error
-
-
-def read_rows(path: str | os.PathLike[str]) -> tuple[list[str], list[dict[str, str]]]:
-    """Return the head of a CSV file, and its rows by these names; raises `ParameterError`."""
-    reader = csv.DictReader(io.StringIO(read_text(path), newline=''))
-    try:
-        rows = list(reader)
-    except csv.Error as error:
-        raise ParameterError(f'{os.fspath(path)}: no table: {error}') from error
-    return list(reader.fieldnames or []), rows
-
-
-def numbers_of(
-    path: str | os.PathLike[str],
-    rows: Sequence[dict[str, str]],
-    names: Sequence[str],
-    *,
-    with_gaps: bool = False,
-) -> Array:
-    """Return columns (rows, names) as finite numbers, gaps as NaN if allowed; `ParameterError`."""
-    try:
-        values = np.array(
-            [[float((row[n] or 'nan') if with_gaps else row[n]) for n in names] for row in rows]
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise ParameterError(
-            f'{os.fspath(path)}: needs the columns {", ".join(names)} with numbers: {error}'
-        ) from error
-    if not (with_gaps or np.isfinite(values).all()):
-        raise ParameterError(f'{os.fspath(path)}: the columns {", ".join(names)} must be finite')
-    return values
-
-
-def read_fiducials(path: Path) -> Array:
-    """Return the positions (P, 3), m, of a list of fiducials; raises `BagError`."""
-    lines = read_text(path).splitlines()
-    rows = [line.split(',') for line in lines if line.strip() and not line.startswith('#')]
-    try:
-        places = np.array([[float(value) for value in row[1:4]] for row in rows])
-    except ValueError as error:
-        raise BagError(f'{path}: no table of fiducials: {error}') from error
-    if not places.size or places.shape[1] != 3:
-        raise BagError(f'{path}: no table of fiducials')
-    return np.asarray(1e-3 * places)
+    except UnicodeDecodeError:
+        text = data.decode('cp1252', 'replace') if any_letters else '\0'
+    if '\0' in text:
+        raise kind(f'{os.fspath(path)}: not a text in UTF-8')
+    return text
 
 
 # libyaml's are several times as fast, where it is there.
@@ -133,16 +96,12 @@ def _check(text: str) -> None:
 
 def read_document(path: str | os.PathLike[str]) -> Any:
     """Parse a model file; raises `ModelFileError` when it can't be read or is no YAML."""
-    name = os.fspath(path)
+    text = read_text(path, ModelFileError)
     try:
-        with open(name, encoding='utf-8') as stream:
-            return read_yaml(stream.read(MOST_CHARACTERS + 1))
-    except OSError as error:
-        raise ModelFileError(f'{name}: {error.strerror}') from error
-    except UnicodeError as error:
-        raise ModelFileError(f'{name}: not a text: {error}') from error
+        return read_yaml(text)
     except (yaml.YAMLError, ValueError) as error:
-        raise ModelFileError(f'{name}: not YAML: {" ".join(str(error).split())}') from error
+        words = ' '.join(str(error).split())
+        raise ModelFileError(f'{os.fspath(path)}: not YAML: {words}') from error
 
 
 def write_document(path: str | os.PathLike[str], document: Any) -> None:

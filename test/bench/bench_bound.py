@@ -29,11 +29,11 @@ from typing import Any
 
 import harness
 import numpy as np
+from ablation import spread_out
 from bound_block import Block, block_points
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 
-from anser_ros.apps.lab.experiments.refit_ablation import spread_out
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.rotations import tangents

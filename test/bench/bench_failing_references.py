@@ -18,12 +18,12 @@ from typing import Any
 
 import harness
 import numpy as np
+from bench_references import judged
 from bench_refit import JITTER_M
 
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.tracked_session import track_session
 
-WRONG_M = 1e-3
 BEFORE_S, AFTER_S = 4.0, 8.0
 """Time before the failure and after it that a case has, s."""
 KINDS = ('frozen', 'silent', 'weaker', 'mixed', 'reversed')
@@ -62,18 +62,12 @@ def failing(session: Session, rng: np.random.Generator) -> tuple[str, Session]:
     return f'{number} {kind} from {moment:.1f} s', case
 
 
-def judged(case: Session, model: Any, baseline: Session) -> tuple[int, int, int]:
+def counted(case: Session, model: Any, baseline: Session) -> tuple[int, int, int]:
     """Return how many poses are wrong and ok, are ok, and could be."""
     found = track_session(case, model, baseline=baseline, refit=True)
-    wrong = ok = total = 0
-    for series in (*found.sensors.values(), *found.bodies.values()):
-        error = series.position_error
-        sigma = np.array([estimate.sigma_position_m for estimate in series.estimates])
-        given = np.isfinite(error)
-        beyond = np.maximum(3 * np.hypot(sigma, JITTER_M), WRONG_M)
-        wrong += int(np.sum(error[given] > beyond[given]))
-        ok, total = ok + int(given.sum()), total + given.size
-    return wrong, ok, total
+    series = [*found.sensors.values(), *found.bodies.values()]
+    figures = judged(series, JITTER_M)
+    return int(figures['gross']), int(figures['poses']), sum(len(s.estimates) for s in series)
 
 
 def main() -> int:
@@ -97,7 +91,7 @@ def main() -> int:
     for _ in range(args.cases):
         name = str(rng.choice(names))
         words, case = failing(sessions[name], rng)
-        counts = judged(case, model, baseline)
+        counts = counted(case, model, baseline)
         sums += counts
         print(f'{name}, {words}: {counts[0]} wrong of {counts[1]} ok of {counts[2]}', flush=True)
     figures = {

@@ -24,11 +24,11 @@ import harness
 import numpy as np
 import recording
 import scenarios
+from ablation import spread_out
 from bench_refit import JITTER_M, rms_mm
 from boards import build
 from laboratory import FLUX_NOISE_T, Laboratory, measured, read_fluxes
 
-from anser_ros.apps.lab.experiments.refit_ablation import spread_out
 from anser_ros.sessions.follower import with_references
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.tracked_session import PoseSeries, track_session

@@ -13,9 +13,10 @@ from typing import Any
 
 import harness
 import numpy as np
+from ablation import FREE, SHARED, ablate, plot, rmse_m
 
-from anser_ros.apps.lab.experiments import refit_ablation as ablation
 from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.tracked_session import track_session
 from anser_ros.tracking.tracker import Tracker, TrackerSettings
@@ -39,7 +40,7 @@ def rms_mm(values: Any) -> float:
 
 def accuracy(name: str, session: Any, model: Any, baseline: Any) -> Iterator[harness.Row]:
     """Error with the refit, beside the frozen model's with nothing refused."""
-    frozen = ablation.ablate(session, name, model, baseline, counts=())[0].rmse_m
+    frozen = rmse_m(session, [model], 7)
     followed = track_session(session, model, baseline=baseline, refit=True)
     series = list(followed.sensors.values())
     errors = np.array([s.position_error for s in series])
@@ -71,7 +72,7 @@ def costs(session: Any, model: Any, baseline: Any) -> Iterator[harness.Row]:
     """
     clean = np.nanmean(baseline.reference.flux, axis=0)
     begin = time.perf_counter()
-    drawing = ablation.NominalBoard.of(session.setup).field
+    drawing = NominalBoard.of(session.setup).field
     refit = LiveRefit(model, session.reference.sensors, clean, drawing=drawing)
     yield harness.row('refit made ready', time.perf_counter() - begin, 's')
     spend(session, model, refit, slice(0, None, 3), 0.0)  # tables that are worked out once
@@ -127,12 +128,12 @@ def against_references(
     found = []
     for name in ('online/approach', 'online/sweep', 'bags/metal (own)'):
         if name in sessions:
-            found += ablation.ablate(sessions[name], name, model, baseline)
-    ablation.plot(found, PLOT, TITLES)
+            found += ablate(sessions[name], name, model, baseline)
+    plot(found, PLOT, TITLES)
     rmse_mm = {(row.method, row.session, row.references): 1e3 * row.rmse_m for row in found}
     for (method, session, count), ours in rmse_mm.items():
-        if method == ablation.SHARED:
-            rival = 'free dipoles', rmse_mm[ablation.FREE, session, count]
+        if method == SHARED:
+            rival = 'free dipoles', rmse_mm[FREE, session, count]
             yield harness.row(f'{session}: {count} references', ours, 'mm', rival)
 
 

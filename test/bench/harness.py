@@ -66,41 +66,38 @@ def calibrated(scan: Session, **options: Any) -> FieldModel:
     from anser_ros.calibration.layouts import Layout
     from anser_ros.sessions.calibration import calibrate_sessions
 
-    layout = Layout('coils', 3, 1.0, 0.0, prior='nominal', moved=True)
+    layout = Layout('drawing', 144, 1.0, 0.0, prior='nominal', moved=True)
     return calibrate_sessions(
         [scan], Options(**{'layout': layout, **(options or {'damping': 1e-6})})
     ).model
 
 
 class Done(NamedTuple):
-    """What a command has printed, and how long it took by the clock and of processors, s."""
+    """What a command has printed, and how long it took of processors, s."""
 
     printed: str
-    wall_s: float
     cpu_s: float
 
 
 def anser(*arguments: object) -> Done:
     """Run a command of `anser` to its end; raises `RuntimeError` with what it says if it fails."""
     command = [sys.executable, '-P', '-m', 'anser_ros.cli.main', *map(str, arguments)]
-    before, began_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(command, cwd=REPO, capture_output=True, text=True, check=False)
-    wall_s, after = time.monotonic() - began_s, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         raise RuntimeError(done.stderr)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return Done(done.stdout, wall_s, cpu_s)
+    return Done(done.stdout, cpu_s)
 
 
-def timed(
-    work: Callable[[], Any], rounds: int = 1, clock: Callable[[], float] = time.perf_counter
-) -> tuple[list[float], Any]:
+def timed(work: Callable[[], Any], rounds: int = 1) -> tuple[list[float], Any]:
     """Return the times, s, that work took in each round, and its last result."""
     spent = []
     for _ in range(rounds):
-        begin = clock()
+        begin = time.perf_counter()
         found = work()
-        spent.append(clock() - begin)
+        spent.append(time.perf_counter() - begin)
     return spent, found
 
 

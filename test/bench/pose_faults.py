@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from pose_world import World
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 MIDDLE = np.array([0.05, 0.02, -0.3])
@@ -24,6 +25,7 @@ class Kind(NamedTuple):
     sizes: tuple[float, ...]
     parts: tuple[str, ...]  # what of a world it uses; two kinds that share one make no pair
     sensors: int = 1  # fewest that it needs
+    may: tuple[str, ...] = ()  # names that may be told besides, or not
 
 
 def _each(world: World, change: Callable[[str, Stream], None], *, also: bool = False) -> None:
@@ -186,6 +188,124 @@ def exchanged(world: World, size: float) -> Truth:
     return {'swapped_sensors': ('fraction', size)}
 
 
+def _cut(world: World, keep: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Leave out the times that are not to be kept, in all streams."""
+    before = world.after
+    world.after = lambda streams: {
+        name: [one[keep(rows[0])] for one in rows] for name, rows in before(streams).items()
+    }
+
+
+def at_rest(world: World, size: float) -> Truth:
+    """Recordings of 5 s at rest, so many, 10 s apart, with an error of their own."""
+    count, rng, world.duration, world.rate = int(size), world.rng, 15.0 * size, 40.0
+    places, turns = rng.normal(0, 0.08, (count + 1, 3)), rng.normal(0, 0.35, (count + 1, 3))
+
+    def at(values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda time: values[np.clip(time // 15, 0, count).astype(int)]
+
+    def change(name: str, rows: Stream) -> None:
+        rows[1] += at(rng.normal(0, 9e-4, (count + 1, 3)))(rows[0])
+
+    world.follow(at(places), at(turns))
+    _each(world, change)
+    _cut(world, lambda time: time % 15 < 5)
+    return {}
+
+
+def _lasting(world: World, duration: float) -> None:
+    """Move as a hand does for so many seconds."""
+    knots = np.arange(-2.0, duration + 3.0, 0.7)
+    spread = (0.06, 0.25)
+    world.follow(*(CubicSpline(knots, world.rng.normal(0, s, (knots.size, 3))) for s in spread))
+    world.duration = duration
+
+
+def paused(world: World, size: float) -> Truth:
+    middle = world.duration / 2
+    _lasting(world, world.duration + size)
+    _cut(world, lambda time: (time < middle) | (time > middle + size))
+    return {}
+
+
+def turned(world: World, size: float) -> Truth:
+    """From four fifths on, turns of some degrees and a millimetre, beside stamps that jitter."""
+    late, world.rate, world.jitter = 68.0, 5.0, 0.017
+    _lasting(world, 86.0)
+
+    def change(name: str, rows: Stream) -> None:
+        share = (1.0, 0.4, 0.3, 0.3)[int(name[-1])] * np.deg2rad(size) * (rows[0] > late)
+        turn = Rotation.from_rotvec(share[:, None] * [0.6, -0.5, 0.62])
+        rows[2] = (turn * Rotation.from_quat(rows[2])).as_quat()
+        rows[1] += 1e-3 * (rows[0] > late)[:, None] * [0.6, 0.5, -0.6]
+
+    _each(world, change)
+    return {'moving_metal': None, 'stamp_jitter': ('rms_s', world.jitter)}
+
+
+def passed(world: World, size: float) -> Truth:
+    """Metal of 3 cm reach at one place, that a hand comes back to four times."""
+    _lasting(world, 90.0)
+    spot, hand, world.rate = world.rng.normal(0, 0.03, 3) + [0.1, 0, 0], world._place, 5.0
+
+    def place(time: np.ndarray) -> np.ndarray:
+        far = np.min(np.abs(np.subtract.outer(time, [15, 34, 55, 76])), axis=1)
+        near = 1 / (1 + np.exp((far - 2) / 0.2))[:, None]
+        return hand(time) * (1 - near) + near * (spot + 0.2 * hand(time))
+
+    def change(name: str, rows: Stream) -> None:
+        away = np.linalg.norm(world.body(rows[0])[0] - spot - MIDDLE, axis=1)
+        near = (1.0 if name == 'sensor_0' else 0.6) * np.exp(-((away / 0.03) ** 2))[:, None]
+        rows[1] += 1e-3 * size * near * [0.7, 0.5, -0.5]
+        turn = Rotation.from_rotvec(np.deg2rad(size / 2) * near * [0.5, 0.5, 0.7])
+        rows[2] = (turn * Rotation.from_quat(rows[2])).as_quat()
+
+    world.follow(place, world._turn)
+    _each(world, change)
+    return {'moving_metal': None}
+
+
+def two_small(world: World, size: float) -> Truth:
+    """All sensors but the last read small, and worse beyond a depth."""
+    last = len(world.levers) - 1
+
+    def bend(sensor: int, place: np.ndarray) -> np.ndarray:
+        deep = np.clip(-0.33 - place[:, [2]], 0, None) ** 2 * [0.6, 0.4, -1.0]
+        return place if sensor == last else MIDDLE + (1 - size) * (place - MIDDLE) + deep
+
+    world.bend = bend
+    return {'field_distortion': None}
+
+
+def scaled_bent(world: World, size: float) -> Truth:
+    """A scale of the reference beside a smooth bend of the tracker, mm at 60 mm."""
+    world.scale, slopes = 1.012, world.rng.normal(size=(3, 3, 3))
+    world.bend = lambda sensor, place: (
+        place
+        + 1e-3 * size / 3 * np.einsum('ijk,nj,nk->ni', slopes, *2 * [(place - MIDDLE) / 0.06])
+    )
+    return {'optical_scale': ('scale', 1.012)}
+
+
+def strained(world: World, size: float) -> Truth:
+    """Space that is stretched at random, so many parts, and no scale."""
+    strain = size * world.rng.normal(size=(3, 3))
+    world.bend = lambda sensor, place: place + (place - MIDDLE) @ strain
+    return {}
+
+
+def stepped(world: World, size: float) -> Truth:
+    """Positions on steps of so many mm, and one sensor far from the generator."""
+    world.levers[-1], world.noise_m = [0, 0, -0.16], 2e-5
+    world.spread = lambda sensor, place: 1 + 4 * (np.linalg.norm(place, axis=1) / 0.35) ** 4
+
+    def change(name: str, rows: Stream) -> None:
+        rows[1][:] = np.round(rows[1] / (1e-3 * size)) * 1e-3 * size
+
+    _each(world, change)
+    return {}
+
+
 KINDS = {
     'late': Kind(stated('offset', 1e-3, 'time_offset', 'offset_s'), (8, 30, 100), ('offset',)),
     'fast': Kind(stated('rate_ppm', 1, 'clock_rate', 'rate_ppm'), (600, 1200, 2500), ('rate',)),
@@ -207,4 +327,15 @@ KINDS = {
     'polled': Kind(polled, (10, 16, 30), ('offset', 'stamps')),
     'misread': Kind(misread, (1, 2, 3), ('reading',)),
     'exchanged': Kind(exchanged, (0.05, 0.1, 0.3), ('place', 'tracked'), 2),
+    'far_off': Kind(stated('offset', 1, 'time_offset', 'offset_s'), (2.2, 3.076, 7), ('offset',)),
+    'at_rest': Kind(at_rest, (40, 60, 85), ('place', 'offset', 'noise'), 3),
+    'paused': Kind(paused, (10, 24, 60), ('tracked', 'reference')),
+    'turned': Kind(turned, (2, 3, 5), ('place', 'stamps', 'tracked'), 3),
+    'passed': Kind(passed, (6, 10, 15), ('place', 'tracked'), 2),
+    'two_small': Kind(two_small, (0.01, 0.02, 0.03), ('place', 'scale'), 3),
+    'scaled_bent': Kind(scaled_bent, (0.3, 0.6, 1), ('place', 'scale'), 4, ('field_distortion',)),
+    'strained': Kind(
+        strained, (0.002, 0.003, 0.004), ('place', 'scale'), 2, ('field_distortion',)
+    ),
+    'stepped': Kind(stepped, (0.05, 0.11, 0.2), ('noise', 'tracked'), 3, ('range_noise',)),
 }

@@ -39,7 +39,7 @@ class Screen:
         self._source, self._loop = source, loop
         self._client = ui.context.client
         self._version, self._is_ready = -1, False
-        self._shown: dict[str, Any] = {}
+        self._shown: dict[Callable[[Any], Any], Any] = {}
         ui.add_css(STYLE)
         ui.colors(primary='#1d4ed8')
         with ui.element('div').classes('bar'):
@@ -131,75 +131,73 @@ class Screen:
         elif self._is_ready:
             self._instrument.run_method('table', source.table(), source.metal)
             self._instrument.run_method('point', source.point())
-            self._once('marks', source.marks(),
-                       lambda marks: self._instrument.run_method('marks', marks))  # fmt: skip
+            self._once(self._show_marks, source.marks())
         self._show_status(source.status())
         self._show_loop()
 
-    def _once(self, key: str, value: Any, show: Callable[[Any], Any]) -> None:
-        """Show a value where it is another than before: what stays costs nothing."""
-        if self._shown.get(key, self) != value:
-            self._shown[key] = value
+    def _once(self, show: Callable[[Any], Any], value: Any) -> None:
+        """Show a value by a method where it is another than before: what stays costs nothing."""
+        if self._shown.get(show, self) != value:
+            self._shown[show] = value
             show(value)
 
-    def _text(self, element: Any, text: str) -> None:
-        self._once(f'text {element.id}', text, element.set_text)
-
-    def _html(self, element: Any, text: str) -> None:
-        self._once(f'html {element.id}', text, element.set_content)
-
-    def _enable(self, element: Any, wanted: bool) -> None:
-        self._once(f'enabled {element.id}', wanted, element.set_enabled)
-
-    def _visible(self, element: Any, wanted: bool) -> None:
-        self._once(f'visible {element.id}', wanted, element.set_visibility)
-
     def _show_status(self, status: dict[str, Any]) -> None:
-        self._text(self._place, status['place'])
-        self._text(self._pill, status['tracked'])
-        self._once('pill', status['level'], lambda level: self._pill.classes(
-            remove='ok warn bad', add=LEVELS[level]))  # fmt: skip
-        self._text(self._recording, f'● {status["recording"]}' if status['recording'] else '')
+        self._once(self._place.set_text, status['place'])
+        self._once(self._pill.set_text, status['tracked'])
+        self._once(self._show_level, status['level'])
+        self._once(
+            self._recording.set_text, f'● {status["recording"]}' if status['recording'] else ''
+        )
         for label, key in zip(self._figures, FIGURES.values(), strict=True):
-            self._text(label, status[key])
-        self._html(self._nodes, ''.join(
+            self._once(label.set_text, status[key])
+        self._once(self._nodes.set_content, ''.join(
             f'<span class="dot {LEVELS[level]}" title="{escape(text)}">{escape(name)}</span>'
             for name, level, text in status['nodes']
         ))  # fmt: skip
         why = escape('  ·  '.join(status['why']))
-        self._html(self._why, f'<span title="{why}">{why}</span>')
-        self._html(self._findings, ''.join(
+        self._once(self._why.set_content, f'<span title="{why}">{why}</span>')
+        self._once(self._findings.set_content, ''.join(
             f'<div class="finding dot {LEVELS[level]}">{escape(words)}</div>'
             for level, words in status['findings']
         ))  # fmt: skip
-        self._enable(self._record, status['recorder'] and not status['recording'])
-        self._enable(self._stop, bool(status['recording']))
-        self._enable(self._baseline, status['field_model'])
+        self._once(self._record.set_enabled, status['recorder'] and not status['recording'])
+        self._once(self._stop.set_enabled, bool(status['recording']))
+        self._once(self._baseline.set_enabled, status['field_model'])
 
     def _show_loop(self) -> None:
         loop, job, found = self._loop, self._loop.job, self._loop.found
-        self._once('names', (loop.names, loop.chosen), self._offer)
+        self._once(self._offer, (loop.names, loop.chosen))
         ready = bool(loop.chosen) and not loop.is_running
-        self._enable(self._calibrate, ready)
-        self._enable(self._diagnose, ready)
-        self._visible(self._cancel, loop.is_running)
-        self._visible(self._progress, loop.is_running)
+        self._once(self._calibrate.set_enabled, ready)
+        self._once(self._diagnose.set_enabled, ready)
+        self._once(self._cancel.set_visibility, loop.is_running)
+        self._once(self._progress.set_visibility, loop.is_running)
         message = loop.message
         if job is not None and loop.is_running:
             known = not math.isnan(job.share)
-            self._once('share', job.share if known else -1.0, self._show_share)
+            self._once(self._show_share, job.share if known else -1.0)
             message = f'{job.kind}: {job.stage or "begins"}, {job.seconds:.0f} s'
-        self._text(self._message, message)
-        self._once('trouble', loop.is_trouble, lambda bad: self._message.classes(
-            add='trouble' if bad else '', remove='' if bad else 'trouble'))  # fmt: skip
-        self._text(self._verdict, '' if found is None else found.words)
-        self._visible(self._verdict, found is not None)
-        self._html(self._held_out, '' if found is None else _table('held out', found.rows))
-        self._enable(self._report, found is not None)
-        self._enable(self._load, loop.can_load)
-        self._enable(self._undo, loop.can_undo)
-        self._text(self._model, f'active: {loop.model_name}' if loop.model else '')
-        self._html(self._live, _table('live, last 10 s', loop.comparison()))
+        self._once(self._message.set_text, message)
+        self._once(self._show_trouble, loop.is_trouble)
+        self._once(self._verdict.set_text, '' if found is None else found.words)
+        self._once(self._verdict.set_visibility, found is not None)
+        self._once(
+            self._held_out.set_content, '' if found is None else _table('held out', found.rows)
+        )
+        self._once(self._report.set_enabled, found is not None)
+        self._once(self._load.set_enabled, loop.can_load)
+        self._once(self._undo.set_enabled, loop.can_undo)
+        self._once(self._model.set_text, f'active: {loop.model_name}' if loop.model else '')
+        self._once(self._live.set_content, _table('live, last 10 s', loop.comparison()))
+
+    def _show_marks(self, marks: Any) -> None:
+        self._instrument.run_method('marks', marks)
+
+    def _show_level(self, level: int) -> None:
+        self._pill.classes(remove='ok warn bad', add=LEVELS[level])
+
+    def _show_trouble(self, is_trouble: bool) -> None:
+        self._message.classes(**{'add' if is_trouble else 'remove': 'trouble'})
 
     def _show_share(self, share: float) -> None:
         self._progress.props(add='indeterminate' if share < 0 else '',

@@ -4,7 +4,7 @@
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -82,15 +82,8 @@ class Watch:
     def look(self, session: Session, first_ns: int) -> Sighting:
         """Look at the last seconds; raises `DiagnosisError` when there are too few frames."""
         seen = self._corrected(session, (session.start_ns - first_ns) * NANO)
-        truth = OPTICAL
-        if sum(int(tool.has_pose.sum()) for tool in seen.session.tools) < FEWEST_POSED_FRAMES:
-            truth = RIGID
-
-        def problem_with(model: FieldModel) -> Problem:
-            """Where the tools give their own poses, `model` is what they are worked out with."""
-            return self._problem(seen, model if truth == RIGID else None)
-
-        self._last = self._judged(problem_with, truth)
+        posed = sum(int(tool.has_pose.sum()) for tool in seen.session.tools)
+        self._last = self._judged(seen, OPTICAL if posed >= FEWEST_POSED_FRAMES else RIGID)
         return self._last
 
     def _corrected(self, session: Session, began_s: float) -> PreparedSession:
@@ -102,8 +95,9 @@ class Watch:
         corrected = correct(later)
         return corrected.with_session(_moved(corrected.session, -began_s))
 
-    def _problem(self, seen: PreparedSession, by: FieldModel | None) -> Problem:
-        if by is None:
+    def _problem(self, seen: PreparedSession, truth: str, by: FieldModel) -> Problem:
+        """What is to be diagnosed; where the tools give their own poses, they do so by a model."""
+        if truth == OPTICAL:
             return problem_of(seen)
         # The model's own effects are taken off already.
         by = replace(by, effects=by.effects[len(seen.model.effects) :])
@@ -113,8 +107,8 @@ class Watch:
         spread = replace(spread, accuracy=replace(spread.accuracy, **free))
         return problem_of(seen.with_session(replace(seen.session, tools=tools)), spread)
 
-    def _judged(self, problem_with: Callable[[FieldModel], Problem], truth: str) -> Sighting:
-        problem = problem_with(self._prepared.model)
+    def _judged(self, window: PreparedSession, truth: str) -> Sighting:
+        problem = self._problem(window, truth, self._prepared.model)
         plain = evaluate(problem, ())
         excess, frames = _excess(plain), sum(tool.time.size for tool in problem.tools)
         seen = Sighting(truth, frames, (), excess, excess, rms(plain))
@@ -123,7 +117,7 @@ class Watch:
         last = self._last
         if last is not None and last.truth == truth and last.model is not None:
             # Poses by a model that is wrong are off by more than their errors' first order.
-            again = problem if truth == OPTICAL else problem_with(last.model)
+            again = problem if truth == OPTICAL else self._problem(window, truth, last.model)
             left = _excess(evaluate(again, last.terms))
             if left < max(EXCESS, SAME * self._left):
                 return replace(
@@ -135,7 +129,7 @@ class Watch:
         found = diagnose(problem, self._prepared.model, LIGHT_SEARCH)
         left = _excess(evaluate(problem, found.terms))
         if truth == RIGID and found.findings and left >= EXCESS:
-            problem = problem_with(found.model)
+            problem = self._problem(window, truth, found.model)
             found = diagnose(problem, self._prepared.model, LIGHT_SEARCH)
             left = _excess(evaluate(problem, found.terms))
         self._left = left

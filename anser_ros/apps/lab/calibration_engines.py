@@ -31,7 +31,7 @@ from anser_ros.calibration.readings import (
     usable_frames,
     with_pose,
 )
-from anser_ros.calibration.result import Calibration
+from anser_ros.calibration.result import Calibration, with_provenance
 from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -217,10 +217,9 @@ def _fitted(
     sessions, _ = at_constant_strength(sessions, options)
     (tool,) = _tools(sessions)
     session = next(one for one in sessions if one.tools)
-    return calibrate(
-        tool, Path(session.path).name, generator_of(sessions[0].setup), options.estimate,
-        options.accuracy, progress,
-    )  # fmt: skip
+    generator = generator_of(sessions[0].setup)
+    calibration = calibrate(tool, generator, options.estimate, options.accuracy, progress)
+    return with_provenance(calibration, [Path(session.path).name])
 
 
 def _fit_still(
@@ -250,9 +249,3 @@ ENGINES = (
 )
 """In their order: a body of many sensors at one place, at a few poses, and any scan, with the
 sizes of emitters without a drawing."""
-
-
-def is_estimated_jointly(session: Session) -> bool:
-    """Return whether a session has few poses of a body of many sensors, and no drawn emitters."""
-    options = Options(session.setup.accuracy, is_joint=True)
-    return any(engine.is_joint and engine.accepts([session], options) for engine in ENGINES)

@@ -10,5 +10,5 @@ OFFLINE = {
 }
 ENGINES = ('calibration_engines:ENGINES',)
 DIAGNOSES = ('few_poses',)
-OBSERVERS = ('source_track:SessionSources',)
+OBSERVERS = ('source_track:Sources',)
 EVALUATIONS = ('cli.known_metal',)

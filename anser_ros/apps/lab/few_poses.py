@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from anser_ros.apps.lab.calibration_engines import is_estimated_jointly
+from anser_ros.apps.lab.calibration_engines import ENGINES
 from anser_ros.apps.lab.still import AS_STATED, BEND, PLACEMENT, STILL_ONLY
 from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
@@ -68,9 +68,14 @@ class FewPosesDiagnosis:
         return tuple(name for axis, name in enumerate(axes) if _differs(power, axis))
 
 
-accepts = is_estimated_jointly
 REPORT = 'anser_ros.apps.lab.cli.few_poses_report'
 """Module whose ``render`` makes the report; it loads matplotlib."""
+
+
+def accepts(session: Session) -> bool:
+    """Return whether a session has few poses of a body of many sensors, and no drawn emitters."""
+    options = Options(session.setup.accuracy, is_joint=True)
+    return any(engine.is_joint and engine.accepts([session], options) for engine in ENGINES)
 
 
 def diagnose(

@@ -3,15 +3,13 @@ model with it.
 """
 
 import math
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from anser_ros.apps.lab.metal_lattice import Coils, KnownMetal, load_known_metal
+from anser_ros.apps.lab.metal_lattice import Coils, KnownMetal
 from anser_ros.apps.lab.metal_learning import real_parts
 from anser_ros.apps.lab.metal_track import (
     MetalState,
@@ -27,18 +25,16 @@ from anser_ros.chain.frame import Answer, ChainFrame
 from anser_ros.chain.model_half import poses_of, tool_readings
 from anser_ros.errors import BagError, ModelFileError
 from anser_ros.field.model import FieldModel
-from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import MODEL_DOUBTFUL, Withheld
-from anser_ros.refit.clouds import Excitation, excitation_for
+from anser_ros.refit.clouds import excitation_for
 from anser_ros.refit.witness import ToolReading, coil_spread, linearised
 from anser_ros.sessions.follower import FrameModels, RefitSummary
 from anser_ros.sessions.nominal_board import stated_volume
 from anser_ros.sessions.prepared import PreparedSession, settings_for
 from anser_ros.sessions.session import tracking_noise
-from anser_ros.settings import ToolSettings
 from anser_ros.stamps import NANO
-from anser_ros.tracking.estimate import NO_GATE, PoseEstimate, TrackerSettings
+from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
 SPACING_M = 0.08
@@ -64,14 +60,14 @@ def places_around(volume: TrackedVolume, known: KnownMetal) -> Array:
 
 
 def likely_starts(
-    scene: Scene, tools: ToolSettings, reading: ToolReading, places: Array, most: int
+    scene: Scene, reading: ToolReading, places: Array, most: int
 ) -> tuple[list[Array], float]:
     """Return poses (6,) of the metal that explain a tool's readings best, the best first, apart,
     and the logarithm of how much more likely the first makes the readings than no metal does.
 
     ``reading``: at a pose that is right to some centimetres. ``places`` (P, 3): to be tried, m.
     """
-    sigma = coil_spread(len(reading.table), tools)
+    sigma = coil_spread(len(reading.table), scene.tools)
     # What a pose that is off leaves beyond the first order would be taken for metal.
     reading = posed(scene, scene.model, reading, 0.0 * sigma, np.diag(sigma**2))
     rows = linearised(reading, scene.model, scene.model.moments, scene.turn)
@@ -134,26 +130,11 @@ class _Track:
 
 
 class KnownMetalFollower:
-    """Follows known metal by the tools alone.
+    """Follows the known metal of a scene by the tools alone, outside the tracked volume."""
 
-    ``sensors`` are those of the rigid tools, ``noise_t`` is that of a phasor component of their
-    readings, T.
-    """
-
-    def __init__(
-        self,
-        known: KnownMetal,
-        model: FieldModel,
-        excitation: Excitation,
-        sensors: SensorTable,
-        tools: ToolSettings,
-        volume: TrackedVolume,
-        noise_t: float,
-    ) -> None:
-        self.model = model
-        self._scene = Scene(known, model, excitation, sensors, tools, noise_t)
-        self._tools, self._known = tools, known
-        self._places = places_around(volume, known)
+    def __init__(self, scene: Scene, volume: TrackedVolume) -> None:
+        self.model, self._scene = scene.model, scene
+        self._places = places_around(volume, scene.known)
         self._tracks: list[_Track] = []
         self._chosen: _Track | None = None
         self._since_ns = self._last_ns = self._searched_ns = 0
@@ -164,11 +145,6 @@ class KnownMetalFollower:
         """Return whether the metal's place is known."""
         return self._chosen is not None
 
-    @property
-    def place(self) -> Array | None:
-        """Return where the metal's middle is, m, shape (3,); None while that is not known."""
-        return None if self._chosen is None else self._chosen.state.pose[:3]
-
     def at(self, stamp_ns: int) -> tuple[FieldModel, Withheld | None]:
         """Return the field model for a frame, and why it is none to give poses by."""
         seconds = self._seconds_to(stamp_ns)
@@ -177,16 +153,17 @@ class KnownMetalFollower:
         state = predicted(self._chosen.state, seconds)
         growth = max(self._chosen.ratio, 1.0)
         model, placed = field_of(self._scene, state, self._near, MODES, growth)
-        reason, name = '', self._known.name
-        driven = placed.strongest_t() / self._known.strongest_t
+        reason, known = '', self._scene.known
+        driven = placed.strongest_t() / known.strongest_t
         nearest = placed.nearest_m(Coils(self._near, np.zeros_like(self._near), None))
         if driven > STRONGER:
-            reason = f'{name} is driven {driven:.1f} times as strongly as it was learnt'
-        elif nearest < NEARER * self._known.nearest_m:
-            reason = f'a coil is {nearest * 1e3:.0f} mm from {name}, nearer than it was learnt'
+            reason = f'{known.name} is driven {driven:.1f} times as strongly as it was learnt'
+        elif nearest < NEARER * known.nearest_m:
+            where = f'{nearest * 1e3:.0f} mm from {known.name}'
+            reason = f'a coil is {where}, nearer than it was learnt'
         elif self._chosen.ratio > DOUBTFUL:
             times = math.sqrt(self._chosen.ratio)
-            reason = f'{name} leaves {times:.1f} times as much of the readings as expected'
+            reason = f'{known.name} leaves {times:.1f} times as much of the readings as expected'
         return model, Withheld(MODEL_DOUBTFUL, reason) if reason else None
 
     def take(
@@ -230,7 +207,7 @@ class KnownMetalFollower:
         """Begin tracks where metal would explain the readings of the largest tool best."""
         self._searched_ns = self._since_ns = stamp_ns
         largest = max(readings, key=lambda reading: len(reading.table))
-        starts, gain = likely_starts(self._scene, self._tools, largest, self._places, CANDIDATES)
+        starts, gain = likely_starts(self._scene, largest, self._places, CANDIDATES)
         if gain < CERTAIN:
             return
         self._tracks = [_Track(self._scene.start(start)) for start in starts]
@@ -264,11 +241,6 @@ FOLLOWED, SEARCHED = 'followed', 'not_found'
 """States in the summary."""
 
 
-def models_of(path: str | os.PathLike[str]) -> Callable[[PreparedSession], FrameModels]:
-    """Return what follows the metal of a file through a session; raises as `load_known_metal`."""
-    return partial(KnownMetalModels, known=load_known_metal(path))
-
-
 class KnownMetalModels(FrameModels):
     """Gives each frame of a session the field with known metal where its tools say that it is.
 
@@ -291,13 +263,13 @@ class KnownMetalModels(FrameModels):
             prepared.model, prepared.nominal.field, stated_volume(session.setup)
         )
         self._correction = prepared.correction
-        sensors = self._correction.sensors()
-        self._follower = KnownMetalFollower(
-            known, prepared.model, excitation, sensors, session.setup.refit.tools,
-            prepared.volume, tracking_noise(session.setup),
+        scene = Scene(
+            known, prepared.model, excitation, self._correction.sensors(),
+            session.setup.refit.tools, tracking_noise(session.setup),
         )  # fmt: skip
+        self._follower = KnownMetalFollower(scene, prepared.volume)
         # Where a pose is withheld, a tracker that withholds none shows where the tool is, nearly.
-        settings = settings_for(session.setup, TrackerSettings(gate=NO_GATE))
+        settings = settings_for(session.setup, TrackerSettings(gate=math.inf))
         self._rough = Tracker(
             prepared.model, prepared.sensors, replace(settings, volume=prepared.volume)
         )

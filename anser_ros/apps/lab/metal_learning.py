@@ -33,7 +33,6 @@ from anser_ros.refit.tables import build_tables
 from anser_ros.refit.witness import FREE_M, FREE_RAD, ToolReading, coil_spread, linearised
 from anser_ros.sessions.nominal_board import stated_volume
 from anser_ros.sessions.prepared import PreparedSession, correct
-from anser_ros.settings import Accuracy, ToolSettings
 from anser_ros.stamps import NANO
 
 
@@ -111,7 +110,7 @@ def learn_metal(
     few = train[:: max(len(train) // TRIAL_FRAMES, 1)]
     tilt = np.log(np.asarray(frequencies_hz) / mean_hz)
     setting = Setting(excitation, tilt)
-    best: tuple[float, Lattice] | None = None
+    starts: dict[float, Lattice] = {}
     for count, spacing in enumerate(SPACINGS_M):
         report('trying sizes', count / len(SPACINGS_M))
         points = lattice_points(COUNTS, spacing)
@@ -120,10 +119,8 @@ def learn_metal(
         start = Lattice(points, ball_answer(spacing), answers, flat, mean_hz)
         trial = _Fit(start, few, setting, noise_t)
         trial.run(TRIAL_ROUNDS, MISFITS[:3])
-        if best is None or trial.cost < best[0]:
-            best = trial.cost, start
-    assert best is not None
-    fit = _Fit(best[1], train, setting, noise_t)
+        starts[trial.cost] = start
+    fit = _Fit(starts[min(starts)], train, setting, noise_t)
     fit.run(ROUNDS, MISFITS, lambda share: report('fitting', share))
     misfit = fit.misfit(held_out)
     if misfit > LARGE_MISFIT:
@@ -356,9 +353,7 @@ def metal_frames(
         raise BagError(
             f'{session.path}: the references see metal in {there.size} frames, {count} are needed'
         )
-    accuracy, tools = session.setup.refit.accuracy, session.setup.refit.tools
-    noise = accuracy.flux_noise_t
-    out = []
+    noise, out = session.setup.refit.accuracy.flux_noise_t, []
     for row in there[np.linspace(0, there.size - 1, count).astype(int)].tolist():
         change = (reference.flux[row] - baseline.flux) * phase.conj()
         good = np.isfinite(change).all(axis=1) & reference.valid[row]
@@ -368,9 +363,7 @@ def metal_frames(
         for tool in session.tools:
             near = np.flatnonzero(np.abs(tool.time - reference.time[row]) < SAME_TIME_S)
             if near.size and tool.has_pose[near[0]] and tool.valid[near[0]].any():
-                readings.append(
-                    _of_tool(tool, int(near[0]), prepared, phase.conj() / noise, accuracy, tools)
-                )
+                readings.append(_of_tool(tool, int(near[0]), prepared, phase.conj() / noise))
         around = places[max(row - SMOOTHED, 0) : row + SMOOTHED + 1]
         out.append(
             MetalFrame(float(reference.time[row]), tuple(readings), np.nanmean(around, axis=0))
@@ -381,21 +374,17 @@ def metal_frames(
 
 
 def _of_tool(
-    tool: Measurements,
-    row: int,
-    prepared: PreparedSession,
-    turn: ComplexArray,
-    accuracy: Accuracy,
-    tools: ToolSettings,
+    tool: Measurements, row: int, prepared: PreparedSession, turn: ComplexArray
 ) -> CoilReadings:
+    settings = prepared.session.setup.refit
+    accuracy, noise = settings.accuracy, settings.accuracy.flux_noise_t
     used = np.flatnonzero(tool.valid[row])
     table = tool.sensors.select(used)
     reading = ToolReading(table, tool.flux[row, used], tool.position[row], tool.rotation[row])
     rows = linearised(reading, prepared.model, prepared.model.moments, turn)
     jitter = np.repeat([accuracy.optical_position_m, accuracy.optical_rotation_rad], 3)
     by_pose = rows.pose * jitter / np.repeat([FREE_M, FREE_RAD], 3)
-    by_own = rows.own * coil_spread(len(used), tools)
-    noise = accuracy.flux_noise_t
+    by_own = rows.own * coil_spread(len(used), settings.tools)
     shared = noise * real_parts(np.concatenate([by_pose, by_own], axis=1))
     change = noise * rows.left.reshape(len(used), -1)
     return CoilReadings(Coils(rows.at, rows.axes, table.length), change, shared)

@@ -104,7 +104,7 @@ class Scene:
         tools: ToolSettings,
         noise_t: float,
     ) -> None:
-        self.known, self.model, self.noise_t = known, model, noise_t
+        self.known, self.model, self.noise_t, self.tools = known, model, noise_t, tools
         self.setting = Setting(excitation, known.lattice.tilt(model.frequencies_hz))
         self.turn = excitation.phase.conj() / noise_t
         self.noise = math.hypot(noise_t, model.flux_error_t) / noise_t
@@ -318,12 +318,8 @@ def field_of(
 def _by_component(metal: Any) -> Any:
     """Return fields (3P, K) split by axis, emitter and phase, (3P, K, 6K)."""
     k = metal.shape[1]
-    out = np.zeros((*metal.shape, 2, 3, k), dtype=complex)
-    for axis in range(3):
-        for emitter in range(k):
-            part = metal[axis::3, emitter]
-            out[axis::3, emitter, 0, axis, emitter] = part
-            out[axis::3, emitter, 1, axis, emitter] = 1j * part
+    by_axis, phases = metal.reshape(-1, 3, k), np.array([1.0, 1.0j])
+    out = np.einsum('pae,c,ab,ef->paecbf', by_axis, phases, np.eye(3), np.eye(k))
     return out.reshape(*metal.shape, -1)
 
 

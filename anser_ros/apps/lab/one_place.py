@@ -22,7 +22,7 @@ from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.population import LEAST_EVIDENCE
 from anser_ros.calibration.readings import FOLDS, with_pose
-from anser_ros.calibration.result import Calibration, Residuals, Scan, with_provenance
+from anser_ros.calibration.result import Calibration, Residuals, Scan
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
@@ -35,13 +35,10 @@ FEWEST_SCATTERS = 4
 """Degrees of freedom of a sensor's scatter from which on it is called noisy."""
 WORDS = 'a three-component dipole for every emitter, place free, and {} of their stray fields'
 """The layout in words, with the number of dipoles of stray fields."""
-REACH = 0.1
-"""How far beyond the sensors' box sources are looked for, as a fraction of its longest side."""
 
 
 def calibrate_at_one_place(
     measurements: Measurements,
-    name: str,
     generator: Generator,
     kinds: Sequence[str],
     accuracy: Accuracy,
@@ -59,9 +56,8 @@ def calibrate_at_one_place(
         silent = ', '.join(emitters[k] for k in np.flatnonzero(~received))
         raise FitError(f'{measurements.body}: all fluxes of {silent} are zero')
     looked_for = tuple(kind for kind in KINDS if kind in kinds)
-    looked_for += ('polarity',) if looked_for else ()
     predicted, spread, evidence = _each_fifth(readings, looked_for, progress)
-    fit = _fitted(readings, looked_for)
+    fit = SourcesFitter(readings, looked_for).fit()
     turned = (fit.sign_evidence > LEAST_EVIDENCE) & (evidence > 0.0) & readings.used
     turned &= bool(looked_for)
     sign = np.where(turned, -1.0, 1.0)
@@ -76,7 +72,7 @@ def calibrate_at_one_place(
     flux = _phasors(sound.flux)[sound.used]
     left = flux - _phasors(fit.predicted)[sound.used]
     strays = sum(len(one.places) - 1 for one in fit.sources)
-    calibration = Calibration(
+    return Calibration(
         model=model,
         fit=figures_of(
             readings.points.basis(model.positions, model.directions),
@@ -94,7 +90,6 @@ def calibrate_at_one_place(
         undetermined=_unclear(posed, fit, readings.used & ~turned) if looked_for else (),
         more={'sources': _places(emitters, fit), 'sensor_widths': dict(fit.widths)},
     )
-    return with_provenance(calibration, [name])
 
 
 def _mean(measured: Measurements, accuracy: Accuracy) -> tuple[SourceReadings, Array]:
@@ -145,17 +140,10 @@ def _each_fifth(
         if progress is not None:
             progress('each fifth of the sensors from the others', k / (FOLDS + 1.0))
         out = fold == k
-        part = _fitted(replace(readings, used=readings.used & ~out), kinds)
+        part = SourcesFitter(replace(readings, used=readings.used & ~out), kinds).fit()
         predicted[out], spread[out] = part.predicted[out], part.sigma[out]
         evidence[out] = part.sign_evidence[out]
     return predicted, spread, evidence
-
-
-def _fitted(readings: SourceReadings, kinds: Sequence[str]) -> SourcesFit:
-    points = readings.points.points
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = REACH * float((high - low).max())
-    return SourcesFitter(readings, (low - margin, high + margin), kinds).fit()
 
 
 def _dipoles(fit: SourcesFit) -> tuple[Array, Array, ComplexArray]:

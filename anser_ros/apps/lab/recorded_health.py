@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,17 +20,10 @@ from anser_ros.wire.recorded import PoseStream
 from anser_ros.wire.setup import topic_of
 
 
-@dataclass(frozen=True)
-class LiveErrors:
-    """Holds errors (n,), m and rad, of a coil's place and axis, or of a body's place and turn."""
+def live_errors(prepared: PreparedSession, namespace: str) -> tuple[Array, Array]:
+    """Return errors (n,), m and rad, of all poses that the tracker of a namespace published.
 
-    position: Array
-    orientation: Array
-
-
-def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErrors]:
-    """Return errors of all that the tracker of a namespace published, by sensor and body.
-
+    They are those of a coil's place and axis, and of a body's place and turn.
     The recording has optical poses, and is prepared with the tracker's model, whose corrections of
     the clock, the optical frame and the sensors are made. Raises `BagError` when the recording has
     no optical poses.
@@ -40,26 +32,26 @@ def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErro
     names = [name for tool in session.tools for name in (*tool.sensors.name, tool.body)]
     topics = {name: f'{namespace}/{topic_of(name)}/pose' for name in names}
     received = published_poses(session.path, list(topics.values()))
-    errors = {}
+    errors = []
     for tool in session.tools:
         true = with_truth(tool, prepared.correction)
-        for column, name in enumerate(tool.sensors.name):
-            errors[name] = _compared(session, true, received[topics[name]], column)
-        errors[tool.body] = _compared(session, true, received[topics[tool.body]], None)
-    return errors
+        for column, name in (*enumerate(tool.sensors.name), (None, tool.body)):
+            errors.append(_compared(session, true, received[topics[name]], column))
+    position, orientation = map(np.concatenate, zip(*errors, strict=True))
+    return position, orientation
 
 
 def _compared(
     session: Session, tool: Measurements, poses: PoseStream, column: int | None
-) -> LiveErrors:
+) -> tuple[Array, Array]:
     """Errors of one sensor (by its column), or of the body."""
     if tool.track is None:
         raise BagError(f'{session.path}: no optical poses of {tool.body}')
     time = np.asarray((poses.stamp_ns - session.start_ns) * NANO, dtype=np.float64)
     position, rotation, valid = tool.track.at(time)
-    turned = Rotation.from_quat(poses.quaternion[valid]).as_matrix() if valid.any() else None
-    if turned is None:
-        return LiveErrors(np.zeros(0), np.zeros(0))
+    if not valid.any():
+        return np.zeros(0), np.zeros(0)
+    turned = Rotation.from_quat(poses.quaternion[valid]).as_matrix()
     if column is None:
         truth = position[valid]
         turn = rotation_angles(rotation[valid].transpose(0, 2, 1) @ turned)
@@ -67,8 +59,7 @@ def _compared(
         centres, axes = tool.sensors.placed(position[valid], rotation[valid])
         truth = centres[:, column]
         turn = axis_angles(turned[:, :, 2], axes[:, column])
-    distance = np.linalg.norm(poses.position[valid] - truth, axis=1)
-    return LiveErrors(distance, turn)
+    return np.linalg.norm(poses.position[valid] - truth, axis=1), turn
 
 
 TOPIC = '/diagnostics'

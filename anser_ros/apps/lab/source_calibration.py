@@ -29,6 +29,8 @@ LEAST_WIDTH = 1e-3
 """Share of its start below which a width is nothing at all."""
 FIRST_GAIN = 0.1
 """Relative error of readings before there is a field to tell what errors of sensors would do."""
+REACH = 0.1
+"""How far beyond the sensors' box sources are looked for, as a fraction of its longest side."""
 ALONG = 16
 """Places of a grid along the longest side of the volume, at which sources are looked for."""
 STARTS = 3
@@ -199,30 +201,30 @@ class _OneEmitter:
 
 
 class SourcesFitter:
-    """Fits all sources of the readings.
+    """Fits all sources of the readings, and errors of the sensors of these `KINDS`.
 
-    ``volume`` (3,): lowest and highest corner of where sources may be, m, frame fg.
+    Where any are looked for, a sensor may be the wrong way round, too.
     """
 
-    def __init__(
-        self, readings: SourceReadings, volume: tuple[Array, Array], kinds: Sequence[str]
-    ) -> None:
-        self.readings, self.turns = readings, 'polarity' in kinds
+    def __init__(self, readings: SourceReadings, kinds: Sequence[str]) -> None:
+        self.readings, self.kinds = readings, kinds
         self.used = readings.used
         self.sign = np.ones(len(readings.flux))
-        self.kinds = tuple(kind for kind in KINDS if kind in kinds)
-        self.widths = {kind: START[kind] for kind in self.kinds}
-        self.grid = self._grid(volume)
+        self.widths = {kind: START[kind] for kind in kinds}
+        self.grid = self._grid()
         sites = DipoleSites.of_any_direction(self.grid)
         rows = readings.points.basis(sites.positions, sites.directions)
         self.grid_rows = rows.reshape(len(rows), -1, 3).transpose(1, 0, 2)
 
-    def _grid(self, volume: tuple[Array, Array]) -> Array:
-        low, high = volume
+    def _grid(self) -> Array:
+        """Places (G, 3), m, around the sensors but not near one, at which sources may be."""
+        points = self.readings.points.points
+        low, high = points.min(axis=0), points.max(axis=0)
+        margin = REACH * float((high - low).max())
+        low, high = low - margin, high + margin
         step = float((high - low).max()) / ALONG
         axes = [np.arange(a + step / 2.0, b, step) for a, b in zip(low, high, strict=True)]
         places = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
-        points = self.readings.points.points
         away = np.linalg.norm(points[None] - places[:, None], axis=2).min(axis=1)
         clear = away > LEAST_CLEARANCE * float(np.ptp(points, axis=0).max())
         if not clear.any():
@@ -277,7 +279,7 @@ class SourcesFitter:
 
     def _learn_signs(self, sources: Sequence[LocatedSource]) -> None:
         """Find which way round each sensor is; those that do not tell clearly take no part."""
-        if not self.turns:
+        if not self.kinds:
             return
         evidence = self._sign_evidence(*self._predicted(sources))
         self.used = self.readings.used & (np.abs(evidence) > CLEAR_SIGN)

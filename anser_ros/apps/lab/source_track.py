@@ -16,8 +16,8 @@ import numpy as np
 from anser_ros import pose_states as states
 from anser_ros.arrays import Array, Booleans
 from anser_ros.field.model import SymmetryAxis, symmetry_axis
-from anser_ros.physics.dipole import field_basis
 from anser_ros.physics.rotations import nearest_rotation, rotation_of_vector
+from anser_ros.refit.prior import vector_basis
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.tracked_session import PoseSeries, pose_series
 from anser_ros.tracking.body_track import BodyFrame, Start, Track
@@ -46,14 +46,18 @@ class SourceScan:
     """
 
     def __init__(self, coils: BodyCoils, near: float, far: float) -> None:
-        middle = coils.offsets.mean(axis=0)
+        self._coils, middle = coils, coils.offsets.mean(axis=0)
         shells = near * RATIO ** np.arange(math.ceil(math.log(far / near) / math.log(RATIO)) + 1)
         places = middle + (shells[:, None, None] * _directions()).reshape(-1, 3)
         gap = np.linalg.norm(places[:, None] - coils.offsets[None], axis=2).min(axis=1)
         self.places = places[gap > NEAREST * near]
-        basis = _vector_basis(coils, self.places)
+        basis = self._basis(self.places)
         self._span = np.linalg.qr(basis / np.linalg.norm(basis, axis=(1, 2))[:, None, None])[0]
-        self._coils = coils
+
+    def _basis(self, places: Array) -> Array:
+        """Flux in every coil of unit dipoles along x, y and z at places (G, 3): (G, S, 3)."""
+        basis = vector_basis(self._coils.offsets, self._coils.axes, None, places)
+        return basis.swapaxes(0, 1)
 
     def best(self, flux: Array) -> list[tuple[Array, Array]]:
         """Return places (3,) and moments' directions (3,), body's frame, that explain fluxes."""
@@ -66,8 +70,7 @@ class SourceScan:
                 chosen.append(index)
         out = []
         for place in self.places[chosen]:
-            basis = _vector_basis(self._coils, place[None])[0]
-            moment = np.linalg.lstsq(basis, flux, rcond=1e-12)[0]
+            moment = np.linalg.lstsq(self._basis(place[None])[0], flux, rcond=1e-12)[0]
             out.append((place, moment / max(float(np.linalg.norm(moment)), 1e-300)))
         return out
 
@@ -78,14 +81,6 @@ def _directions() -> Array:
     z, turn = 1.0 - 2.0 * steps / DIRECTIONS, np.pi * (1.0 + math.sqrt(5.0)) * steps
     across = np.sqrt(1.0 - z * z)
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
-
-
-def _vector_basis(coils: BodyCoils, places: Array) -> Array:
-    """Flux in every coil of unit dipoles along x, y and z at places (G, 3): (G, S, 3)."""
-    fields = [
-        field_basis(coils.offsets, places, np.tile(axis, (len(places), 1))) for axis in np.eye(3)
-    ]
-    return np.stack([np.einsum('sgi,si->gs', field, coils.axes) for field in fields], axis=2)
 
 
 @dataclass
@@ -102,6 +97,8 @@ class Sources:
     ``found``: of each body in the last frame, where the field is the same all around an axis:
     place (m) and axis of the source in the body's frame.
     """
+
+    KIND = 'sources'
 
     def __init__(self) -> None:
         self._tracks: dict[str, SourceTrack] = {}
@@ -121,6 +118,23 @@ class Sources:
             for body in bodies
             if (axis := body.context.symmetry) is not None
         }
+
+    @staticmethod
+    def compare(
+        prepared: PreparedSession, estimates: Mapping[str, Sequence[PoseEstimate]]
+    ) -> dict[str, PoseSeries]:
+        """Compare where bodies saw the source with where the optical poses say it was."""
+        model, out = prepared.model, {}
+        axis = symmetry_axis(model.positions, model.directions, model.moments)
+        for tool in prepared.session.tools:
+            if axis is None or tool.body not in estimates:
+                continue
+            true = with_truth(tool, prepared.correction)
+            position = np.where(true.has_pose[:, None], true.position, np.nan)
+            place, direction = seen_from(axis, position, true.rotation)
+            name = f'{tool.body}/source'
+            out[tool.body] = pose_series(name, estimates[tool.body], place, direction)
+        return out
 
 
 class _SourceFrame(SolveFrame):
@@ -224,11 +238,8 @@ def _covariance(frame: _SourceFrame, solution: BodySolution) -> Array:
     """Covariance (6, 6) of place and turn of the source, body's frame; its roll is unknown."""
     away, axis = frame.axis.point - solution.position, frame.axis.direction
     # A turn w of the body moves the place seen by (away x w), and turns the axis seen by -w.
-    cross = np.array(
-        [[0.0, -away[2], away[1]], [away[2], 0.0, -away[0]], [-away[1], away[0], 0.0]]
-    )
     jacobian = np.zeros((6, 6))
-    jacobian[:3, :3], jacobian[:3, 3:] = -np.eye(3), cross
+    jacobian[:3, :3], jacobian[:3, 3:] = -np.eye(3), np.cross(away, np.eye(3)).T
     jacobian[3:, 3:] = -(np.eye(3) - np.outer(axis, axis))
     # The open turn is taken out before the inverse: nothing of it reaches what is seen.
     free = np.concatenate([np.cross(axis, -away), axis])
@@ -263,26 +274,3 @@ def _judged(
     if estimate.state == states.OK:
         track.noise.add(estimate.chi2)
     return estimate
-
-
-class SessionSources(Sources):
-    """Follows sources through a session: place and axis in the body's frame."""
-
-    KIND = 'sources'
-
-    @staticmethod
-    def compare(
-        prepared: PreparedSession, estimates: Mapping[str, Sequence[PoseEstimate]]
-    ) -> dict[str, PoseSeries]:
-        """Compare where bodies saw the source with where the optical poses say it was."""
-        model, out = prepared.model, {}
-        axis = symmetry_axis(model.positions, model.directions, model.moments)
-        for tool in prepared.session.tools:
-            if axis is None or tool.body not in estimates:
-                continue
-            true = with_truth(tool, prepared.correction)
-            position = np.where(true.has_pose[:, None], true.position, np.nan)
-            place, direction = seen_from(axis, position, true.rotation)
-            name = f'{tool.body}/source'
-            out[tool.body] = pose_series(name, estimates[tool.body], place, direction)
-        return out

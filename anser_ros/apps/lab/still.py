@@ -10,7 +10,7 @@ looked for and found, each half of the sensors is predicted at the pose that the
 
 import functools
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from anser_ros.calibration.readings import (
     usable_weights,
     with_pose,
 )
-from anser_ros.calibration.result import Calibration, Scan, corrections, residuals, with_provenance
+from anser_ros.calibration.result import Calibration, Scan, corrections, residuals
 from anser_ros.calibration.sensor_fit import SensorFit
 from anser_ros.calibration.sensor_parameters import SensorParameters
 from anser_ros.field.measurements import Measurements
@@ -66,7 +66,6 @@ POSE_STEPS = 4
 
 def calibrate_still(
     measurements: Measurements,
-    name: str,
     generator: Generator,
     kinds: Sequence[str],
     accuracy: Accuracy,
@@ -92,11 +91,11 @@ def calibrate_still(
         kind for kind in chosen if 2 * sum(kind in fold.evidence for fold in folds) > len(folds)
     ]
     fit = whole.fit(kept)
-    held_out = _held_out(posed, folds, accuracy, _as_stated)
+    held_out = _held_out(posed, folds, accuracy)
     misplaced = []
     if 'poses' in looked_for and len(posed.time) >= FEWEST_PLACED:
         gain = whole.evidence_of_poses(fit)
-        elsewhere = _held_out(posed, folds, accuracy, _where_the_other_half_finds_it)
+        elsewhere = _held_out(posed, folds, accuracy, is_as_stated=False)
         if gain >= LEAST_EVIDENCE and rms(elsewhere.error) < rms(held_out.error):
             evidence = {'log_probability': gain, AS_STATED: rms(held_out.error)}
             held_out, misplaced = elsewhere, [_misplaced(fit, folds, evidence)]
@@ -112,7 +111,7 @@ def calibrate_still(
         effects=scan.corrections,
     )
     basis = basis_rows(scan.measurements[0], fit.sites)
-    calibration = Calibration(
+    return Calibration(
         model=model,
         fit=figures_of(basis, fit.weights, fit.widths.noise_t, fit.freedom, STILL_STEPS),
         held_out=held_out,
@@ -123,7 +122,6 @@ def calibrate_still(
         scan=scan,
         undetermined=_not_determined(kinds, len(posed.time)),
     )
-    return with_provenance(calibration, [name])
 
 
 @functools.lru_cache(maxsize=1)
@@ -161,25 +159,24 @@ def _parameters(
 
 
 def _held_out(
-    posed: Measurements,
-    folds: Sequence[StillFit],
-    accuracy: Accuracy,
-    predicted: Callable[[Measurements, StillFit, Accuracy], PoseTerms],
+    posed: Measurements, folds: Sequence[StillFit], accuracy: Accuracy, is_as_stated: bool = True
 ) -> HeldOut:
-    """Sum up each frame's residual, its sensors and its field as the other frames predict them."""
+    """Sum up each frame's residual, its sensors and its field as the other frames predict them.
+
+    It is at the stated pose, however good that is, or where the other half of its sensors is.
+    """
     noise = min(fit.widths.noise_t for fit in folds)
     tally = HeldOutTally(noise, noise, accuracy, max(len(fit.sites) for fit in folds))
     for frame, fit in enumerate(folds):
         part = posed.frames(np.array([frame]))
         parameters, values, *_ = _parameters(part, fit)
         sound = parameters.errors_of(part.body, values).apply(part)
-        tally.add(predicted(sound, fit, accuracy), usable_weights(sound), sound.position)
+        if is_as_stated:
+            terms = pose_terms(sound, fit.sites, fit.moments)
+        else:
+            terms = _where_the_other_half_finds_it(sound, fit, accuracy)
+        tally.add(terms, usable_weights(sound), sound.position)
     return tally.result()
-
-
-def _as_stated(sound: Measurements, fit: StillFit, accuracy: Accuracy) -> PoseTerms:
-    """A frame's readings less those at its stated pose; how good that is plays no part."""
-    return pose_terms(sound, fit.sites, fit.moments)
 
 
 def _where_the_other_half_finds_it(

@@ -22,7 +22,8 @@ from anser_ros.apps.poses.start import (
 from anser_ros.arrays import Array
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
-from anser_ros.sessions.plausibility import LENGTH_M, check_positions
+from anser_ros.sessions.plausibility import check_positions
+from anser_ros.wire.table_names import LENGTH_M
 
 POOR_M = 8e-3
 """Median misfit of hand-eye, m and tenths of rad together, from which other readings are tried:

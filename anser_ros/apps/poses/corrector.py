@@ -1,7 +1,7 @@
 """Writes models of poses, of a diagnosis or of points, and applies them to poses one by one."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,14 @@ from anser_ros.apps.poses.convention import PoseReading
 from anser_ros.apps.poses.diagnosis import PoseDiagnosis
 from anser_ros.apps.poses.effect import SMOOTH, PoseMap, Role, effect_of_record, effect_with
 from anser_ros.apps.poses.hand_eye import PoseClock
-from anser_ros.apps.poses.sequence import FARTHEST, NO_TURN, PoseSequence
+from anser_ros.apps.poses.sequence import FARTHEST, NO_TURN, PoseSequence, PoseSession
 from anser_ros.arrays import Array
 from anser_ros.calibration.error_map import ErrorMap
 from anser_ros.diagnosis.diagnose import SCHEMA
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord, plain
 
+MOUNT = effect_with(Role.MOUNT).name
 MODEL_SCHEMA = 'anser_pose_model/1'
 """Name of the layout of a model of poses."""
 
@@ -58,9 +59,13 @@ def _rms(m_before: float, rad_before: float, m_after: float, rad_after: float) -
     }
 
 
-def to_model(found: PoseDiagnosis) -> dict[str, Any]:
-    """Return what a corrector needs: the frames and the effects, and where they were learnt."""
+def to_model(found: PoseDiagnosis, before: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return what a corrector needs: the frames and the effects, and where they were learnt.
+
+    ``before``: the model by which the session had been corrected; its effects go on.
+    """
     document = to_document(found)
+    known = [e for e in (before or {'effects': []})['effects'] if e['name'] != MOUNT]
     places = np.concatenate([s.position for s in found.session.sensors.values()])
     low, high = np.percentile(places, [1, 99], axis=0)
     setting = found.fit.state.problem.setting
@@ -81,7 +86,7 @@ def to_model(found: PoseDiagnosis) -> dict[str, Any]:
         },
         'effects': [
             {key: effect[key] for key in ('name', 'parameters', 'uncertainty')}
-            for effect in document['effects']
+            for effect in [*document['effects'], *known]
         ],
     }
 
@@ -222,3 +227,24 @@ class PoseCorrector:
         state = OK if away == 0.0 else OUTSIDE
         late_ns = self._clock.late_ns(sensor, stamp_ns)
         return CorrectedPose(state, stamp_ns - late_ns, place, turn, covariance)
+
+
+def corrected(session: PoseSession, document: Mapping[str, Any]) -> PoseSession:
+    """Return a session as a model (`PoseCorrector`) corrects it, without sensors unknown to it.
+
+    Raises `ModelFileError` when it knows none, or is no model of poses.
+    """
+    corrector, sensors = PoseCorrector(document), {}
+    for name in (n for n in session.sensors if n in corrector.sensors):
+        poses = session.sensors[name]
+        stamps = session.start_ns + np.round(1e9 * poses.time).astype(np.int64)
+        rows = zip(stamps.tolist(), poses.position, poses.quaternion, strict=True)
+        done = [corrector.correct(name, *row) for row in rows]
+        time = 1e-9 * np.array([one.stamp_ns - session.start_ns for one in done])
+        place, turn = (np.array([getattr(one, k) for one in done]).reshape(-1, n)
+                       for k, n in (('position', 3), ('quaternion', 4)))  # fmt: skip
+        sensors[name] = replace(poses, time=time, position=place, quaternion=turn)
+    if not sensors:
+        known = ', '.join(sorted(corrector.sensors))
+        raise ModelFileError(f'the model knows {known}, the session {", ".join(session.sensors)}')
+    return replace(session, sensors=sensors)

@@ -33,7 +33,7 @@ from anser_ros.apps.poses.problem import (
     floor_of,
 )
 from anser_ros.apps.poses.search import LEAST_MAP_M, PoseSearch, frame_terms, search_effects
-from anser_ros.apps.poses.sequence import PoseSession
+from anser_ros.apps.poses.sequence import REFERENCE, PoseSession
 from anser_ros.apps.poses.start import (
     coarse_offset,
     first_fit,
@@ -219,6 +219,9 @@ LEAST_REPORTED_M = 0.3e-3
 one place at rest, which jitters by micrometres, something always is."""
 
 
+BASELINE_BEFORE_S = 10.0  # s by which a baseline ends before the session: a pause of all streams
+
+
 @dataclass(frozen=True)
 class PoseDiagnosis:
     """Holds what a session of poses was found to contain."""
@@ -247,14 +250,19 @@ class PoseDiagnosis:
 
 
 def diagnose_poses(
-    session: PoseSession, progress: Callable[[str], None] | None = None
-) -> PoseDiagnosis:
+    session: PoseSession, progress: Callable[[str], None] | None = None,
+    baseline: PoseSession | None = None, is_searched: bool = True,
+) -> PoseDiagnosis:  # fmt: skip
     """Find what a tracker of poses lacks on a session.
 
+    ``baseline``: of the same trackers, body and clocks, without metal: it takes part in all but
+    the held-out errors; ``is_searched``: whether effects are looked for, beside the frames.
     Raises `DiagnosisError` when there are too few poses with a reference.
     Raises `PlausibilityError` when tracked and optical poses fit in no reading.
     """
     say = progress or (lambda text: None)
+    begin = min((float(p.time[0]) for p in session.streams.values() if p.size), default=0.0)
+    session = session if baseline is None else _behind(baseline, session, begin)
     say('conventions')
     exchanged: list[EffectRecord] = []
     try:
@@ -277,23 +285,24 @@ def diagnose_poses(
         problem = pose_problem(session)
         training = problem.in_blocks(train)
         first = first_fit(training, coarse_offset(training), alone)
-    search = search_effects(first, session, say)
+    search = search_effects(first, session, say, is_searched)
     say('held out')
     state = search.fit.state
     # A clock may stand for what else there is besides jitter.
-    if not search.knows_levers and state.rms()[0] > ABOVE_FLOOR * floor_of(state):
+    if is_searched and not search.knows_levers and state.rms()[0] > ABOVE_FLOOR * floor_of(state):
         alone_fit = fit_poses(state.problem, frame_terms(search.fit.terms))
         search = replace(search, fit=alone_fit, evidence=(None,) * len(alone_fit.terms))
     search = _confirmed(search, problem, test)
     found = search.fit
     whole = with_time_constants(fit_poses(judged(problem, found), found.terms))
-    before, after, registered = held_out(problem, found, test)
+    own = problem.rows([poses.time >= begin for poses in problem.sensors])
+    before, after, registered = held_out(own, found, test)
     floor = floor_of(after)
     residuals = _residuals(session, problem, whole)
     records = records_of(whole, search.evidence, session)
     most = most_poses(session)
     is_known = search.knows_levers and knows_levers(whole, most)
-    for effect in pose_effects().values():
+    for effect in pose_effects().values() if is_searched else ():
         words = {'summary': effect.summary, 'advice': effect.advice}
         seen = effect.observed(residuals) if is_known or not effect.needs_levers else ()
         records += [replace(r, evidence={**words, **r.evidence}) for r in seen]
@@ -319,6 +328,24 @@ def diagnose_poses(
         ),
         knows_levers=search.knows_levers,
     )
+
+
+def _behind(baseline: PoseSession, session: PoseSession, begin: float) -> PoseSession:
+    """A session from a time on, s, with the same streams of another one before it."""
+    end = max(float(p.time[-1]) for p in baseline.streams.values() if p.size)
+    streams = {}
+    for name, poses in session.streams.items():
+        streams[name] = poses
+        if name in baseline.streams:
+            first = baseline.streams[name]
+            earlier = replace(first, time=first.time + begin - end - BASELINE_BEFORE_S)
+            keys = ('time', 'position', 'quaternion')
+            rows: dict[str, Any] = {
+                k: np.concatenate([getattr(p, k) for p in (earlier, poses)]) for k in keys
+            }
+            streams[name] = replace(poses, **rows)
+    reference = streams.pop(REFERENCE, None)
+    return replace(session, sensors=streams, reference=reference)
 
 
 def _confirmed(search: PoseSearch, problem: PoseProblem, test: Integers) -> PoseSearch:

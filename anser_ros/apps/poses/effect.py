@@ -33,6 +33,7 @@ class PoseSite(TypedDict, total=False):
     sensor: str  # name of a sensor; all of them where there is none
     degree: int  # of a map's polynomial
     lowest: int  # lowest degree in it
+    is_equal: Literal[True]  # a map beside a scale, which has what is alike along all axes
     centre_m: list[float]  # where the polynomial's coordinates are zero, frame of the tracker
     size_m: float  # what they are divided by
     middle_s: float  # time at which a clock's offset is its offset
@@ -209,8 +210,8 @@ class PoseEffect(BaseEffect[PoseTerm]):
         """Return the map of a record, which a corrector applies; None for other effects."""
         return None
 
-    def beside_scale(self, term: PoseTerm) -> PoseTerm | None:
-        """Return what is left of a term beside one scale of all sensors; None where nothing is."""
+    def beside_scale(self, term: PoseTerm) -> PoseTerm:
+        """Return what is left of a term beside one scale of all sensors."""
         return term
 
     def is_scale(self, term: PoseTerm) -> bool:

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv, ndtri
 
-from anser_ros.apps.poses.effect import PoseTerm, Role
+from anser_ros.apps.poses.effect import PoseTerm, Role, effect_with
 from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState, stamp_step
 from anser_ros.apps.poses.sequence import PoseSequence, PoseSession
 from anser_ros.arrays import Array, Booleans
@@ -63,6 +63,15 @@ class PoseFit(JointFit[PoseState]):
 
     @cached_property
     def covariance(self) -> Array:
+        """Return the covariance of all parameters, of a scale with what distortions fake of it."""
+        whole, scale = self.noise_covariance, np.ones(self.prior.size)
+        for index in (i for i, term in enumerate(self.terms) if term.role is Role.SCALE):
+            own = self.rows(index)
+            scale[own] = np.sqrt(1 + strain_variance(self) / np.diag(whole)[own])
+        return np.asarray(whole * scale[:, None] * scale[None, :])
+
+    @cached_property
+    def noise_covariance(self) -> Array:
         """Return the covariance of all parameters, as `BlockSums.covariance`.
 
         Errors of stamps are not independent where these lie on the grid of a poll: they are a
@@ -102,6 +111,25 @@ def fit_poses(problem: PoseProblem, terms: Sequence[PoseTerm], iterations: int =
     """Fit all parameters of all terms together, the two frames among them, from their values."""
     state = problem.state(terms)
     return PoseFit(*descended(state, state.numbers, iterations))
+
+
+def strain_variance(fit: PoseFit) -> float:
+    """Return the variance, 1e-6, of a scale by a smooth distortion of the size that is seen.
+
+    The tracker's space stretches in six ways, the scale is the mean of three of them. The scatter
+    of the five others, of a linear map in the scale's place, less what noise makes of it, is that
+    of any: a third of it is the mean's, and five tell it to 5/3 (Student's t).
+    """
+    setting = fit.state.problem.setting
+    linear = next(t for t in effect_with(Role.MAP).sites(setting) if t.theta.size == 9)
+    shared = (Role.SCALE, Role.MAP)
+    terms = [linear, *(t for t in fit.terms if t.sensor or t.role not in shared)]
+    trial = fit_poses(fit.state.problem, terms, 3)
+    other = np.eye(9) + np.eye(9).reshape(3, 3, 9).swapaxes(0, 1).reshape(9, 9)
+    unequal = other / 2 - np.outer(np.eye(3), np.eye(3)).reshape(9, 9) / 3
+    strains = unequal @ trial.terms[0].theta / setting.size
+    noise = np.trace(unequal @ trial.covariance_of(0) @ unequal) / setting.size**2
+    return max(float(strains @ strains) - float(noise), 0.0) / 9
 
 
 def with_time_constants(fit: PoseFit) -> PoseFit:

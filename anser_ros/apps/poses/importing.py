@@ -1,19 +1,30 @@
 """Reads sessions of poses: files as trackers write them, and bags by topic; writes bags."""
 
-import csv
+import contextlib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
+from anser_ros.apps.poses.sequence import (
+    FARTHEST,
+    REFERENCE,
+    PoseSequence,
+    PoseSession,
+    sequence_of,
+    stamp_words,
+)
 from anser_ros.arrays import Array, Integers
 from anser_ros.errors import BagError, ParameterError
-from anser_ros.sessions.plausibility import LENGTH_M
-from anser_ros.stamps import NANO
+from anser_ros.physics.rotations import nearest_rotation
+from anser_ros.sessions.table_import import SCHEMA
+from anser_ros.stamps import NANO, RECENT_NS, SECOND_NS, stamp_fault
 from anser_ros.wire.bag import Salvage, published_poses
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import (
@@ -21,10 +32,14 @@ from anser_ros.wire.recorded import (
     ENDING,
     OPTICAL,
     TRACKED,
+    legal_name,
     optical_topic,
     pose_setup,
     tracked_topic,
 )
+from anser_ros.wire.table_names import LENGTH_M, TIME_NS, UNITS, meaning_of, pose_columns
+from anser_ros.wire.tables import Table, read_table
+from anser_ros.wire.text_files import read_text
 
 ORDERS = {
     'xyzw': ((0, 1, 2, 3), 1.0),
@@ -39,12 +54,26 @@ COUNTERS = {'AuroraFrame': AURORA_HZ, 'PolarisFrame': POLARIS_HZ, 'DeviceTime': 
 """Keys of a device's own time, with its counts a second."""
 HOST_TIMES = ('NetworkTime', 'Time')
 """Keys of the host's counter at receipt, ns."""
-TUM_NUMBERS = 8  # in a line: the time, a position, a quaternion
-TUM = re.compile(r'\s*[-+.\deE]+([\s,]+([-+.\deE]+|[-+]?nan|[-+]?inf)){7}', re.IGNORECASE)
-"""A line of TUM's form; values that are no numbers stand where there was no pose."""
+TUM = ('time_s', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
+"""Columns of a table without names: those of TUM."""
+LABELS = ('sensor', 'body', 'tool', 'name', 'sensor_id', 'tool_id', 'handle', 'port')
+"""Columns that say of whom a row is."""
+VALID = ('valid', 'visible', 'tracked', 'is_valid')
+"""Columns that say whether a row is a pose."""
+NOT_VALID = ('0', 'false', 'no')
+MOST_FALLS = 0.1
+"""Share of times before the one above them from which a column is no time."""
+FARTHEST_M = 3.0
+"""Median distance, m, from which on positions without a stated unit are not in metres."""
+LONGEST_INTERVAL_S = 2.0
+"""Interval of a tracker's poses, s, from which on times without a stated unit are no seconds."""
+UNITS_OF_TIME = ((9e17, 2.2e18, 'ns'), (9e14, 2.2e15, 'us'), (9e11, 2.2e12, 'ms'))
+"""What numbers must be whose name states no unit, by their range, if they count since 1970."""
 TITLE_LINES = 20  # lines that a program may write before its poses
 PORT_COLUMNS = 13
 """Columns of a port in a ToolTracker file: name, frame, face, state, pose, error, markers."""
+PLUS = ('.mha', '.mhd', '.nrrd')
+_PLUS_FIELD = re.compile(r'^Seq_Frame(\d+)_(\w+?)\s*:?=\s*(.*?)\s*$', re.MULTILINE)
 _KEY = re.compile(r'(\w+):\s*((?:[^\s:]+(?:\s+|$)(?!:))*?)(?=\s*\w+:|\s*$)')
 
 
@@ -58,7 +87,7 @@ class RawRows:
 
     rows: list[tuple[float, ...]] = field(default_factory=list)
     form: str = 'xyzw'  # how its quaternions are written, a key of `ORDERS`
-    unit: str = 'mm'  # unit of its lengths, a key of `LENGTH_M`
+    unit: str = 'mm'  # unit of its lengths, a key of `LENGTH_M`; empty where it is not stated
 
     @property
     def table(self) -> Array:
@@ -76,28 +105,22 @@ def read_form(path: Path) -> Found:
     Lines before the first that has the form, such as a title, are left out. Raises
     `ParameterError` when no form fits, or the file has no row.
     """
-    lines = path.read_text(encoding='utf-8-sig', errors='replace').splitlines()
-    lines = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
-    if not lines:
-        raise ParameterError(f'{path}: no rows')
-    first, reader = next(
-        ((i, r) for i, line in enumerate(lines[:TITLE_LINES]) if (r := _reader(line))), (0, _table)
-    )
-    rows, read = reader(lines[first:], path)
+    if path.suffix.lower() in PLUS:
+        return _plus(path), 0
+    lines = [line for line in read_text(path, any_letters=True).splitlines() if line.strip()]
+    lines = [line for line in lines if not line.lstrip().startswith('#')]
+    for first, line in enumerate(lines[:TITLE_LINES]):
+        if line.startswith(('Tools\t', 'Tools,')):
+            rows, read = _tool_tracker(lines[first:])
+            break
+        if 'Position:' in line:
+            rows, read = _keyed(lines[first:], path)
+            break
+    else:
+        rows, read = _table(path), len(lines)
     if not any(one.rows for one in rows.values()):
         raise ParameterError(f'{path}: no row that is a pose')
     return rows, len(lines) - read
-
-
-def _reader(line: str) -> Callable[[Sequence[str], Path], Found] | None:
-    """What reads the form that a line is of, or None; a table's header has names of columns."""
-    if line.startswith('Tools\t'):
-        return _tool_tracker
-    if 'Position:' in line:
-        return _keyed
-    if TUM.match(line):
-        return _tum
-    return _table if {'qx', 'qw'} <= set(line.strip().split(',')) else None
 
 
 def _number(text: str) -> float:
@@ -107,12 +130,12 @@ def _number(text: str) -> float:
         return float('nan')
 
 
-def _tool_tracker(lines: Sequence[str], path: Path) -> Found:
+def _tool_tracker(lines: Sequence[str]) -> Found:
     """NDI ToolTracker: a group of columns a port; scalar first; states in words."""
     rows: dict[str, RawRows] = {}
-    read = 0
+    read, separator = 0, lines[0][len('Tools')]
     for line in lines:
-        cells = line.split('\t')
+        cells = line.split(separator)
         if cells[0] == 'Tools':  # once more where the program was started again
             read += 1
             continue
@@ -156,36 +179,128 @@ def _keyed(lines: Sequence[str], path: Path) -> Found:
     return rows, sum(len(one.rows) for one in rows.values())
 
 
-def _tum(lines: Sequence[str], path: Path) -> Found:
-    """TUM: s, m, scalar last."""
-    one = RawRows(unit='m')
-    for line in lines:
-        numbers = [_number(cell) for cell in re.split(r'[\s,]+', line.strip())]
-        if len(numbers) < TUM_NUMBERS:
-            raise ParameterError(f'{path}: a line of {len(numbers)} numbers, TUM has 8')
-        one.rows.append((numbers[0], float('nan'), *numbers[1:8]))
-    return {path.stem: one}, len(lines)
-
-
-def _table(lines: Sequence[str], path: Path) -> Found:
-    """CSV: ``stamp_ns`` or ``time_s``, positions with their unit, quaternions, ``sensor``."""
-    reader = csv.DictReader(lines)
-    names = reader.fieldnames or []
-    unit = next((u for u in LENGTH_M if {f'{axis}_{u}' for axis in 'xyz'} <= set(names)), None)
-    clock = next((c for c in ('stamp_ns', 'time_s') if c in names), None)
-    turn = ('qx', 'qy', 'qz', 'qw')
-    if unit is None or clock is None or not set(turn) <= set(names):
-        raise ParameterError(
-            f'{path}: no known form; a CSV needs the columns stamp_ns or time_s, x_m, y_m, z_m '
-            f'(or _mm), qx, qy, qz, qw'
-        )
+def _plus(path: Path) -> dict[str, RawRows]:
+    """A sequence of PLUS: matrices of tools in the tracker's frame, mm, before any pictures."""
+    frames: dict[str, dict[str, str]] = {}
+    for number, key, value in _PLUS_FIELD.findall(path.read_bytes().decode('latin-1')):
+        frames.setdefault(number, {})[key] = value
     rows: dict[str, RawRows] = {}
-    for row in reader:
-        one = rows.setdefault(str(row.get('sensor') or path.stem), RawRows(unit=unit))
-        stamp = _number(row[clock] or '') * (1e-9 if clock == 'stamp_ns' else 1.0)
-        pose = (_number(row[key] or '') for key in (*(f'{axis}_{unit}' for axis in 'xyz'), *turn))
-        one.rows.append((stamp, float('nan'), *pose))
-    return rows, len(lines)
+    for fields in frames.values():
+        for key, value in fields.items():
+            if not key.endswith('ToTrackerTransform'):
+                continue
+            matrix = np.array([_number(cell) for cell in value.split()])
+            pose = np.full(7, np.nan)
+            if matrix.size == 16 and fields.get(f'{key}Status', 'OK') == 'OK':
+                turn = nearest_rotation(matrix.reshape(4, 4)[:3, :3])
+                pose = np.concatenate([matrix[3:12:4], Rotation.from_matrix(turn).as_quat()])
+            one = rows.setdefault(key.removesuffix('ToTrackerTransform').lower(), RawRows())
+            one.rows.append((_number(fields.get('Timestamp', '')), np.nan, *pose.tolist()))
+    if not rows:
+        raise ParameterError(f'{path}: a sequence of PLUS without ...ToTrackerTransform')
+    return rows
+
+
+def _table(path: Path) -> dict[str, RawRows]:
+    """A table with names of columns, or one of TUM's eight numbers."""
+    table = read_table(path)
+    names = table.names if table.has_names else TUM
+    if len(names) != len(table.names):
+        matrix = ', so these are matrices' if len(table.names) in (12, 16) else ''
+        words = f'{len(table.names)} numbers a line and no names of columns'
+        raise ParameterError(f'{path}: {words}; times, places and quaternions are 8{matrix}')
+    try:
+        bodies, clocks = pose_columns(names, table.units)
+        time = np.sum([_seconds(table, column, unit) for column, unit in clocks], axis=0)
+    except ParameterError as error:
+        raise ParameterError(
+            f'{error}' if str(path) in f'{error}' else _advice(table, error)
+        ) from error
+    stated = next(
+        (u for row in table.titles for k, u in pairwise(row) if 'length unit' in k.lower()), ''
+    )
+    label, valid = (
+        next((n for n in table.names if n.casefold() in known), '') for known in (LABELS, VALID)
+    )
+    whose = np.array(table.words(label) if label else [''] * len(table.cells))
+    rows: dict[str, RawRows] = {}
+    for body, columns in bodies.items():
+        cells = [table.names[column] for column in (*columns.place, *columns.turn)]
+        pose = table.numbers(cells, with_gaps=True)
+        if valid:
+            pose[table.words(valid).str.casefold().isin(NOT_VALID)] = np.nan
+        for name in dict.fromkeys(whose.tolist()):
+            here = whose == name
+            _check_times(path, time[here])
+            lines = np.column_stack([time[here], np.full(here.sum(), np.nan), pose[here]])
+            called = '_'.join(filter(None, (name, body))) if name or len(bodies) > 1 else path.stem
+            unit = columns.unit or UNITS.get(stated.casefold(), '')
+            rows[called] = RawRows(lines.tolist(), unit=unit)
+    return rows
+
+
+def _seconds(table: Table, column: int, unit: str) -> Array:
+    """A column of times, s; without a unit what the numbers alone can be."""
+    time = table.array(table.names[column]).astype(np.float64)
+    unit = unit or _unit_of(time)
+    if not unit:
+        raise ParameterError(f'{table.names[column]} states no unit of time, or is a counter')
+    return np.asarray(time * (TIME_NS[unit] * NANO))
+
+
+def _unit_of(time: Array) -> str:
+    """The unit that times can have; empty if they do not count since 1970, and no tracker gives
+    them in seconds: they are whole numbers, or far apart."""
+    known = time[np.isfinite(time)]
+    if not known.size:
+        return 's'
+    middle, apart = np.median(known), np.median(np.diff(known, append=known[-1:]))
+    unit = next((u for low, high, u in UNITS_OF_TIME if low < middle < high), 's')
+    is_odd = apart > LONGEST_INTERVAL_S or not np.any(known % 1)
+    return '' if unit == 's' and is_odd and middle < RECENT_NS * NANO else unit
+
+
+def _check_times(path: Path, time: Array) -> None:
+    steps = np.diff(time[np.isfinite(time)])
+    if steps.size and not steps.any():
+        raise ParameterError(
+            f'{path}: all {steps.size + 1} times are {time[0]:g} s: is it a time?'
+        )
+    if steps.size and np.mean(steps < 0) > MOST_FALLS:
+        raise ParameterError(
+            f'{path}: the times do not ascend: {np.count_nonzero(steps < 0)} of {steps.size} are '
+            'before the one above them; is the first column a time?'
+        )
+
+
+def _advice(table: Table, error: ParameterError) -> str:
+    """What a header lacks, what it has, and a document for `anser import`, written beside it."""
+    path = Path(table.path)
+    document = path.with_name(f'{path.stem}.tables.yaml')
+    found = list(map(meaning_of, table.names, table.units))
+    seen: dict[tuple[str, str], str] = {}
+    for name, one in zip(table.names, found, strict=True):
+        seen.setdefault((one.kind, one.axis), name)
+    stamp = seen.get(('time', ''), '?')
+    units = {one.kind: one.unit for one in found}
+    with contextlib.suppress(ParameterError):
+        units['time'] = units.get('time') or _unit_of(table.array(stamp).astype(np.float64))
+    text = yaml.safe_dump({
+        'schema': SCHEMA, 'time': {'unit': units.get('time') or 's', 'start_ns': 0},
+        'tracked': [{
+            'file': path.name, 'stamp': stamp,
+            'sensor': legal_name(path.stem),
+            'position': [seen.get(('place', axis), '?') for axis in 'xyz'],
+            'unit': units.get('place') or 'm',
+            'quaternion': [seen.get(('turn', axis), '?') for axis in 'xyzw'], 'order': 'xyzw',
+        }],
+    }, sort_keys=False, default_flow_style=None)  # fmt: skip
+    with contextlib.suppress(OSError), document.open('x', encoding='utf-8') as stream:
+        stream.write(f'# Columns: {", ".join(table.names)}\n{text}')
+    return (
+        f'{path}: {error}; its columns are {", ".join(table.names)}: say what they mean in '
+        f'{document}, and read it by: anser import {document} --out session.mcap'
+    )
 
 
 Piece = tuple[str, Array, Array, Array]
@@ -197,8 +312,6 @@ SET_S, CLOCKS_APART = 0.3, 3e-3
 other between recordings: these start late by some 40 ms, and quartz errs by a thousandth."""
 MOST_RESTARTS = 5
 """Falls of a counter in a recording that may be restarts; with more, rows are in no order."""
-LATEST_S = 9e9
-"""Latest time, s: stamps in ns have no room for more in 63 bits."""
 STAMPS = ('host', 'device')  # which time becomes the stamp; the other where a file lacks the one
 
 
@@ -210,6 +323,7 @@ def import_poses(
     unit: str | None = None,
     quaternion: str | None = None,
     names: Mapping[str, str] | None = None,
+    shift_s: tuple[float, float] = (0.0, 0.0),
 ) -> PoseSession:
     """Read files of tracked poses, and of the reference's, as one session.
 
@@ -217,9 +331,10 @@ def import_poses(
     both together; ``unit``: unit of the tracked positions where the form does not state it
     correctly (`LENGTH_M`); ``quaternion``: how the tracked quaternions are written where it is not
     as usual in their form (`ORDERS`); ``names``: what sensors shall be called, by the names that
-    the files give them. Raises `ParameterError` when a file has no known form, an option no known
-    value, numbers of files differ, or names fit no sensor or become the same. Raises
-    `PlausibilityError` when quaternions are not of unit length.
+    the files give them; ``shift_s``: added to the times of the tracked poses and of the reference,
+    where a host's clock has given them. Raises `ParameterError` when a file has no known form, an
+    option no known value, numbers of files differ, or names fit no sensor or become the same.
+    Raises `PlausibilityError` when quaternions are not of unit length.
     """
     for value, known in ((stamps, STAMPS), (unit, LENGTH_M), (quaternion, ORDERS)):
         if value is not None and value not in known:
@@ -233,10 +348,10 @@ def import_poses(
     lost: list[str] = []
     for number, path in enumerate(tracked):
         rows, unread = read_form(path)
-        groups, files = _named(rows, None, unit, quaternion), [(path, unread)]
+        groups, files = _named(path, rows, None, unit, quaternion), [(path, unread)]
         if reference:
             rows, unread = read_form(reference[number])
-            groups |= _named(rows, REFERENCE, None, None)
+            groups |= _named(reference[number], rows, REFERENCE, None, None)
             files.append((reference[number], unread))
         words = 'lines of {} that are no poses, and are left out: {}'
         lost += [words.format(*one) for one in files if one[1]]
@@ -244,23 +359,34 @@ def import_poses(
             if not np.isfinite(table[:, :2]).any():
                 raise ParameterError(f'{path}: {label}: no pose has a time')
         recordings.append(groups)
-    pieces = _placed(recordings, stamps)
-    session = _session(str(tracked[0]), _renamed(pieces, names or {}))
-    return replace(session, lost='; '.join(lost))
+    pieces = _placed(recordings, stamps, shift_s)
+    called = _called([piece[0] for piece in pieces], names or {})
+    lost += [
+        f'{old} is called {new}'
+        for old, new in called.items()
+        if old not in (names or {}) and old != new
+    ]
+    renamed = [(called[piece[0]], *piece[1:]) for piece in pieces]
+    session = _session(str(tracked[0]), renamed)
+    return replace(session, lost='; '.join(filter(None, (*lost, session.lost))))
 
 
-def _renamed(pieces: Sequence[Piece], names: Mapping[str, str]) -> list[Piece]:
-    found = list(dict.fromkeys(piece[0] for piece in pieces if piece[0] != REFERENCE))
-    unknown = sorted(set(names) - set(found))
+def _called(found: Sequence[str], names: Mapping[str, str]) -> dict[str, str]:
+    """What sensors are called: as they shall be, or as a topic can be."""
+    sensors = [name for name in dict.fromkeys(found) if name != REFERENCE]
+    unknown = sorted(set(names) - set(sensors))
     if unknown:
-        raise ParameterError(f'no sensor {", ".join(unknown)}; there are: {", ".join(found)}')
-    called = [names.get(name, name) for name in found]
-    if len(set(called)) < len(called) or REFERENCE in called:
-        raise ParameterError(f'sensors must differ in name, and from optical: {", ".join(called)}')
-    return [(names.get(piece[0], piece[0]), *piece[1:]) for piece in pieces]
+        raise ParameterError(f'no sensor {", ".join(unknown)}; there are: {", ".join(sensors)}')
+    called = {name: names.get(name) or legal_name(name) for name in sensors}
+    new = list(called.values())
+    if len(set(new)) < len(new) or REFERENCE in new:
+        raise ParameterError(f'sensors must differ in name, and from optical: {", ".join(new)}')
+    return {**called, REFERENCE: REFERENCE}
 
 
-def _placed(recordings: Sequence[Mapping[str, Array]], stamps: str) -> list[Piece]:
+def _placed(
+    recordings: Sequence[Mapping[str, Array]], stamps: str, shift_s: tuple[float, float]
+) -> list[Piece]:
     """All recordings on one axis of time. Two devices that count for themselves start together,
     and their counters go on in the next recording if both have moved on alike since the last.
     """
@@ -288,7 +414,8 @@ def _placed(recordings: Sequence[Mapping[str, Array]], stamps: str) -> list[Piec
         last = begin
         for label, table in groups.items():
             time, is_host = known[label]
-            shift = 0.0 if is_host else zero[label == REFERENCE]
+            is_reference = label == REFERENCE
+            shift = -shift_s[is_reference] if is_host else zero[is_reference]
             pieces.append((label, time - shift, table[:, 2:5], table[:, 5:]))
         if begin:
             free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
@@ -301,7 +428,11 @@ def _runs_on(before: float, after: float, elapsed: float) -> bool:
 
 
 def _named(
-    rows: Mapping[str, RawRows], name: str | None, unit: str | None, quaternion: str | None
+    path: Path,
+    rows: Mapping[str, RawRows],
+    name: str | None,
+    unit: str | None,
+    quaternion: str | None,
 ) -> dict[str, Array]:
     """Each group of rows (n, 9) under its name, with positions in m and quaternions x y z w."""
     if name is not None:  # of an optical file only the tool with most poses is the reference
@@ -311,7 +442,15 @@ def _named(
     for label, one in rows.items():
         table = one.table
         order, sense = ORDERS[quaternion or one.form]
-        table[:, 2:5] *= LENGTH_M[unit or one.unit]
+        away = np.linalg.norm(table[:, 2:5], axis=1)
+        if (
+            not (unit or one.unit)
+            and np.nanmedian(np.where(away < FARTHEST, away, np.nan)) > FARTHEST_M
+        ):
+            raise ParameterError(
+                f'{path}: {label}: positions of {np.nanmedian(away):.4g} state no unit: --unit mm?'
+            )
+        table[:, 2:5] *= LENGTH_M[unit or one.unit or 'm']
         table[:, 5:] = table[:, 5:][:, list(order)]
         table[:, 5:8] *= sense
         found[label] = table
@@ -375,10 +514,8 @@ def _continued(counter: Array) -> Array:
 def _session(path: str, pieces: Sequence[Piece]) -> PoseSession:
     start = min(float(np.nanmin(time)) for _, time, _, _ in pieces)
     end = max(float(np.nanmax(time)) for _, time, _, _ in pieces)
-    if start < 0.0 or end > LATEST_S:
-        raise ParameterError(
-            f'{path}: times from {start:g} to {end:g} s cannot be stamps of a bag'
-        )
+    if fault := stamp_fault(int(start * SECOND_NS), int(end * SECOND_NS)):
+        raise ParameterError(f'{path}: {fault}')
     sequences: dict[str, PoseSequence] = {}
     for label in dict.fromkeys(piece[0] for piece in pieces):
         chosen = [piece for piece in pieces if piece[0] == label]
@@ -391,7 +528,13 @@ def _session(path: str, pieces: Sequence[Piece]) -> PoseSession:
         raise ParameterError(f'{path}: no complete pose with a time')
     # A bag's stamp of zero means none.
     start_ns = max(round(start * 1e9), 1_000_000_000)
-    return PoseSession(path, start_ns, sequences, reference)
+    return _judged(PoseSession(path, start_ns, sequences, reference))
+
+
+def _judged(session: PoseSession) -> PoseSession:
+    """The session with what its stamps show."""
+    words = filter(None, (session.lost, stamp_words(session)))
+    return replace(session, lost='; '.join(words))
 
 
 def read_pose_session(
@@ -408,7 +551,10 @@ def read_pose_session(
     length.
     """
     name, salvage = os.fspath(path), Salvage()
+    named = [*(tracked or {}).values(), *filter(None, [optical])]
     streams = published_poses(path, salvage=salvage)
+    if not set(named) <= set(streams):  # poses of another type, of which there may be more
+        streams |= {t: s for t, s in published_poses(path, named).items() if s.stamp_ns.size}
     chosen = tracked or {
         topic[len(TRACKED) : -len(ENDING)]: topic
         for topic in sorted(streams)
@@ -436,7 +582,7 @@ def read_pose_session(
 
     sensors = {label: sequence(label, topic) for label, topic in chosen.items()}
     found = sequence(REFERENCE, reference) if reference else None
-    return PoseSession(name, start, sensors, found, salvage.lost)
+    return _judged(PoseSession(name, start, sensors, found, salvage.lost))
 
 
 def write_pose_session(path: Path, session: PoseSession) -> None:

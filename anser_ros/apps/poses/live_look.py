@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.diagnosis import PoseDiagnosis, diagnose_poses
 from anser_ros.apps.poses.effect import PoseTerm, Role, effect_of_record, pose_effects
@@ -17,8 +16,6 @@ from anser_ros.apps.poses.sequence import REFERENCE, PoseSession
 from anser_ros.apps.poses.start import pose_problem
 from anser_ros.diagnosis.engine import block_sums
 from anser_ros.field.model import EffectRecord
-
-Array = NDArray[np.float64]
 
 FEWEST_S = 4.0
 """Time, s, that must be left before a stream froze for a diagnosis of the rest."""

@@ -43,10 +43,13 @@ SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
 LEAST_MAP_M = 0.5e-3
 """Least that a map moves poses and takes off their errors, m rms: no tracker claims less."""
 
-LEAST_SCALE_SIGMAS = 5.0
-"""Sigmas by which a scale differs from one, or a sensor's clock from others: chance, 1 in 250."""
-LEAST_CLOCK_SIGMAS = 3.0
+LEAST_OWN_SIGMAS = 5.0
+"""Sigmas, of noise, by which a scale differs from one, or a sensor's clock from others: chance, 1
+in 250."""
+LEAST_SIGMAS = 3.0
 """The same of a clock that all sensors share: chance, 1 in 370."""
+LEAST_FAKED = 2.3
+"""Sigmas, with what distortions fake, by which a scale differs from one: chance, 1 in 30."""
 
 
 def gain_of(before: PoseFit, after: PoseFit, term: PoseTerm) -> float:
@@ -94,14 +97,14 @@ def doubt(fit: PoseFit, index: int) -> str:
     seen = effect.seen_at(record, term, covariance, [part.view for part in fit.state.parts])
     if term.role is Role.MAP and float(seen.parameters['rms_m']) < LEAST_MAP_M:
         return f'moves poses by less than {1e3 * LEAST_MAP_M:g} mm'
-    sigma = float(np.sqrt(covariance[0, 0]))
+    noise = float(np.sqrt(fit.noise_covariance[fit.rows(index), fit.rows(index)][0, 0]))
     own_clock = effect.role.is_clock and term.sensor is not None
     if effect.role is Role.RATE and _is_beat(fit, term):
         return 'no more than the beat of a poll'
-    least = LEAST_CLOCK_SIGMAS if effect.role.is_clock else 0.0
-    if effect.is_scale(term) or own_clock:
-        least = LEAST_SCALE_SIGMAS
-    if abs(float(term.theta[0])) < least * sigma:
+    is_told = effect.role.is_clock or effect.is_scale(term)
+    least = LEAST_OWN_SIGMAS if effect.is_scale(term) or own_clock else LEAST_SIGMAS
+    sigma = max(least * noise, LEAST_FAKED * float(np.sqrt(covariance[0, 0])))
+    if is_told and abs(float(term.theta[0])) < sigma:
         return f'less than {least:g} of its standard deviations'
     return ''
 
@@ -132,7 +135,7 @@ def with_lag(
     if any(term.role is Role.FILTER for term in fit.terms):
         return None, None
     trials = [
-        fit_poses(fit.state.problem, [*fit.terms, term], 3)
+        fit_poses(fit.state.problem, [*fit.terms, term], 1)
         for effect in pose_effects().values()
         if effect.role is Role.FILTER
         for term in effect.sites(fit.state.problem.setting)
@@ -204,8 +207,6 @@ FULL_FITS = 3  # candidates fitted in full in each round, which takes most of th
 NOISE_ROUNDS = 3  # times that noise and what stands out, which depend on each other, are found
 STAMP_GAIN = 25.0
 """Minus twice the log likelihood that an error of a sensor's stamps takes off; chance: one."""
-PART_OF_MAP = 2 / 3
-"""Share of what a map gains below which a scale is only a part of it."""
 
 
 class PoseEvidence(NamedTuple):
@@ -257,9 +258,11 @@ def likely_noise(part: PosePart) -> PoseNoise:
 
 
 def search_effects(
-    start: PoseFit, session: PoseSession, say: Callable[[str], None] | None = None
+    start: PoseFit, session: PoseSession, say: Callable[[str], None], is_wanted: bool = True
 ) -> PoseSearch:
     """Add effects one by one, the best first, while each pays for itself; drop what does not.
+
+    Where it is not wanted the frames alone are fitted, with the noise that they leave.
 
     Where the motion determines no lever arm, turns that go with the place or the velocity, times a
     lever arm of any length, look like any of them. Only the clocks are tried there. Raises
@@ -275,7 +278,10 @@ def search_effects(
     is_known = knows_levers(fit, most_poses(session))
     if not is_known:
         fit = with_noise(start, False)
-    how = _PoseSelection(is_known, say or (lambda text: None))
+    how = _PoseSelection(is_known, say)
+    if not is_wanted:
+        fit = with_noise(fit_poses(fit.state.problem, frame_terms(fit.terms)), is_known)
+        return PoseSearch(fit, (None,) * len(fit.terms), (), is_known)
     fit = how.thinned(how.grown(fit))
     return PoseSearch(fit, tuple(how.evidence), tuple(how.refused), is_known)
 
@@ -298,7 +304,9 @@ class _PoseSelection(ForwardSelection[PoseFit]):
         self._say(f'search besides {len(fit.terms) - len(frame_terms(fit.terms))} effects')
         trials = [self._accepted(fit, term) for term in _finalists(fit, self._knows_levers)]
         accepted = [trial for trial in trials if trial is not None]
-        best = _simplest(accepted) if accepted else None
+        # A map only when no effect with few numbers is left: a scale is a part of any.
+        plain = [pair for pair in accepted if pair[1].terms[-1].role is not Role.MAP]
+        best = max(plain or accepted, key=lambda pair: pair[0])[1] if accepted else None
         if not self._knows_levers or (best is not None and best.terms[-1].role.is_clock):
             return best
         # A filter rounds off turning points, which looks like a scale or a map.
@@ -365,8 +373,10 @@ def _finalists(fit: PoseFit, knows_levers: bool) -> list[PoseTerm]:
     state = fit.state
     scorers = [Scorer(s, s.numbers) for s in (state, state.in_space)]
     promising: list[tuple[float, PoseTerm]] = []
+    is_scaled = any(term.role is Role.SCALE for term in fit.terms)
     for effect in pose_effects().values():
-        for term in _beside_scale(effect.sites(state.problem.setting), fit.terms):
+        for site in effect.sites(state.problem.setting):
+            term = effect.beside_scale(site) if is_scaled else site
             if term.role is Role.FILTER or is_covered(term, fit.terms):
                 continue
             if not knows_levers and (not term.role.is_clock or term.sensor):
@@ -390,28 +400,3 @@ def _promise(scorer: Scorer[PoseState], term: PoseTerm) -> float:
     """What a term takes off the cross-validated sum of squares, linear about the state."""
     score = scorer.score(term, term.effect.prior(term))
     return 0.0 if score is None else scorer.held_out - score.held_out
-
-
-def _beside_scale(sites: Sequence[PoseTerm], active: Sequence[PoseTerm]) -> list[PoseTerm]:
-    """What is left of some terms beside an active scale."""
-    if not any(term.role is Role.SCALE for term in active):
-        return list(sites)
-    return [left for t in sites if (left := t.effect.beside_scale(t)) is not None]
-
-
-def _simplest(accepted: list[tuple[float, PoseFit]]) -> PoseFit:
-    """The one that gains most; a map only when no effect with few numbers is left.
-
-    A scale that gains much less than a map is a part of that, unless several sensors vouch for it,
-    which see the same one (`is_one_scale`) at different places.
-    """
-    maps = [gain for gain, fit in accepted if fit.terms[-1].role is Role.MAP]
-    is_alone = len(accepted[0][1].state.parts) == 1
-    least = PART_OF_MAP * max(maps, default=0.0) if is_alone else 0.0
-    plain = [
-        (gain, fit)
-        for gain, fit in accepted
-        if fit.terms[-1].role is not Role.MAP
-        and (gain >= least or fit.terms[-1].role is not Role.SCALE)
-    ]
-    return max(plain or accepted, key=lambda pair: pair[0])[1]

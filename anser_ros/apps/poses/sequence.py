@@ -24,6 +24,13 @@ NO_TURN = 0.1
 LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
 """How far a pose is from the line between its neighbours if it leaps: m, rad, and in distances of
 these from each other. A hand that shakes turns back within 5 mm at 20 poses a second."""
+MOST_ALIKE = 2.5
+"""Poses with the same stamp from which on stamps are not those of the poses."""
+LEAST_STEP_S, LEAST_INTERVALS, MOST_STEPS = 0.1, 3.0, 5
+"""Least leap of stamps, s and intervals, that may be a step of a clock, and most of them."""
+STRETCH, FEWEST_POSES, LEAST_WAY_M = 5, 50, 3e-3
+"""Poses before and after a leap that tell the pace, poses of a stream that is looked at, and the
+way, m, that a body would have to go within a leap."""
 LONGEST_JUMP = 3  # rounds; each takes out one pose of a run, or two from its ends
 NOT_UNIT = 0.05
 """How far the norm of a quaternion may be from one: smaller refuses rounded files."""
@@ -40,6 +47,8 @@ class PoseSequence:
     quaternion: Array
     missing: Array  # (k,), stamps, s, under which the device said that it has no pose
     unordered: int = 0  # poses whose stamp was before that of the pose written before them
+    # Time, s, and size, s, of every step of the clock that gave the stamps.
+    steps: tuple[tuple[float, float], ...] = ()
 
     @property
     def size(self) -> int:
@@ -156,7 +165,52 @@ def sequence_of(name: str, time: Array, position: Array, quaternion: Array) -> P
         (quaternion[whole] / norm[whole, None])[order],
         np.sort(time[~whole]),
         int(np.count_nonzero(np.diff(time) < 0)),
+        _steps(time[whole], position[whole]),
     )
+
+
+def _steps(time: Array, position: Array) -> tuple[tuple[float, float], ...]:
+    """Where stamps leap while the body goes on as from one pose to the next: a clock was set."""
+    if time.size < FEWEST_POSES:
+        return ()
+    gaps = np.diff(time)
+    usual = float(np.median(gaps))
+    leaps = np.flatnonzero(np.abs(gaps - usual) > max(LEAST_STEP_S, LEAST_INTERVALS * usual))
+    found = []
+    for k in leaps[: MOST_STEPS + 1]:
+        if usual <= 0.0 or k < STRETCH or k + STRETCH + 1 >= time.size:
+            continue
+        before = (position[k] - position[k - STRETCH]) / STRETCH
+        after = (position[k + 1 + STRETCH] - position[k + 1]) / STRETCH
+        pace = 0.5 * (before + after)
+        way = float(np.linalg.norm(pace) * abs(gaps[k]) / usual)
+        off = np.linalg.norm(position[k + 1] - position[k] - pace)
+        turned = np.linalg.norm(after - before)
+        if way > LEAST_WAY_M and off < 0.2 * way and turned < 0.5 * np.linalg.norm(pace):
+            found.append((float(time[k]), float(gaps[k] - usual)))
+    return tuple(found) if len(found) <= MOST_STEPS else ()
+
+
+def stamp_words(session: PoseSession) -> str:
+    """Return where clocks of a session step, in words.
+
+    Raises `PlausibilityError` when several poses of a stream have each stamp.
+    """
+    words = []
+    for name, poses in session.streams.items():
+        stamps = np.unique(poses.time)
+        each = poses.size / max(stamps.size, 1)
+        if poses.size >= FEWEST_POSES and each > MOST_ALIKE:
+            is_cut = np.allclose(np.diff(stamps), np.rint(np.diff(stamps)))
+            why = 'cut to seconds?' if is_cut else 'does the driver set header.stamp?'
+            raise PlausibilityError(
+                f'{session.path}: {each:.0f} poses of {name} have each stamp: {why}'
+            )
+        words += [
+            f'the clock of {name} steps by {size:.1f} s at {time:.1f} s'
+            for time, size in poses.steps
+        ]
+    return '; '.join(words)
 
 
 LIVE = 'live'

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from itertools import combinations
 
 import numpy as np
@@ -18,6 +19,7 @@ from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.physics.rotations import nearest_rotation
+from anser_ros.stamps import NANO
 
 PAUSE_S = 2.0
 """Pause, s, that parts static recordings; where there are several, each is a block."""
@@ -74,10 +76,8 @@ def pose_problem(session: PoseSession) -> PoseProblem:
         if np.count_nonzero(path.at(poses.time)[3]) >= FEWEST_HAND_EYE_POSES
     }
     if not kept:
-        raise DiagnosisError(
-            f'{session.path}: no sensor has {FEWEST_HAND_EYE_POSES} poses '
-            'at times with a reference'
-        )
+        words = f'no sensor has {FEWEST_HAND_EYE_POSES} poses at times with a reference'
+        raise DiagnosisError(f'{session.path}: {_apart(session) or words}')
     everywhere = np.concatenate([poses.position for poses in kept.values()])
     centre = np.median(everywhere, axis=0)
     size = float(np.sqrt(np.mean(np.sum((everywhere - centre) ** 2, axis=1))))
@@ -93,6 +93,25 @@ def pose_problem(session: PoseSession) -> PoseProblem:
         _space_blocks(values, starts),
         tuple(np.ones(poses.size) for poses in values),
         tuple(START_NOISE for _ in values),
+    )
+
+
+def _apart(session: PoseSession) -> str:
+    """Both intervals, where the reference's shares no time with that of the sensors."""
+    tracked = [p.time for p in session.sensors.values() if p.size]
+    if session.reference is None or not (tracked and session.reference.size):
+        return ''
+    first, last = min(float(t[0]) for t in tracked), max(float(t[-1]) for t in tracked)
+    begin, end = (float(session.reference.time[k]) for k in (0, -1))
+    if begin <= last and first <= end:
+        return ''
+    start = datetime.fromtimestamp(session.start_ns * NANO, UTC)
+    dates = [start + timedelta(seconds=round(s)) for s in (first, last)]
+    away, lasts = begin - first, end - begin
+    return (
+        f'{dates[0]:%Y-%m-%d %H:%M:%S} to {dates[1]:%H:%M:%S}, reference {abs(away):.1f} s '
+        f'{"later" if away > 0.0 else "earlier"}, for {lasts:.0f} s: other time zones or epochs? '
+        f'--shift {away:.1f} shifts the tracked ones of files'
     )
 
 

@@ -19,6 +19,7 @@ from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.runtime import incoming, parameters, qos
@@ -62,6 +63,8 @@ class AnserNode(Node):
     PARAMETERS: ClassVar[type] = NoParameters
     HAS_KERNELS: ClassVar[bool] = False
     """Whether the node calculates with compiled kernels, and waits until all are there."""
+    PAUSE_S: ClassVar[float] = 0.0
+    """Time, s, in which messages gather before they are looked at, where nobody waits for it."""
 
     def __init__(self, beside: Sequence[type['AnserNode']] = (), **options: Any) -> None:
         # The base class already creates services, so what guards them must be there first.
@@ -185,7 +188,19 @@ class AnserNode(Node):
         if bounded:
             options['raw'] = True
         guarded = self._guard(self._in_turn(unpacked))
+        options = {**self._qos_options(), **options}
         return super().create_subscription(msg_type, topic, guarded, qos_profile, **options)
+
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
+        """Publish as rclpy does; parameters ``qos_overrides`` are honoured."""
+        options = {**self._qos_options(), **options}
+        return super().create_publisher(msg_type, topic, qos_profile, **options)
+
+    def _qos_options(self) -> dict[str, Any]:
+        """What lets parameters override a quality of service; nothing where none does."""
+        if not any(name.startswith(parameters.QOS) for name in self._parameter_overrides):
+            return {}
+        return {'qos_overriding_options': QoSOverridingOptions(qos.OVERRIDABLE)}
 
     def create_timer(
         self, timer_period_sec: float, callback: Callback, *args: Any, **options: Any

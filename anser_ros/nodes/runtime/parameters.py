@@ -9,6 +9,7 @@ import dataclasses
 import difflib
 import itertools
 import math
+import re
 import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -46,10 +47,14 @@ def rules(table: type) -> dict[str, Rule]:
     return {field.name: field.metadata['rule'] for field in dataclasses.fields(table)}
 
 
+QOS = 'qos_overrides.'
+"""How the names of parameters begin that change a topic's quality of service."""
+
+
 def is_foreign(name: str) -> bool:
     """Return whether a parameter is rclpy's own."""
     own = 'use_sim_time', 'start_type_description_service'
-    return name in own or name.startswith('qos_overrides.')
+    return name in own or name.startswith(QOS)
 
 
 def is_known(table: type, name: str) -> bool:
@@ -177,19 +182,22 @@ def _sections_given(arguments: Sequence[str]) -> Iterator[tuple[str, dict[str, A
 
 
 def complaints(arguments: Sequence[str], node: str) -> list[str]:
-    """Return one line for each parameter file without a section for a node.
+    """Return one line for each parameter file without a section for a node, by its full name.
 
     rclpy ignores such a file silently, and the node runs with its defaults.
     """
-    found = []
-    for path, sections in _sections_given(arguments):
-        keys = {_node_of(key): key for key in sections}
-        if not keys.keys() & {node, *WILDCARDS}:
-            close = difflib.get_close_matches(node, keys, n=1)
-            hint = f'it has: {", ".join(sections) or "no section at all"}'
-            hint = f"is '{keys[close[0]]}' meant?" if close else hint
-            found.append(f'{path} has nothing for {node}; {hint}')
-    return found
+    return [
+        f'{path} has parameters of {", ".join(sections) or "no node"}, none of {node}: write '
+        f'{node} or /**/{_node_of(node)}'
+        for path, sections in _sections_given(arguments)
+        if not any(re.fullmatch(_pattern(key), node) for key in sections)
+    ]
+
+
+def _pattern(key: str) -> str:
+    """What names of nodes look like that a section is for: ** are any parts of one, * is one."""
+    parts = key.strip('/').replace('**', '.+').replace('*', '[^/]+').replace('.+', '.*')
+    return f'/{parts}'.replace('/.*/', '/(.*/)?')
 
 
 def names_for(arguments: Sequence[str], node: str) -> Iterator[str]:

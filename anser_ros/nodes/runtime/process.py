@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from types import FrameType
@@ -17,6 +18,7 @@ import rclpy
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, OneLineParser, ParameterError
@@ -259,8 +261,15 @@ def _run(
         gc.freeze()
         gc.enable()
         signals.is_node_made = True
+        # The older executor takes one message a turn, so that a pause after each would not do.
+        has_events = not isinstance(executor, SingleThreadedExecutor)
+        pause_s = min(node.PAUSE_S for node in nodes) if has_events else 0.0
         while not signals.caught and all(node.exit_code is None for node in nodes):
-            executor.spin_once(timeout_sec=SPIN_SLICE_S)
+            if pause_s:
+                time.sleep(pause_s)
+                executor.spin_until_future_complete(Future(), timeout_sec=0.0)
+            else:
+                executor.spin_once(timeout_sec=SPIN_SLICE_S)
         code = max(node.exit_code or 0 for node in nodes)
     finally:
         signals.ignore()
@@ -290,7 +299,7 @@ def _complain(nodes: Sequence[AnserNode], arguments: Sequence[str]) -> None:
         for name in names_for(arguments, node.get_name()):
             if not parameters.is_known(node.PARAMETERS, name):
                 raise ParameterError(f'{node.get_name()} has no parameter {name}')
-    refusals = [complaints(arguments, node.get_name()) for node in nodes]
+    refusals = [complaints(arguments, node.get_fully_qualified_name()) for node in nodes]
     if all(refusals):
         for text in refusals[-1]:
             nodes[-1].get_logger().warning(text)

@@ -1,6 +1,6 @@
 """Sets the quality of service of every topic: one profile a kind of topic, alike on both ends."""
 
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 
 
 def _reliable(depth: int, *, is_latched: bool = False) -> QoSProfile:
@@ -22,5 +22,9 @@ MODELS = _reliable(50, is_latched=True)
 MODEL_ERRORS = _reliable(16, is_latched=True)
 # Fluxes and poses: deep enough to bridge half a second at 200 Hz without a loss.
 STREAM = _reliable(100)
+# Poses of others: best effort takes them from every driver, those of sensor data among them.
+OTHERS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 # /diagnostics and /tf, as everybody else has them.
 EVENTS = _reliable(100)
+OVERRIDABLE = [QoSPolicyKind[name] for name in ('HISTORY', 'DEPTH', 'RELIABILITY', 'DURABILITY')]
+"""What parameters ``qos_overrides`` may change."""

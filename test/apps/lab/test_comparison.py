@@ -13,8 +13,7 @@ from anser_ros.pose_states import OK
 from anser_ros.sessions.evaluation_files import (
     ERRORS_FILE,
     FEWEST_BLOCKS,
-    compare_errors,
-    compare_shares,
+    compare,
     read_errors,
     write_tables,
 )
@@ -32,17 +31,17 @@ def errors(scale, seed=3, frames=FRAMES):
 
 def test_a_clear_difference_has_an_interval_that_holds_it():
     rng = np.random.default_rng(1)
-    found = compare_errors(errors(2.0), errors(1.0, seed=4), rng)['a']
+    found = compare(errors(2.0), errors(1.0, seed=4), rng)['a']
     assert found.verdict == 'b' and found.n == FRAMES
     assert found.low < -1e-3 < found.high, 'the true difference is -1 mm'
-    back = compare_errors(errors(1.0, seed=4), errors(2.0), rng)['a']
+    back = compare(errors(1.0, seed=4), errors(2.0), rng)['a']
     assert back.verdict == 'a'
 
 
 def test_noise_alone_is_seldom_called_a_difference():
     rng = np.random.default_rng(2)
     pairs = [(errors(1.0, seed=s), errors(1.0, seed=100 + s)) for s in range(40)]
-    called = sum(compare_errors(*pair, rng)['a'].verdict != 'neither' for pair in pairs)
+    called = sum(compare(*pair, rng)['a'].verdict != 'neither' for pair in pairs)
     assert called <= 6, 'of 40, two are expected'
 
 
@@ -54,24 +53,24 @@ def test_frames_that_only_one_has_are_counted_and_not_compared():
         second.pop(key)
     worst = next(iter(second))
     second[worst] = 1.0  # not in the other: a metre that counts for nothing
-    found = compare_errors(first, second, np.random.default_rng(1))['a']
+    found = compare(first, second, np.random.default_rng(1))['a']
     assert (found.n, found.only_a, found.only_b) == (FRAMES - 13, 3, 10)
-    assert found.rmse_a == found.rmse_b and found.verdict == 'neither'
+    assert found.a == found.b and found.verdict == 'neither'
 
 
 def test_few_stretches_give_no_interval_and_other_sessions_are_refused():
     short = errors(1.0, frames=25 * (FEWEST_BLOCKS - 1))
-    found = compare_errors(short, short, np.random.default_rng(1))['a']
+    found = compare(short, short, np.random.default_rng(1))['a']
     assert np.isnan(found.low) and found.verdict == 'neither'
     with pytest.raises(ParameterError, match='of the same session'):
-        compare_shares(short, {(1, 'a'): 1.0}, np.random.default_rng(1))
+        compare(short, {(1, 'a'): 1.0}, np.random.default_rng(1), are_shares=True)
 
 
 def test_a_side_without_a_pose_is_told_and_not_refused(tmp_path, capsys):
     some = errors(1.0)
     states = {'one': OK, 'none': 'residual'}
     folders = [written(tmp_path / name, some, state) for name, state in states.items()]
-    found = compare_errors(some, {}, np.random.default_rng(1))['a']
+    found = compare(some, {}, np.random.default_rng(1))['a']
     assert (found.n, found.only_a, found.only_b) == (0, FRAMES, 0)
     assert found.verdict == 'neither'
     assert main(['compare', *folders, '--out', str(tmp_path / 'out')]) == 0
@@ -89,12 +88,12 @@ def test_the_share_of_frames_with_a_pose_has_a_verdict_of_its_own():
         return {key: float(pose) for key, pose in zip(errors(1.0), had, strict=True)}
 
     rng = np.random.default_rng(1)
-    found = compare_shares(states(0.9, 5), states(0.6, 6), rng)['a']
+    found = compare(states(0.9, 5), states(0.6, 6), rng, are_shares=True)['a']
     assert found.verdict == 'a' and found.n == FRAMES
     assert found.low < -0.3 < found.high, 'the true difference is 30 %'
-    assert compare_shares(states(0.6, 6), states(0.9, 5), rng)['a'].verdict == 'b'
+    assert compare(states(0.6, 6), states(0.9, 5), rng, are_shares=True)['a'].verdict == 'b'
     pairs = [(states(0.8, s), states(0.8, 100 + s)) for s in range(40)]
-    called = sum(compare_shares(*pair, rng)['a'].verdict != 'neither' for pair in pairs)
+    called = sum(compare(*pair, rng, are_shares=True)['a'].verdict != 'neither' for pair in pairs)
     assert called <= 6, 'of 40, two are expected'
 
 

@@ -57,10 +57,6 @@ DIPOLE = FieldModel(
 )
 
 
-def dipoles_of(model):
-    return model.dipoles
-
-
 def recorded(world, rng, frames):
     """Readings of an array that moves about a magnet, 80 to 160 mm away, and its optical poses."""
     table, time = array_of_sensors(rng), np.arange(frames) / 25.0
@@ -98,7 +94,7 @@ def apparatus():
 def test_a_second_moment_is_what_a_cylinder_has_beyond_its_dipole(world, apparatus):
     (term,) = EFFECT.candidates(apparatus)
     term = term.with_theta(np.array([world.second_moment_m2 / 1e-4]))
-    base = dipoles_of(DIPOLE)
+    base = DIPOLE.dipoles
     added = EFFECT.sources(term, base, base, np.ones(1))
     away = np.random.default_rng(2).normal(size=(200, 3))
     away /= np.linalg.norm(away, axis=1)[:, None]

@@ -18,6 +18,7 @@ from anser_ros.apps.lab import metal_follower, metal_learning
 from anser_ros.apps.lab.metal_follower import KnownMetalFollower, KnownMetalModels
 from anser_ros.apps.lab.metal_lattice import Coils, KnownMetal, load_known_metal, moved
 from anser_ros.apps.lab.metal_learning import learn_metal
+from anser_ros.apps.lab.metal_track import Scene
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, FitError
 from anser_ros.pose_states import MODEL_DOUBTFUL
@@ -180,11 +181,9 @@ def test_frames_hold_what_metal_adds_to_references_and_tools(bags, seen):
 
 
 def follower_of(known, made) -> KnownMetalFollower:
-    model, setup = certain_model(), made.setup
-    prepared = prepare(made, model)
-    return KnownMetalFollower(
-        known, model, world.excitation(), made.sensors, setup.refit.tools, prepared.volume, NOISE_T
-    )
+    model, tools = certain_model(), made.setup.refit.tools
+    scene = Scene(known, model, world.excitation(), made.sensors, tools, NOISE_T)
+    return KnownMetalFollower(scene, prepare(made, model).volume)
 
 
 def stamp(made, row) -> int:
@@ -192,14 +191,13 @@ def stamp(made, row) -> int:
 
 
 def followed(subject, made, rows):
-    """Run over frames: whether the metal was followed, its place, and why no pose is given."""
+    """Run over frames: whether the metal was followed, and why no pose is given."""
     out = []
     for row in rows:
         model, withheld = subject.at(stamp(made, row))
         assert (model is not subject.model) == subject.is_followed
-        place = None if subject.place is None else subject.place.copy()
         subject.take(stamp(made, row), world.readings(made, row))
-        out.append((subject.is_followed, place, withheld))
+        out.append((subject.is_followed, withheld))
     return out
 
 
@@ -225,16 +223,16 @@ def subject(begun):
 class TestFollowing:
     def test_metal_is_followed_until_it_is_driven_too_strongly(self, begun, subject, dive):
         run = begun[1] + followed(subject, dive, range(9, 25))
-        assert [is_followed for is_followed, *_ in run] == [False] * 7 + [True] * 18
-        assert not any(withheld for *_, withheld in run[:12])
-        for *_, withheld in run[-3:]:
+        assert [is_followed for is_followed, _ in run] == [False] * 7 + [True] * 18
+        assert not any(withheld for _, withheld in run[:12])
+        for _, withheld in run[-3:]:
             assert withheld is not None and withheld.state == MODEL_DOUBTFUL
             words = r'lump is driven [12]\.\d times as strongly as it was learnt'
             assert re.fullmatch(words, withheld.reason)
 
     def test_metal_nearer_to_a_coil_than_learnt_withholds_poses(self, subject, dive):
         assert subject.at(stamp(dive, 9))[1] is None
-        subject._known = replace(subject._known, nearest_m=0.5)
+        subject._scene.known = replace(subject._scene.known, nearest_m=0.5)
         _, withheld = subject.at(stamp(dive, 9))
         assert withheld is not None and withheld.state == MODEL_DOUBTFUL
         words = r'a coil is \d+ mm from lump, nearer than it was learnt'
@@ -246,8 +244,8 @@ class TestFollowing:
         flux = tool.flux.copy()
         flux[9:13] = clean[9:] - 1.6 * (tool.flux[9:13] - clean[9:])
         run = followed(subject, replace(dive, tools=(replace(tool, flux=flux),)), range(9, 13))
-        assert not run[0][2], 'the first such frame is not known yet'
-        withheld = run[1][2]
+        assert not run[0][1], 'the first such frame is not known yet'
+        withheld = run[1][1]
         assert withheld is not None and withheld.state == MODEL_DOUBTFUL
         words = r'lump leaves \d\.\d times as much of the readings as expected'
         assert re.fullmatch(words, withheld.reason)

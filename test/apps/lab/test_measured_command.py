@@ -12,14 +12,13 @@ from anser_ros.apps.lab.measured import anser_board
 from anser_ros.apps.lab.measured.recipe import Recipe, ReportRow
 from anser_ros.calibration.error_map import LEAST_GAIN_SIGMAS, learn_error_map
 from anser_ros.cli.main import main
-from anser_ros.cli.main import main as measured_main
 from anser_ros.errors import BagError, FitError
 
 
 def test_unknown_data_set_and_missing_folder(capsys, tmp_path):
-    assert measured_main(['measured', 'nothing']) == 2
+    assert main(['measured', 'nothing']) == 2
     assert 'no data set' in capsys.readouterr().err
-    assert measured_main(['measured', 'anser_board', '--shared', str(tmp_path)]) == 2
+    assert main(['measured', 'anser_board', '--shared', str(tmp_path)]) == 2
     assert 'no measured data' in capsys.readouterr().err
 
 
@@ -43,12 +42,12 @@ def test_a_recipe_is_commands_that_anybody_can_type(capsys, tmp_path, monkeypatc
 
     monkeypatch.setattr(measured.main, 'main', run)
     monkeypatch.setattr(measured, 'RECIPES', {'set': recipe('calibrate')})
-    assert measured_main(['measured', 'set', '--shared', str(tmp_path)]) == 0
+    assert main(['measured', 'set', '--shared', str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert typed[0][1].endswith('set.mcap') and '$ anser calibrate' in out
     assert 'not shown' not in out and '0.9 mm' in out
     monkeypatch.setattr(measured, 'RECIPES', {'set': recipe('evaluate')})
-    assert measured_main(['measured', 'set', '--shared', str(tmp_path)]) == 2
+    assert main(['measured', 'set', '--shared', str(tmp_path)]) == 2
     assert 'anser evaluate ended with 2' in capsys.readouterr().err
 
 
@@ -63,7 +62,7 @@ def test_numbers_that_are_missing_are_null():
 @pytest.mark.long
 @needs('measured')
 def test_json_alone_on_stdout(capsys, tmp_path):
-    code = measured_main(
+    code = main(
         ['measured', 'anser_board', '--json', '--out', str(tmp_path), '--shared', str(SHARED)]
     )
     out = capsys.readouterr().out

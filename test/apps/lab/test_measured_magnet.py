@@ -16,7 +16,7 @@ from anser_ros.apps.lab.measured.magnet_patch import (
     write_session,
 )
 from anser_ros.cli.main import main
-from anser_ros.errors import BagError, FitError
+from anser_ros.errors import BagError, FitError, ParameterError
 from anser_ros.sessions.session import load_session
 
 FOLDER = SHARED / 'measured' / 'magnet_patch'
@@ -105,10 +105,10 @@ class TestKept:
 class TestFiles:
     def test_missing_and_broken_files_are_one_line(self, tmp_path):
         with pytest.raises(FitError, match='no such file'):
-            magnet_patch.read_table(tmp_path / 'none.csv')
+            magnet_patch.read_poses(tmp_path / 'none.csv', 'm')
         (tmp_path / 'empty.csv').write_text('a,b\n')
-        with pytest.raises(FitError, match='no rows'):
-            magnet_patch.read_table(tmp_path / 'empty.csv')
+        with pytest.raises(ParameterError, match='no row of numbers'):
+            magnet_patch.read_poses(tmp_path / 'empty.csv', 'm')
         (tmp_path / 'part.csv').write_text('id,Bx\n' + '1,2\n' * 5)
         with pytest.raises(FitError, match='not poses'):
             magnet_patch.read_poses(tmp_path / 'part.csv', 'm')

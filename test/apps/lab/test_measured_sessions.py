@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.apps.lab.cli import measured
 from anser_ros.apps.lab.measured import hpi_coils, ilemt, navion, transformer
 from anser_ros.cli.main import main
-from anser_ros.errors import FitError
+from anser_ros.errors import FitError, ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import save_model
@@ -215,11 +215,12 @@ def test_measured_planes_become_sessions_in_the_frame_of_the_transformer(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ('text', 'said'), [('1 2 3\n', '3 columns, expected 9'), ('a b\n', 'data_set.txt: could not')]
+    ('text', 'said'),
+    [('1 2 3\n', '3 columns, expected 9'), ('a b\n', 'data_set.txt: no row of num')],
 )
 def test_a_file_of_another_form_is_refused(tmp_path, text, said):
     (tmp_path / 'data_set.txt').write_text(text)
-    with pytest.raises(FitError, match=said):
+    with pytest.raises((FitError, ParameterError), match=said):
         transformer.read(tmp_path)
 
 
@@ -251,7 +252,7 @@ def test_the_published_file_has_the_planes(tmp_path):
 class TestIlemt:
     def test_a_pole_that_turns_keeps_its_end_on_the_axis(self):
         stage = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 90], [10, 0, 0, 0, 0, 0.0]])
-        place, turn = ilemt.poses(stage, 'YoutZup')
+        place, turn = ilemt.poses(stage, 'YoutZup', 'YoutZup')
         np.testing.assert_allclose(place[0], [0.012, 0.0, 0.243], atol=1e-12)
         np.testing.assert_allclose(place[1], place[0], atol=1e-12)
         np.testing.assert_allclose(place[2] - place[0], [0.0, 0.01, 0.0], atol=1e-4)
@@ -261,7 +262,12 @@ class TestIlemt:
     @needs('measured', 'ilemt')
     def test_the_real_data(self, tmp_path):
         bags = ilemt.write_sessions(SHARED / 'measured' / 'ilemt', tmp_path)
-        assert [path.stem for path in bags[:2]] == ['ilemt_dipole_md', 'ilemt_dipole_ld']
+        assert bags[0].stem == 'ilemt_dipole_YoutZup_YoutZup_md'
+        assert len(bags) == 2 * (3 + 3 + 3 + 6)
         (tool,) = load_session(bags[0]).tools
-        assert tool.flux.shape == (426, 3, 3) and tool.has_pose.all()
-        assert len(ilemt.commands(bags, tmp_path)) == 8
+        assert tool.flux.shape == (142, 3, 3) and tool.has_pose.all()
+        (other,) = load_session(next(b for b in bags if 'turned_ZoutYup' in b.stem)).tools
+        # The source's fixture turns: what was before it is beside it.
+        turned = other.position.mean(axis=0) / np.linalg.norm(other.position.mean(axis=0))
+        assert tool.position[:, 2].min() > 0.1 and abs(turned[2]) < 0.3
+        assert len(ilemt.commands(bags, tmp_path)) == 5 + 3 + 3 + 3 + 6 + 3

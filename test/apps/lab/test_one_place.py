@@ -76,7 +76,7 @@ def resting(rng, *, tilt=0.01, inverted=(), noisy=(), count=60):
 
 
 def calibrated(measured, kinds=KINDS):
-    return calibrate_at_one_place(measured, 'simulated', GENERATOR, kinds, ACCURACY)
+    return calibrate_at_one_place(measured, GENERATOR, kinds, ACCURACY)
 
 
 class TestPlacedPoints:

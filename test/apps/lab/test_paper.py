@@ -91,7 +91,7 @@ def test_the_articles_own_method_is_real_least_squares(recordings):
 
 def test_the_drawing_gets_one_gain_an_emitter(recordings):
     session = recordings.load('factory_tool_a')
-    model = drawn_model(session, [session])
+    model = drawn_model(session)
     assert model.modes is None
     assert model.flux_error_t > 0
     assert field_errors(session, model)['N-RMSE'] < 3.0
@@ -153,7 +153,7 @@ def test_the_bound_shrinks_with_the_noise(recordings):
 def test_corrected_errors_keep_what_was_not_tracked(recordings):
     session = recordings.load('c_arm_30cm_tool_b')
     found = track(session, article_model(recordings.load('factory_tool_a')), in_phase=True)['Y']
-    assert found.tracked_fraction == 1.0
+    assert found.document()['tracked_fraction'] == 1.0
     assert np.allclose(found.corrected(found.true).distance, 0.0)
 
 

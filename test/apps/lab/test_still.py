@@ -97,7 +97,7 @@ def calibrated(measured, kinds):
     count = measured.flux.shape[2]
     centres, tones = CENTRES[:count] + [[0.01, -0.01, 0.0]], (1.0, 2.0, 3.0)[:count]
     generator = Generator(centres, np.zeros(count), 0.1, tuple('abc'[:count]), tones)
-    return calibrate_still(measured, 'made.mcap', generator, kinds, STATED)
+    return calibrate_still(measured, generator, kinds, STATED)
 
 
 class TestModel:

@@ -9,6 +9,7 @@ from conftest import spin_until
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from pose_world import World
 from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.corrector import (
@@ -21,6 +22,7 @@ from anser_ros.apps.poses.corrector import (
     to_model,
 )
 from anser_ros.apps.poses.diagnosis import diagnose_poses
+from anser_ros.apps.poses.importing import write_pose_session
 from anser_ros.apps.poses.nodes.corrector import Corrector
 from anser_ros.cli.main import main
 from anser_ros.errors import ModelFileError
@@ -158,7 +160,7 @@ def test_the_node_corrects_what_comes_and_tells_what_does_not(ros, bent, tmp_pat
     other.create_subscription(
         PoseWithCovarianceStamped, '/anser/corrected/sensor_0/pose_with_covariance', got.append, 10
     )
-    sender = other.create_publisher(PoseStamped, '/tracked/sensor_0/pose', 10)
+    sender = other.create_publisher(PoseStamped, '/tracked/sensor_0/pose', qos_profile_sensor_data)
     message = PoseStamped()
     message.header.stamp.sec = 5
     message.pose.position.x, message.pose.position.z = 0.05, -0.3
@@ -183,6 +185,46 @@ def test_the_node_corrects_what_comes_and_tells_what_does_not(ros, bent, tmp_pat
     finally:
         node.destroy_node()
         other.destroy_node()
+
+
+def test_a_model_corrects_and_judges_another_session(bent, tmp_path, capsys):
+    world, model = bent
+    other = World(12, duration=20.0, sensors=1)
+    other.offset, other.bend = world.offset, world.bend
+    bag, out, path = tmp_path / 'a.mcap', tmp_path / 'out', tmp_path / 'model.yaml'
+    write_pose_session(bag, other.session())
+    path.write_text(yaml.safe_dump(model), encoding='utf-8')
+    plain = [str(bag), '--poses', '--out', str(out)]
+    assert main(['evaluate', *plain]) == 0
+    assert 'Nothing was searched for' in capsys.readouterr().out
+    before = json.loads((out / 'evaluation.json').read_text())['held_out']
+    assert before['position_rmse_after_m'] == before['position_rmse_before_m']
+    assert main(['evaluate', *plain, '--model', str(path)]) == 0
+    assert 'before, mm' in capsys.readouterr().out
+    after = json.loads((out / 'evaluation.json').read_text())['held_out']
+    assert after['position_rmse_before_m'] == pytest.approx(before['position_rmse_after_m'])
+    assert after['position_rmse_after_m'] < 0.3 * after['position_rmse_before_m']
+    rows = np.genfromtxt(out / 'poses.csv', delimiter=',', names=True, dtype=None)
+    assert len(rows) == len(other.session().sensors['sensor_0'].time)
+    time = 1e-9 * rows['stamp_ns'] - 2.0
+    true, _ = other.sensor(0, time)
+    places = np.stack([rows[f'{axis}_m'] for axis in 'xyz'], axis=1)
+    inside = (time > 0.5) & (time < 19.0)
+    assert misfit(places[inside], true[inside]) < 1.2e-3
+    assert main(['diagnose', *plain, '--model', str(path)]) == 0
+    document = json.loads((out / 'diagnosis.json').read_text())
+    names = {effect['name'] for effect in document['effects']}
+    assert not names & {'time_offset', 'field_distortion'}  # what is left is out of its support
+    kept = yaml.safe_load((out / 'model.yaml').read_text())['effects']
+    assert {e['name'] for e in kept} >= {e['name'] for e in model['effects']}
+    for extra in (['--model', 'none.yaml'], ['--set', 'gate=3'], ['--resurveyed', 'tool']):
+        assert main(['diagnose', *plain, *extra]) != 0
+    assert main(['evaluate', *plain, '--baseline', str(bag)]) == 2
+    assert 'leave out: --baseline' in capsys.readouterr().err
+    model['effects'][0]['parameters']['sensor'] = 'tip'
+    path.write_text(yaml.safe_dump(model), encoding='utf-8')
+    assert main(['evaluate', *plain, '--model', str(path)]) != 0
+    assert 'the model knows tip, the session sensor_0' in capsys.readouterr().err
 
 
 def test_a_map_of_points_is_applied_where_it_is_confirmed(tmp_path, capsys):

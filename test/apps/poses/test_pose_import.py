@@ -249,6 +249,56 @@ def test_a_tool_tracker_file_with_its_header_once_more_goes_on(tmp_path):
     assert not session.lost
 
 
+def moving(count, stamp):
+    """Rows of TUM at 60 Hz of a hand with a jitter of 0.1 mm, under stamps of a function, s."""
+    time = np.arange(count) / 60.0
+    rng = np.random.default_rng(1)
+    places = 0.1 * np.sin(time[:, None] * [0.9, 0.7, 1.1]) + rng.normal(0, 1e-4, (count, 3))
+    return [f'{stamp(t):.6f} {x:.6f} {y:.6f} {z:.6f} 0 0 0 1' for t, (x, y, z) in
+            zip(time, places, strict=True)]  # fmt: skip
+
+
+@pytest.mark.parametrize('size', [0.4, 3600.0, -0.7])
+def test_a_clock_that_was_set_is_told_with_time_and_size(tmp_path, size):
+    start = 1_760_000_000.0
+    rows = moving(1200, lambda t: start + t + (size if t > 10.0 else 0.0))
+    session = import_poses([write(tmp_path / 'a.tum', *rows)])
+    assert f'the clock of a steps by {size:.1f} s at 10.0 s' in session.lost
+
+
+def test_a_pause_of_a_tracker_is_no_step_of_its_clock(tmp_path):
+    rows = moving(1200, lambda t: 1000.0 + t)
+    session = import_poses([write(tmp_path / 'a.tum', *rows[:600], *rows[630:])])
+    assert not session.lost
+
+
+def test_stamps_that_are_cut_are_refused_and_clocks_apart_are_told(tmp_path, capsys):
+    start = 1_760_000_000.0
+    cut = write(tmp_path / 'cut.tum', *moving(600, lambda t: start + t // 1))
+    assert run_verb('pivot', [str(cut)]) == 2
+    assert '60 poses of cut have each stamp: cut to seconds?' in capsys.readouterr().err
+    em = write(tmp_path / 'em.tum', *moving(600, lambda t: start + t))
+    for late, said in ((7200.0, '7200.0 s later'), (-1.76e9 + 50.0, '1759999950.0 s earlier')):
+        ot = write(tmp_path / 'ot.tum', *moving(600, lambda t, late=late: start + t + late))
+        assert run_verb('handeye', [str(em), '--reference', str(ot)]) == 2
+        words = capsys.readouterr().err
+        assert f'2025-10-09 08:53:20 to 08:53:30, reference {said}' in words
+    session = import_poses([em], [ot], shift_s=(late, 0.0))
+    np.testing.assert_allclose(session.sensors['em'].time, session.reference.time, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ('name', 'called'),
+    [('EM run-1', 'EM_run_1'), ('2025-03-04', 'sensor_2025_03_04'), ('Zeiger_ä', 'Zeiger_a'),
+     ('a.b.c', 'a_b_c'), ('—', 'body'), ('pen(2)', 'pen_2')],
+)  # fmt: skip
+def test_names_of_files_become_names_of_topics_and_are_told(tmp_path, name, called, capsys):
+    path = write(tmp_path / f'{name}.tum', *moving(9, lambda t: 5.0 + t))
+    assert run_verb('import_poses', [str(path), '--out', str(tmp_path / 'o.mcap')]) == 0
+    assert f'{name} is called {called}' in capsys.readouterr().out
+    assert set(read_pose_session(tmp_path / 'o.mcap').sensors) == {called}
+
+
 def test_counters_that_run_through_several_files_are_one_clock(tmp_path):
     """Two devices of their own clocks, one 250 ppm fast; the programs start 40 ms apart."""
     files = {'EM': [], 'OT': []}

@@ -40,20 +40,6 @@ def _coils(points, start, end, owner, count):
     return out
 
 
-@njit(cache=True, fastmath=True)
-def _weighted(points, start, end, currents):
-    count = currents.shape[1]
-    out = np.zeros((points.shape[0], count, 3), dtype=np.complex128)
-    for i in range(points.shape[0]):
-        for s in range(start.shape[0]):
-            x, y, z = _piece(points[i], start[s], end[s])
-            for k in range(count):
-                out[i, k, 0] += x * currents[s, k]
-                out[i, k, 1] += y * currents[s, k]
-                out[i, k, 2] += z * currents[s, k]
-    return out
-
-
 def coil_field(points, coils):
     """Field (P, K, 3), T/A, of K closed paths at points (P, 3), m, each carrying one ampere.
 

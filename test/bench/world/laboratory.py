@@ -35,7 +35,6 @@ class Laboratory:
     metals: list = field(default_factory=list)  # of (Body, Travel)
     on_flux: list[Callable] = field(default_factory=list)
     on_optical: list[Callable] = field(default_factory=list)
-    noise: dict = field(default_factory=dict)  # factor by channel; key -1 for all
 
     @classmethod
     def clean(cls, board):
@@ -131,7 +130,5 @@ def measured(lab, time, fluxes, noise_t, rng):
     for channels, flux in groups:
         for change in lab.on_flux:
             flux = change(lab, time, channels, flux)
-        factor = np.array([lab.noise.get(int(c), lab.noise.get(-1, 1.0)) for c in channels])
-        white = rng.normal(size=(*flux.shape, 2)) @ np.array([1.0, 1.0j])
-        out.append(flux + noise_t * factor[:, None] * white)
+        out.append(flux + noise_t * (rng.normal(size=(*flux.shape, 2)) @ np.array([1.0, 1.0j])))
     return out

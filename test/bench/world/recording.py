@@ -73,14 +73,13 @@ def wander_over(board, rng):
 
 
 def record_scan(path, lab, rng):
-    """Write the factory's recording, the tool at rest at point after point; its true path."""
+    """Write the factory's recording, the tool at rest at point after point."""
     position, rotation = raster(lab.board.scan, rng)
     time = np.arange(len(position), dtype=np.float64)
     fluxes = measured(lab, time, read_fluxes(lab, time, position, rotation), STATIC_NOISE_T, rng)
     stamps = _stamps(time)
     poses = _reported(position, rotation, rng)
     _write(path, lab.board, FLUX_HZ, stamps, fluxes, stamps, poses)
-    return {'stamp_ns': stamps, 'position': position, 'rotation': rotation}
 
 
 def _tracked(lab, wander, rng):

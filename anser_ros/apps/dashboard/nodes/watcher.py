@@ -159,7 +159,7 @@ class FluxStreams:
             if body not in self._pose_subscriptions:
                 topic, take = optical_topic(body, table.optical), partial(self._on_optical, body)
                 self._pose_subscriptions[body] = self._node.create_subscription(
-                    PoseStamped, topic, take, qos.STREAM
+                    PoseStamped, topic, take, qos.OTHERS
                 )
 
     def _on_optical(self, body: str, message: PoseStamped) -> None:

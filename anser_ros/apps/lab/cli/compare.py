@@ -3,7 +3,6 @@
 import argparse
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +23,8 @@ from anser_ros.cli.output import (
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.evaluation_files import (
     Compared,
-    ComparedShares,
     check_same_recording,
-    compare_errors,
-    compare_shares,
+    compare,
     read_errors,
     read_states,
 )
@@ -60,9 +57,10 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     one, two = read_errors(args.first), read_errors(args.second)
     tell('resampling')
     rng = np.random.default_rng(SEED)
-    found = {kind: compare_errors(one[kind], two[kind], rng) for kind, _, _ in KINDS}
-    shares = compare_shares(read_states(args.first), read_states(args.second), rng)
-    everything: dict[str, Mapping[str, Compared | ComparedShares]] = {**found, 'coverage': shares}
+    found = {kind: compare(one[kind], two[kind], rng) for kind, _, _ in KINDS}
+    states = read_states(args.first), read_states(args.second)
+    shares = compare(*states, rng, are_shares=True)
+    everything = {**found, 'coverage': shares}
     document: dict[str, Any] = {
         'schema': SCHEMA, 'first': str(args.first), 'second': str(args.second),
         **{kind: {name: _plain(c) for name, c in all_of.items()}
@@ -82,13 +80,17 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     return Result(document, (), shown, written)
 
 
-def _plain(one: Compared | ComparedShares) -> dict[str, Any]:
+def _plain(one: Compared) -> dict[str, Any]:
     """Plain data; null where there is no number."""
-    values = {key: None if value != value else value for key, value in asdict(one).items()}
-    return {**values, 'better': one.verdict}
+    kind = 'share' if one.are_shares else 'rmse'
+    alone = {} if one.are_shares else {'only_a': one.only_a, 'only_b': one.only_b}
+    values = {'low': one.low, 'high': one.high, 'n': one.n, **alone, f'{kind}_a': one.a}
+    values[f'{kind}_b'] = one.b
+    known = {key: None if value != value else value for key, value in values.items()}
+    return {**known, 'better': one.verdict}
 
 
-def verdict(found: Mapping[str, Mapping[str, Compared | ComparedShares]]) -> str:
+def verdict(found: Mapping[str, Mapping[str, Compared]]) -> str:
     """State in a line for how many coils and bodies each is better, in error and in coverage."""
     words = {'position': 'position error', 'orientation': 'orientation error',
              'coverage': 'frames with a pose'}  # fmt: skip
@@ -109,29 +111,19 @@ def alone(found: Mapping[str, Compared]) -> str:
     return f'Both have {pairs} poses with an error; {", ".join(counted)} has.'
 
 
-def _pair(one: Compared | ComparedShares) -> tuple[float, float]:
-    if isinstance(one, Compared):
-        return one.rmse_a, one.rmse_b
-    return one.share_a, one.share_b
-
-
-def _rows(
-    found: Mapping[str, Compared | ComparedShares], scale: float, digits: int
-) -> list[list[str]]:
+def _rows(found: Mapping[str, Compared], scale: float, digits: int) -> list[list[str]]:
     """Rows of a table of at most 80 columns."""
     rows = []
     for name, one in found.items():
         interval = f'{scale * one.low:+.{digits}f} .. {scale * one.high:+.{digits}f}'
         rows.append([
-            name, str(one.n), *(number(value, scale, f'.{digits}f') for value in _pair(one)),
+            name, str(one.n), *(number(value, scale, f'.{digits}f') for value in (one.a, one.b)),
             '-' if np.isnan(one.low) else interval, WORDS[one.verdict],
         ])  # fmt: skip
     return rows
 
 
-def draw(
-    found: Mapping[str, Mapping[str, Compared]], shares: Mapping[str, ComparedShares]
-) -> Figure:
+def draw(found: Mapping[str, Mapping[str, Compared]], shares: Mapping[str, Compared]) -> Figure:
     """Draw the differences of each name's errors and shares of poses with their intervals.
 
     Left of zero the second evaluation has smaller errors, and right of zero more poses.
@@ -151,8 +143,8 @@ def draw(
             panel.set(xticks=[], xlabel=label)
             continue
         for name, one in all_of.items():
-            row, (first, second) = names.index(name), _pair(one)
-            panel.plot(scale * (second - first), row, 'o', color='C0')
+            row = names.index(name)
+            panel.plot(scale * (one.b - one.a), row, 'o', color='C0')
             if np.isfinite(one.low):
                 panel.hlines(row, scale * one.low, scale * one.high, color='C0')
         if not any(one.sign or one.low != one.high for one in all_of.values()):

@@ -2,10 +2,11 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
-from anser_ros.apps.lab.metal_follower import models_of
-from anser_ros.apps.lab.metal_lattice import save_known_metal
+from anser_ros.apps.lab.metal_follower import KnownMetalModels
+from anser_ros.apps.lab.metal_lattice import load_known_metal, save_known_metal
 from anser_ros.cli.output import (
     Result,
     Tell,
@@ -89,7 +90,8 @@ def models(
 ) -> Callable[[PreparedSession], FrameModels] | None:
     """Return what gives the model of each frame, None where the option is not given.
 
-    Raises `ParameterError` when it is given beside other options that give a model.
+    Raises `ParameterError` when it is given beside other options that give a model, and as
+    `load_known_metal`.
     """
     if args.known_metal is None:
         return None
@@ -97,4 +99,4 @@ def models(
         raise ParameterError(
             f'--known-metal follows metal by the tools alone; leave out {", ".join(others)}'
         )
-    return models_of(args.known_metal)
+    return partial(KnownMetalModels, known=load_known_metal(args.known_metal))

@@ -21,7 +21,6 @@ from rich.console import Console
 from rich.table import Table
 
 from anser_ros.apps.lab.recorded_health import (
-    LiveErrors,
     first_warnings,
     kept_share,
     last_words,
@@ -118,11 +117,11 @@ def record(run: Run) -> Path:
     bag = run.folder / 'bag'
     try:
         with Supervisor(run.folder / 'logs') as supervisor:
-            for name, command in _commands(run, ports / 'cu').items():
+            commands = _commands(run, ports / 'cu')
+            for name, command in commands.items():
                 supervisor.start(name, command)
-            listeners = [f'{AFTER}/acquisition', f'{AFTER}/recorder']
-            listeners += [f'{AFTER}/tracker'] if run.served is not None else []
-            listeners += [f'{AFTER}/watcher'] if run.watched is not None else []
+            ours = ('acquisition', 'recorder', 'tracker', 'watcher')
+            listeners = [f'{AFTER}/{name}' for name in ours if name in commands]
             listeners += [f'{apart}/tracker' for apart in _beside(run)]
             _wait(supervisor, run, lambda: _unready(bag, listeners))
             unit = simulated_unit(ports / 'cu', setup_file=run.setup, metal=False, **run.unit)
@@ -201,6 +200,9 @@ NAMED, PARTLY, UNEXPLAINED = 'named', 'named in part', 'said unexplained'
 MISSED, WRONG = 'missed', 'wrong name'
 SITES = ('channel', 'channels', 'coil', 'coils')
 TRACKERS = ('ungated', 'before', 'after')
+LIVE_FIGURES = (
+    'position_rmse_m', 'position_prc95_m', 'orientation_rmse_rad', 'orientation_prc95_rad',
+)  # fmt: skip
 
 
 def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
@@ -266,19 +268,12 @@ def second_run(session: Session, corrected: FieldModel, known: FieldModel) -> di
     for name, namespace, model in (
         ('ungated', UNGATED, known), ('before', BEFORE, known), ('after', AFTER, corrected)
     ):  # fmt: skip
-        errors = list(live_errors(prepare(session, model), namespace).values())
         share = ok_share(words, f'{namespace}/tracker'.strip('/'))
-        figures[name] = {'published_share': share, **_figures(errors)}
+        place, turn = live_errors(prepare(session, model), namespace)
+        found = error_statistics('position', 'm', place)
+        found |= error_statistics('orientation', 'rad', turn)
+        figures[name] = {'published_share': share, **{key: found[key] for key in LIVE_FIGURES}}
     return figures
-
-
-def _figures(errors: list[LiveErrors]) -> dict[str, float | None]:
-    out: dict[str, float | None] = {}
-    for key, unit in (('position', 'm'), ('orientation', 'rad')):
-        values = np.concatenate([getattr(error, key) for error in errors])
-        found = error_statistics(key, unit, values)
-        out |= {name: found[name] for name in (f'{key}_rmse_{unit}', f'{key}_prc95_{unit}')}
-    return out
 
 
 def table(rounds: list[dict[str, Any]], console: Console) -> None:

@@ -22,8 +22,7 @@ from anser_ros.apps.lab.measured import (
     navion,
     transformer,
 )
-from anser_ros.apps.lab.measured import recipe as shared_data
-from anser_ros.apps.lab.measured.recipe import SHARED, Recipe, ReportRow
+from anser_ros.apps.lab.measured.recipe import SHARED, Recipe, ReportRow, shared_folder
 from anser_ros.cli import main
 from anser_ros.cli.output import Result, add_json, add_out, make_folder, say, write_files
 from anser_ros.errors import ParameterError
@@ -59,7 +58,9 @@ def run(args: argparse.Namespace) -> int:
     wrong = [name for name in args.datasets if name not in RECIPES]
     if wrong:
         raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(RECIPES)}')
-    shared = shared_folder(args.shared)
+    shared = args.shared or shared_folder()
+    if not (shared / 'measured').is_dir():
+        raise ParameterError(f'no measured data: {shared} has no folder measured; use --shared')
     console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
     make_folder(args.out)
     make_folder(args.bags)
@@ -109,14 +110,6 @@ def _cook(
                 words = f'anser {command[0]} ended with {code}: {last}'
                 raise ParameterError(f'{recipe.name}: {words}')
         return recipe.rows(folder, bags, out)
-
-
-def shared_folder(given: Path | None) -> Path:
-    """Return the folder that contains ``measured/``; raises `ParameterError` without one."""
-    folder = given or shared_data.shared_folder()
-    if not (folder / 'measured').is_dir():
-        raise ParameterError(f'no measured data: {folder} has no folder measured; use --shared')
-    return folder
 
 
 def to_document(rows: list[ReportRow]) -> dict[str, Any]:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 from anser_ros.apps.lab.experiments.recordings import (
     Recordings,
-    default_folder,
     given_recordings,
     missing,
     simulate_recordings,
 )
 from anser_ros.apps.lab.experiments.report import draw_all, write_report
 from anser_ros.apps.lab.experiments.study import Study
+from anser_ros.apps.lab.measured.recipe import shared_folder
 from anser_ros.cli.output import (
     Result,
     Tell,
@@ -73,11 +73,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
 
 def _recordings(args: argparse.Namespace, scratch: Path) -> Recordings:
     """Return the recordings asked for, the shared ones, or else ones simulated here."""
-    if args.simulate:
+    folder = args.sessions or shared_folder() / 'sessions' / 'paper'
+    if args.simulate or (args.sessions is None and missing(folder)):
         return simulate_recordings(scratch, args.seed)
-    if args.sessions is not None:
-        return given_recordings(args.sessions)
-    folder = default_folder()
-    if not missing(folder):
-        return given_recordings(folder)
-    return simulate_recordings(scratch, args.seed)
+    return given_recordings(folder)

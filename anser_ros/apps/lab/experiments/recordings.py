@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.lab.measured.recipe import shared_folder
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array
 from anser_ros.errors import BagError
-from anser_ros.physics.dipole import field_basis
+from anser_ros.physics.dipole import dipole_field
+from anser_ros.physics.sensor import along_each_axis
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.recording import STATIC_NOISE_T, record
@@ -29,7 +29,7 @@ from anser_ros.simulation.world import (
     steel_disc,
 )
 from anser_ros.wire.setup import SensorSpec, Setup, parse_setup
-from anser_ros.wire.text_files import config_path
+from anser_ros.wire.text_files import read_config
 
 STATISTICS = ('RMSE', 'ME', 'PRC50', 'PRC95')
 SENSORS = ('Y', 'Z')
@@ -85,16 +85,6 @@ TABLE_5_MM = {
 HEAD_DISTANCES_CM = (30, 20, 10, 8, 6, 4, 2)
 """Distances of the X-ray head below the board, cm (article, Figs. 7 and 8)."""
 MATERIALS = ('aluminium', 'mu-metal')
-NAMES = (
-    'factory_tool_a',
-    'midplane_tool_b',
-    *(f'shield_{m.replace("-", "_")}_tool_b' for m in MATERIALS),
-    *(f'shield_{m.replace("-", "_")}_c_arm_tool_b' for m in MATERIALS),
-    *(f'c_arm_{d:02d}cm_tool_b' for d in HEAD_DISTANCES_CM),
-    'collimator_tool_a',
-    'collimator_bottom_tool_b',
-    'collimator_midplane_tool_b',
-)
 
 
 @dataclass(frozen=True)
@@ -119,11 +109,6 @@ def missing(folder: Path) -> list[str]:
     return [name for name in NAMES if not (folder / f'{name}.mcap').is_file()]
 
 
-def default_folder() -> Path:
-    """Return the shared recordings' folder."""
-    return shared_folder() / 'sessions' / 'paper'
-
-
 def given_recordings(folder: Path) -> Recordings:
     """Return the recordings of a folder; raises `BagError` when one is missing."""
     lacking = missing(folder)
@@ -135,21 +120,17 @@ def given_recordings(folder: Path) -> Recordings:
     return Recordings(folder, 'simulated by an independent field world')
 
 
-def with_sensors(session: Session, names: list[str]) -> Session:
-    """Return the session with some sensors of its only tool."""
-    tool = session.tools[0]
-    rows = np.array([i for i, name in enumerate(tool.sensors.name) if name in names])
-    return replace(session, tools=(tool.sensors_only(rows),), reference=None)
+def lattice_cells(position: Array) -> Array:
+    """Return numbers along x and y (F, 2) of the points (F, 3) of a square lattice."""
+    where, side = position[:, :2], max(round(np.sqrt(len(position))) - 1, 1)
+    low, high = np.nanmin(where, axis=0), np.nanmax(where, axis=0)
+    return np.asarray(np.rint((where - low) / np.maximum(high - low, 1e-9) * side))
 
 
 def checkerboard(session: Session) -> tuple[Session, Session]:
     """Return training and test points of a lattice, as on a checkerboard (article, Fig. 2)."""
     tool = session.tools[0]
-    where = tool.position[:, :2]
-    side = max(round(np.sqrt(len(where))) - 1, 1)
-    low, high = np.nanmin(where, axis=0), np.nanmax(where, axis=0)
-    cell = np.rint((where - low) / np.maximum(high - low, 1e-9) * side)
-    black = np.nansum(cell, axis=1).astype(np.int64) % 2 == 0
+    black = np.nansum(lattice_cells(tool.position), axis=1).astype(np.int64) % 2 == 0
     training, test = (
         replace(session, tools=(tool.frames(rows),), reference=None) for rows in (black, ~black)
     )
@@ -236,14 +217,33 @@ def with_metal(source: FieldSource, metal: Sequence[MetalBody], setup: Setup) ->
         [source(body.centres(0.0)) * body.polarisability(tones) for body in metal]
     )
 
-    def field(points: Array) -> ComplexArray:
-        out = np.array(source(points), dtype=complex)
-        for component, unit in enumerate(np.eye(3)):
-            basis = field_basis(points, where, np.broadcast_to(unit, where.shape))
-            out += np.einsum('pni,nk->pik', basis, induced[:, component])
-        return out
+    dipoles = (*along_each_axis(where), induced.reshape(-1, len(tones)))
+    return lambda points: source(points) + dipole_field(points, *dipoles)
 
-    return field
+
+def _experiments() -> list[tuple[str, Raster, list[MetalBody]]]:
+    """Each experiment's name, its points, and the metal."""
+    small, collimator = Raster(8, 0.2, 0.15), [head(COLLIMATOR_DEPTH_M)]
+    found: list[tuple[str, Raster, list[MetalBody]]] = [
+        ('factory_tool_a', Raster(31, 0.30, 0.15), []),
+        ('midplane_tool_b', Raster(26, 0.25, 0.15), []),
+    ]
+    for material in MATERIALS:
+        stem = f'shield_{material.replace("-", "_")}'
+        found.append((f'{stem}_tool_b', Raster(25, 0.25, 0.15), [plate(material)]))
+        found.append((f'{stem}_c_arm_tool_b', small, [plate(material), head(0.05)]))
+    for distance in HEAD_DISTANCES_CM:
+        found.append((f'c_arm_{distance:02d}cm_tool_b', small, [head(0.03 + distance / 100)]))
+    return [
+        *found,
+        ('collimator_tool_a', Raster(13, 0.24, 0.15), collimator),
+        ('collimator_bottom_tool_b', Raster(8, 0.2, 0.12), collimator),
+        ('collimator_midplane_tool_b', small, collimator),
+    ]
+
+
+EXPERIMENTS = _experiments()
+NAMES = tuple(name for name, *_ in EXPERIMENTS)
 
 
 def simulate_recordings(folder: Path, seed: int, share: float = 1.0) -> Recordings:
@@ -253,31 +253,13 @@ def simulate_recordings(folder: Path, seed: int, share: float = 1.0) -> Recordin
     fraction of the article's; at least six are left.
     """
     rng = np.random.default_rng(seed)
-    text = config_path('demo_setup.yaml').read_text(encoding='utf-8')
-    drawn = replace(parse_setup(text), flux_rate_hz=1.0)
+    drawn = replace(parse_setup(read_config('demo_setup.yaml')), flux_rate_hz=1.0)
     board = board_source(manufactured(drawn, rng))
     setups = {
         'tool_a': replace(drawn, sensors=_tool_a()),
         'tool_b': replace(drawn, sensors=_tool_b()),
     }
-    small = Raster(8, 0.2, 0.15)
-    jobs: list[tuple[str, Raster, list[MetalBody]]] = [
-        ('factory_tool_a', Raster(31, 0.30, 0.15), []),
-        ('midplane_tool_b', Raster(26, 0.25, 0.15), []),
-    ]
-    for material in MATERIALS:
-        stem = f'shield_{material.replace("-", "_")}'
-        jobs.append((f'{stem}_tool_b', Raster(25, 0.25, 0.15), [plate(material)]))
-        jobs.append((f'{stem}_c_arm_tool_b', small, [plate(material), head(0.05)]))
-    for distance in HEAD_DISTANCES_CM:
-        jobs.append((f'c_arm_{distance:02d}cm_tool_b', small, [head(0.03 + distance / 100)]))
-    collimator = [head(COLLIMATOR_DEPTH_M)]
-    jobs += [
-        ('collimator_tool_a', Raster(13, 0.24, 0.15), collimator),
-        ('collimator_bottom_tool_b', Raster(8, 0.2, 0.12), collimator),
-        ('collimator_midplane_tool_b', small, collimator),
-    ]
-    for name, full, metal in jobs:
+    for name, full, metal in EXPERIMENTS:
         raster = replace(full, side=max(round(full.side * share), 6))
         body = 'tool_a' if name.endswith('tool_a') else 'tool_b'
         setup = setups[body]

@@ -1,7 +1,6 @@
 """Writes the study of the article's experiments as tables and figures."""
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -167,12 +166,9 @@ def _lattices(errors: Mapping[str, SensorErrors], folder: Path) -> Path:
 
 def _lattice_lines(places: Array) -> Sequence[Integers]:
     """Return the rows and columns of a square lattice as indices in order."""
-    side = max(round(np.sqrt(len(places))) - 1, 1)
-    low, high = np.nanmin(places, axis=0)[:2], np.nanmax(places, axis=0)[:2]
-    cell = np.rint((places[:, :2] - low) / np.maximum(high - low, 1e-9) * side)
-    lines = []
+    cell, lines = recordings.lattice_cells(places), []
     for along, across in ((0, 1), (1, 0)):
-        for value in range(side + 1):
+        for value in range(int(np.nanmax(cell)) + 1):
             rows = np.flatnonzero(cell[:, across] == value)
             lines.append(rows[np.argsort(places[rows, along])])
     return lines
@@ -224,37 +220,33 @@ def _header(results: Document) -> str:
     )
 
 
-def _row(cells: Sequence[str]) -> str:
-    return '| ' + ' | '.join(cells) + ' |'
-
-
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [_row(head), _row(['---'] * len(head)), *(_row(row) for row in rows)]
-    return '\n'.join(lines)
+    lines = (head, ['---'] * len(head), *rows)
+    return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
 
 
-def _sensor_rows(name: str, cell: Callable[[str, str], str]) -> list[list[str]]:
-    """Return a row for each sensor, with a cell for each of its statistics."""
+def _sensor_rows(name: str, digits: int, *figures: recordings.Column) -> list[list[str]]:
+    """Return a row for each sensor, with a cell for each statistic of all figures."""
     return [
-        [name, sensor, *(cell(sensor, statistic) for statistic in recordings.STATISTICS)]
+        [name, sensor, *(
+            ' / '.join(f'{one[sensor][statistic]:.{digits}f}' for one in figures)
+            for statistic in recordings.STATISTICS
+        )]
         for sensor in recordings.SENSORS
-    ]
+    ]  # fmt: skip
 
 
-def _printed_rows(millimetres: recordings.Column) -> list[list[str]]:
-    return _sensor_rows(PRINTED, lambda sensor, s: f'{millimetres[sensor][s]:.2f}')
-
-
-def _position_rows(name: str, errors: Document) -> list[list[str]]:
-    return _sensor_rows(name, lambda sensor, s: f'{errors[sensor]["position_mm"][s]:.3f}')
+def _column(errors: Document, figure: str) -> recordings.Column:
+    return {sensor: found[figure] for sensor, found in errors.items()}
 
 
 def _tracked(results: Document, experiment: str, printed: recordings.Column) -> str:
     """Return the table of an experiment's position errors below what the article printed."""
-    rows = _printed_rows(printed)
+    rows = _sensor_rows(PRINTED, 2, printed)
     for method, errors in results['tracking'][experiment].items():
         is_clean = method == 'ours' and experiment.split()[1] in CLEAN
-        rows += _position_rows(CLEAN_WORDS if is_clean else WORDS[method], errors)
+        words = CLEAN_WORDS if is_clean else WORDS[method]
+        rows += _sensor_rows(words, 3, _column(errors, 'position_mm'))
     return _table(['model', 'sensor', *recordings.STATISTICS], rows)
 
 
@@ -264,21 +256,13 @@ def _bound_line(results: Document, experiment: str) -> str:
     return f'Cramer-Rao bound of the position (root mean square): {values}.'
 
 
-def _pair(
-    mm: recordings.Column, deg: recordings.Column, digits: int, sensor: str, statistic: str
-) -> str:
-    return f'{mm[sensor][statistic]:.{digits}f} / {deg[sensor][statistic]:.{digits}f}'
-
-
 def _table_2(results: Document) -> str:
     rows = []
     for model, mm in recordings.TABLE_2_MM.items():
-        deg = recordings.TABLE_2_DEG[model]
-        rows += _sensor_rows(f'{PRINTED}: {model}', partial(_pair, mm, deg, 2))
+        rows += _sensor_rows(f'{PRINTED}: {model}', 2, mm, recordings.TABLE_2_DEG[model])
     for method, errors in results['tracking']['table_2'].items():
-        mm = {sensor: found['position_mm'] for sensor, found in errors.items()}
-        deg = {sensor: found['orientation_deg'] for sensor, found in errors.items()}
-        rows += _sensor_rows(WORDS[method], partial(_pair, mm, deg, 3))
+        both = (_column(errors, figure) for figure in ('position_mm', 'orientation_deg'))
+        rows += _sensor_rows(WORDS[method], 3, *both)
     head = ['model', 'sensor', *(f'{s}, mm / deg' for s in recordings.STATISTICS)]
     return (
         '## Table II: a new model of the board (simulated)\n\nTrained with tool A, tested with '

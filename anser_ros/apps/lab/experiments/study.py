@@ -14,7 +14,6 @@ from anser_ros.apps.lab.experiments.recordings import (
     STATISTICS,
     Recordings,
     checkerboard,
-    with_sensors,
 )
 from anser_ros.apps.lab.measured import anser_board
 from anser_ros.apps.lab.measured.recipe import shared_folder
@@ -75,13 +74,13 @@ def centres_extension(session: Session) -> float:
     return float((reach / generator.half_extent).max())
 
 
-def drawn_model(session: Session, training: Sequence[Session]) -> FieldModel:
+def drawn_model(session: Session) -> FieldModel:
     """Return the drawing's Biot-Savart model with a real gain for each emitter.
 
-    The gains are fitted to undistorted recordings.
+    The gains are fitted to the session, which must be undistorted.
     """
     nominal = model_for(NOMINAL, session)
-    tools = [with_pose(tool) for other in training for tool in other.tools]
+    tools = [with_pose(tool) for tool in session.tools]
     gains = emitter_gains(nominal, tools).real
     # The drawing's own tolerances are what the gains and the data now replace.
     model = replace(nominal, moments=nominal.moments * gains, modes=None)
@@ -138,18 +137,17 @@ class SensorErrors:
         )
         return SensorErrors(tracked, self.true, distance, self.angle)
 
-    @property
-    def tracked_fraction(self) -> float:
-        """Return the fraction of the frames that have a pose."""
-        return float(np.isfinite(self.distance).mean())
-
     def millimetres(self) -> dict[str, float]:
         """Return RMSE, ME, PRC50 and PRC95 of the position (article, equation 7), mm."""
         return statistics(1e3 * self.distance)
 
-    def degrees(self) -> dict[str, float]:
-        """Return the same figures of the orientation, degrees."""
-        return statistics(np.degrees(self.angle))
+    def document(self) -> dict[str, Any]:
+        """Return these, those of the orientation, and the share of frames with a pose."""
+        return {
+            'position_mm': self.millimetres(),
+            'orientation_deg': statistics(np.degrees(self.angle)),
+            'tracked_fraction': float(np.isfinite(self.distance).mean()),
+        }
 
 
 def statistics(errors: Array) -> dict[str, float]:
@@ -207,14 +205,7 @@ class Results:
             'origin': self.origin,
             'tracking': {
                 experiment: {
-                    method: {
-                        sensor: {
-                            'position_mm': e.millimetres(),
-                            'orientation_deg': e.degrees(),
-                            'tracked_fraction': e.tracked_fraction,
-                        }
-                        for sensor, e in errors.items()
-                    }
+                    method: {sensor: found.document() for sensor, found in errors.items()}
                     for method, errors in methods.items()
                 }
                 for experiment, methods in self.tracking.items()
@@ -247,7 +238,7 @@ class Study:
     @cached_property
     def drawing(self) -> FieldModel:
         """Return the drawing's Biot-Savart model with gains from the recording without metal."""
-        return drawn_model(self.factory, [self.factory])
+        return drawn_model(self.factory)
 
     def run(self) -> Results:
         """Run all experiments and return their results."""
@@ -313,15 +304,11 @@ class Study:
         """Run Table III and Fig. 6: half of the points over a plate predict the other half."""
         for material in MATERIALS:
             training, test = checkerboard(self.recordings.shield(material))
-            article, ours = (
-                article_model(training),
-                self._ours(f'{material}, half', training).model,
-            )
+            article = article_model(training)
+            ours = self._ours(f'{material}, half', training).model
+            sets = {'training': training, 'test': test}
             self.results.fields[material] = {
-                method: {
-                    'training': field_errors(training, model),
-                    'test': field_errors(test, model),
-                }
+                method: {name: field_errors(part, model) for name, part in sets.items()}
                 for method, model in (('article', article), ('ours', ours))
             }
             self._compare(f'table_3 {material}', test, ours, article=article)
@@ -394,9 +381,7 @@ def outer_planes(session: Session) -> Session:
     tool = session.tools[0]
     heights = tool.sensors.position[:, 2]
     outer = np.abs(heights - np.median(heights)) > 0.25 * np.ptp(heights)
-    return with_sensors(
-        session, [n for n, keep in zip(tool.sensors.name, outer, strict=True) if keep]
-    )
+    return replace(session, tools=(tool.sensors_only(np.flatnonzero(outer)),), reference=None)
 
 
 def field_errors(session: Session, model: FieldModel) -> dict[str, float]:

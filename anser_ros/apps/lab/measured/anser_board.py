@@ -12,7 +12,7 @@ import numpy as np
 from anser_ros.apps.lab.measured.recipe import Recipe, ReportRow, figure, ran
 from anser_ros.arrays import Array
 from anser_ros.errors import FitError
-from anser_ros.wire.text_files import read_fiducials
+from anser_ros.wire.tables import read_points
 
 NAME = 'anser_board'
 PITCH_M = 31.75e-3
@@ -30,9 +30,9 @@ def load(folder: Path) -> dict[str, Array]:
     """Return the reported points (m) of every run, by the names of the files.
 
     Raises `FitError` when no run is there, or one has another number of points than the board has
-    places, and `BagError` when a file is no list of fiducials.
+    places, and `ParameterError` when a file is no list of fiducials.
     """
-    runs = {path.stem: read_fiducials(path) for path in sorted(folder.glob('*.fcsv'))}
+    runs = {path.stem: read_points(path) for path in sorted(folder.glob('*.fcsv'))}
     if not runs:
         raise FitError(f'no runs (*.fcsv) in {folder}')
     count = len(places())

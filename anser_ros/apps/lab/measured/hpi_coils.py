@@ -149,11 +149,6 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
     return [path]
 
 
-def commands(bags: list[Path], out: Path) -> list[list[str]]:
-    """Return the commands that find the coils, with sensors as stated and as found."""
-    return calibrations(bags[0], out)
-
-
 def distance_mm(found: Array, digitised: Array) -> float:
     """Return the rms distance, mm, of places (4, 3), in any order, after the best rigid move."""
 
@@ -222,4 +217,4 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     ]  # fmt: skip
 
 
-RECIPE = Recipe(NAME, write_sessions, commands, rows)
+RECIPE = Recipe(NAME, write_sessions, lambda bags, out: calibrations(bags[0], out), rows)

@@ -3,25 +3,18 @@
 The data (github robmacl/ilemt_cal_data, IEEE Sensors J. 2025, doi 10.1109/JSEN.2025.3533436; no
 licence file, the paper states Apache-2.0 for its software) are read where they lie: `stage`
 (F, 6), mm and degrees as commanded, and `coupling` (F, band, sensor, source), complex, without a
-unit, of which 1 is written as 10 uT. Frame fg is the source fixture's: z to the sensor, x up. The
-body's origin is the middle of the sensor's fixture. A model of coarse patterns (`md`) tracks
-fine ones (`ld`), the three sensor fixtures together.
+unit, of which 1 is written as 10 uT. Frame fg turns with the source: in its home fixture z points
+to the sensor and x up. The body's origin is the middle of the sensor's fixture. Each pair of
+fixtures is a session; a model of all coarse patterns (`md`) tracks the fine ones (`ld`).
 """
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.lab.measured.recipe import (
-    Recipe,
-    ReportRow,
-    existing,
-    figure,
-    ran,
-    vector,
-    write_frames,
-)
+from anser_ros.apps.lab.measured import recipe
 from anser_ros.arrays import Array
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
@@ -29,24 +22,34 @@ NAME, BODY = 'ilemt', 'premo'
 X, Y, Z = np.eye(3)  # unit vectors of any frame
 FG = np.stack([Z, X, Y])  # rows: axes of fg in the source fixture's frame
 HOME_M = np.array([0.0, 0.243, 0.012])  # the stage's zero in that frame, by a ruler
-FIXTURES = {'YoutZup': (Y, Z), 'ZinXdown': (-Z, -X), 'ZinYup': (-Z, Y)}
-"""Axes of the sensor that point away from the source and up."""
+FIXTURES = {
+    'YoutZup': (Y, Z), 'ZinXdown': (-Z, -X), 'ZinYup': (-Z, Y), 'XinYup': (-X, Y),
+    'XoutZup': (X, Z), 'ZoutYup': (Z, Y),
+}  # fmt: skip
+"""Axes of what a fixture holds that point away from the source and up."""
+HOME = 'YoutZup'
+SENSOR = tuple((HOME, held) for held in (HOME, 'ZinXdown', 'ZinYup'))  # fixtures of both
+SOURCE = tuple((held, HOME) for held in ('XinYup', 'XoutZup', 'ZoutYup'))
 AXES = (Y, X, -Z)  # of the sensor's three coils on its mover
 DIPOLE = ((0.030, 0.045, -0.020), (-0.035, 0.050, -0.020), (0.0, 0.055, 0.035))
 CONCENTRIC = ((-0.015, 0.0, 0.010),) * 3
 """Middles of the source's coils in its fixture's frame, m, by a ruler."""
+TONES = (7500.0, 10500.0, 13500.0), (300.0, 330.0, 360.0)  # of the bands, Hz
+ROTATED = 'cal_9_16_premo_rotated_dipole'
 SETS = {
-    'dipole': ('cal_9_16_premo_rotated_dipole', DIPOLE, 0, (7500.0, 10500.0, 13500.0)),
-    'concentric': ('cal_7_30_premo_cmu', CONCENTRIC, 0, (7500.0, 10500.0, 13500.0)),
-    'low': ('cal_9_16_premo_rotated_dipole', DIPOLE, 1, (300.0, 330.0, 360.0)),
+    'dipole': (ROTATED, DIPOLE, 0, SENSOR),
+    'concentric': ('cal_7_30_premo_cmu', CONCENTRIC, 0, SENSOR),
+    'low': (ROTATED, DIPOLE, 1, SENSOR),
+    'turned': (ROTATED, DIPOLE, 0, (*SENSOR, *SOURCE)),
 }
-"""Folder, places of the coils, band and tones, Hz, of each set."""
-PAPER = {'dipole': (0.272, 0.210), 'concentric': (0.416, 0.273)}
+"""Folder, places of the coils and band of each set, and its fixtures."""
+PAPER = {'dipole': (0.272, 0.210), 'concentric': (0.416, 0.273), 'turned': (3.60, 1.49)}
 """Errors of the makers' own calibration, mm and degrees rms, on data of the same source."""
+KEYS = 'position_rmse_m', 'orientation_rmse_rad', 'tracked_fraction'
+SCALES = 1e3, np.degrees(1.0), 100.0
 TESLA = 1e-5  # T of a unit of the readings: nominal, cancels in all errors
 STATED = {'flux_noise_t': 2e-10, 'optical_position_m': 6.2e-5, 'optical_rotation_rad': 1.7e-3}
-"""Noise at rest, and what is left of the stage's errors."""
-VOLUME = ((-0.09, -0.11, 0.14), (0.12, 0.11, 0.35))  # m: all poses, and some beside
+BEFORE, AROUND = ((-0.09, -0.11, 0.14), (0.12, 0.11, 0.35)), ((-0.35,) * 3, (0.35,) * 3)  # m
 STAGE = (  # from axis, to axis, place and error, mm: the makers' measurement of their stage
     (2, 0, ((-46, -20, 0, 20, 50), (-0.14, -0.01, 0.05, 0.085, 0.1))),
     (2, 2, ((-46, -21, 4, 29, 49), (0.0, -0.05, -0.09, -0.115, -0.13))),
@@ -55,74 +58,80 @@ STAGE = (  # from axis, to axis, place and error, mm: the makers' measurement of
 )
 
 
-def poses(stage: Array, fixture: str) -> tuple[Array, Array]:
+def held(fixture: str) -> Array:
+    """Return the rotation to a fixture's frame from that of what it holds."""
+    out, up = FIXTURES[fixture]
+    return np.stack([np.cross(out, up), out, up])
+
+
+def poses(stage: Array, source: str, sensor: str) -> tuple[Array, Array]:
     """Return positions (F, 3), m, and quaternions (F, 4) of the body, of a stage's (F, 6)."""
     off = np.zeros((len(stage), 3))
-    for source, target, (place, error) in STAGE:
-        off[:, target] += np.interp(stage[:, source], place, error) - np.interp(0.0, place, error)
+    for of, target, (place, error) in STAGE:
+        off[:, target] += np.interp(stage[:, of], place, error) - np.interp(0.0, place, error)
     spin = Rotation.from_euler('z', stage[:, 5:6], degrees=True)
-    out, up = FIXTURES[fixture]
-    held = np.stack([np.cross(out, up), out, up])
-    turn = Rotation.from_matrix(FG @ spin.as_matrix() @ held)
-    return (1e-3 * (stage[:, :3] + spin.apply(off)) + HOME_M) @ FG.T, turn.as_quat()
+    to_fg = FG @ held(source).T
+    turn = Rotation.from_matrix(to_fg @ spin.as_matrix() @ held(sensor))
+    return (1e-3 * (stage[:, :3] + spin.apply(off)) + HOME_M) @ to_fg.T, turn.as_quat()
 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
-    """Write a session of each set and pattern, with all sensor fixtures; return the files."""
+    """Write a session of each set, pattern and pair of fixtures; return the files."""
     bags = []
-    for name, (where, places, band, tones) in SETS.items():
+    for name, (where, places, band, fixtures) in SETS.items():
         coils = tuple(
-            Coil(axis, vector(FG @ np.array(place)), 0.0, tone)
-            for axis, place, tone in zip('xyz', places, tones, strict=True)
+            Coil(axis, recipe.vector(FG @ np.array(place)), 0.0, tone)
+            for axis, place, tone in zip('xyz', places, TONES[band], strict=True)
         )
         sensors = tuple(
-            SensorSpec(k, f'{BODY}/{"xyz"[k]}', BODY, (0.0, 0.0, 0.0), vector(axis), 0.0)
+            SensorSpec(k, f'{BODY}/{"xyz"[k]}', BODY, (0.0, 0.0, 0.0), recipe.vector(axis), 0.0)
             for k, axis in enumerate(AXES)
         )
-        setup = Setup('fg', 1.0, Emitter(f'{NAME}_{name}', {}, coils), sensors, VOLUME, STATED)
-        for pattern in ('md', 'ld'):
-            flux, held = [], []
-            for fixture in FIXTURES:
-                file = existing(folder / where / f'soYoutZup_se{fixture}_{pattern}.npz')
-                with np.load(file) as kept:
-                    flux.append(TESLA * kept['coupling'][:, band])
-                    held.append(poses(kept['stage'], fixture))
-            bags.append(into / f'{NAME}_{name}_{pattern}.mcap')
-            position, quaternion = (np.concatenate(part) for part in zip(*held, strict=True))
-            at = {BODY: (position, quaternion)}
-            write_frames(bags[-1], setup, np.concatenate(flux), at)
+        volume = BEFORE if fixtures is SENSOR else AROUND
+        setup = Setup('fg', 1.0, Emitter(f'{NAME}_{name}', {}, coils), sensors, volume, STATED)
+        for pattern, (source, sensor) in product(('md', 'ld'), fixtures):
+            file = recipe.existing(folder / where / f'so{source}_se{sensor}_{pattern}.npz')
+            bags.append(into / f'{NAME}_{name}_{source}_{sensor}_{pattern}.mcap')
+            with np.load(file) as kept:
+                flux, at = TESLA * kept['coupling'][:, band], poses(kept['stage'], source, sensor)
+            recipe.write_frames(bags[-1], setup, flux, {BODY: at})
     return bags
 
 
+def tried(bags: list[Path]) -> dict[str, tuple[list[Path], list[Path]]]:
+    """Return what is learnt and what is tracked: each set's patterns, and one the other way."""
+    found = {}
+    for name in SETS:
+        own = [bag for bag in bags if bag.stem.split('_')[1] == name]
+        found[name] = own[: len(own) // 2], own[len(own) // 2 :]
+    return {**found, 'dipole-backwards': found['dipole'][::-1]}
+
+
 def commands(bags: list[Path], out: Path) -> list[list[str]]:
-    """Return the commands that learn on one pattern and track the other, both ways."""
+    """Return the commands that learn on one pattern and track the other."""
     made = []
-    for learnt, tracked in [*zip(bags[::2], bags[1::2], strict=True), bags[1::-1]]:
-        model = str(out / f'{learnt.stem}.yaml')
-        made.append(['calibrate', str(learnt), '--out', model])
-        result = str(out / f'{learnt.stem}_tracked')
-        made.append(['evaluate', str(tracked), '--model', model, '--out', result])
+    for name, (learnt, tracked) in tried(bags).items():
+        model = str(out / f'{name}.yaml')
+        made.append(['calibrate', *map(str, learnt), '--out', model])
+        for bag in tracked:
+            made.append(['evaluate', str(bag), '--model', model, '--out', str(out / bag.stem)])
     return made
 
 
-def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
-    """Return the errors of the patterns that were tracked, beside the makers'."""
-    found = []
-    for learnt in (*bags[::2], bags[1]):
-        _, name, pattern = learnt.stem.split('_')
-        error = ran(out / f'{learnt.stem}_tracked', 'evaluation.json')
-        paper = PAPER.get(name, (None, None)) if pattern == 'md' else (None, None)
-        note = f'{pattern}; scored on the other'
-        for key, scale, unit, theirs in (
-            ('position_rmse_m', 1e3, 'mm', paper[0]),
-            ('orientation_rmse_rad', np.degrees(1.0), 'deg', paper[1]),
-            ('tracked_fraction', 100.0, '%', None),
-        ):
-            value = float(scale * figure(error, 'bodies', BODY, key))
-            what = key.rpartition('_')[0].replace('_', ' ')
-            words = f'{name}, learnt on {pattern}: {what}'
-            found.append(ReportRow(NAME, words, float('nan'), value, unit, note, special=theirs))
+def rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
+    """Return the errors of the patterns that were tracked, of all frames, beside the makers'."""
+    found, nan = [], float('nan')
+    for name, (_, tracked) in tried(bags).items():
+        own = [bag for bag in tracked if name != 'turned' or bag.stem.split('_')[2] != HOME]
+        each = [recipe.ran(out / bag.stem, 'evaluation.json') for bag in own]
+        paper = *PAPER.get(name, (None, None)), None
+        for key, scale, unit, theirs in zip(KEYS, SCALES, ('mm', 'deg', '%'), paper, strict=True):
+            values = np.array([recipe.figure(one, 'bodies', BODY, key) for one in each])
+            value = float(scale * np.sqrt((values**2).mean()))
+            words = f'{name}: {key.rpartition("_")[0].replace("_", " ")}'
+            note = 'the other pattern'
+            found.append(recipe.ReportRow(NAME, words, nan, value, unit, note, special=theirs))
     return found
 
 
-RECIPE = Recipe(NAME, write_sessions, commands, rows)
+RECIPE = recipe.Recipe(NAME, write_sessions, commands, rows)

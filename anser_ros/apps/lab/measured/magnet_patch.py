@@ -13,7 +13,6 @@ surroundings are not taken off, since the data set has none for it.
 The data (github xpy-zju/Dual-stage-magnetic-localization, MIT) are read where they lie.
 """
 
-import csv
 import itertools
 import math
 from collections.abc import Mapping
@@ -38,6 +37,7 @@ from anser_ros.errors import FitError
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 from anser_ros.wire.setup_values import Vector
+from anser_ros.wire.tables import read_table
 
 NAME, BODY, AXES = 'magnet_patch', 'patch', 'xyz'
 SENSORS = 16
@@ -75,34 +75,14 @@ class Recording:
     stamp_s: Array  # (F,)
 
 
-def read_table(path: Path) -> tuple[list[str], Array]:
-    """Return the header and numbers of a CSV file; text columns become nan.
-
-    Raises `FitError` when the file is missing or has no rows.
-    """
-    with existing(path).open(newline='') as stream:
-        header, *rows = list(csv.reader(stream))
-    if not rows:
-        raise FitError(f'{path.name} has no rows')
-
-    def number(text: str) -> float:
-        try:
-            return float(text)
-        except ValueError:
-            return math.nan
-
-    return header, np.array([[number(text) for text in row] for row in rows])
-
-
 def read_poses(path: Path, magnet: str) -> dict[str, Array]:
     """Return columns of a file of 16 sensors a pose, (F, 16, 3), the magnet's by their prefix.
 
     Raises `FitError` when a column is missing, or the rows are not whole poses.
     """
-    header, table = read_table(path)
-    if len(table) % SENSORS:
-        raise FitError(f'{path.name}: {len(table)} rows are not poses of {SENSORS} sensors')
-    column = {name: k for k, name in enumerate(header)}
+    table = read_table(existing(path))
+    if len(table.cells) % SENSORS:
+        raise FitError(f'{path.name}: {len(table.cells)} rows are not poses of {SENSORS} sensors')
     groups = {
         'field': ('Bx', 'By', 'Bz'),
         'place': ('sensor_x', 'sensor_y', 'sensor_z'),
@@ -112,12 +92,12 @@ def read_poses(path: Path, magnet: str) -> dict[str, Array]:
     }
     out: dict[str, Array] = {}
     for key, names in groups.items():
-        lost = [name for name in names if name not in column]
+        lost = [name for name in names if name not in table.names]
         if lost:
             raise FitError(f'{path.name} lacks the columns {", ".join(lost)}')
-        out[key] = table[:, [column[name] for name in names]].reshape(-1, SENSORS, 3)
-    if 'timestamp' in column:
-        out |= {'stamp': table[:, column['timestamp']].reshape(-1, SENSORS)}
+        out[key] = table.numbers(names, with_gaps=True).reshape(-1, SENSORS, 3)
+    if 'timestamp' in table.names:
+        out |= {'stamp': table.numbers(['timestamp'], with_gaps=True).reshape(-1, SENSORS)}
     return out
 
 
@@ -140,7 +120,8 @@ def as_recording(name: str, parts: dict[str, Array], background_t: Array) -> Rec
 def load(folder: Path, name: str) -> Recording:
     """Read one file of poses, its own background subtracted."""
     parts = read_poses(folder / f'{name}.csv', 'm')
-    background = read_table(folder / f'{name}_background_uT.csv')[1] * 1e-6
+    table = read_table(existing(folder / f'{name}_background_uT.csv'))
+    background = table.numbers(table.names) * 1e-6
     if background.shape != (SENSORS, 3):
         raise FitError(f'{name}: background of shape {background.shape}, expected (16, 3)')
     return as_recording(name, parts, background)

@@ -8,7 +8,6 @@ is a body of three channels a sensor, with a frame for each height. Its poses ar
 the only ones that the data set has.
 """
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from anser_ros.apps.lab.measured.recipe import (
 from anser_ros.arrays import Array
 from anser_ros.errors import FitError
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
+from anser_ros.wire.tables import read_table
 
 NAME, PLATE, AXES = 'navion', 'plate', 'xyz'
 TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -61,11 +61,10 @@ def read(folder: Path) -> tuple[Array, Array]:
     combinations of currents.
     """
     path = existing(folder / 'navion_steady.csv')
-    with path.open(newline='') as stream:
-        rows = list(csv.DictReader(stream))
+    table = read_table(path)
 
     def take(*names: str) -> Array:
-        return np.array([[float(row[name]) for name in names] for row in rows])
+        return table.numbers(names)
 
     current = take('I0_A', 'I1_A', 'I2_A')
     driven = np.abs(current).min(axis=1) > 0.0

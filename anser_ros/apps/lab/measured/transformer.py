@@ -25,6 +25,7 @@ from anser_ros.errors import FitError
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
+from anser_ros.wire.tables import read_table
 
 NAME, PROBE = 'transformer', 'probe'
 COLUMNS = 9
@@ -50,10 +51,8 @@ def read(folder: Path) -> tuple[Array, ComplexArray]:
     Raises `FitError` when the file is missing, or is no table of nine columns.
     """
     path = existing(folder / 'data_set.txt')
-    try:
-        table = np.loadtxt(path, comments='%', ndmin=2)
-    except ValueError as error:
-        raise FitError(f'{path.name}: {error}') from error
+    found = read_table(path)
+    table = found.numbers(found.names)
     if table.shape[1] != COLUMNS:
         raise FitError(f'{path.name}: {table.shape[1]} columns, expected {COLUMNS}')
     decimetres = np.rint(10 * table[:, :3]).astype(int)

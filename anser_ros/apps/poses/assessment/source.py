@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,11 +19,11 @@ from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.sessions.tracked_session import track_session
 from anser_ros.stamps import NANO
-from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
-from anser_ros.wire.recorded import ENDING, OPTICAL, optical_topic
+from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages, published_poses
+from anser_ros.wire.recorded import ENDING, OPTICAL, POSE_TYPE, optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
-BAGS = ('.mcap', '.db3', '.bag')  # endings; a folder is a bag too
+BAGS = ('.mcap', '.db3', '.zstd', '.bag')  # endings; a folder is a bag too
 TOOL = 'tool'
 """What the body of a file of poses is called that names none."""
 
@@ -90,24 +91,21 @@ def _carried(found: AssessedPoses, tip: Array) -> AssessedPoses:
     return replace(found, poses=poses, session=session)
 
 
-def pose_topics(path: str | os.PathLike[str]) -> tuple[list[str], Setup | None]:
-    """Return topics of poses in a bag, and its setup document where it is one of a board."""
-    topics: set[str] = set()
-    setup = None
-    decoder = MessageDecoder()
-    for raw in iter_messages(path, Salvage()):
-        if raw.type_name == POSE_TYPE:
-            topics.add(raw.topic)
-        elif setup is None and raw.topic.endswith('/setup'):
-            try:
+def pose_topics(path: str | os.PathLike[str]) -> tuple[list[str], Setup | None, str]:
+    """Return topics of poses in a bag, its setup document where it is one of a board, and which
+    topics there are at all; poses of other types than PoseStamped count where there are none.
+    """
+    setup, salvage, decoder = None, Salvage(), MessageDecoder()
+    for raw in iter_messages(path, salvage):
+        if setup is None and raw.topic.endswith('/setup'):
+            with suppress(AnserError):  # a document of another schema tells no bodies
                 setup = parse_setup(decoder.decode(raw).data)
-            except AnserError:  # a document of another schema tells no bodies
-                continue
-    return sorted(topics), setup
+    plain = [topic for topic, kind in salvage.topics.items() if kind == POSE_TYPE]
+    return sorted(plain or published_poses(path)), setup, salvage.topic_words()
 
 
 def _recorded(path: str | os.PathLike[str], wanted: PoseSource) -> AssessedPoses:
-    topics, setup = pose_topics(path)
+    topics, setup, there = pose_topics(path)
     bodies = [] if setup is None else [b for b in setup.bodies if wanted.body in ('', b)]
     theirs = [t for t in topics for b in bodies if t.endswith(f'/{topic_of(b)}{ENDING}')]
     ours = [t for t in topics if not t.startswith(OPTICAL)]
@@ -119,7 +117,7 @@ def _recorded(path: str | os.PathLike[str], wanted: PoseSource) -> AssessedPoses
                 f'{os.fspath(path)}: no poses of {wanted.sensor}; topics of poses: '
                 f'{", ".join(ours) or "none"}'
             )
-    chosen = wanted.topic or _only(os.fspath(path), 'topic', '', own or ours)
+    chosen = wanted.topic or _only(os.fspath(path), 'topic', '', own or ours, there)
     if wanted.body and not (wanted.topic or wanted.sensor) and not own:
         raise BagError(f'{os.fspath(path)}: no poses of {wanted.body}; with --model its fluxes '
                        'are tracked')  # fmt: skip
@@ -132,7 +130,7 @@ def _recorded(path: str | os.PathLike[str], wanted: PoseSource) -> AssessedPoses
     return AssessedPoses(name, session.sensors[name], session, setup)
 
 
-def _only(path: str, kind: str, named: str, known: list[str]) -> str:
+def _only(path: str, kind: str, named: str, known: list[str], there: str = '') -> str:
     """The one that is named, or the only one."""
     if named:
         if named not in known:
@@ -140,7 +138,7 @@ def _only(path: str, kind: str, named: str, known: list[str]) -> str:
         return named
     if len(known) != 1:
         words = f'several, name one with --{kind}: {", ".join(known)}' if known else (
-            'no poses; fluxes are tracked with --model'
+            f'no poses; fluxes are tracked with --model; there are: {there}'
         )  # fmt: skip
         raise BagError(f'{path}: {words}')
     return known[0]

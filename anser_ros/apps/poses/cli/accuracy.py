@@ -39,7 +39,6 @@ from anser_ros.apps.poses.assessment.source import read_poses
 from anser_ros.apps.poses.cli.pose_source import add_source_options, source_of
 from anser_ros.apps.poses.corrector import as_document
 from anser_ros.apps.poses.sequence import missing_words
-from anser_ros.arrays import Array
 from anser_ros.cli.output import (
     Result,
     Tell,
@@ -62,7 +61,7 @@ from anser_ros.cli.page import (
 )
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
-from anser_ros.wire.text_files import numbers_of, read_rows
+from anser_ros.wire.tables import read_table
 
 SEED = 1
 """Seed of the resamples, so that the same recordings give the same intervals."""
@@ -144,7 +143,9 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     written = write_files(args.out, {'accuracy.json': document, 'report.html': report})
     if verdict is not None and args.history is not None:
         written = (*written, keep(found, args.history, verdict.figures))
-    return Result(document, (), _shown(found, document), written)
+    lost = [one.session for one in recordings if one.session.lost]
+    notes = tuple(f'{session.path}: {session.lost}' for session in lost)
+    return Result(document, notes, _shown(found, document), written)
 
 
 def _shown(found: Assessment, document: dict[str, Any]) -> tuple[Any, ...]:
@@ -179,7 +180,7 @@ def _options(args: argparse.Namespace) -> ProtocolOptions:
             raise ParameterError(f'--axis takes three numbers, got {args.axis!r}')
     truth = None
     if args.truth != OPTICAL_TRUTH and args.protocol == 'point-to-point':
-        truth = _truth(Path(args.truth))
+        truth = read_table(args.truth).positions()
     rule = PauseRule()
     # Points of a narrow board, or of a fine ring, are not merged.
     apart_m = min(rule.apart_m, 0.2e-3 * args.spacing_mm)
@@ -188,16 +189,6 @@ def _options(args: argparse.Namespace) -> ProtocolOptions:
         PauseRule(args.pause_s, apart_m, apart_rad), grid, 1e-3 * args.spacing_mm, args.step_deg,
         args.order, axis, truth,
     )  # fmt: skip
-
-
-def _truth(path: Path) -> Array:
-    """Points of a CSV, m, shape (n, 3)."""
-    _, rows = read_rows(path)
-    for unit, scale in (('m', 1.0), ('mm', 1e-3)):
-        names = [f'{axis}_{unit}' for axis in 'xyz']
-        if rows and all(name in rows[0] for name in names):
-            return scale * numbers_of(path, rows, names)
-    raise ParameterError(f'{path}: needs rows with the columns x_m, y_m, z_m, or x_mm, y_mm, z_mm')
 
 
 def _tolerances(texts: list[str]) -> dict[str, float]:

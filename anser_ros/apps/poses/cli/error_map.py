@@ -1,7 +1,6 @@
 """Learn a correction of positions where true ones are known, and apply it to others."""
 
 import argparse
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,13 @@ from anser_ros.apps.poses.corrector import to_point_model
 from anser_ros.arrays import Array
 from anser_ros.calibration.error_map import ErrorMap, HeldOutError, learn_error_map
 from anser_ros.cli.output import Result, Tell, add_json, add_out, make_folder, write_files
-from anser_ros.errors import FitError, ParameterError, PlausibilityError
+from anser_ros.errors import ParameterError, PlausibilityError
 from anser_ros.sessions.plausibility import check_points
-from anser_ros.wire.text_files import numbers_of, read_fiducials, read_rows
+from anser_ros.wire.tables import MARKUPS, read_points, read_table
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')
 TRUE = ('true_x_m', 'true_y_m', 'true_z_m')
-MARKUPS = '.fcsv'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'points', type=Path,
         help=f'CSV with the columns {", ".join((*TRACKED, *TRUE))}; or, with --true, tracked '
-        f'positions: a CSV with {", ".join(TRACKED)}, or a list of 3D Slicer ({MARKUPS}, mm)',
+        f'positions: a CSV with {", ".join(TRACKED)}, or a list of 3D Slicer '
+        f'({", ".join(MARKUPS)})',
     )  # fmt: skip
     words = 'the true positions, one row per tracked position'
     parser.add_argument('--true', type=Path, metavar='PLACES', help=words)
@@ -60,8 +59,8 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     tell(f'a map of {len(tracked)} places')
     error_map = learn_error_map(tracked, true, registers=args.register)
     if args.apply is not None:
-        names, poses = _read(args.apply)
-        places = numbers_of(args.apply, poses, TRACKED, with_gaps=True)
+        poses = read_table(args.apply, as_text=True)
+        places = poses.numbers(TRACKED, with_gaps=True)
         corrected = error_map.apply(places) if error_map.is_confirmed else places
     document = to_document(error_map)
     model = yaml.safe_dump(
@@ -70,7 +69,8 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     written = write_files(args.out, {'error_map.json': document, 'model.yaml': model})
     if args.apply is not None:
         written = (*written, args.out / 'corrected.csv')
-        _write(written[-1], poses, names, corrected)
+        cells = poses.cells.assign(**dict(zip(TRACKED, corrected.T, strict=True)))
+        cells.to_csv(written[-1], index=False, na_rep='nan')
     return Result(document, (), (verdict(error_map),), written)
 
 
@@ -92,12 +92,11 @@ def verdict(error_map: ErrorMap) -> str:
 def _points(args: argparse.Namespace) -> tuple[Array, Array]:
     """Tracked and true positions, m."""
     if args.true is None:
-        if args.points.suffix == MARKUPS:
+        if args.points.name.endswith(MARKUPS):
             raise ParameterError(f'{args.points} has tracked positions only; --true is needed')
-        _, rows = _read(args.points)
-        tracked, true = (numbers_of(args.points, rows, n, with_gaps=True) for n in (TRACKED, TRUE))
-        return tracked, true
-    tracked, true = map(_places, (args.points, args.true))
+        table = read_table(args.points)
+        return table.positions(with_gaps=True), table.positions('true', with_gaps=True)
+    tracked, true = map(read_points, (args.points, args.true))
     if len(tracked) != len(true):
         raise ParameterError(
             f'{args.points} has {len(tracked)} positions and {args.true} {len(true)}; '
@@ -131,25 +130,3 @@ def _errors(error: HeldOutError) -> dict[str, float | None]:
         'in_plane_rmse_m': error.in_plane,
         'out_of_plane_rmse_m': error.out_of_plane,
     }
-
-
-def _places(path: Path) -> Array:
-    """Positions of a list of points, or of a table."""
-    if path.suffix == MARKUPS:
-        return read_fiducials(path)
-    return numbers_of(path, _read(path)[1], TRACKED, with_gaps=True)
-
-
-def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    names, rows = read_rows(path)
-    if not rows:
-        raise FitError(f'{path}: no rows')
-    return names, rows
-
-
-def _write(path: Path, rows: list[dict[str, str]], names: list[str], places: Array) -> None:
-    with path.open('w', encoding='utf-8', newline='') as stream:
-        writer = csv.DictWriter(stream, names)
-        writer.writeheader()
-        for row, place in zip(rows, places, strict=True):
-            writer.writerow({**row, **dict(zip(TRACKED, place.tolist(), strict=True))})

@@ -1,18 +1,16 @@
 """Fit registration, lever arm, mount and clocks of two streams of poses, jointly."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import yaml
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from anser_ros.apps.poses.assessment.source import PoseSource, is_bag, read_poses
 from anser_ros.apps.poses.cli.import_poses import add_form_options
-from anser_ros.apps.poses.cli.pose_session import add_topic_options, load_poses
+from anser_ros.apps.poses.cli.pose_session import add_topic_options, load_poses, over_time
 from anser_ros.apps.poses.convention import reading_words
 from anser_ros.apps.poses.corrector import as_document
 from anser_ros.apps.poses.hand_eye import HandEye, fit_hand_eye, turn_of
@@ -28,12 +26,11 @@ from anser_ros.cli.output import (
     terminal_table,
     write_files,
 )
-from anser_ros.cli.page import heading, legend_beside, listed, page, paragraph, picture, table, top
+from anser_ros.cli.page import heading, listed, page, paragraph, picture, table, top
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 
 SCHEMA = 'anser_handeye/1'
-Array = NDArray[np.float64]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,7 +105,7 @@ def _session(args: argparse.Namespace) -> PoseSession:
         raise ParameterError('--tracked, --model and --optical need a bag')
     return import_poses(
         args.tracked, args.reference, stamps=args.stamps, unit=args.unit,
-        quaternion=args.quaternion,
+        quaternion=args.quaternion, shift_s=(args.shift, args.shift_reference),
     )  # fmt: skip
 
 
@@ -199,7 +196,7 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
         )
     ]  # fmt: skip
     lines = [*clock_words(document), *left_out_words(document)]
-    is_open = bool(found.undetermined)
+    is_open, state = bool(found.undetermined), found.fit.state
     return page(
         'Hand-eye',
         top(
@@ -220,15 +217,12 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
         ),
         [heading('Not determined'), listed(found.undetermined)] if is_open else [],
         heading('Residuals over time'),
-        picture(_over_time(found)),
+        picture(
+            over_time(
+                {
+                    part.view.sensor: (replace(state, parts=(part,)), f'C{k}')
+                    for k, part in enumerate(state.parts)
+                }
+            )
+        ),
     )
-
-
-def _over_time(found: HandEye) -> Figure:
-    figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
-    for part in found.fit.state.parts:
-        size = 1e3 * np.linalg.norm(part.residual[part.used, :3], axis=1)
-        axes.plot(part.view.time[part.used], size, '.', ms=2, label=part.view.sensor)
-    axes.set(xlabel='time, s', ylabel='distance, mm', yscale='log')
-    legend_beside(figure)
-    return figure

@@ -6,8 +6,8 @@ from pathlib import Path
 from anser_ros.apps.poses.importing import ORDERS, STAMPS, import_poses, write_pose_session
 from anser_ros.cli.output import Result, Tell, add_json, add_list, check_new_file
 from anser_ros.errors import ParameterError
-from anser_ros.sessions.plausibility import LENGTH_M
 from anser_ros.wire.setup_values import read_name
+from anser_ros.wire.table_names import LENGTH_M
 
 SCHEMA = 'anser_import_poses/1'
 
@@ -51,6 +51,9 @@ def add_form_options(parser: argparse.ArgumentParser, when: str = '') -> None:
         '--quaternion', choices=list(ORDERS),
         help=f'{when}how the tracked quaternions are written',
     )  # fmt: skip
+    for option, whose in (('--shift', 'tracked'), ('--shift-reference', "reference's")):
+        words = f'{when}seconds that are added to the {whose} stamps of a host'
+        parser.add_argument(option, type=float, default=0.0, metavar='S', help=words)
 
 
 def parse_name(text: str) -> tuple[str, str]:
@@ -67,7 +70,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     check_new_file(args.out)
     session = import_poses(
         args.tracked, args.reference, stamps=args.stamps, unit=args.unit,
-        quaternion=args.quaternion, names=names,
+        quaternion=args.quaternion, names=names, shift_s=(args.shift, args.shift_reference),
     )  # fmt: skip
     tell(f'writing {args.out}')
     write_pose_session(args.out, session)

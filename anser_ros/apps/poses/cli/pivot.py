@@ -90,7 +90,9 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         raise FitError(f'{found.session.path}: {found.name}: {words}') from error
     document = to_document(fit, found, body)
     written = _write(args, text, body, fit, document)
-    notes = (f'{found.session.path}: {missing}',) if missing else ()
+    notes = tuple(
+        f'{found.session.path}: {words}' for words in (found.session.lost, missing) if words
+    )
     shown = terminal_table(HEAD, _rows(fit)), _agreement(fit, document)
     return Result(document, notes, shown, written)
 

@@ -4,7 +4,8 @@ import argparse
 import csv
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,14 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import yaml
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.spatial.transform import Rotation
+from rich.table import Table
 
-from anser_ros.apps.poses.corrector import to_document, to_model
+from anser_ros.apps.poses.corrector import corrected, to_document, to_model
 from anser_ros.apps.poses.diagnosis import PoseDiagnosis, diagnose_poses
 from anser_ros.apps.poses.effect import Role, effect_with
 from anser_ros.apps.poses.importing import read_pose_session
-from anser_ros.apps.poses.problem import PosePart, PoseState
+from anser_ros.apps.poses.problem import PoseState, jitter, predicted
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.arrays import Array
 from anser_ros.cli.diagnosis_words import short_ones, value_text
@@ -51,8 +51,13 @@ from anser_ros.cli.page import (
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.tracked_session import error_statistics
+from anser_ros.tracking.estimate import TrackerSettings
+from anser_ros.wire.text_files import read_document
 
-UNSHOWN = ('centre_m', 'size_m', 'lowest', 'middle_s', 'degree', 'strain')
+UNUSED = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', 'known_metal', 'resurveyed',
+          'stated')  # fmt: skip
+"""Options of other sessions."""
+UNSHOWN = ('centre_m', 'size_m', 'lowest', 'is_equal', 'middle_s', 'degree', 'strain')
 """Parameters that tell how a map or a course is written, and not what it does."""
 SCALES = {'s': (1e3, 'ms'), 'm': (1e3, 'mm'), 'rad': (180 / math.pi, 'deg'), 'deg': (1.0, 'deg'),
           'ppm': (1.0, 'ppm')}  # fmt: skip
@@ -80,6 +85,10 @@ def _line(key: str, value: Any, sigma: Any, by_time: bool) -> str:
         ]
         return f'{_name(key)}: {", ".join(each)} {unit}'.rstrip()
     name, _, unit = key.rpartition('_')
+    if key == 'quaternion':
+        return f'quaternion: {ORDERS.get(value, value)}'
+    if key == 'spans':
+        return f'spans: {", ".join(f"{a:.1f} to {b:.1f}" for a, b in value)} s'
     if not isinstance(value, float):
         return f'{_name(key)}: {value_text(value)}'
     if key == 'fraction':
@@ -99,17 +108,26 @@ def _name(key: str) -> str:
 
 
 def _number(value: float, sigma: float | None) -> str:
-    """A number with as many decimals as its standard deviation has two digits, or three digits."""
+    """A number with the decimals of its standard deviation, of one digit (two from a 1), or with
+    three digits.
+    """
     if isinstance(value, int):
         return str(value)
     size = sigma if sigma else abs(value) / 10
     if not math.isfinite(size) or size <= 0:
         return f'{value:.3g}'
-    decimals = 1 - math.floor(math.log10(size))
+    digits = 1 + (not sigma or f'{sigma:e}'.startswith('1'))
+    decimals = digits - 1 - math.floor(math.log10(size))
     return f'{value:.{min(max(decimals, 0), MOST_DECIMALS)}f}'
 
 
-GROUPS = 5  # groups of equal numbers of poses by distance, speed and orientation
+SLICES, CELLS = 3, 8  # groups by distance or depth; cells of arrows along the longest side
+FEWEST, FEWEST_IN_CELL = 5, 2  # poses of which a group, and an arrow, is the mean
+ORDERS = {
+    'xyzw': 'scalar last, as stated', 'wxyz': 'scalar first', 'conjugate': 'of the inverse turn',
+    'wxyz_conjugate': 'scalar first, of the inverse turn',
+}  # fmt: skip
+"""Orders and senses of quaternions, as a file has them."""
 LIMITS = 1.96  # standard deviations within which 95 % of normal differences lie
 
 
@@ -138,12 +156,13 @@ def pose_verdict(document: dict[str, Any]) -> str:
         text += f' Left out, with too few poses at times with a reference: {names}.'
     if rest['fraction'] > 0:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
-        text += f' {rest["fraction"]:.0%} of the squared error above the jitter stays'
-        text += f' unexplained; it depends on {on}.'
+        share = f'{rest["fraction"]:.0%} of the squared error above the jitter stays unexplained'
+        text += f' {share if found else "More than the jitter has no name here"}; it depends on '
+        text += f'{on}.'
         if 'distance' in rest['depends_on']:
             text += (
                 ' It is larger far from the field generator, as at the edge of its volume or '
-                'beside metal that is deep in it: work nearer to it.'
+                'beside metal that is deep in it: see what is there.'
             )
     return text
 
@@ -164,16 +183,19 @@ def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -
             'sensor, after with what was found as well.',
         ),
         _by_sensor(document),
-        picture(_groups(before, after)),
+        _by_distance(found.fit.state, before, after),
+        heading(
+            'Where space is bent',
+            'Mean held-out errors in the plane of the field generator at three depths.',
+        ),
+        picture(_arrows(before, after)),
         heading('Over time'),
-        picture(_over_time(before, after)),
+        picture(over_time({'before': (before, BEFORE), 'after': (after, AFTER)})),
         heading(
             'Agreement of both trackers (Bland and Altman)',
-            'Difference of the two trackers after correction against their mean, by axis of the '
-            'tracker. The middle line is the mean difference; 95% of differences lie between the '
-            'others, the limits of agreement.',
+            'Difference of the two trackers after correction, by axis of the tracker; 95% of '
+            'differences lie between the limits.',
         ),
-        picture(_bland_altman(after)),
         _agreement(after),
         heading(
             'Frames',
@@ -261,62 +283,78 @@ def _triple(values: dict[str, Any], sigma: dict[str, Any], key: str, scale: floa
     )
 
 
-def _groups(before: PoseState, after: PoseState) -> Figure:
-    """Errors by distance, speed and orientation, in groups of equal numbers of poses."""
-    measures: dict[str, Callable[[PosePart], Array]] = {
-        'distance from the field generator, mm': lambda p: _size(1e3 * p.view.measured),
-        'speed, mm/s': lambda p: _size(1e3 * p.view.velocity[:, :3]),
-        'turn from the mean orientation, deg': _turn,
-    }
-    if not any(part.view.velocity.any() for part in after.parts):
-        del measures['speed, mm/s']  # all is at rest
+def _by_distance(state: PoseState, before: PoseState, after: PoseState) -> Html:
+    """Held-out errors, and the noise of a coordinate of all poses, by distance and speed."""
+    rows = []
+    for parts in zip(before.parts, after.parts, state.parts, strict=True):
+        distances, whole = [_size(1e3 * part.view.measured) for part in parts], parts[-1]
+        speed = _size(whole.view.velocity[:, :3])
+        is_fast = speed > np.median(speed)
+        edges = np.quantile(distances[-1], np.linspace(0, 1, 1 + SLICES))
+        for low, high in pairwise(edges):
+            near = [
+                p.used & (low <= d) & (d <= high) for p, d in zip(parts, distances, strict=True)
+            ]
+            squares = [np.sum(p.residual[m, :3] ** 2, axis=1)
+                       for p, m in zip(parts[:2], near[:2], strict=True)]  # fmt: skip
+            squares += [jitter(whole, near[-1] & half, whole.noise.stamp_s > 0)[0]
+                        for half in (~is_fast, is_fast)]  # fmt: skip
+            sizes = [np.sqrt(one.mean()) if one.size > FEWEST else None for one in squares]
+            rows.append([whole.view.sensor, f'{low:.0f} to {high:.0f}',
+                         *(number(size, 1e3, '.2f') for size in sizes)])  # fmt: skip
+    head = ['sensor', 'from the field generator, mm', 'error before, mm', 'error after, mm',
+            'noise of a coordinate, slow half, mm', 'fast half, mm']  # fmt: skip
+    return table(head, rows)
+
+
+def _arrows(before: PoseState, after: PoseState) -> Figure:
+    """Mean errors in cells of three slices of space, those of x and y as arrows."""
     figure, panels = plt.subplots(
-        1, len(measures), figsize=(9, 3), layout='constrained', sharey=True
+        2, SLICES, figsize=(9, 6), layout='constrained', sharex=True, sharey=True
     )
-    for panel, (label, measure) in zip(panels, measures.items(), strict=True):
-        panel.set(xlabel=label)
-        _bars(panel, before, measure, -0.2, {'color': BEFORE, 'label': 'before'})
-        _bars(panel, after, measure, 0.2, {'color': AFTER, 'label': 'after'})
-    panels[0].set_ylabel('error, mm')
-    legend_below(figure, panels[0])
+    every = 1e3 * np.concatenate([p.view.measured[p.used] for p in before.parts])
+    if not len(every):
+        return figure
+    low, high = np.percentile(every, [1, 99], axis=0)
+    cell = max(float(np.max(high - low)) / CELLS, 1e-3)
+    levels, longest = np.quantile(every[:, 2], np.linspace(0, 1, 1 + SLICES)), 0.0
+    for row, (state, colour, label) in enumerate(
+        ((before, BEFORE, 'before'), (after, AFTER, 'after'))
+    ):
+        place = 1e3 * np.concatenate([p.view.measured[p.used] for p in state.parts])
+        error = 1e3 * np.concatenate([p.residual[p.used, :3] for p in state.parts])
+        slices = np.digitize(place[:, 2], levels[1:-1])
+        code = np.column_stack([slices, np.floor(place[:, :2] / cell)])
+        _, index, count = np.unique(code, axis=0, return_inverse=True, return_counts=True)
+        sums = np.zeros((count.size, 5))
+        np.add.at(sums, index.ravel(), np.column_stack([slices, place[:, :2], error[:, :2]]))
+        means = sums[count >= FEWEST_IN_CELL] / count[count >= FEWEST_IN_CELL, None]
+        longest = longest or max(float(np.max(_size(means[:, 3:]), initial=0.0)), 1e-3)
+        for k, panel in enumerate(panels[row]):
+            x, y, u, v = means[means[:, 0].round() == k, 1:].T
+            arrows = panel.quiver(x, y, u, v, color=colour, angles='xy', scale_units='xy',
+                                  scale=longest / cell)  # fmt: skip
+            panel.set_title(f'{label}, z {levels[k]:.0f} to {levels[k + 1]:.0f} mm', fontsize=8)
+            panel.set(aspect='equal', xlim=(low[0] - cell, high[0] + cell),
+                      ylim=(low[1] - cell, high[1] + cell))  # fmt: skip
+    panels[0, 0].quiverkey(arrows, 0.15, 0.02, longest, f'{longest:.2g} mm', labelpos='E',
+                           coordinates='figure')  # fmt: skip
+    figure.supxlabel('x, mm')
+    figure.supylabel('y, mm')
     return figure
-
-
-def _bars(
-    panel: Axes, state: PoseState, measure: Callable[[PosePart], Array], way: float,
-    style: dict[str, Any],
-) -> None:  # fmt: skip
-    """The error of each group by a measure, beside its middle."""
-    value = np.concatenate([measure(part)[part.used] for part in state.parts])
-    square = np.concatenate([np.sum(p.residual[p.used, :3] ** 2, axis=1) for p in state.parts])
-    if value.size < 2 * GROUPS:
-        return
-    edges = np.quantile(value, np.linspace(0, 1, GROUPS + 1))
-    group = np.clip(np.searchsorted(edges, value, side='right') - 1, 0, GROUPS - 1)
-    found = np.unique(group)
-    error = [1e3 * float(np.sqrt(np.mean(square[group == k]))) for k in found]
-    bars = panel.bar(found + way, error, 0.4, **style)
-    panel.bar_label(bars, [f'{v:.2g}' if v < 10 else f'{v:.0f}' for v in error], fontsize=6)
-    digits = 0 if np.ptp(edges) > 10 * GROUPS else 1
-    names = [f'{a:.{digits}f} to\n{b:.{digits}f}' for a, b in pairwise(edges)]
-    panel.set_xticks(range(GROUPS), names, fontsize=7)
 
 
 def _size(vectors: Array) -> Array:
     return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
-def _turn(part: PosePart) -> Array:
-    turns = Rotation.from_matrix(part.view.measured_rotation)
-    return np.asarray(np.rad2deg((turns.mean().inv() * turns).magnitude()))
-
-
-def _over_time(before: PoseState, after: PoseState) -> Figure:
+def over_time(states: Mapping[str, tuple[PoseState, str]]) -> Figure:
+    """Return distances of poses over time, of states by their label, each in a colour."""
     figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
-    for state, colour, label in ((before, BEFORE, 'before'), (after, AFTER, 'after')):
+    for label, (state, colour) in states.items():
         for k, part in enumerate(state.parts):
-            size = 1e3 * np.linalg.norm(part.residual[:, :3], axis=1)
-            axes.plot(part.view.time[part.used], size[part.used], '.', ms=2, color=colour,
+            size = 1e3 * np.linalg.norm(part.residual[part.used, :3], axis=1)
+            axes.plot(part.view.time[part.used], size, '.', ms=2, color=colour,
                       label=label if k == 0 else None)  # fmt: skip
     axes.set(xlabel='time, s', ylabel='distance, mm', yscale='log')
     spell_out(axes.yaxis)
@@ -324,38 +362,16 @@ def _over_time(before: PoseState, after: PoseState) -> Figure:
     return figure
 
 
-def _differences(state: PoseState, axis: int) -> Array:
-    return 1e3 * np.concatenate([part.residual[part.used, axis] for part in state.parts])
-
-
-def _limits(values: Array) -> tuple[float, float, float]:
-    """The mean difference between the lower and the upper limit of agreement."""
-    middle, spread = float(values.mean()), LIMITS * float(values.std())
-    return middle - spread, middle, middle + spread
-
-
 def _agreement(state: PoseState) -> Html:
-    rows = [
-        [name, *(f'{value:.2f}' for value in _limits(_differences(state, axis)))]
-        for axis, name in enumerate('xyz')
-    ]
+    rows = []
+    for axis, name in enumerate('xyz'):
+        values = 1e3 * np.concatenate([part.residual[part.used, axis] for part in state.parts])
+        middle, spread = float(values.mean()), LIMITS * float(values.std())
+        rows.append([name, *(f'{middle + way * spread:.2f}' for way in (-1, 0, 1))])
     return table(['axis', 'lower limit, mm', 'mean difference, mm', 'upper limit, mm'], rows)
 
 
-def _bland_altman(state: PoseState) -> Figure:
-    figure, panels = plt.subplots(1, 3, figsize=(9, 3), layout='constrained', sharey=True)
-    for axis, (panel, name) in enumerate(zip(panels, 'xyz', strict=True)):
-        for part in state.parts:
-            difference = 1e3 * part.residual[part.used, axis]
-            mean = 1e3 * part.view.position[part.used, axis] + 0.5 * difference
-            panel.plot(mean, difference, '.', ms=2, label=part.view.sensor)
-        for line in _limits(_differences(state, axis)):
-            panel.axhline(line, color='0.4', lw=0.8)
-        panel.set(xlabel=f'mean of both, {name}, mm')
-        panel.locator_params(axis='x', nbins=5)
-    panels[0].set_ylabel('tracked minus optical, mm')
-    legend_below(figure, panels[0], markers=4.0)
-    return figure
+OPTIONS = {'tracked': 'topics', 'optical': 'optical'}  # of this kind of session alone
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -387,51 +403,86 @@ def load_poses(path: Path | str, args: argparse.Namespace) -> PoseSession:
 
 
 def diagnose(args: argparse.Namespace, tell: Tell) -> Result:
-    """Diagnose a session of poses into the folder of the arguments."""
-    found, document = _found(args, tell)
+    """Diagnose a session of poses, corrected by a model if one is given, into the folder."""
+    session, model = _session(args, ('baseline',))
+    baseline = load_poses(args.baseline, args) if args.baseline else None
+    make_folder(args.out)
+    if model:
+        session = corrected(session, model)
+        baseline = baseline and corrected(baseline, model)
+    found = diagnose_poses(session, tell, baseline)
+    document = to_document(found)
     written = write_files(
         args.out,
         {
             'diagnosis.json': document,
-            'model.yaml': yaml.safe_dump(to_model(found), sort_keys=False),
+            'model.yaml': yaml.safe_dump(to_model(found, model), sort_keys=False),
             'report.html': render_poses(found, document, str(args.session)),
         },
     )
-    return _result(args, found, document, document, written)
+    head = ['with lever arms, mm', 'corrected, mm', 'corrected, deg']
+    shown = _by_sensor_text(document, head), pose_verdict(document)
+    return Result(document, loss_notes(args.session, session.lost), shown, written)
 
 
 def evaluate(args: argparse.Namespace, tell: Tell) -> Result:
-    """Report the errors of a session of poses, into the folder of the arguments."""
-    found, diagnosis = _found(args, tell)
+    """Report the errors of a session of poses, before and after a model's correction if one is
+    given, into the folder of the arguments; nothing is searched for.
+    """
+    session, model = _session(args, ())
+    make_folder(args.out)
+    first = found = diagnose_poses(session, tell, is_searched=False)
+    if model:
+        found = diagnose_poses(corrected(session, model), tell, is_searched=False)
+    states = first.states[0], found.states[0]
+    found = replace(found, registered=first.registered, states=states)
+    diagnosis = to_document(found)
     document = _evaluation(found, diagnosis)
     written = write_files(args.out, {'evaluation.json': document})
     _write_poses(args.out / 'poses.csv', found)
-    return _result(args, found, document, diagnosis, (*written, args.out / 'poses.csv'))
+    head, words = (
+        ['with lever arms, mm', '', 'deg'],
+        'Nothing was searched for; diagnose names causes.',
+    )
+    if model:
+        head = ['before, mm', 'after, mm', 'after, deg']
+        sizes = [f'{1e3 * one.position_m:.2f} mm' for one in (found.before, found.after)]
+        words = f'Held out, the error is {sizes[0]} before and {sizes[1]} after the model.'
+    return Result(
+        document, loss_notes(args.session, session.lost),
+        (_by_sensor_text(diagnosis, head), words), (*written, args.out / 'poses.csv'),
+    )  # fmt: skip
 
 
-def _found(args: argparse.Namespace, tell: Tell) -> tuple[PoseDiagnosis, dict[str, Any]]:
-    session = load_poses(args.session, args)
-    make_folder(args.out)
-    found = diagnose_poses(session, tell)
-    return found, to_document(found)
+def _session(
+    args: argparse.Namespace, used: Sequence[str]
+) -> tuple[PoseSession, dict[str, Any] | None]:
+    """The session and the model that the options name.
+
+    Raises `ParameterError` when an option is given that a session of poses has no use for.
+    """
+    idle = [name for name in UNUSED if name not in used and getattr(args, name, None)]
+    if getattr(args, 'gate', TrackerSettings().gate) != TrackerSettings().gate:
+        idle.append('gate')
+    if idle:
+        names = ', '.join('--' + name.replace('stated', 'set').replace('_', '-') for name in idle)
+        raise ParameterError(f'without effect on a session of poses, leave out: {names}')
+    model = read_document(args.model) if args.model else None
+    return load_poses(args.session, args), model
 
 
-def _result(
-    args: argparse.Namespace, found: PoseDiagnosis, document: dict[str, Any],
-    diagnosis: dict[str, Any], written: tuple[Path, ...],
-) -> Result:  # fmt: skip
+def _by_sensor_text(diagnosis: dict[str, Any], head: Sequence[str]) -> Table:
+    """Held-out errors of each sensor; a figure without a name in the head is left out."""
+    when = [key for key, name in zip(('before', 'after'), head, strict=False) if name]
     rows = [
         [
             name,
-            *(number(row[f'position_rmse_{key}_m'], 1e3, '.2f')
-              for key in ('registration_only', 'before', 'after')),
-            number(row['orientation_rmse_after_rad'], DEGREES, '.2f'),
+            *(number(row[f'position_rmse_{key}_m'], 1e3) for key in ('registration_only', *when)),
+            number(row['orientation_rmse_after_rad'], DEGREES),
         ]
         for name, row in diagnosis['sensors'].items()
-    ]  # fmt: skip
-    head = ['sensor', 'registration mm', 'hand-eye mm', 'effects mm', 'effects deg']
-    shown = terminal_table(head, rows), pose_verdict(diagnosis)
-    return Result(document, loss_notes(args.session, found.session.lost), shown, written)
+    ]
+    return terminal_table(['sensor', 'registered, mm', *filter(None, head)], rows)
 
 
 def _evaluation(found: PoseDiagnosis, document: dict[str, Any]) -> dict[str, Any]:
@@ -452,16 +503,18 @@ def _evaluation(found: PoseDiagnosis, document: dict[str, Any]) -> dict[str, Any
 
 
 def _write_poses(path: Path, found: PoseDiagnosis) -> None:
-    """Write the corrected poses in the optical body's prediction frame, a row each."""
+    """Write all poses as they are corrected, tracker's frame, a row each."""
+    state = found.fit.state
     with path.open('w', encoding='utf-8', newline='') as stream:
         writer = csv.writer(stream)
-        writer.writerow(['stamp_ns', 'sensor', 'x_m', 'y_m', 'z_m', 'distance_m', 'angle_rad',
-                         'status'])  # fmt: skip
-        for part in found.fit.state.parts:
-            stamps = found.session.start_ns + np.round(1e9 * part.view.time).astype(np.int64)
-            place = part.view.position + part.residual[:, :3]
-            for k, stamp in enumerate(stamps.tolist()):
-                size = [np.linalg.norm(half) for half in np.split(part.residual[k], 2)]
-                status = 'ok' if part.used[k] else 'outlier_or_no_reference'
-                values = [f'{v:.9g}' for v in (*place[k], *size)]
-                writer.writerow([stamp, part.view.sensor, *values, status])
+        writer.writerow(['stamp_ns', 'sensor', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw',
+                         'distance_m', 'angle_rad', 'status'])  # fmt: skip
+        for name in state.problem.setting.sensors:
+            poses = found.session.sensors[name]
+            view, residual, known = predicted(state.problem.path, poses, state.terms)
+            sizes = [_size(half)[:, None] for half in np.hsplit(residual, 2)]
+            rows = [view.position + residual[:, :3], poses.quaternion, *sizes]
+            stamps = found.session.start_ns + np.round(1e9 * poses.time).astype(np.int64)
+            for stamp, row, is_known in zip(stamps.tolist(), np.hstack(rows), known, strict=True):
+                values = [f'{value:.9g}' for value in row]
+                writer.writerow([stamp, name, *values, 'ok' if is_known else 'no_reference'])

@@ -83,6 +83,20 @@ def _without_turn(term: PoseTerm) -> Array:
     return bent.ravel()
 
 
+def _apart(term: PoseTerm, views: Sequence[PoseView]) -> dict[str, float]:
+    """How far a map's only sensor is from the field generator, m, and how its z axis is tilted,
+    deg, and the same of the others, which have no such map.
+    """
+    found = {}
+    for key in ('own', 'others') if term.sensor and len(views) > 1 else ():
+        chosen = [v for v in views if term.acts_on(v.sensor) == (key == 'own')]
+        far = np.linalg.norm(np.concatenate([v.measured for v in chosen]), axis=1)
+        upright = np.median(np.concatenate([v.measured_rotation[:, 2, 2] for v in chosen]))
+        found[f'distance_{key}_m'] = float(np.median(far))
+        found[f'tilt_{key}_deg'] = float(np.rad2deg(np.arccos(upright)))
+    return found
+
+
 class FieldDistortion(PoseEffect):
     """Theta is a vector (mm) a monomial: what is added to the tracked position."""
 
@@ -116,21 +130,19 @@ class FieldDistortion(PoseEffect):
             return PoseTerm(self, site, np.zeros(4))
         return PoseTerm(self, site, np.zeros(3 * _count(site)))
 
-    def beside_scale(self, term: PoseTerm) -> PoseTerm | None:
-        """Return a map of all sensors without its linear part, which is the scale's."""
-        if term.sensor is not None:
-            return term
-        site: PoseSite = {**term.site, 'lowest': 2}
-        return PoseTerm(self, site, np.zeros(3 * _count(site))) if site['degree'] > 1 else None
+    def beside_scale(self, term: PoseTerm) -> PoseTerm:
+        """Return a map of all sensors that stretches space by as much as it shrinks it."""
+        return term if term.sensor else replace(term, site={**term.site, 'is_equal': True})
 
     def is_scale(self, term: PoseTerm) -> bool:
         return int(term.site['degree']) == 0
 
     def covers(self, term: PoseTerm, candidate: PoseTerm) -> bool:
         """Return whether the map contains what a scale, or a map of a lower degree, is."""
-        if not (candidate.role is Role.SCALE or candidate.role is Role.MAP):
-            return False
         own, site = term.site, candidate.site
+        is_part = candidate.role is Role.MAP
+        if not (is_part or (candidate.role is Role.SCALE and 'is_equal' not in own)):
+            return False
         if term.sensor not in (None, candidate.sensor):
             return False
         has_lowest = own.get('lowest', 1) <= site.get('lowest', 1)
@@ -148,6 +160,8 @@ class FieldDistortion(PoseEffect):
         out = np.zeros((len(position), 3, term.theta.size))
         for axis in range(3):
             out[:, axis, axis::3] = UNIT_M * basis
+        if 'is_equal' in term.site:
+            out[:, :, :9:4] -= out[:, :, :9:4].mean(axis=2, keepdims=True)
         return out
 
     def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
@@ -230,14 +244,13 @@ class FieldDistortion(PoseEffect):
         rms = float(np.sqrt(size @ size / len(place)))
         slope = (size @ bent) / (len(place) * max(rms, 1e-12))
         sigma = float(np.sqrt(slope @ covariance @ slope))
+        values = {**record.parameters, 'rms_m': rms, **_apart(term, views)}
         return replace(
-            record,
-            parameters={**record.parameters, 'rms_m': rms},
-            uncertainty={**record.uncertainty, 'rms_m': sigma},
+            record, parameters=values, uncertainty={**record.uncertainty, 'rms_m': sigma}
         )
 
     def term(self, record: EffectRecord) -> PoseTerm:
-        keys = ('sensor', 'degree', 'lowest', 'centre_m', 'size_m')
+        keys = ('sensor', 'degree', 'lowest', 'is_equal', 'centre_m', 'size_m')
         site = cast(PoseSite, {k: record.parameters[k] for k in keys if k in record.parameters})
         theta = np.asarray(record.needed('coefficients_mm'), dtype=np.float64)
         count = 3 * _count(site) if site['degree'] else 4

@@ -31,6 +31,7 @@ LONG_GAPS = 6.0
 PAUSE_S, MANY_PAUSES = 2.0, 4
 """Pauses of this length, s, where there are so many, lie between recordings and are no gaps."""
 FEWEST_OUTLYING_POSES = 3  # outliers that must be there at least: one or two are an accident
+MOST_TIMES = 20  # times of outliers, or spans without poses, of a stream that are listed
 FAR = 14.0
 """Distance of the median outlier in spreads of a coordinate from which it is one: errors of real
 trackers have tails of half that."""
@@ -104,7 +105,7 @@ class MissingPoses(PoseEffect):
                 continue
             found.append(EffectRecord(self.name, {
                 'stream': poses.name, 'fraction': share, 'marked': int(poses.missing.size),
-                'spans': [[round(a, 3), round(b, 3)] for a, b in spans[:20]],
+                'spans': [[round(a, 3), round(b, 3)] for a, b in spans[:MOST_TIMES]],
             }, {}))  # fmt: skip
         return found
 
@@ -144,6 +145,10 @@ class PoseOutliers(PoseEffect):
             'orientation_rad': float(np.median(turn)),
             'by_sensor': {
                 s.view.sensor: int(m.sum()) for s, m in zip(residuals.sensors, outs, strict=True)
+            },
+            'times_s': {
+                s.view.sensor: [round(float(t), 3) for t in s.view.time[m][:MOST_TIMES]]
+                for s, m in zip(residuals.sensors, outs, strict=True)
             },
         }
         return [EffectRecord(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
@@ -247,42 +252,36 @@ class ReceiptJitter(PoseEffect):
     units = {'rms_s': 's'}
     needs_levers = True
     makes_jitter = True
+    is_polled = False
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
-        """Look for a residual that lies along the velocity and grows with it."""
+        """Look for a residual along the velocity that grows with it; a grid may make it."""
         rms, gain, step = _stamp_error(residuals)
-        if not rms or step:
+        if not rms or bool(step) != self.is_polled:
             return []
-        spread = _sigma(residuals)
-        values = {
-            'rms_s': rms,
-            'by_sensor': {s.view.sensor: s.noise.stamp_s for s in residuals.sensors},
-        }
-        return [EffectRecord(self.name, values, {'rms_s': spread}, {'likelihood_gain': gain})]
+        values: dict[str, object] = {'rms_s': rms}
+        if step:
+            values, sigma = {'step_s': step, **values}, {'step_s': 0.01 * step}
+        else:
+            values['by_sensor'] = {s.view.sensor: s.noise.stamp_s for s in residuals.sensors}
+            sigma = {'rms_s': _sigma(residuals)}
+        return [EffectRecord(self.name, values, sigma, {'likelihood_gain': gain})]
 
 
-class QuantisedStamps(PoseEffect):
+class QuantisedStamps(ReceiptJitter):
     """Stamps lie on the grid of a poll, and poses are off along their velocity by as much."""
 
     name = 'quantised_stamps'
     summary = 'stamps are those of a poll'
-    advice = 'Use the counter of the device as stamp, or poll more often.'
+    advice = 'Use the counter of the device as stamp, if it is not in use, or poll more often.'
     units = {'step_s': 's'}
-    needs_levers = True
-    makes_jitter = True
-
-    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
-        """Look for an error of the stamps that is that of their grid."""
-        rms, gain, step = _stamp_error(residuals)
-        if not step:
-            return []
-        sigma = {'step_s': 0.01 * step}
-        values = {'step_s': step, 'rms_s': rms}
-        return [EffectRecord(self.name, values, sigma, {'likelihood_gain': gain})]
+    is_polled = True
 
 
 NOISIER = 2.0
 """Factor over other sensors' median noise to be named; those of one kind differ by a half."""
+SURE = 2.0  # sigmas within which an exponent may be what makes a farther sensor noisier
+SMALLEST_STEP_M = 1e-8  # by which positions differ that are the same: their rounding
 GROWN = 2.0
 """Factor over a first look's jitter to be reported: over a tracker's volume it grows by half."""
 WIDEST = 1.3
@@ -385,24 +384,55 @@ class PoseExcessNoise(PoseEffect):
         return [EffectRecord(self.name, {'factor': factor}, {'factor': 0.1 * factor})]
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
-        """Return each sensor that is noisier than the median of the others."""
-        noise = {}
-        law = RangeNoise().observed(residuals)
-        exponent = float(law[0].parameters['exponent']) if law else 0.0
+        """Return each sensor that is noisier than the median of the others.
+
+        Not where its distance, or the step on which positions lie, may make it so.
+        """
+        exponent, sigma, _, is_clear = _law(residuals)
+        possible = np.clip([exponent - SURE * sigma, exponent + SURE * sigma], 0.0, EXPONENTS[1])
+        noise, exponent = {}, exponent if is_clear else 0.0
         for sensing in residuals.sensors:
-            quiet = sensing.used & ~in_episode(sensing, residuals)
-            square, distance = _jitter(sensing, quiet)
-            square = square / distance[:, 1] ** (2 * exponent)
+            square, distance = _jitter(sensing, sensing.used & ~in_episode(sensing, residuals))
             if square.size >= FEWEST_DIFFERENCES:
-                noise[sensing.view.sensor] = float(np.sqrt(np.median(square)))
+                steps = np.diff(np.sort(sensing.view.measured, axis=0), axis=0)
+                step = np.min(steps[steps > SMALLEST_STEP_M], initial=1.0) / np.sqrt(12)
+                far = float(np.median(distance))
+                size = np.sqrt(np.median(square / (distance[:, 1] / far) ** (2 * exponent)))
+                noise[sensing.view.sensor] = max(float(size), step), far
         found = []
-        for name, size in noise.items():
-            others = [n for other, n in noise.items() if other != name]
-            if others and size > NOISIER * float(np.median(others)):
-                factor = size / float(np.median(others))
+        for name, (size, far) in noise.items():
+            others = np.array([pair for other, pair in noise.items() if other != name])
+            if not others.size:
+                continue
+            usual, middle = np.median(others, axis=0)
+            factor = float(size / usual / (far / middle) ** exponent)
+            if factor > NOISIER * np.max((far / middle) ** (possible - exponent), initial=1.0):
                 values = {'sensor': name, 'factor': factor}
                 found.append(EffectRecord(self.name, values, {'factor': 0.1 * factor}))
         return found
+
+
+def _law(residuals: PoseResiduals) -> tuple[float, float, float, bool]:
+    """Exponent of a power law of all sensors together, each with a level of its own; its sigma,
+    infinite where nothing tells it; their median distance, m; and whether it is clear.
+    """
+    # Far poses stand out from one common noise; those of an episode have another cause.
+    every = [
+        _jitter(one, (one.used | one.out) & ~in_episode(one, residuals))
+        for one in residuals.sensors
+    ]
+    pairs = [pair for pair in every if pair[0].size >= FEWEST_DIFFERENCES]
+    if not pairs:
+        return 0.0, np.inf, 1.0, False
+    middle = float(np.median(np.concatenate([distance for _, distance in pairs])))
+    square = np.concatenate([one / np.median(one) for one, _ in pairs])
+    distance = np.concatenate([one / np.median(one) for _, one in pairs])
+    low, high = np.percentile(distance, [5, 95])
+    if high < WIDEST * low:
+        return 0.0, np.inf, middle, False
+    exponent, sigma, gain = power_law(square, distance)
+    is_clear = gain > LEAST_LAW_SIGMAS**2 and exponent > LEAST_LAW_SIGMAS * sigma
+    return exponent, sigma, middle, is_clear and EXPONENTS[0] <= exponent <= EXPONENTS[1]
 
 
 class RangeNoise(PoseEffect):
@@ -415,27 +445,10 @@ class RangeNoise(PoseEffect):
     makes_jitter = True
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
-        """Return a power law of all sensors together, each with a level of its own."""
-        # Far poses stand out from one common noise; those of an episode have another cause.
-        every = [
-            _jitter(one, (one.used | one.out) & ~in_episode(one, residuals))
-            for one in residuals.sensors
-        ]
-        pairs = [pair for pair in every if pair[0].size >= FEWEST_DIFFERENCES]
-        if not pairs:
-            return []
-        places = np.concatenate([distance for _, distance in pairs])
-        square = np.concatenate([one / np.median(one) for one, _ in pairs])
-        distance = np.concatenate([one / np.median(one) for _, one in pairs])
-        low, high = np.percentile(distance, [5, 95])
-        if high < WIDEST * low:
-            return []
-        exponent, spread, gain = power_law(square, distance)
-        is_clear = gain > LEAST_LAW_SIGMAS**2 and exponent > LEAST_LAW_SIGMAS * spread
-        if not (is_clear and EXPONENTS[0] <= exponent <= EXPONENTS[1]):
-            return []
-        values = {'exponent': exponent, 'reference_m': float(np.median(places))}
-        return [EffectRecord(self.name, values, {'exponent': spread})]
+        """Return the law of all sensors together."""
+        exponent, sigma, middle, is_clear = _law(residuals)
+        values = {'exponent': exponent, 'reference_m': middle}
+        return [EffectRecord(self.name, values, {'exponent': sigma})] if is_clear else []
 
 
 EFFECTS = (

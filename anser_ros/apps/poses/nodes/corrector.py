@@ -60,7 +60,7 @@ class Corrector(AnserNode):
             self._states[sensor] = Counter()
             topic = f'{self.parameters.tracked}/{stem}/pose'
             self.create_subscription(
-                PoseStamped, topic, partial(self._on_pose, sensor), qos.STREAM
+                PoseStamped, topic, partial(self._on_pose, sensor), qos.OTHERS
             )
 
     def part_statuses(self) -> list[Status]:

@@ -52,7 +52,7 @@ class PoseStreams:
         self.received_s = 0.0
         self._node = node
         self.sources = [
-            OneSource(node, PoseStamped, topic, partial(self._on_pose, topic, name), qos.STREAM)
+            OneSource(node, PoseStamped, topic, partial(self._on_pose, topic, name), qos.OTHERS)
             for topic, name in self._topics.items()
         ]
 

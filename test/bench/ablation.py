@@ -7,13 +7,17 @@ layer that carries the result are those of the refit. No gate withholds a pose h
 poses count as such.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from __future__ import annotations
+
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-from anser_ros.arrays import ComplexArray, Integers
+from anser_ros.cli.page import legend_below, save
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import FieldFunction, default_clouds, excitation_for
@@ -36,21 +40,17 @@ class FreeDipoles:
     """
 
     def __init__(
-        self,
-        model: FieldModel,
-        references: SensorTable,
-        baseline: ComplexArray,
-        drawing: FieldFunction | None = None,
+        self, model: FieldModel, table: SensorTable, baseline: Any, drawing: FieldFunction | None
     ) -> None:
         accuracy = Accuracy()
         excitation, region = excitation_for(model, drawing)
-        clouds = [cloud for cloud in default_clouds(region) if not cloud.overhead]
         self.model, self.baseline, self._noise = model, baseline, accuracy.flux_noise_t
         self._layer = bottom_layer(region, excitation)
-        self._spectra, self._bases, self._transfers = [], [], []
-        for cloud in clouds:
+        self._clouds = []
+        for cloud in default_clouds(region):
+            if cloud.overhead:
+                continue
             root = np.repeat(np.sqrt(cloud.volumes), 3)
-            table = references
             basis = vector_basis(table.position, table.axis, table.length, cloud.positions)
             rows = basis.reshape(len(table), -1) * root
             covariance = rows @ rows.T
@@ -58,21 +58,17 @@ class FreeDipoles:
                 wrong = variant.reshape(len(table), -1) * root
                 covariance[np.diag_indices_from(covariance)] += (wrong**2).sum(axis=1)
             scale = np.trace(covariance) / len(covariance)
-            values, vectors = np.linalg.eigh(covariance / scale)
-            self._spectra.append(np.maximum(values, 0.0))
-            self._bases.append(vectors)
+            spectrum, vectors = np.linalg.eigh(covariance / scale)
             transfer = (self._layer.project(cloud.positions) * root) @ rows.T
-            self._transfers.append(transfer @ vectors / scale)
+            self._clouds.append((np.maximum(spectrum, 0.0), vectors, transfer @ vectors / scale))
 
-    def update(self, flux: ComplexArray) -> FieldModel:
+    def update(self, flux: Any) -> FieldModel:
         """Return the model for one frame of all references, shape (S, K), T."""
         change = (flux - self.baseline) / self._noise
         values = np.concatenate([change.real, change.imag], axis=1)
         best, kept = -np.inf, np.zeros((len(self._layer.positions), values.shape[1]))
-        for spectrum, basis, transfer in zip(
-            self._spectra, self._bases, self._transfers, strict=True
-        ):
-            projected = basis.T @ values
+        for spectrum, vectors, transfer in self._clouds:
+            projected = vectors.T @ values
             variance = STRENGTHS[:, None] * spectrum + 1.0
             curve = -0.5 * (
                 (1.0 / variance) @ projected**2 + np.log(variance).sum(axis=1)[:, None]
@@ -85,7 +81,7 @@ class FreeDipoles:
                 shrink = (STRENGTHS[:, None] / variance).T @ (weight / total)
                 best, kept = evidence, transfer @ (shrink * projected)
         k, layer = flux.shape[1], self._layer
-        moments = (self._noise * (kept[:, :k] + 1j * kept[:, k:])).astype(np.complex128)
+        moments = self._noise * (kept[:, :k] + 1j * kept[:, k:])
         return self.model.with_dipoles(layer.positions, layer.directions, moments)
 
 
@@ -96,9 +92,8 @@ COUNTS = (4, 8, 16, 32)
 FROZEN, FREE, SHARED = 'frozen model', 'free dipoles', 'shared polarisability'
 
 
-@dataclass(frozen=True)
-class AblationRow:
-    """Holds the error of one method with one number of references on one session."""
+class AblationRow(NamedTuple):
+    """The error of one method with one number of references on one session."""
 
     session: str
     method: str
@@ -106,7 +101,7 @@ class AblationRow:
     rmse_m: float  # of all tool coils tracked singly, against the optical pose
 
 
-def spread_out(references: SensorTable, count: int) -> Integers:
+def spread_out(references: SensorTable, count: int) -> Any:
     """Return the rows of some references, each as far as possible from those before it.
 
     Coils at the place of another one come last, in the order of how different their axes are.
@@ -123,56 +118,39 @@ def spread_out(references: SensorTable, count: int) -> Integers:
 
 
 def ablate(
-    session: Session,
-    name: str,
-    model: FieldModel,
-    baseline: Session,
-    counts: Sequence[int] = COUNTS,
-    every: int = 7,
-) -> list[AblationRow]:
+    session: Session, name: str, model: FieldModel, baseline: Session,
+    counts: Sequence[int] = COUNTS, every: int = 7,
+) -> list[AblationRow]:  # fmt: skip
     """Track a session by every method with every number of references.
 
     ``every``: only so many frames are tracked; best no common divisor of the rates, or all of them
     meet an optical pose whose jitter no interpolation has smoothed.
     """
-    if session.reference is None or not session.tools:
-        return []
-    clean = baseline_flux(baseline, session.reference.sensors)
-    rows = [AblationRow(name, FROZEN, 0, _rmse(session, [model], every))]
+    reference, drawing = session.reference, NominalBoard.of(session.setup).field
+    clean = baseline_flux(baseline, reference.sensors)
+    stamps = session.start_ns + np.round(reference.time[::every] / NANO).astype(np.int64)
+    rows = [AblationRow(name, FROZEN, 0, rmse_m(session, [model], every))]
     for count in counts:
-        if count > len(session.reference.sensors):
+        if count > len(reference.sensors):
             continue
-        chosen = spread_out(session.reference.sensors, count)
-        for method in (FREE, SHARED):
-            models = _models(session, model, clean, chosen, method, every)
-            rows.append(AblationRow(name, method, count, _rmse(session, models, every)))
+        chosen = spread_out(reference.sensors, count)
+        given = model, reference.sensors.select(chosen), clean[chosen]
+        flux = reference.flux[::every, chosen]
+        free, refit = FreeDipoles(*given, drawing), LiveRefit(*given, drawing=drawing)
+        followed = {
+            FREE: [free.update(frame) for frame in flux],
+            SHARED: [
+                refit.update(stamp, given[1].channel, frame).model
+                for stamp, frame in zip(stamps.tolist(), flux, strict=True)
+            ],
+        }
+        for method, models in followed.items():
+            rows.append(AblationRow(name, method, count, rmse_m(session, models, every)))
     return rows
 
 
-def _models(
-    session: Session,
-    model: FieldModel,
-    clean: ComplexArray,
-    chosen: Integers,
-    method: str,
-    every: int,
-) -> list[FieldModel]:
-    """Return the model of every frame that is tracked."""
-    reference = session.reference
-    assert reference is not None
-    sensors, drawing = reference.sensors.select(chosen), NominalBoard.of(session.setup).field
-    flux = reference.flux[::every, chosen]
-    if method == FREE:
-        free = FreeDipoles(model, sensors, clean[chosen], drawing)
-        return [free.update(frame) for frame in flux]
-    refit = LiveRefit(model, sensors, clean[chosen], drawing=drawing)
-    stamps = session.start_ns + np.round(reference.time[::every] / NANO).astype(np.int64)
-    pairs = zip(stamps.tolist(), flux, strict=True)
-    return [refit.update(stamp, sensors.channel, frame).model for stamp, frame in pairs]
-
-
-def _rmse(session: Session, models: Sequence[FieldModel], every: int) -> float:
-    """Return the position RMSE (m) of the first tool's coils, by one model or one a frame.
+def rmse_m(session: Session, models: Sequence[FieldModel], every: int) -> float:
+    """Position RMSE of the first tool's coils, by one model or one a frame.
 
     The solve starts at the optical pose, since the models are compared and not the search.
     """
@@ -196,16 +174,8 @@ def _rmse(session: Session, models: Sequence[FieldModel], every: int) -> float:
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def plot(rows: Sequence[AblationRow], path: Path, titles: Mapping[str, str] | None = None) -> None:
-    """Draw the error over the number of references with a panel for each session.
-
-    ``titles`` tell readers what a session is, where its name does not.
-    """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter, ScalarFormatter
-
-    from anser_ros.cli.page import legend_below, save
-
+def plot(rows: Sequence[AblationRow], path: Path, titles: dict[str, str]) -> None:
+    """Draw the error over the number of references with a panel for each session of the titles."""
     sessions = list(dict.fromkeys(row.session for row in rows))
     figure = Figure(figsize=(4.2 * len(sessions), 3.9), layout='constrained')
     for panel, session in enumerate(sessions):
@@ -214,17 +184,14 @@ def plot(rows: Sequence[AblationRow], path: Path, titles: Mapping[str, str] | No
         for method, style in ((FREE, 'o--'), (SHARED, 's-')):
             points = [(row.references, 1e3 * row.rmse_m) for row in here if row.method == method]
             axes.plot(*zip(*points, strict=True), style, label=method)
-        frozen = next(1e3 * row.rmse_m for row in here if row.method == FROZEN)
-        axes.axhline(frozen, color='0.5', label=FROZEN)
+        axes.axhline(1e3 * here[0].rmse_m, color='0.5', label=FROZEN)
         axes.set_xscale('log', base=2)
         axes.set_yscale('log')
-        axes.set_xticks(sorted({row.references for row in here if row.references}))
+        axes.set_xticks(sorted({row.references for row in here[1:]}))
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter(ScalarFormatter())
             axis.set_minor_formatter(NullFormatter())
-        axes.set_title((titles or {}).get(session, session))
-        axes.set_xlabel('reference coils')
-        axes.set_ylabel('position RMSE / mm')
+        axes.set(title=titles[session], xlabel='reference coils', ylabel='position RMSE / mm')
         axes.grid(True, which='both', alpha=0.3)
     legend_below(figure, figure.axes[0])
     save(figure, path)

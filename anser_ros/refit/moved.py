@@ -1,0 +1,125 @@
+"""Asks whether the frame of the references has moved against the board, beside metal or without.
+
+References that slide together are no metal, but clouds of metal explain a slide quite well, and a
+model that follows them is wrong by as much. So "they have moved as one, and metal may be there
+too" is a hypothesis beside each of a bank's: to its covariance come the six columns of what such a
+motion makes of the baseline. Its evidence is against the same baseline however slow the slide is.
+The rules are those of `refit.posterior`: ``1/2 b^T (1 + M)^-1 b - 1/2 log |1 + M|`` is what the
+columns X, whose factors have a variance of one, add to the log likelihood of readings y with the
+precision P, where ``M = X^T P X`` and ``b = X^T P y``.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from anser_ros.arrays import Array
+from anser_ros.integrity.board_place import FAR_M, FAR_SIGMAS, PRIOR_M, PRIOR_RAD
+from anser_ros.physics.rotations import rotation_of_vector
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.clouds import FieldFunction
+from anser_ros.refit.posterior import Bank, FrameEvidence, log_sum, make_room
+from anser_ros.stamps import NANO
+
+LOOK_S = 0.16
+"""Time, s, from one look to the next: a frame that slides by 5 mm/s slides 0.8 mm meanwhile."""
+MOVED_ODDS = 20.0
+"""Log odds from which on a motion is believed: metal of independent recordings reaches -12 where
+an X-ray head touches the board, and simulated slides of 0.05 mm are at 100 to 200."""
+STEP = 1e-3
+"""Step of the derivatives, in prior deviations: 5 um and 20 urad."""
+MOST_KEPT = 16
+"""Hypotheses at a noise level whose matrices are kept."""
+
+
+@dataclass(frozen=True)
+class _Slide:
+    """What depends on a hypothesis and the noise alone, for A strengths: X in its eigenvectors
+    (n, 6), ``(1 + M)^-1`` (A, 6, 6), and half of ``log |1 + M|`` (A,).
+    """
+
+    columns: Array
+    inverse: Array
+    half_log_det: Array
+
+
+class FrameMotion:
+    """Watches the frame of some references in the in-phase ``field`` of the emitters.
+
+    ``noise_t`` is the unit of readings, T. ``reason`` is why the frame counts as moved; empty
+    where it does not.
+    """
+
+    reason: str
+
+    def __init__(self, field: FieldFunction, references: SensorTable, noise_t: float) -> None:
+        self._points, self._last_ns = references.position, 0
+        self._known: dict[tuple[object, ...], _Slide] = {}
+        self.forget()
+        columns = []
+        for unit in np.eye(6):
+            sides = []
+            for step in (STEP, -STEP):
+                turn = rotation_of_vector(step * PRIOR_RAD * unit[3:])
+                shift = step * PRIOR_M * unit[:3]
+                moved, axes = references.position @ turn.T + shift, references.axis @ turn.T
+                reach = references.length[:, None] / np.sqrt(12.0) * axes
+                both = 0.5 * (field(moved + reach) + field(moved - reach))
+                sides.append(np.einsum('ski,si->sk', both, axes).ravel())
+            columns.append((sides[0] - sides[1]) / (2.0 * STEP * noise_t))
+        self._columns = np.array(columns).T
+
+    def forget(self) -> None:
+        """Believe that nothing has moved, and look with the next frame."""
+        self._next_ns, self._away_m, self.reason = 0.0, 0.0, ''
+
+    def look(self, stamp_ns: int, bank: Bank, seen: FrameEvidence) -> None:
+        """Take in a frame's evidence; it is looked at every `LOOK_S`."""
+        if self._last_ns <= stamp_ns < self._next_ns:
+            return
+        self._last_ns, self._next_ns = stamp_ns, stamp_ns + LOOK_S / NANO
+        found, best = [], (-np.inf, np.zeros(6), np.zeros(6))
+        for hypothesis in {0, seen.best}:
+            known = self._known_of(bank, hypothesis, seen.noise)
+            precision, curve = bank.precision(seen.noise)[0], seen.curve[hypothesis, 0]
+            b = (precision[hypothesis] * seen.projected[hypothesis, :, 0]) @ known.columns
+            moved = (known.inverse @ b[:, :, None])[..., 0]
+            gained = curve + 0.5 * (b * moved).sum(axis=1) - known.half_log_det
+            evidence = float(seen.log_evidence[hypothesis]) + log_sum(gained) - log_sum(curve)
+            found.append(evidence)
+            top = int(gained.argmax())
+            if evidence > best[0]:
+                best = evidence, moved[top], np.sqrt(np.diag(known.inverse[top]))
+        odds = log_sum(np.array(found)) - log_sum(seen.log_evidence)
+        # Far away a motion is not linear any more, and not seen beside metal: it must come back.
+        if odds > MOVED_ODDS:
+            self.reason = self._said(*best[1:])
+        elif seen.best == 0:
+            self.reason, self._away_m = '', 0.0
+
+    def _said(self, motion: Array, sigma: Array) -> str:
+        """Return how far a motion (6,) takes the references, where that is certain and too far
+        until the next look.
+        """
+        shift, turn = PRIOR_M * motion[:3], PRIOR_RAD * motion[3:]
+        away = float(np.linalg.norm(shift + np.cross(turn, self._points), axis=1).max())
+        before, self._away_m = self._away_m, away
+        is_certain = (np.abs(motion) > FAR_SIGMAS * sigma).any()
+        if not is_certain or max(away, 2.0 * away - before) < FAR_M:
+            return ''
+        words = ', '.join(f'{1e3 * v:+.1f}' for v in shift)
+        return (
+            f'the references have moved as one against the board, by up to {1e3 * away:.1f} mm '
+            f'({words} along x, y, z)'
+        )
+
+    def _known_of(self, bank: Bank, hypothesis: int, noise: float) -> _Slide:
+        key = (bank.rows.tobytes(), bank.names[hypothesis], noise)
+        if key not in self._known:
+            columns = bank.bases[hypothesis].T @ self._columns[bank.rows]
+            precision = bank.precision(noise)[0][hypothesis]
+            inside = np.eye(6) + (precision[:, None] * columns.T) @ columns
+            make_room(self._known, MOST_KEPT)
+            half = 0.5 * np.linalg.slogdet(inside)[1]
+            self._known[key] = _Slide(columns, np.linalg.inv(inside), half)
+        return self._known[key]
