@@ -276,9 +276,7 @@ def test_readings_are_averaged_until_they_change():
     assert average.update(frame(2e-6), 1e-10)[1] == 1
 
 
-@pytest.mark.parametrize(
-    'response', [Response(), UPRIGHT, ORIENTED, Response('all', 0.7, 2.0, 0.6)]
-)
+@pytest.mark.parametrize('response', [Response(), UPRIGHT, ORIENTED, Response('all', 2.0, 0.6)])
 def test_priors_are_the_covariance_of_their_own_draws(world, parts, response):
     excitation, region, layer, references, _ = parts
     cloud = below(region, 0.16)

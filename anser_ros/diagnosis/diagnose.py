@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from anser_ros.arrays import Array, Integers
-from anser_ros.diagnosis import decisions
+from anser_ros.diagnosis import decisions, screening
 from anser_ros.diagnosis.choice import Confirmation, doubtful, refit_spreads
 from anser_ros.diagnosis.fit import FINE, Fit, Fitter, settled
 from anser_ros.diagnosis.problem import (
@@ -21,16 +21,6 @@ from anser_ros.diagnosis.problem import (
     test_blocks,
     tool_parts,
     train_blocks,
-)
-from anser_ros.diagnosis.screening import (
-    StructureTest,
-    clean_start,
-    noise_scale,
-    noise_t,
-    not_white,
-    outlying_share,
-    structure_tests,
-    without_outliers,
 )
 from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
 from anser_ros.diagnosis.wiring import wiring_faults
@@ -90,7 +80,7 @@ def outlier_findings(
     part with all effects; ``excess``: power that is not explained, over the floor's; ``known``:
     the model's effects. Frames that stood out in its own scan are what the tracker always does.
     """
-    share, channels = outlying_share(whole, cleaned)
+    share, channels = screening.outlying_share(whole, cleaned)
     # A fluctuation is taken for normal: frames far out along it are its own tails.
     own_tails = any(term.effect.family is Family.FLUCTUATION for term in after.terms)
     alone = excess < decisions.MOST_EXCESS_OF_OUTLIERS and not own_tails
@@ -105,7 +95,7 @@ def outlier_findings(
 
 def noise_findings(whole: Problem, after: State) -> list[Finding]:
     """Return excess noise, of all channels or of those that have it."""
-    factor = noise_t(after) / whole.spread.noise_t
+    factor = screening.noise_t(after) / whole.spread.noise_t
     if factor <= decisions.LEAST_NOISE_GROWTH:
         return []
     squares: dict[int, Array] = {}
@@ -189,8 +179,8 @@ class Diagnosis:
     flux_rms_floor_t: float
     unexplained: float  # share of the power above the floor that remains
     depends_on: tuple[str, ...]
-    tests_before: tuple[StructureTest, ...]
-    tests_after: tuple[StructureTest, ...]
+    tests_before: tuple[screening.StructureTest, ...]
+    tests_after: tuple[screening.StructureTest, ...]
     model: FieldModel  # with the effects
     search: Search
     refused: tuple[tuple[Term, Confirmation], ...]  # explained something, but not confirmed
@@ -245,7 +235,7 @@ def screen(problem: Problem) -> Screened:
     """Name the faults of the wiring, and leave out dead channels and values that stand out."""
     known = wiring_faults(problem.thinned(WIRING_FRAMES))
     whole = _without_dead(problem, known)
-    return Screened(tuple(known), whole, whole if known else clean_start(whole))
+    return Screened(tuple(known), whole, whole if known else screening.clean_start(whole))
 
 
 def search_screened(
@@ -261,8 +251,8 @@ def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirme
     blocks, whole = train_blocks(), screened.whole
     last = how.fitter(screened.training(FINAL_FRAMES), blocks)
     fit, refused = _settled(how.fitter(search.fit.state.problem, blocks), last, search)
-    cleaned = without_outliers(whole, evaluate(whole, fit.terms))
-    if outlying_share(screened.start, cleaned)[0] > decisions.FEWEST_OUTLIERS:
+    cleaned = screening.without_outliers(whole, evaluate(whole, fit.terms))
+    if screening.outlying_share(screened.start, cleaned)[0] > decisions.FEWEST_OUTLIERS:
         thinned = cleaned.in_blocks(blocks).thinned(FINAL_FRAMES)
         fit = settled(how.fitter(thinned, blocks), fit.terms, FINE)
     return Confirmed(fit, cleaned, refused)
@@ -286,7 +276,7 @@ def _settled(
 ) -> tuple[Fit, tuple[tuple[Term, Confirmation], ...]]:
     """The joint fit, by ``last``, of the effects that are the same in all parts of the data."""
     fit, refused = search.fit, []
-    while bad := doubtful(fitter.problem, fit, noise_scale(fit.state) ** 2):
+    while bad := doubtful(fitter.problem, fit, screening.noise_scale(fit.state) ** 2):
         # Metal that is doubtful costs much to fit again and is hardly ever more than a stand-in.
         metal = [pair for pair in bad if pair[1].effect.family.is_metal]
         crowd = [pair for pair in bad if pair[0].alike >= decisions.MANY]
@@ -305,13 +295,14 @@ def conclude(
     whole, cleaned, fit = screened.whole, confirmed.cleaned, confirmed.fit
     unseen = cleaned.in_blocks(test_blocks())
     before, after = evaluate(unseen, ()), evaluate(unseen, fit.terms)
-    depending = not_white(after)
+    depending = screening.not_white(after)
     expected = expected_rms(after)
     # Residuals that are no noise must not make the floor that they are measured by.
-    grown = noise_t(after) > decisions.LEAST_NOISE_GROWTH * cleaned.spread.noise_t
-    scale = min(noise_scale(after), 1.0) if grown and depending else noise_scale(after)
+    grown = screening.noise_t(after) > decisions.LEAST_NOISE_GROWTH * cleaned.spread.noise_t
+    scale = screening.noise_scale(after)
+    scale = min(scale, 1.0) if grown and depending else scale
     floor = min(scale * expected, rms(after))
-    tests = tuple(structure_tests(after))
+    tests = tuple(screening.structure_tests(after))
     excess = max(rms(after) ** 2 - floor**2, 0.0)
     named = [test.variable for test in tests if test.significant]
     significant = excess > (decisions.STRUCTURED if named else decisions.UNSTRUCTURED) * floor**2
@@ -335,7 +326,7 @@ def conclude(
         flux_rms_floor_t=floor,
         unexplained=excess / possible if significant and possible > 0 else 0.0,
         depends_on=depends,
-        tests_before=tuple(structure_tests(before)),
+        tests_before=tuple(screening.structure_tests(before)),
         tests_after=tests,
         model=corrected_model(model, fit.terms, records, cleaned.fields),
         search=search,

@@ -70,7 +70,8 @@ itself uncertain, by a tenth with 48; more cost memory and the start of the refi
 
 @dataclass(frozen=True)
 class Response:
-    """Holds the prior of a source's polarisability tensor, as variances of its independent parts.
+    """Holds the prior of a source's polarisability tensor, as variances of its independent parts
+    over that of a multiple of the unit tensor.
 
     A compact piece responds equally in all directions. A flat piece responds only across its face,
     and pieces that touch drive each other: in recordings, metal below a board responds differently
@@ -78,16 +79,15 @@ class Response:
     """
 
     name: str = ''  # empty for the plain one
-    isotropic: float = 1.0  # of a multiple of the unit tensor
     upright: float = 0.0  # of the component along the board's normal (z)
     tensor: float = 0.0  # of every component of a symmetric tensor, in an orthonormal basis
 
 
-UPRIGHT = Response('upright', 1.0, 1.0, 0.0)
+UPRIGHT = Response('upright', 1.0, 0.0)
 """Metal that answers in every direction, and more along the normal of the board."""
-ORIENTED = Response('oriented', 1.0, 0.0, 0.25)
+ORIENTED = Response('oriented', 0.0, 0.25)
 """Metal whose answer depends moderately on the direction of the field."""
-BODY = Response('', 1.0, 0.0, 0.5)
+BODY = Response('', 0.0, 0.5)
 """Dense pieces of metal that drive each other and answer in any direction."""
 
 
@@ -134,7 +134,7 @@ class _Sources:
         """Return the covariance (R1, K, R2, K) of the readings of two sets of rows (R, M, 3)."""
         mine, theirs = self.along(first), self.along(second)
         product = self._product(mine, theirs)
-        out = self.response.isotropic * product
+        out = product.copy()
         if self.response.upright > 0.0:
             out += self.response.upright * self._product(self.upright(first), self.upright(second))
         if self.response.tensor > 0.0:
@@ -160,7 +160,7 @@ class _Sources:
         """Return the covariance (R, K, K) of the readings of each row among themselves."""
         rows = self.along(basis)
         alike = (rows * self.volumes) @ rows.swapaxes(1, 2)
-        out = (self.response.isotropic + 0.5 * self.response.tensor) * alike
+        out = (1.0 + 0.5 * self.response.tensor) * alike
         if self.response.upright > 0.0:
             rows = self.upright(basis)
             out += self.response.upright * ((rows * self.volumes) @ rows.swapaxes(1, 2))
@@ -172,8 +172,7 @@ class _Sources:
 
     def coupling(self, basis: Array) -> Array:
         """Return the covariance (R K, M) of readings with a third of each source's trace."""
-        mean = self.response.isotropic + self.response.tensor / 3.0
-        out = mean * self.along(basis)
+        out = (1.0 + self.response.tensor / 3.0) * self.along(basis)
         if self.response.upright > 0.0:
             out += self.response.upright / 3.0 * self.upright(basis)
         return np.asarray((out * self.volumes).reshape(-1, len(self.volumes)))
@@ -182,7 +181,7 @@ class _Sources:
         """Return random polarisability tensors, (M, 3, 3, D)."""
         m, response = len(self.volumes), self.response
         out = np.zeros((m, 3, 3, count))
-        isotropic = np.sqrt(response.isotropic) * rng.standard_normal((m, count))
+        isotropic = rng.standard_normal((m, count))
         for axis in range(3):
             out[:, axis, axis] = isotropic
         out[:, 2, 2] += np.sqrt(response.upright) * rng.standard_normal((m, count))
@@ -316,10 +315,7 @@ def _columns(prior: CloudPrior, excitation: Array, frequencies_hz: Array) -> Ite
         at = slice(start, start + AT_ONCE)
         p = projected[:, at].astype(np.float32)
         b = (excitation[at] * np.sqrt(cloud.volumes[at])[:, None, None]).astype(np.float32)
-        parts = []
-        if response.isotropic > 0.0:
-            along = np.einsum('nma,mka->nkm', p, b, optimize=True)
-            parts.append(np.sqrt(response.isotropic) * along)
+        parts = [np.einsum('nma,mka->nkm', p, b, optimize=True)]
         if response.upright > 0.0:
             up = p[:, None, :, 2] * b[None, :, :, 2].swapaxes(1, 2)
             parts.append(np.sqrt(response.upright) * up)

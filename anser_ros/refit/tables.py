@@ -20,15 +20,7 @@ from anser_ros.arrays import Array, Integers, Single
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.refit.clouds import (
-    Cloud,
-    Excitation,
-    FieldFunction,
-    Region,
-    bodies,
-    default_clouds,
-    excitation_for,
-)
+from anser_ros.refit import clouds
 from anser_ros.refit.kernels import fill_products, fill_scores
 from anser_ros.refit.layer import Layer, body_layer, bottom_layer, box_layer, pose_weight
 from anser_ros.refit.prior import (
@@ -60,7 +52,7 @@ def _symmetric() -> Array:
     return out
 
 
-def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Single:
+def body_factor(cloud: clouds.Cloud, references: SensorTable, excitation: Array) -> Single:
     """Return the readings of a body's coarse sources, a column for each tensor component.
 
     Of shape (S K, 6 COARSE), scaled so that the readings have a mean variance of 1.
@@ -123,7 +115,7 @@ class BodySearch:
         return scores
 
 
-Hypothesis = tuple[Cloud, Response, Layer]
+Hypothesis = tuple[clouds.Cloud, Response, Layer]
 """Where metal may be, how it answers, and what stands for its field."""
 ReportShare = Callable[[float], None]
 """Called between two pieces of the work with the share that is done."""
@@ -142,8 +134,8 @@ class RefitTables:
     needs of each of the `bodies`.
     """
 
-    excitation: Excitation
-    region: Region
+    excitation: clouds.Excitation
+    region: clouds.Region
     frequencies_hz: Array
     references: SensorTable
     settings: RefitSettings
@@ -152,9 +144,9 @@ class RefitTables:
     priors: tuple[CloudPrior, ...] = ()
 
     @cached_property
-    def bodies(self) -> tuple[Cloud, ...]:
+    def bodies(self) -> tuple[clouds.Cloud, ...]:
         """Return the compact bodies that may be put in as further hypotheses."""
-        return bodies(self.region)
+        return clouds.bodies(self.region)
 
     @cached_property
     def _weight(self) -> Array:
@@ -176,7 +168,7 @@ class RefitTables:
     def hypotheses(self) -> list[Hypothesis]:
         """Return every cloud with each response that is worth its time."""
         out: list[Hypothesis] = []
-        for cloud in default_clouds(self.region):
+        for cloud in clouds.default_clouds(self.region):
             layer = self.layers[int(cloud.overhead)]
             out.append((cloud, Response() if cloud.overhead else UPRIGHT, layer))
             if len(cloud.positions) <= MOST_ORIENTED:
@@ -194,7 +186,7 @@ class RefitTables:
         return replace(self, priors=tuple(priors))
 
     def _prior(
-        self, cloud: Cloud, response: Response, layer: Layer, rng: np.random.Generator
+        self, cloud: clouds.Cloud, response: Response, layer: Layer, rng: np.random.Generator
     ) -> CloudPrior:
         field = self.excitation.field(cloud.positions)
         return build_prior(
@@ -207,15 +199,15 @@ def build_tables(
     model: FieldModel,
     references: SensorTable,
     settings: RefitSettings,
-    drawing: FieldFunction | None,
+    drawing: clouds.FieldFunction | None,
     volume: TrackedVolume | None = None,
     report: ReportShare = lambda share: None,
 ) -> RefitTables:
     """Compute the tables; raises `FitError` as `excitation_for` does, and what ``report`` does."""
-    excitation, region = excitation_for(model, drawing, volume)
+    excitation, region = clouds.excitation_for(model, drawing, volume)
     report(START)
     layers = bottom_layer(region, excitation), box_layer(region, excitation)
-    around = bodies(region)
+    around = clouds.bodies(region)
     places = np.concatenate([cloud.positions[:COARSE] for cloud in around])
     driving = excitation.field(places).reshape(len(around), COARSE, -1, 3)
     pairs = zip(around, driving, strict=True)
@@ -245,16 +237,16 @@ def tables_of(
     model: FieldModel,
     references: SensorTable,
     settings: RefitSettings,
-    drawing: FieldFunction | None,
+    drawing: clouds.FieldFunction | None,
     volume: TrackedVolume | None = None,
 ) -> RefitTables:
     """Return the tables whose arrays these are; the other arguments are those of `build_tables`.
 
     Raises `KeyError` when an array is missing; `FitError` as `excitation_for`.
     """
-    excitation, region = excitation_for(model, drawing, volume)
+    excitation, region = clouds.excitation_for(model, drawing, volume)
     bottom, box = (Layer(**_given(f'layer{i}', Layer, arrays)) for i in range(2))
-    factors = tuple(arrays[f'factor{i}'] for i in range(len(bodies(region))))
+    factors = tuple(arrays[f'factor{i}'] for i in range(len(clouds.bodies(region))))
     frequencies_hz = np.array(model.frequencies_hz)
     tables = RefitTables(
         excitation, region, frequencies_hz, references, settings, (bottom, box), factors

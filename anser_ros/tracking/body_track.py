@@ -10,18 +10,10 @@ from anser_ros import pose_states as states
 from anser_ros.arrays import Array, Integers
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.stamps import NANO
+from anser_ros.tracking import rigid
 from anser_ros.tracking.coil_step import MOST_STEPS, SUSPICIOUS_JUMP_M
 from anser_ros.tracking.coil_track import CoilResult, CoilTracks
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings
-from anser_ros.tracking.rigid import (
-    BodyCoils,
-    BodySolution,
-    common_factor,
-    solve_body,
-    start_from_coils,
-    start_from_grid,
-    step_to_coils,
-)
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import bounded_inverse
 from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
@@ -50,16 +42,16 @@ Start = tuple[Array, Array]
 class Track:
     """Remembers the last two good solutions of one thing, and its noise scale."""
 
-    good: BodySolution | None = None
+    good: rigid.BodySolution | None = None
     good_ns: int = 0
-    before: tuple[int, BodySolution] | None = None
+    before: tuple[int, rigid.BodySolution] | None = None
     noise: NoiseScale = field(default_factory=NoiseScale)
 
     def forget(self) -> None:
         """Drop the last poses, so that the next solve starts cold."""
         self.good = self.before = None
 
-    def fresh(self, stamp_ns: int, settings: TrackerSettings) -> BodySolution | None:
+    def fresh(self, stamp_ns: int, settings: TrackerSettings) -> rigid.BodySolution | None:
         """Return the last good solution; None where there is none, or it is too old."""
         return self.good if (stamp_ns - self.good_ns) * NANO <= settings.warm_age_s else None
 
@@ -70,7 +62,7 @@ class Track:
         steps = (stamp_ns - self.good_ns) / max(self.good_ns - self.before[0], 1)
         return steps if 0.0 < steps <= MOST_STEPS else 0.0
 
-    def remember(self, solution: BodySolution, stamp_ns: int) -> None:
+    def remember(self, solution: rigid.BodySolution, stamp_ns: int) -> None:
         """Take in a good solution."""
         last, self.before = self.good, None
         if last is not None and math.dist(last.position, solution.position) < SUSPICIOUS_JUMP_M:
@@ -90,7 +82,7 @@ class BodyTrack(Track):
         super().forget()
         self.left_out = frozenset()
 
-    def expected(self, good: BodySolution, stamp_ns: int) -> Start:
+    def expected(self, good: rigid.BodySolution, stamp_ns: int) -> Start:
         """Return where the body is if it moves on as it did between its last two good poses."""
         steps = self.steps(stamp_ns)
         if self.before is None or steps == 0.0:
@@ -107,7 +99,7 @@ class BodyTrack(Track):
 class BodyFit:
     """Holds a body's solution, the coils (indices) that took part, and the degrees of freedom."""
 
-    solution: BodySolution
+    solution: rigid.BodySolution
     used: Integers
     freedom: int
 
@@ -140,7 +132,7 @@ class BodyFrame(SolveFrame):
     among the tracks.
     """
 
-    coils: BodyCoils
+    coils: rigid.BodyCoils
     single: list[CoilResult]
     rows: Integers
     tracks: CoilTracks
@@ -163,12 +155,12 @@ class BodyFrame(SolveFrame):
         weights = np.tile(self.inverse_sigma, (len(used), 1))
         gains = self.coils.subset(used).gain_errors(self.flux[used])
         if self.context.modes is None:
-            return common_factor(gains, weights)
+            return rigid.common_factor(gains, weights)
         coils, (position, rotation) = self.coils.subset(used), start
         points, axes = coils.offsets @ rotation.T + position, coils.axes @ rotation.T
         shared = self.tracks.errors_at(self.rows[used], points, axes, coils.lengths, self.context)
         modes = np.concatenate([shared, gains], axis=1) if gains.shape[1] else shared
-        return common_factor(modes, weights)
+        return rigid.common_factor(modes, weights)
 
     def nearer(self, start: Start, used: Integers) -> Start:
         """Return a start moved to where the coils' own good poses agree best."""
@@ -177,7 +169,7 @@ class BodyFrame(SolveFrame):
         if not coils.observable:
             return start
         known = [s for s in (self.single[i].solution for i in rows) if s is not None]
-        nearer: Start = step_to_coils(
+        nearer: Start = rigid.step_to_coils(
             *start, coils.offsets, coils.axes, np.array([s.position for s in known]),
             np.array([s.axis for s in known]), np.array([s.normal for s in known]),
             self.context.low - coils.reach, self.context.high + coils.reach,
@@ -188,7 +180,7 @@ class BodyFrame(SolveFrame):
 def _solve(frame: BodyFrame, used: Integers, start: Start) -> BodyFit:
     part, context = frame.coils.subset(used), frame.context
     weights = np.tile(frame.inverse_sigma, (len(used), 1))
-    solution = solve_body(
+    solution = rigid.solve_body(
         context.field, part, np.ascontiguousarray(frame.flux[used]), weights,
         frame.common(used, start), *start, context.low - part.reach, context.high + part.reach,
     )  # fmt: skip
@@ -219,7 +211,7 @@ def _cold_starts(frame: BodyFrame, used: Integers) -> list[Start]:
         solutions = [single[i].solution for i in rows]
         known = [s for s in solutions if s is not None]
         if known:
-            start = start_from_coils(
+            start = rigid.start_from_coils(
                 coils.subset(np.array(rows)),
                 np.array([s.position for s in known]),
                 np.array([s.axis for s in known]),
@@ -229,7 +221,7 @@ def _cold_starts(frame: BodyFrame, used: Integers) -> list[Start]:
                 return [start]
     if any(single[i].estimate.state == states.RESIDUAL for i in used):
         return []
-    return start_from_grid(context.grid, context.field, coils.subset(used), frame.flux[used])
+    return rigid.start_from_grid(context.grid, context.field, coils.subset(used), frame.flux[used])
 
 
 def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
@@ -327,7 +319,7 @@ def _judge(
     return estimate, gain
 
 
-def _apart(one: BodySolution, other: BodySolution) -> bool:
+def _apart(one: rigid.BodySolution, other: rigid.BodySolution) -> bool:
     """Whether two solutions are different poses, not one that two descents ended at."""
     return bool(
         np.linalg.norm(one.position - other.position) > SAME_PLACE_M

@@ -16,19 +16,7 @@ from anser_ros import pose_states as states
 from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.errors import TrackingError
 from anser_ros.stamps import NANO
-from anser_ros.tracking.coil_step import (
-    ERROR_REACH,
-    SELDOM,
-    UNKNOWN,
-    UNKNOWNS,
-    CoilMemory,
-    Followed,
-    follow_coils,
-    freedom_of,
-    remember,
-    rules_of,
-    take_errors,
-)
+from anser_ros.tracking import coil_step
 from anser_ros.tracking.estimate import FRESH_NOISE, NoiseScale, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import CoilSolution, coil_covariance, solve_coil, whitening_of
@@ -73,7 +61,7 @@ class CoilTracks:
         self.noise = [NoiseScale(row) for row in noise]
         some, none = np.zeros((count, 6)), np.empty((count, 0, 0))
         stamps = np.zeros(count, dtype=np.int64)
-        self.memory = CoilMemory(
+        self.memory = coil_step.CoilMemory(
             stamps, stamps.copy(), some, some.copy(), noise, np.empty((count, 0)), some.copy(),
             np.full(count, -1.0), np.zeros(count), none, none,
         )  # fmt: skip
@@ -84,7 +72,7 @@ class CoilTracks:
         for scans in self.scans:
             scans.forget()
 
-    def prepare(self, context: SolveContext) -> CoilMemory:
+    def prepare(self, context: SolveContext) -> coil_step.CoilMemory:
         """Drop what is remembered of the errors of another model; return the memory."""
         modes, sigma = context.modes, context.sigma
         if self._made_for is not None:
@@ -114,12 +102,12 @@ class CoilTracks:
         lengths: Array,
         context: SolveContext,
         settings: TrackerSettings,
-    ) -> Followed:
+    ) -> coil_step.Followed:
         """Solve all coils near where they are expected; see `follow_coils`."""
-        out, memory = Followed.empty(*values.shape), self.prepare(context)
-        if context.readings >= UNKNOWNS and not follow_coils(
+        out, memory = coil_step.Followed.empty(*values.shape), self.prepare(context)
+        if context.readings >= coil_step.UNKNOWNS and not coil_step.follow_coils(
             stamp_ns, values, sound, lengths, memory, context.arrays,
-            rules_of(settings, values.shape[1]), out,
+            coil_step.rules_of(settings, values.shape[1]), out,
         ):  # fmt: skip
             raise TrackingError(NOT_FINITE)
         return out
@@ -131,7 +119,7 @@ class CoilTracks:
         at, memory = self.memory.error_at[rows], self.memory
         moved = np.sqrt(((points - at[:, :3]) ** 2).sum(axis=1))
         turned = np.sqrt(((axes - at[:, 3:]) ** 2).sum(axis=1))
-        far = np.flatnonzero((moved >= memory.reach_m[rows]) | (turned >= ERROR_REACH))
+        far = np.flatnonzero((moved >= memory.reach_m[rows]) | (turned >= coil_step.ERROR_REACH))
         shared: Array = memory.errors[rows]
         if far.size:
             shared[far] = context.errors_at(points[far], axes[far], lengths[far])
@@ -149,7 +137,7 @@ class CoilFrame(SolveFrame):
     @property
     def freedom(self) -> int:
         """Return the degrees of freedom of the residual."""
-        return freedom_of(self.flux.size)
+        return coil_step.freedom_of(self.flux.size)
 
     @property
     def limit(self) -> float:
@@ -181,7 +169,7 @@ class CoilResult(NamedTuple):
         return (self.is_received or self.solution is not None) and not self.among_metal
 
 
-def track_coil(frame: CoilFrame, followed: Followed) -> CoilResult:
+def track_coil(frame: CoilFrame, followed: coil_step.Followed) -> CoilResult:
     """Estimate a sensor's pose from one frame's fluxes, near where it was expected or anywhere."""
     context, settings, row = frame.context, frame.settings, frame.row
     scans, fault = frame.tracks.scans[row], followed.fault[row]
@@ -195,7 +183,7 @@ def track_coil(frame: CoilFrame, followed: Followed) -> CoilResult:
             context.model_id,
         )  # fmt: skip
         return CoilResult(estimate, solution, False, frame.among_metal)
-    if fault != UNKNOWN:
+    if fault != coil_step.UNKNOWN:
         solution = followed.solution(row)
         return CoilResult(_judge(frame, solution, []), solution, False, frame.among_metal)
     loudness = frame.flux / context.sigma
@@ -203,8 +191,9 @@ def track_coil(frame: CoilFrame, followed: Followed) -> CoilResult:
     if signal < settings.min_signal:
         reason = f'flux is {signal:.2g} times the noise'
         return CoilResult(frame.no_pose(states.NO_SIGNAL, reason), None)
-    if context.readings < UNKNOWNS:
-        reason = f'{context.readings} readings are too few for the {UNKNOWNS} unknowns of a pose'
+    if context.readings < coil_step.UNKNOWNS:
+        few = f'{context.readings} readings are too few'
+        reason = f'{few} for the {coil_step.UNKNOWNS} unknowns of a pose'
         return CoilResult(frame.no_pose(states.AMBIGUOUS, reason), None, is_received=True)
     if scans.suspect is not None and frame.stamp_ns < scans.retry_ns:
         solution = _descend(frame, scans.suspect.position, scans.suspect.axis)
@@ -245,7 +234,7 @@ def _descend(frame: CoilFrame, position: Array, axis: Array) -> CoilSolution:
 def _take_errors(frame: CoilFrame, position: Array, axis: Array) -> None:
     """Remember the model's error for the coil at a pose."""
     length, memory = np.array([frame.length]), frame.tracks.memory
-    if not take_errors(frame.row, position, axis, length, memory, frame.context.arrays):
+    if not coil_step.take_errors(frame.row, position, axis, length, memory, frame.context.arrays):
         raise TrackingError(NOT_FINITE)
 
 
@@ -257,7 +246,7 @@ def _scanned(
     if judged.state == states.OK:
         scans.forget()
         _take_errors(frame, solution.position, solution.axis)
-        remember(
+        coil_step.remember(
             frame.row, frame.stamp_ns, solution.position, solution.axis, solution.residual,
             judged.chi2, float(frame.freedom), frame.tracks.memory,
         )  # fmt: skip
@@ -278,8 +267,8 @@ def _judge(
         if rival.converged and settings.box.contains(rival.position)
     )
     return frame.estimate(
-        frame.tracks.noise[frame.row], solution, Freedom(frame.freedom, UNKNOWNS, SELDOM),
-        (position, axis, None),
+        frame.tracks.noise[frame.row], solution,
+        Freedom(frame.freedom, coil_step.UNKNOWNS, coil_step.SELDOM), (position, axis, None),
         lambda scale: coil_covariance(solution.normal, axis, settings.roll_variance / scale),
         others, position, in_metal=frame.among_metal,
     )  # fmt: skip

@@ -116,7 +116,7 @@ def descend_body(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Find the least chi-square near a pose, whose arrays are written over.
 
-    Returns chi-square, evaluations used, whether it converged; position and rotation; residual,
+    Returns chi-square, whether it converged; position and rotation; residual,
     whitened residual with derivatives, and information as `_look` fills them at its last pose.
     """
     basis, size = np.empty((flux.shape[0], 7, dipoles.shape[1])), flux.size
@@ -160,7 +160,7 @@ def descend_body(  # type: ignore[no-untyped-def]
             chi2 -= promised
             converged, place = True, trial[:2]
             break
-    return chi2, used, converged, place[0], place[1], pose[2], pose[3], pose[4]
+    return chi2, converged, place[0], place[1], pose[2], pose[3], pose[4]
 
 
 @kernel
@@ -271,7 +271,6 @@ class BodySolution:
     information: Array  # (6, 6), inverse covariance of (position, rotation vector), both in fg
     residual: Array  # (S, 2K), measured minus modelled flux, T
     coil_chi2: Array  # (S,), each coil's squared residual in units of its own noise
-    evaluations: int
     converged: bool
     # (8, S 2K), whitened: residual, derivatives as in `_look`, flux; and `common_factor`
     rows: Array
@@ -353,15 +352,13 @@ def solve_body(
         raise TrackingError(f'{count} coils and {width} components, got flux {flux.shape}')
 
     r, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
-    chi2, used, converged, r, turn, residual, white, information = descend_body(
+    chi2, converged, r, turn, residual, white, information = descend_body(
         r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma, common,
         field.columns, field.moments, low, high, MAX_EVALUATIONS,
     )  # fmt: skip
     coil_chi2 = (white[0].reshape(count, width) ** 2).sum(axis=1)
     rows = np.concatenate([white, (inverse_sigma * flux).reshape(1, -1)])
-    return BodySolution(
-        r, turn, chi2, information, residual, coil_chi2, used, converged, rows, common
-    )
+    return BodySolution(r, turn, chi2, information, residual, coil_chi2, converged, rows, common)
 
 
 def start_from_coils(

@@ -9,7 +9,7 @@ explains the fluxes equally well. Coils and frames are compared with each other 
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from anser_ros import pose_states as states
 from anser_ros.arrays import Array
@@ -21,7 +21,8 @@ from anser_ros.tracking.estimate import (
     TrackerSettings,
     no_pose,
 )
-from anser_ros.tracking.solve import chi2_limit
+from anser_ros.tracking.rigid import BodySolution
+from anser_ros.tracking.solve import CoilSolution, chi2_limit
 from anser_ros.tracking.solve_context import SolveContext
 
 RARE = 0.01
@@ -63,98 +64,9 @@ def usual_and_most(settings: TrackerSettings, freedom: int, seldom: float) -> tu
     return usual, USUAL_GATE**2 if settings.has_gate else usual
 
 
-def variance_scale(
-    noise: NoiseScale,
-    chi2: float,
-    freedom: int,
-    unknowns: int,
-    seldom: float,
-    context: SolveContext,
-    settings: TrackerSettings,
-) -> float:
-    """Return the factor on the variances of a pose; 1 where the noise is not adapted.
-
-    ``chi2`` is the whitened residual power, with ``freedom`` degrees of freedom, of a pose of so
-    many ``unknowns``; a residual of a probability below ``seldom`` counts as more than noise.
-    """
-    if not settings.adaptive:
-        return 1.0
-    (usual, most), ratio = usual_and_most(settings, freedom, seldom), chi2 / freedom
-    scale = noise.of_frame(
-        ratio, usual, freedom / unknowns, context.model_share, context.modes is not None
-    )
-    return scale if ratio <= most else SYSTEMATIC * scale
-
-
-def verdict(
-    settings: TrackerSettings,
-    chi2: float,
-    freedom: int,
-    residual_t: float,
-    place: Array,
-    converged: bool,
-    sigma_m: float,
-    scale: float,
-    what: str = 'position',
-    in_metal: bool = False,
-    rivals: Iterable[tuple[float, str]] = (),
-) -> tuple[str, str]:
-    """Return the state of a solved pose, and the reason in words where it is not ``ok``.
-
-    ``chi2`` is the whitened residual power with ``freedom`` degrees of freedom, ``residual_t`` the
-    root mean square of the residual, T. ``place`` (3,) has to be in the volume: the coil, or the
-    middle of the body's coils, m, frame fg. ``sigma_m`` is the root of the position covariance's
-    trace, m, ``what`` is uncertain where it is too large, and ``scale`` is from `variance_scale`.
-    ``in_metal``: whether the pose lies among the dipoles that stand for metal, where the model's
-    field is none. ``rivals`` are other poses, the likeliest first: the chi-square of each, and its
-    name in the reason; they are looked at only where the pose is good by itself.
-    """
-    ratio = chi2 / freedom
-    most_m = settings.max_sigma_m * settings.max_sigma_factor(scale)
-    fault = fault_of.py_func(
-        ratio, settings.gate, settings.box.contains(place), converged, sigma_m, most_m,
-        in_metal and settings.has_gate,
-    )  # fmt: skip
-    if fault == MISFIT:
-        times = math.sqrt(ratio)
-        return (
-            states.RESIDUAL,
-            f'residual {residual_t:.3g} T is {times:.3g} times the expected one',
-        )
-    if fault == OUTSIDE:
-        return states.OUTSIDE_VOLUME, f'at {millimetres(place)} mm'
-    if fault == UNENDED:
-        return states.AMBIGUOUS, 'the solve did not converge'
-    if fault == UNCERTAIN:
-        return states.AMBIGUOUS, f'{what} uncertain by {1e3 * sigma_m:.3g} mm'
-    if fault == IN_METAL:
-        return states.AMBIGUOUS, 'where there may be metal'
-    margin = settings.margin(ratio)
-    for other_chi2, words in rivals:
-        if other_chi2 < chi2 + margin:
-            return states.AMBIGUOUS, f'{words} would explain the fluxes too'
-    return states.OK, ''
-
-
 def millimetres(place: Array) -> str:
     """Return coordinates of a place given in m as text in mm."""
     return ', '.join(f'{1e3 * v:.1f}' for v in place)
-
-
-class Solution(Protocol):
-    """States where the solve of any tracked thing ended."""
-
-    @property
-    def chi2(self) -> float:
-        """Return the sum of squared whitened residuals."""
-
-    @property
-    def residual(self) -> Array:
-        """Return measured minus modelled flux, T."""
-
-    @property
-    def converged(self) -> bool:
-        """Return whether the last step was negligible."""
 
 
 class Freedom(NamedTuple):
@@ -184,7 +96,7 @@ class SolveFrame:
     def estimate(
         self,
         noise: NoiseScale,
-        solution: Solution,
+        solution: CoilSolution | BodySolution,
         freedom: Freedom,
         pose: tuple[Array, Array, Array | None],
         covariance: Callable[[float], Array],
@@ -196,20 +108,53 @@ class SolveFrame:
         """Judge a solution by itself: its covariance, its state, and the reason for it.
 
         ``pose`` are position, axis, and rotation or None, as the estimate has them. ``covariance``
-        returns the pose's (6, 6) before the scale, which it is given. The last four are those of
-        `verdict`.
+        returns the pose's (6, 6) before the scale, which it is given; ``what`` is uncertain where
+        that is too large. ``place`` (3,) has to be in the volume: the coil, or the middle of the
+        body's coils, m, frame fg. ``rivals`` are other poses, the likeliest first: the chi-square
+        of each, and its name in the reason; they are looked at only where the pose is good by
+        itself. ``in_metal``: whether the pose lies among the dipoles that stand for metal, where
+        the model's field is none.
         """
-        settings, chi2 = self.settings, solution.chi2
-        scale = variance_scale(noise, chi2, *freedom, self.context, settings)
+        settings, ratio = self.settings, solution.chi2 / freedom.of_residual
+        scale = self._variance_scale(noise, ratio, freedom)
         scaled = scale * covariance(scale)
-        sigma = math.sqrt(scaled[0, 0] + scaled[1, 1] + scaled[2, 2])
+        sigma_m = math.sqrt(scaled[0, 0] + scaled[1, 1] + scaled[2, 2])
         flat = solution.residual.ravel()
-        residual = math.sqrt(float(flat @ flat) / flat.size)
-        state, reason = verdict(
-            settings, chi2, freedom.of_residual, residual, place, solution.converged, sigma,
-            scale, what, in_metal, rivals,
+        residual_t = math.sqrt(float(flat @ flat) / flat.size)
+        fault = fault_of.py_func(
+            ratio, settings.gate, settings.box.contains(place), solution.converged, sigma_m,
+            settings.max_sigma_m * settings.max_sigma_factor(scale),
+            in_metal and settings.has_gate,
         )  # fmt: skip
+        state, reason = states.AMBIGUOUS, ''
+        if fault == MISFIT:
+            times = math.sqrt(ratio)
+            state = states.RESIDUAL
+            reason = f'residual {residual_t:.3g} T is {times:.3g} times the expected one'
+        elif fault == OUTSIDE:
+            state, reason = states.OUTSIDE_VOLUME, f'at {millimetres(place)} mm'
+        elif fault == UNENDED:
+            reason = 'the solve did not converge'
+        elif fault == UNCERTAIN:
+            reason = f'{what} uncertain by {1e3 * sigma_m:.3g} mm'
+        elif fault == IN_METAL:
+            reason = 'where there may be metal'
+        else:
+            most = solution.chi2 + settings.margin(ratio)
+            words = next((name for chi2, name in rivals if chi2 < most), '')
+            reason = f'{words} would explain the fluxes too' if words else ''
+            state = states.AMBIGUOUS if words else states.OK
         return PoseEstimate(
-            self.name, self.stamp_ns, state, *pose, scaled, sigma, residual,
-            chi2 / freedom.of_residual, self.context.model_id, reason,
+            self.name, self.stamp_ns, state, *pose, scaled, sigma_m, residual_t, ratio,
+            self.context.model_id, reason,
         )  # fmt: skip
+
+    def _variance_scale(self, noise: NoiseScale, ratio: float, freedom: Freedom) -> float:
+        """Return the factor on the variances of a pose; 1 where the noise is not adapted."""
+        if not self.settings.adaptive:
+            return 1.0
+        of_residual, unknowns, seldom = freedom
+        usual, most = usual_and_most(self.settings, of_residual, seldom)
+        share, follows = self.context.model_share, self.context.modes is not None
+        scale = noise.of_frame(ratio, usual, of_residual / unknowns, share, follows)
+        return scale if ratio <= most else SYSTEMATIC * scale
