@@ -43,10 +43,11 @@ def read(data):
 
 def test_every_fault_has_a_name_of_its_own():
     from faults_files import COMMANDS
+    from recorded import RECORDED
     from run import GROUPS
 
     names = [fault.name for group in GROUPS.values() for fault in group]
-    names += [command.name for command in COMMANDS]
+    names += [one.name for one in (*COMMANDS, *RECORDED)]
     assert len(names) == len(set(names)) > 90
     assert not {'+', ' '} & set(''.join(names))
 

@@ -13,7 +13,7 @@ covariances (Hausman, Econometrica 1978), which the coil's own bounds from above
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -178,7 +178,7 @@ several would have to fail alike, which is less likely than a bend, and of a ben
 be the one that moved: the coils of a body do not say which."""
 
 
-def is_part(offsets: Array, against: Sequence[int], others: Sequence[int]) -> bool:
+def is_part(offsets: Array, against: Collection[int], others: Collection[int]) -> bool:
     """Return whether coils that contradict the others may be a part of the tool that is bent.
 
     ``offsets`` (S, 3), m, are all coils' in the body; ``against`` and ``others`` are some of them.

@@ -9,13 +9,11 @@ columns X, whose factors have a variance of one, add to the log likelihood of re
 precision P, where ``M = X^T P X`` and ``b = X^T P y``.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anser_ros.arrays import Array
 from anser_ros.integrity.board_place import FAR_M, FAR_SIGMAS, PRIOR_M, PRIOR_RAD
-from anser_ros.physics.rotations import rotation_of_vector
+from anser_ros.integrity.clean_references import DrawnReadings
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import FieldFunction
 from anser_ros.refit.posterior import Bank, FrameEvidence, log_sum, make_room
@@ -26,21 +24,8 @@ LOOK_S = 0.16
 MOVED_ODDS = 20.0
 """Log odds from which on a motion is believed: metal of independent recordings reaches -12 where
 an X-ray head touches the board, and simulated slides of 0.05 mm are at 100 to 200."""
-STEP = 1e-3
-"""Step of the derivatives, in prior deviations: 5 um and 20 urad."""
 MOST_KEPT = 16
 """Hypotheses at a noise level whose matrices are kept."""
-
-
-@dataclass(frozen=True)
-class _Slide:
-    """What depends on a hypothesis and the noise alone, for A strengths: X in its eigenvectors
-    (n, 6), ``(1 + M)^-1`` (A, 6, 6), and half of ``log |1 + M|`` (A,).
-    """
-
-    columns: Array
-    inverse: Array
-    half_log_det: Array
 
 
 class FrameMotion:
@@ -54,20 +39,11 @@ class FrameMotion:
 
     def __init__(self, field: FieldFunction, references: SensorTable, noise_t: float) -> None:
         self._points, self._last_ns = references.position, 0
-        self._known: dict[tuple[object, ...], _Slide] = {}
+        self._known: dict[tuple[object, ...], tuple[Array, Array, Array]] = {}
         self.forget()
-        columns = []
-        for unit in np.eye(6):
-            sides = []
-            for step in (STEP, -STEP):
-                turn = rotation_of_vector(step * PRIOR_RAD * unit[3:])
-                shift = step * PRIOR_M * unit[:3]
-                moved, axes = references.position @ turn.T + shift, references.axis @ turn.T
-                reach = references.length[:, None] / np.sqrt(12.0) * axes
-                both = 0.5 * (field(moved + reach) + field(moved - reach))
-                sides.append(np.einsum('ski,si->sk', both, axes).ravel())
-            columns.append((sides[0] - sides[1]) / (2.0 * STEP * noise_t))
-        self._columns = np.array(columns).T
+        drawn = DrawnReadings.of(field, references.position, references.axis, references.length)
+        columns = PRIOR_M * drawn.by_place, PRIOR_RAD * drawn.turned(np.zeros(3))
+        self._columns = np.concatenate(columns).reshape(6, -1).T / noise_t
 
     def forget(self) -> None:
         """Believe that nothing has moved, and look with the next frame."""
@@ -80,16 +56,16 @@ class FrameMotion:
         self._last_ns, self._next_ns = stamp_ns, stamp_ns + LOOK_S / NANO
         found, best = [], (-np.inf, np.zeros(6), np.zeros(6))
         for hypothesis in {0, seen.best}:
-            known = self._known_of(bank, hypothesis, seen.noise)
+            columns, inverse, half_log_det = self._known_of(bank, hypothesis, seen.noise)
             precision, curve = bank.precision(seen.noise)[0], seen.curve[hypothesis, 0]
-            b = (precision[hypothesis] * seen.projected[hypothesis, :, 0]) @ known.columns
-            moved = (known.inverse @ b[:, :, None])[..., 0]
-            gained = curve + 0.5 * (b * moved).sum(axis=1) - known.half_log_det
+            b = (precision[hypothesis] * seen.projected[hypothesis, :, 0]) @ columns
+            moved = (inverse @ b[:, :, None])[..., 0]
+            gained = curve + 0.5 * (b * moved).sum(axis=1) - half_log_det
             evidence = float(seen.log_evidence[hypothesis]) + log_sum(gained) - log_sum(curve)
             found.append(evidence)
             top = int(gained.argmax())
             if evidence > best[0]:
-                best = evidence, moved[top], np.sqrt(np.diag(known.inverse[top]))
+                best = evidence, moved[top], np.sqrt(np.diag(inverse[top]))
         odds = log_sum(np.array(found)) - log_sum(seen.log_evidence)
         # Far away a motion is not linear any more, and not seen beside metal: it must come back.
         if odds > MOVED_ODDS:
@@ -113,13 +89,16 @@ class FrameMotion:
             f'({words} along x, y, z)'
         )
 
-    def _known_of(self, bank: Bank, hypothesis: int, noise: float) -> _Slide:
+    def _known_of(self, bank: Bank, hypothesis: int, noise: float) -> tuple[Array, Array, Array]:
+        """Return what a hypothesis and the noise decide: the columns (n, 6) in its eigenvectors,
+        and for each strength ``(1 + M)^-1`` (A, 6, 6) and half of ``log |1 + M|`` (A,).
+        """
         key = (bank.rows.tobytes(), bank.names[hypothesis], noise)
         if key not in self._known:
+            make_room(self._known, MOST_KEPT)
             columns = bank.bases[hypothesis].T @ self._columns[bank.rows]
             precision = bank.precision(noise)[0][hypothesis]
             inside = np.eye(6) + (precision[:, None] * columns.T) @ columns
-            make_room(self._known, MOST_KEPT)
             half = 0.5 * np.linalg.slogdet(inside)[1]
-            self._known[key] = _Slide(columns, np.linalg.inv(inside), half)
+            self._known[key] = columns, np.linalg.inv(inside), half
         return self._known[key]

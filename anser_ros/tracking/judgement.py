@@ -221,10 +221,10 @@ def _judged_by_coils(found: Estimates, body: RigidBody, settings: TrackerSetting
         against = dict.fromkeys(members, why)
     elif estimate.state in (states.OK, states.OUTSIDE_VOLUME):
         against = _contradictions(found, body, members, settings)
-        others = [i for i in members if i not in against]
-        if pose_checks.is_part(body.coils.offsets, list(against), others):
+        apart = {*against, *members} - (set(fit.used.tolist()) - {*against})
+        if against and pose_checks.is_part(body.coils.offsets, apart, {*members} - apart):
             words = next(iter(against.values()))
-            why = f'{len(against)} of {len(members)} coils contradict the others: {words}'
+            why = f'{len(apart)} of {len(members)} coils contradict the others: {words}'
             against = dict.fromkeys(members, why)
             estimate = replace(estimate, state=states.INCONSISTENT, reason=why)
     for i, why in against.items():

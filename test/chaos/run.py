@@ -23,6 +23,7 @@ from faults_graph import GRAPH
 from faults_line import CLOCK, REFERENCES, SERIAL
 from faults_models import MODELS
 from faults_processes import PROCESSES
+from recorded import RECORDED, Drift
 from rig import RATE_HZ, Rig, domain_pool
 from table import ALLOWED_S, Row, line, load, save, write_docs
 from witness import WINDOW_S, is_wrong
@@ -151,19 +152,18 @@ def _command(faults: Sequence[Fault], seed: int, lasts_s: float | None) -> str:
     return f"make chaos ARGS='--only {names} --seed {seed}{duration}'"
 
 
-def chosen(args: argparse.Namespace) -> tuple[list[list[Fault]], list[Command]]:
-    """Return the faults to be tried, each alone or together, and the commands."""
+def chosen(args: argparse.Namespace) -> tuple[list[list[Fault]], list[Command | Drift]]:
+    """Return the faults to be tried live, each alone or together, and all others."""
     known = {fault.name: fault for group in GROUPS.values() for fault in group}
-    commands = {command.name: command for command in COMMANDS}
+    groups: dict[str, tuple[Command | Drift, ...]] = {'files': COMMANDS, 'recorded': RECORDED}
+    groups |= {one.name: (one,) for one in (*COMMANDS, *RECORDED)}
     trials: list[list[Fault]] = []
-    asked: list[Command] = []
-    for names in args.only or (*GROUPS, 'files'):
+    asked: list[Command | Drift] = []
+    for names in args.only or (*GROUPS, 'files', 'recorded'):
         if names in GROUPS:
             trials += [[fault] for fault in GROUPS[names]]
-        elif names == 'files':
-            asked += COMMANDS
-        elif names in commands:
-            asked.append(commands[names])
+        elif names in groups:
+            asked += groups[names]
         else:
             missing = [name for name in names.split('+') if name not in known]
             if missing:
@@ -200,13 +200,13 @@ def main() -> int:
     )  # fmt: skip
     parser.add_argument('--list', action='store_true', help='name all faults and end')
     args = parser.parse_args()
-    trials, commands = chosen(args)
+    trials, others = chosen(args)
     if args.list:
-        for one in (*itertools.chain.from_iterable(trials), *commands):
+        for one in (*itertools.chain.from_iterable(trials), *others):
             print(f'{one.name:24} {one.what}')
         return 0
     if args.random:
-        trials, commands = combinations(args.seed, args.random), []
+        trials, others = combinations(args.seed, args.random), []
     # Faults of one world share a chain.
     trials.sort(key=lambda faults: max(fault.world == 'metal' for fault in faults))
     found: dict[str, Row] = {}
@@ -214,12 +214,14 @@ def main() -> int:
         found = {row.name: row for row in load(args.again)}
         open_ = {row.name for row in found.values() if not row.is_judged}
         trials = [faults for faults in trials if _name(faults) in open_]
-        commands = []
+        others = []
     with tempfile.TemporaryDirectory(prefix='anser_chaos_') as folder, domain_pool() as domains:
         chain = Chain(Path(folder), domains.take())
         try:
-            for command in commands:
-                _note(commanded(command), found, args.out)
+            for one in others:
+                rows = one.rows(args.seed) if isinstance(one, Drift) else [commanded(one)]
+                for row in rows:
+                    _note(row, found, args.out)
             for faults in trials:
                 row = _tried_surely(chain, faults, args)
                 _note(row, found, args.out)
