@@ -292,7 +292,11 @@ def _fit_as_scan(
         check_explained(calibration)
     scan = calibration.scan
     scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
-    return replace(calibration, scan=scan)
+    model = calibration.model
+    if drifts:
+        state = {'emitter_strengths': 'those at the start of each session'}
+        model = replace(model, provenance={**model.provenance, **state})
+    return replace(calibration, model=model, scan=scan)
 
 
 def _with_faults(scan: Scan, faults: Sequence[Term]) -> Scan:
@@ -376,5 +380,6 @@ def calibrate_sessions(
     model = calibration.model
     for session in sessions:
         model = made_for(model, session.setup)
-    kept = next((r for r in map(readings_of, sessions) if r is not None), None)
+    steady, _ = at_constant_strength(sessions, options)
+    kept = next((r for r in map(readings_of, steady) if r is not None), None)
     return replace(calibration, model=replace(model, references=kept))
