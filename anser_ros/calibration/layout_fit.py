@@ -68,7 +68,7 @@ class ScaledNominal:
 
     def moments(self, dipoles: DipoleSites) -> ComplexArray:
         """Return the moments (N, K), A m^2, with which N dipoles make the drawn field best."""
-        return _moments_of_field(self.points, self.axes, as_real(self.flux), dipoles)
+        return moments_of_field(self.points, self.axes, as_real(self.flux), dipoles)
 
 
 def volume_lattice(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
@@ -159,10 +159,10 @@ def join_regions(
     basis = flux_basis(points, axes, None, dipoles.positions, dipoles.directions)
     shares = regions.shares(points)
     blended = sum(share[:, None] * (basis @ m) for share, m in zip(shares.T, moments, strict=True))
-    return _moments_of_field(points, axes, np.asarray(blended), layer)
+    return moments_of_field(points, axes, np.asarray(blended), layer)
 
 
-def _moments_of_field(
+def moments_of_field(
     points: Array, axes: Array, flux: Array, dipoles: DipoleSites
 ) -> ComplexArray:
     """Moments (N, K), A m^2, that make given real fluxes (P, 2K), T, best."""

@@ -38,6 +38,7 @@ from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.baseline import readings_of
+from anser_ros.sessions.drawn_calibration import fit_to_drawing, is_for_drawing
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
@@ -325,6 +326,18 @@ def _steady(session: Session, tool: Measurements) -> Booleans:
     return outside(tool.time, spans_of(session.reference.time, changed))
 
 
+def _fit_drawn(
+    sessions: Sessions, options: Options, progress: Progress | None = None
+) -> Calibration:
+    """Fit the drawn board; where its field is not the readings', a free one."""
+    setup = sessions[0].setup
+    generator = replace(generator_of(setup), nominal=NominalBoard.of(setup).model)
+    found = fit_to_drawing(sessions[0], generator, options, progress)
+    return _fit_as_scan(sessions, options, progress) if found is None else found
+
+
+DRAWN = Engine(is_for_drawing, _fit_drawn)
+"""Calibrates what leaves a free field open, with the drawn board as the prior."""
 SCAN = Engine(lambda sessions, options: True, _fit_as_scan)
 """Calibrates any sessions: a scan of the volume, with or without a nominal model."""
 
@@ -332,7 +345,7 @@ SCAN = Engine(lambda sessions, options: True, _fit_as_scan)
 @functools.cache
 def all_engines() -> tuple[Engine, ...]:
     """Return what calibrates, in the order of asking; the last, a scan's, accepts everything."""
-    return (*itertools.chain(*extensions.loaded('ENGINES')), SCAN)
+    return (*itertools.chain(*extensions.loaded('ENGINES')), DRAWN, SCAN)
 
 
 def named_kinds() -> tuple[str, ...]:
