@@ -161,8 +161,8 @@ def test_a_drift_is_found_and_taken_away(references):
     drifting = replace(steady, flux=steady.flux * true[:, None])
     strength = emitter_strength(drifting)
     assert (np.delete(strength, 5, axis=1) == 1.0).all()
-    ratio = strength[:, 5] / true[:, 5]
-    assert np.abs(ratio / ratio.mean() - 1.0).max() < 1e-3
+    # The state is that of the start, which the next session begins in.
+    assert np.abs(strength[:, 5] / true[:, 5] - 1.0).max() < 2e-3
     constant = at_strength(drifting, drifting.time, strength)
     assert (emitter_strength(constant) == 1.0).all()
     (record,) = drift_records(strength)

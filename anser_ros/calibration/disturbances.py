@@ -176,7 +176,9 @@ a large metal body that comes up from below up to 97 %."""
 
 
 def emitter_strength(reference: Measurements) -> ComplexArray:
-    """Return each emitter's strength relative to its median over a scan, shape (F, K), complex.
+    """Return each emitter's strength relative to that at a scan's start, shape (F, K), complex.
+
+    That is the one state which other sessions have too: a scan's median is that of warm emitters.
 
     It is one for emitters that do not drift, and for all emitters if there are too few references.
 
@@ -207,7 +209,8 @@ def emitter_strength(reference: Measurements) -> ComplexArray:
         by_noise = np.sqrt(1.0 / max(total * float(np.mean(size[seen])), 1e-300))
         is_drift = drift >= max(LEAST_DRIFT, CERTAIN * by_noise)
         if is_drift and common > COMMON * (power - float(change.size)):
-            out[:, k] = CubicSpline(middle, gain)(reference.time)
+            course = CubicSpline(middle, gain)
+            out[:, k] = course(reference.time) / course(middle[0])
     return out
 
 

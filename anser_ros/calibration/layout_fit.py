@@ -60,7 +60,7 @@ class ScaledNominal:
 
     def moments(self, dipoles: DipoleSites) -> ComplexArray:
         """Return the moments (N, K), A m^2, with which N dipoles make the drawn field best."""
-        return _moments_of_field(self.points, self.axes, as_real(self.flux), dipoles)
+        return moments_of_field(self.points, self.axes, as_real(self.flux), dipoles)
 
 
 def volume_lattice(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
@@ -90,7 +90,7 @@ def emitter_gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> 
     return np.asarray(above / np.maximum(below, 1e-300))
 
 
-def _moments_of_field(
+def moments_of_field(
     points: Array, axes: Array, flux: Array, dipoles: DipoleSites
 ) -> ComplexArray:
     """Moments (N, K), A m^2, that make given real fluxes (P, 2K), T, best."""

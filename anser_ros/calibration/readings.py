@@ -271,14 +271,25 @@ def usable_frames(measurements: Sequence[Measurements]) -> int:
     return sum(int(m.usable.any(axis=1).sum()) for m in measurements)
 
 
-def _check_thickness(measurements: Sequence[Measurements]) -> None:
+def is_thick(measurements: Sequence[Measurements]) -> bool:
+    """Return whether usable readings spread enough across their plane for a free field."""
+    got, need = _thickness(measurements)
+    return got >= need
+
+
+def _thickness(measurements: Sequence[Measurements]) -> tuple[float, float]:
+    """Return the spread of the usable readings across their plane, and the least one, m rms."""
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
-    need = max(FLATTEST * float(spread[0]), THINNEST_M)
-    if spread[-1] < need:
+    return float(spread[-1]), max(FLATTEST * float(spread[0]), THINNEST_M)
+
+
+def _check_thickness(measurements: Sequence[Measurements]) -> None:
+    got, need = _thickness(measurements)
+    if got < need:
         raise FitError(
             f'all readings lie in one plane: their spread across it must be at least '
-            f'{1e3 * need:.2f} mm rms, got {1e3 * spread[-1]:.2f} mm'
+            f'{1e3 * need:.2f} mm rms, got {1e3 * got:.2f} mm'
         )
 
 

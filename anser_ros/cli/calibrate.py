@@ -134,6 +134,7 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     rows += [(effect.name, _parameters(effect)) for effect in calibration.model.effects]
     for effect in calibration.scan.reported_effects:
         rows.append((f'{effect.name}, not in the model', _parameters(effect)))
+    rows += [(one['name'], one['words']) for one in document.get('emitters_off', ())]
     return output.terminal_table(['', ''], rows, title='calibration', show_header=False)
 
 

@@ -38,6 +38,7 @@ from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.baseline import readings_of
+from anser_ros.sessions.drawn_calibration import fit_to_drawing, is_for_drawing
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
@@ -293,7 +294,11 @@ def _fit_as_scan(
         check_explained(calibration)
     scan = calibration.scan
     scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
-    return replace(calibration, scan=scan)
+    model = calibration.model
+    if drifts:
+        state = {'emitter_strengths': 'those at the start of each session'}
+        model = replace(model, provenance={**model.provenance, **state})
+    return replace(calibration, model=model, scan=scan)
 
 
 def _with_faults(scan: Scan, faults: Sequence[Term]) -> Scan:
@@ -322,6 +327,18 @@ def _steady(session: Session, tool: Measurements) -> Booleans:
     return outside(tool.time, spans_of(session.reference.time, changed))
 
 
+def _fit_drawn(
+    sessions: Sessions, options: Options, progress: Progress | None = None
+) -> Calibration:
+    """Fit the drawn board; where its field is not the readings', a free one."""
+    setup = sessions[0].setup
+    generator = replace(generator_of(setup), nominal=NominalBoard.of(setup).model)
+    found = fit_to_drawing(sessions[0], generator, options, progress)
+    return _fit_as_scan(sessions, options, progress) if found is None else found
+
+
+DRAWN = Engine(is_for_drawing, _fit_drawn)
+"""Calibrates what leaves a free field open, with the drawn board as the prior."""
 SCAN = Engine(lambda sessions, options: True, _fit_as_scan)
 """Calibrates any sessions: a scan of the volume, with or without a nominal model."""
 
@@ -329,7 +346,7 @@ SCAN = Engine(lambda sessions, options: True, _fit_as_scan)
 @functools.cache
 def all_engines() -> tuple[Engine, ...]:
     """Return what calibrates, in the order of asking; the last, a scan's, accepts everything."""
-    return (*itertools.chain(*extensions.loaded('ENGINES')), SCAN)
+    return (*itertools.chain(*extensions.loaded('ENGINES')), DRAWN, SCAN)
 
 
 def named_kinds() -> tuple[str, ...]:
@@ -377,5 +394,6 @@ def calibrate_sessions(
     model = calibration.model
     for session in sessions:
         model = made_for(model, session.setup)
-    kept = next((r for r in map(readings_of, sessions) if r is not None), None)
+    steady, _ = at_constant_strength(sessions, options)
+    kept = next((r for r in map(readings_of, steady) if r is not None), None)
     return replace(calibration, model=replace(model, references=kept))

@@ -245,7 +245,7 @@ ENGINES = (
         f'{MANY_SENSORS} sensors, over emitters without a drawing, and with no layout of dipoles '
         'stated',
     ),
-    Engine(SCAN.accepts, lambda *scan: with_source_sizes(SCAN.fit(*scan))),
+    Engine(_is_free, lambda *scan: with_source_sizes(SCAN.fit(*scan))),
 )
-"""In their order: a body of many sensors at one place, at a few poses, and any scan, with the
+"""In their order: a body of many sensors at one place, at a few poses, and a scan, with the
 sizes of emitters without a drawing."""

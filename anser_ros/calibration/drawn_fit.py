@@ -1,0 +1,493 @@
+"""Fits a drawn board, every coil of which is a little off, to readings at typed places.
+
+The drawing is the prior: a coil's place, tilt and strength have the spread of manufacturing,
+and a layer of weak dipoles stands for leads and windings that the drawing lacks. Errors of the
+sensors, of the plate that the places belong to, and of every frame's typed pose are unknown
+besides. Poses are eliminated frame by frame, and one linear-Gaussian problem remains (Tarantola,
+Inverse Problem Theory, section 3.2), solved again at each estimate. The widths of populations are
+those that make the data most probable (MacKay, Neural Computation 1992), with the stated width as
+`STATED` values more: few data leave the field near the drawing, many make it free, and the
+covariance says which.
+
+What no reading determines is the frame: field and poses may move together by six numbers, which
+only the prior holds. They are stated apart (`FieldModel.shift_sigma_m`).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from anser_ros.arrays import Array, ComplexArray
+from anser_ros.calibration.layout_fit import moments_of_field
+from anser_ros.calibration.layouts import Generator, Layout, grid, place
+from anser_ros.calibration.least_squares import as_real
+from anser_ros.calibration.moments import (
+    SMALLEST_NOISE_T,
+    PoseTerms,
+    PoseWhitener,
+    Progress,
+    moved,
+    outlier_weights,
+    pose_slopes,
+)
+from anser_ros.calibration.population import Likelihood, Posterior, solve
+from anser_ros.calibration.readings import (
+    DipoleSites,
+    basis_rows,
+    flux_slopes,
+    fold_of_frames,
+    usable_weights,
+)
+from anser_ros.calibration.sensor_parameters import SensorParameters
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import Dipoles, FieldModel
+from anser_ros.field.nominal import GAIN, LOWEST_M, SHIFT_M, TILT_RAD
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import along_each_axis
+
+REST = 1e-4
+"""Standard deviation of a moment of the layer for what the drawing lacks, relative to a coil's:
+leads a millimetre apart that are some centimetres long enclose that share of the turns' area."""
+REST_LAYER = Layout('layer', 8, 1.1, 0.0)
+"""That layer: dipoles every 3 to 4 cm, closer than the distance to any sensor."""
+REST_MODES = 24
+"""Its combinations that are fitted; at `LOWEST_M` others make a thousandth."""
+HEIGHTS_M = LOWEST_M * np.array([1.0, 1.5, 2.5, 4.0])
+"""Heights over the board at which its field is looked at."""
+COIL = {'shift': SHIFT_M, 'turn': TILT_RAD, 'strength': GAIN, 'rest': REST}
+"""Standard deviations of a coil's errors: m, rad, and relative."""
+SENSORS = {'gains': 0.02, 'axes': 0.02, 'places': 5e-4}
+"""The same of the sensors': relative, rad, m, those of coils wound and glued by hand."""
+LEVEL = 0.02
+"""The same of a factor that all readings share, such as a coil's turns, relative."""
+PLATE = np.array([1.5e-3] * 3 + [0.01] * 3 + [3e-4])
+"""The same of a plate's place (m), turn (rad) and scale: laid by eye, drilled well."""
+PLACE = np.array([1.5e-4] * 3 + [5e-3] * 3)
+"""The same of a place on a plate (m, rad): a probe has some play in it."""
+STATED = 12.0
+"""Values of a population that its stated width counts as when it is learnt."""
+WIDEST = 3.0
+"""Width of a population at most, relative to the stated one."""
+STEPS, WIDTH_STEPS = 15, 10
+"""Gauss-Newton steps at most, and steps of the widths within each."""
+SETTLING = 2
+"""Steps before widths, noise and weights are learnt: first the board comes to where it is."""
+SMALL = 0.05
+"""Step, in standard deviations, that ends the iteration."""
+MOST_READINGS = 4000
+"""Readings of coils that are used at most, of frames evenly spread: more change no pose."""
+MOST_MODES = 64
+"""Modes of the model's covariance: what more would add is below a hundredth of the noise."""
+SIDE_STEP = 1e-5
+"""Step of the differences by a coil's place (m) and turn (rad)."""
+
+KINDS = {
+    'shift': slice(0, 3),
+    'turn': slice(3, 6),
+    'strength': slice(6, 8),
+    'rest': slice(8, None),
+}
+"""Where the parameters of these kinds stand among a coil's own."""
+OWN = 8 + REST_MODES
+"""Parameters of a coil."""
+
+
+def _turned(vectors: Array) -> Array:
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
+
+
+def _carried(places: Array, middle: Array) -> Array:
+    """Shifts (P, 3, 6) of places by a motion (m, rad) about a middle."""
+    turns = [np.cross(unit, places - middle) for unit in np.eye(3)]
+    return np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(places), 3, 3)), np.stack(turns, axis=2)], axis=2
+    )
+
+
+class Drawing:
+    """A board's drawing as N dipoles, coil by coil, and L more for what it lacks.
+
+    The errors of its K coils are a table (K, `OWN`): shift (m), turn (rad) about the centre,
+    complex strength less one, and amplitudes of the combinations of the L dipoles.
+    """
+
+    def __init__(self, generator: Generator) -> None:
+        assert generator.nominal is not None
+        self.nominal, self.centres = generator.nominal, generator.centres
+        self.owner = np.argmax(np.abs(self.nominal.moments), axis=1)
+        self.layer = place(REST_LAYER, generator)
+        square = grid(9, 1.6 * generator.half_extent)
+        flat = generator.middle + np.column_stack([square, np.zeros(len(square))])
+        self.places = (flat + HEIGHTS_M[:, None, None] * [0.0, 0.0, 1.0]).reshape(-1, 3)
+        self.lattice = along_each_axis(self.places)
+        made = flux_basis(*self.lattice, None, self.layer.positions, self.layer.directions)
+        size = float(np.abs(self.nominal.moments.sum(axis=0)).mean())
+        self.rest = size * np.linalg.svd(made, full_matrices=False)[2][:REST_MODES].T
+
+    def dipoles(self, errors: Array) -> Dipoles:
+        """Return the dipoles (N + L) of a board with such errors."""
+        turns, own = _turned(errors[:, 3:6])[self.owner], self.centres[self.owner]
+        arms = np.einsum('nij,nj->ni', turns, self.nominal.positions - own)
+        along = np.einsum('nij,nj->ni', turns, self.nominal.directions)
+        moments = np.concatenate([self.nominal.moments, self.rest @ errors[:, 8:].T])
+        return Dipoles(
+            np.concatenate([own + errors[self.owner, :3] + arms, self.layer.positions]),
+            np.concatenate([along, self.layer.directions]),
+            moments * (1.0 + errors[:, 6] + 1j * errors[:, 7]),
+        )
+
+    def columns(self, errors: Array) -> ComplexArray:
+        """Return the moments (K, N + L, OWN) of the same dipoles by each coil's own errors."""
+        here, out = self.dipoles(errors), []
+        sites = DipoleSites(here.positions, here.directions)
+        rest = np.concatenate([np.zeros((len(self.owner), REST_MODES)), self.rest])
+        for k in range(len(errors)):
+            pairs = []
+            for j in range(6):
+                step = np.zeros_like(errors)
+                step[k, j] = SIDE_STEP
+                ahead, behind = (
+                    self.dipoles(errors + sign * step).flux(*self.lattice, None)[:, k]
+                    for sign in (1.0, -1.0)
+                )
+                pairs.append((ahead - behind) / (2.0 * SIDE_STEP))
+            found = moments_of_field(*self.lattice, as_real(np.stack(pairs, axis=1)), sites)
+            own, strength = here.moments[:, k, None], 1.0 + errors[k, 6] + 1j * errors[k, 7]
+            by_strength = own / strength
+            parts = [found, by_strength, 1j * by_strength, strength * rest]
+            out.append(np.concatenate(parts, axis=1))
+        return np.stack(out)
+
+
+@dataclass
+class _Part:
+    """Frames of one body of one fold."""
+
+    stated: Measurements  # at the poses that are typed
+    fold: int
+    offset: Array  # (F, 6): of the poses from those stated on the plate
+    weights: Array  # (F, S)
+    now: Measurements  # corrected by the present estimate
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """What frames say of all P parameters, and what the step of their poses takes."""
+
+    normal: Array  # (P, P)
+    gradient: Array  # (P,)
+    answer: Array  # (F, 6, P): by how much poses give way
+    step: Array  # (F, 6): of the poses alone
+    variance: Array  # (F, 6)
+    freedom: float  # pose parameters that the readings determine
+
+
+@dataclass(frozen=True)
+class DrawnFit:
+    """Holds a fitted board with what is known of it."""
+
+    model: FieldModel  # without corrections of sensors; its modes are what is open but the frame
+    errors: Array  # (K, OWN): of the coils, and their standard deviations
+    sigma: Array
+    plate: Array  # (7,): place (m), turn (rad) and scale of the typed places
+    sensors: SensorParameters
+    posterior: Posterior  # of the sensors' parameters
+    evidence: dict[str, float]  # gain of the log probability by each of their kinds
+    noise_t: float
+    jitter: Array  # (6,): of typed poses
+    parts: tuple[_Part, ...]
+    # of each part what a fit without its fold leaves, at the poses of the fit to all
+    held_out: tuple[PoseTerms, ...]
+    freedom: float  # parameters that the readings determine
+    steps: int
+
+
+class DrawnFitter:
+    """Fits a drawn board and the errors of sensors, plate and poses.
+
+    ``measurements``: of bodies whose typed places belong to one plate, all frames with a pose.
+    """
+
+    def __init__(
+        self,
+        measurements: Sequence[Measurements],
+        generator: Generator,
+        kinds: Sequence[str],
+        noise_t: float,
+    ) -> None:
+        self.drawing, self.noise_t, self.jitter = Drawing(generator), noise_t, PLACE
+        # A single coil's place and gain are the plate's and the board's.
+        one = all(len(m.sensors) == 1 for m in measurements)
+        kept = [kind for kind in kinds if kind in SENSORS and (kind == 'axes' or not one)]
+        self.sensors = SensorParameters(measurements, kept, generator.frequencies_hz)
+        self.parts = list(_parts(measurements))
+        self.middle = np.mean(np.concatenate([p.stated.position for p in self.parts]), axis=0)
+        self.count = len(generator.centres)
+        ends = np.cumsum([OWN * self.count, 2, 7, len(self.sensors)]).tolist()
+        self.own, self.level, self.plate, self.sensed = (
+            slice(*pair) for pair in zip([0, *ends[:3]], ends, strict=True)
+        )
+        self.values, self.width = np.zeros(ends[3]), np.full(ends[3], LEVEL)
+        self.width[self.plate] = PLATE
+        table = np.arange(OWN * self.count).reshape(self.count, OWN)
+        self.groups = [(table[:, at].ravel(), COIL[kind]) for kind, at in KINDS.items()]
+        start = self.sensed.start
+        self.groups += [(start + rows, SENSORS[kind]) for kind, rows in self.sensors.groups()]
+        for rows, width in self.groups:
+            self.width[rows] = width
+
+    def fit(self, progress: Progress | None = None) -> DrawnFit:
+        """Take steps until they are small."""
+        step = 0
+        self._place(self.values)
+        self._weigh(0.0, is_learning=False)
+        for step in range(STEPS):
+            if progress is not None:
+                progress('board, sensors and poses', step / STEPS)
+            self._place(self.values)
+            sums = [self._sums(part) for part in self.parts]
+            if self._step(sums, step >= SETTLING) < SMALL and step > SETTLING:
+                break
+        self._place(self.values)
+        return self._result([self._sums(part) for part in self.parts], step + 1)
+
+    def errors(self, values: Array) -> Array:
+        """Return the coils' errors (K, OWN); the factor that all share is in their strengths."""
+        errors = values[self.own].reshape(self.count, OWN).copy()
+        strength = (1.0 + errors[:, 6] + 1j * errors[:, 7]) * (1.0 + values[self.level] @ [1, 1j])
+        errors[:, 6], errors[:, 7] = strength.real - 1.0, strength.imag
+        return errors
+
+    def _place(self, values: Array) -> None:
+        """Bring board, sensors and poses to some values."""
+        self.board = self.errors(values)
+        self.dipoles = self.drawing.dipoles(self.board)
+        shift, turn, scale = np.split(values[self.plate], [3, 6])
+        rotation = _turned(turn)
+        for part in self.parts:
+            arms = (1.0 + scale) * (part.stated.position - self.middle) @ rotation.T
+            there = replace(
+                part.stated,
+                position=self.middle + shift + arms,
+                rotation=rotation @ part.stated.rotation,
+            )
+            errors = self.sensors.errors_of(there.body, values[self.sensed])
+            part.now = moved(errors.apply(there), part.offset)
+
+    def _terms(self, now: Measurements) -> tuple[PoseTerms, tuple[ComplexArray, ...]]:
+        """Residuals of frames, with fluxes and their derivatives by coils' places and axes."""
+        sites = DipoleSites(self.dipoles.positions, self.dipoles.directions)
+        made = flux_slopes(now, sites, self.dipoles.moments)
+        points, axes = now.placed()
+        slope = pose_slopes(points, axes, now.position, *made[1:])
+        return PoseTerms(as_real(now.flux) - as_real(made[0]), slope), made
+
+    def _sums(self, part: _Part) -> _Sums:
+        now, size = part.now, self.values.size
+        terms, made = self._terms(now)
+        white = PoseWhitener(terms.slope, part.weights, self.noise_t, self.jitter**-2.0)
+        shared = self._shared(part, terms, made)
+        root = (np.sqrt(part.weights) / self.noise_t)[:, :, None]
+        frames, sensors = part.weights.shape
+        slope = white.slope.reshape(frames, sensors, -1, 6)
+        normal, gradient = np.zeros((size, size)), np.zeros(size)
+        mixed = np.zeros((frames, 6, size))
+        for k, own in enumerate(self._of_coils(now, made)):
+            pair = slice(2 * k, 2 * k + 2)
+            rows = np.concatenate([own, shared[:, :, pair]], axis=3) * root[..., None]
+            rows = rows.reshape(frames, 2 * sensors, -1)
+            at = np.concatenate([OWN * k + np.arange(OWN), np.arange(self.level.start, size)])
+            flat = rows.reshape(-1, at.size)
+            normal[np.ix_(at, at)] += flat.T @ flat
+            gradient[at] += flat.T @ (terms.residual[:, :, pair] * root).ravel()
+            along = slope[:, :, pair].reshape(frames, -1, 6)
+            mixed[:, :, at] += along.transpose(0, 2, 1) @ rows
+        answer = white.inverse @ mixed
+        step = white.step(terms.residual, part.offset)
+        flat_mixed = mixed.reshape(-1, size)
+        normal -= flat_mixed.T @ answer.reshape(-1, size)
+        gradient -= flat_mixed.T @ step.ravel()
+        variance = np.diagonal(white.inverse, axis1=1, axis2=2)
+        return _Sums((normal + normal.T) / 2.0, gradient, answer, step, variance, white.freedom)
+
+    def _shared(self, part: _Part, terms: PoseTerms, made: tuple[ComplexArray, ...]) -> Array:
+        """Derivatives (F, S, 2K, .) by what all coils share: level, plate and sensors."""
+        now, flux = part.now, made[0]
+        level = np.stack([as_real(flux), as_real(1j * flux)], axis=-1)
+        ways = np.zeros((len(now.time), 6, 7))
+        ways[:, :3, :6] = _carried(now.position, self.middle)
+        ways[:, 3:, 3:6] = np.eye(3)
+        ways[:, :3, 6] = now.position - self.middle
+        plate = np.einsum('fsci,fij->fscj', terms.slope, ways, optimize=True)
+        still = np.zeros((len(now.time), 6))
+        by_sensors = as_real(
+            self.sensors.derivatives(now, made[0], made[1], made[2], still)
+        ).transpose(0, 1, 3, 2)
+        return np.concatenate([level, plate, by_sensors], axis=3)
+
+    def _of_coils(self, now: Measurements, made: tuple[ComplexArray, ...]) -> Iterator[Array]:
+        """Yield the derivatives (F, S, 2, OWN) of each coil's fluxes by its own errors."""
+        flux, by_place, by_axis = made
+        points, axes = now.placed()
+        rest = (basis_rows(now, self.drawing.layer) @ self.drawing.rest).reshape(
+            *flux.shape[:2], -1
+        )
+        for k, errors in enumerate(self.board):
+            arms = points - self.drawing.centres[k] - errors[:3]
+            turn = np.cross(arms, by_place[..., k]) + np.cross(axes, by_axis[..., k])
+            strength = 1.0 + errors[6] + 1j * errors[7]
+            own = flux[..., k, None] / strength
+            each = [-by_place[..., k], -turn, own, 1j * own, strength * rest]
+            whole = np.concatenate(each, axis=-1)
+            yield np.stack([whole.real, whole.imag], axis=2)
+
+    def _likelihood(self, sums: Sequence[_Sums]) -> Likelihood:
+        normal = np.sum([one.normal for one in sums], axis=0)
+        gradient = np.sum([one.gradient for one in sums], axis=0)
+        return Likelihood(normal, gradient + normal @ self.values)
+
+    def _step(self, sums: Sequence[_Sums], is_learning: bool) -> float:
+        """Take a step; return its size in standard deviations."""
+        likelihood = self._likelihood(sums)
+        found = solve(likelihood, self.width)
+        for _ in range(WIDTH_STEPS if is_learning else 0):
+            for rows, stated in self.groups:
+                ratio = np.diag(found.covariance)[rows] / self.width[rows] ** 2
+                self.width[rows] = _learnt(found.values[rows], ratio, stated)
+            found = solve(likelihood, self.width)
+        change, self.values, self.posterior = found.values - self.values, found.values, found
+        for part, one in zip(self.parts, sums, strict=True):
+            part.offset = part.offset + one.step - one.answer @ change
+        if is_learning:
+            self._learn_jitter(sums)
+        self._place(self.values)
+        used = float((found.covariance * likelihood.information).sum())
+        self._weigh(used + sum(one.freedom for one in sums), is_learning)
+        return float((np.abs(change) / np.maximum(found.sigma, 1e-15)).max())
+
+    def _learn_jitter(self, sums: Sequence[_Sums]) -> None:
+        offset = np.concatenate([part.offset for part in self.parts])
+        ratio = np.concatenate([one.variance for one in sums]) / self.jitter**2
+        new = [
+            _learnt(offset[:, own], ratio[:, own], float(PLACE[own][0]))
+            for own in (slice(0, 3), slice(3, 6))
+        ]
+        self.jitter = np.repeat(new, 3)
+
+    def _weigh(self, used: float, is_learning: bool) -> None:
+        """Weigh the readings, and estimate the noise, less ``used`` degrees of freedom."""
+        power = count = 0.0
+        for part in self.parts:
+            left = self._terms(part.now)[0].residual
+            if is_learning:
+                part.weights = outlier_weights(left, usable_weights(part.now))
+            power += float((part.weights[:, :, None] * left**2).sum())
+            count += float(part.weights.sum()) * left.shape[2]
+        self.noise_t = max(
+            float(np.sqrt(power / max(count - used, 0.05 * count))), SMALLEST_NOISE_T
+        )
+
+    def _result(self, sums: Sequence[_Sums], steps: int) -> DrawnFit:
+        likelihood = self._likelihood(sums)
+        found, held_out = solve(likelihood, self.width), []
+        for part in self.parts:
+            rest = [s for s, p in zip(sums, self.parts, strict=True) if p.fold != part.fold]
+            self._place(solve(self._likelihood(rest), self.width).values)
+            held_out.append(self._terms(part.now)[0])
+        # A gain that all sensors share is the board's.
+        gains, common = self.sensors.by_rule(found.values[self.sensed])
+        level = (1.0 + found.values[self.level] @ [1.0, 1j]) * common
+        self.values = found.values.copy()
+        self.values[self.sensed] = gains
+        self.values[self.level] = level.real - 1.0, level.imag
+        self._place(self.values)
+        model = self._model(found.covariance)
+        sensed = replace(
+            found, values=gains, width=self.width[self.sensed],
+            covariance=found.covariance[self.sensed, self.sensed],
+        )  # fmt: skip
+        evidence = {}
+        for kind in self.sensors.kinds:
+            without = self.width.copy()
+            without[self.sensed.start + self.sensors.rows(kind)] = 1e-12
+            evidence[kind] = found.evidence - solve(likelihood, without).evidence
+        return DrawnFit(
+            model, self.board, found.sigma[self.own].reshape(self.count, OWN),
+            found.values[self.plate], self.sensors, sensed, evidence, self.noise_t, self.jitter,
+            tuple(self.parts), tuple(held_out),
+            float((found.covariance * likelihood.information).sum()), steps,
+        )  # fmt: skip
+
+    def _model(self, covariance: Array) -> FieldModel:
+        """The field's model with its modes, and the frame's part of what is open.
+
+        The frame's motion is that which makes the field over the board most like a given one.
+        """
+        drawing, here, size = self.drawing, self.dipoles, OWN * self.count
+        columns = drawing.columns(self.board)
+        basis = flux_basis(*drawing.lattice, None, here.positions, here.directions)
+        lift = np.zeros((size, len(covariance)))
+        lift[:, :size] = np.eye(size)
+        lift[6:size:OWN, self.level.start] = lift[7:size:OWN, self.level.start + 1] = 1.0
+        motion = np.zeros((self.count, OWN, 6))
+        motion[:, :3] = _carried(drawing.centres + self.board[:, :3], self.middle)
+        motion[:, 3:6, 3:] = np.eye(3)
+        weight = 1.0 / np.linalg.norm(basis @ here.moments, axis=1)[:, None]
+        made = [weight * (basis @ of_coil) for of_coil in columns]
+        moving = np.concatenate([m @ v for m, v in zip(made, motion, strict=True)])
+        whole = np.zeros((len(moving), size), complex)
+        for k, block in enumerate(made):
+            rows = slice(k * len(block), (k + 1) * len(block))
+            whole[rows, OWN * k : OWN * (k + 1)] = block
+        to_motion = np.linalg.lstsq(as_rows(moving), as_rows(whole), rcond=None)[0]
+        open_all = lift @ covariance @ lift.T
+        frame = to_motion @ open_all @ to_motion.T
+        still = np.eye(size) - motion.reshape(size, 6) @ to_motion
+        modes = self._modes(still @ open_all @ still.T, columns, as_rows(whole))
+        arms = _carried(drawing.places, self.middle)
+        shift = np.sqrt(np.einsum('pij,jk,pik->', arms, frame, arms) / (3.0 * len(arms)))
+        nominal = drawing.nominal
+        return FieldModel(
+            here.positions, here.directions, here.moments, nominal.emitters,
+            nominal.frequencies_hz, modes=modes, shift_sigma_m=float(shift),
+        )  # fmt: skip
+
+    def _modes(self, covariance: Array, columns: ComplexArray, flux: Array) -> ComplexArray:
+        """The strongest modes (R, N + L, K) of what is open of the field."""
+        values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        _, turn = np.linalg.eigh((flux @ root).T @ (flux @ root))
+        best = (root @ turn[:, ::-1][:, :MOST_MODES]).reshape(self.count, OWN, -1)
+        return np.ascontiguousarray((columns @ best).transpose(2, 1, 0))
+
+
+def as_rows(values: ComplexArray) -> Array:
+    """Return complex rows (M, P) as twice as many real ones."""
+    return np.concatenate([values.real, values.imag])
+
+
+def _learnt(values: Array, ratio: Array, stated: float) -> float:
+    """Width of a population by its values, and by what is stated of it."""
+    if not values.size:
+        return stated
+    freedom = values.size - float(ratio.sum())
+    square = float((values**2).sum()) + STATED * stated**2
+    return min(float(np.sqrt(square / (freedom + STATED))), WIDEST * stated)
+
+
+def evenly(measurements: Sequence[Measurements]) -> list[Measurements]:
+    """Return frames evenly over all, of about `MOST_READINGS` readings."""
+    readings = sum(m.flux.shape[0] * m.flux.shape[1] for m in measurements)
+    step = max(1, -(-readings // MOST_READINGS))
+    return [m.frames(slice(None, None, step)) for m in measurements]
+
+
+def _parts(measurements: Sequence[Measurements]) -> Iterator[_Part]:
+    """The frames, those of each fold apart."""
+    folds = fold_of_frames([m.position for m in measurements])
+    for whole, fold in zip(measurements, folds, strict=True):
+        for one in np.unique(fold).tolist():
+            m = whole.frames(fold == one)
+            yield _Part(m, one, np.zeros((len(m.time), 6)), usable_weights(m), m)

@@ -1,0 +1,184 @@
+"""Calibration from what leaves a free field open: typed places of a plate.
+
+The worlds are boards whose coils are each a little off, by Biot and Savart along their tracks.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import REPO
+from scipy.spatial.transform import Rotation
+
+from anser_ros.calibration.calibrate import Options
+from anser_ros.calibration.sensor_parameters import KINDS
+from anser_ros.errors import FitError
+from anser_ros.field.measurements import Measurements
+from anser_ros.physics.board import loop_field
+from anser_ros.physics.rotations import tilted
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.sessions.calibration import calibrate_sessions
+from anser_ros.sessions.drawn_calibration import check_typed
+from anser_ros.sessions.nominal_board import board_of
+from anser_ros.sessions.session import Session, load_session
+
+NOISE_T, START = 40e-12, 1_700_000_000_000_000_000
+PROBE = SensorTable(
+    np.zeros(1, int), ('probe/0/z',), ('probe',), np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]),
+    np.zeros(1),
+)  # fmt: skip
+
+
+class World:
+    """A board of the setup's drawing whose coils are off in place, tilt and strength."""
+
+    def __init__(self, setup, seed):
+        self.setup, self.board = setup, board_of(setup)
+        rng = self.rng = np.random.default_rng(seed)
+        count = len(self.board.names)
+        self.shift = 4e-4 * rng.normal(size=(count, 3))
+        self.turn = Rotation.from_rotvec(6e-3 * rng.normal(size=(count, 3))).as_matrix()
+        self.strength = 1.0 + 0.012 * rng.normal(size=count)
+
+    def field(self, points):
+        """Fluxes density (P, K, 3), T."""
+        board = self.board
+        coils = zip(board.rotations, board.centres, self.shift, self.turn, strict=True)
+        paths = [board.shape @ (own @ turn).T + at + off for turn, at, off, own in coils]
+        made = [loop_field(path, points, board.current_a) for path in paths]
+        return np.stack(made, axis=1) * self.strength[:, None]
+
+    def flux(self, points, axes):
+        """Noisy fluxes (F, S, K) of coils (F, S, 3)."""
+        field = self.field(points.reshape(-1, 3)).reshape(*points.shape[:2], -1, 3)
+        flux = np.einsum('fski,fsi->fsk', field, axes)
+        parts = self.rng.normal(size=(2, *flux.shape))
+        return flux + NOISE_T * (parts[0] + 1j * parts[1])
+
+    def session(self, body, table, flux, position=None, rotation=None):
+        """A session of one body, posed or not."""
+        count = len(flux)
+        posed = position is not None
+        tool = Measurements(
+            body, table, np.arange(float(count)), flux, np.ones(flux.shape[:2], bool),
+            np.zeros(flux.shape[:2], int),
+            position if posed else np.full((count, 3), np.nan),
+            rotation if posed else np.full((count, 3, 3), np.nan), np.full(count, posed),
+        )  # fmt: skip
+        specs = tuple(
+            replace(
+                self.setup.tool_sensors[0], channel=i, name=name, body=body,
+                position_m=tuple(table.position[i]), axis=tuple(table.axis[i]), length_m=0.0,
+            )
+            for i, name in enumerate(table.name)
+        )  # fmt: skip
+        return Session('own.mcap', replace(self.setup, sensors=specs), START, (tool,), None)
+
+    def grid(self, heights=(0.084,)):
+        """A plate of 7 x 7 places, typed as drawn, and put down 0.5 mm off."""
+        rng, steps = self.rng, 0.04286 * (np.arange(7) - 3.0)
+        typed = np.array([[x, y, z] for z in heights for y in steps for x in steps])
+        turn = Rotation.from_rotvec(4e-3 * rng.normal(size=3)).as_matrix()
+        true = typed @ turn.T + 5e-4 * rng.normal(size=3) + 1e-4 * rng.normal(size=typed.shape)
+        axis = tilted(
+            np.tile(turn[:, 2], (len(typed), 1)), 0.005 * rng.normal(size=(len(typed), 2))
+        )
+        flux = 1.01 * self.flux(true[:, None], axis[:, None])
+        flat = np.tile(np.eye(3), (len(typed), 1, 1))
+        return self.session('probe', PROBE, flux, typed, flat)
+
+    def error_m(self, model):
+        """How far coils are found off, m: as they are, and after one rigid registration."""
+        places = self.rng.uniform([-0.11, -0.11, 0.1], [0.11, 0.11, 0.2], (200, 3))
+        axes = self.rng.normal(size=(200, 3))
+        axes /= np.linalg.norm(axes, axis=1)[:, None]
+        step = 1e-5
+        made = [
+            model.flux(places + way, axes) for way in np.vstack([np.zeros(3), np.eye(3) * step])
+        ]
+        slope = [(one - made[0]).real / step for one in made[1:]]
+        turns = [model.flux(places, np.eye(3)[[j]].repeat(200, 0)).real for j in range(3)]
+        true = np.einsum('pki,pi->pk', self.field(places), axes)
+        left = true - made[0].real
+        steps = np.array(
+            [
+                np.linalg.lstsq(np.stack([*s, *t], axis=1), one, rcond=1e-6)[0][:3]
+                for s, t, one in zip(np.stack(slope, 1), np.stack(turns, 1), left, strict=True)
+            ]
+        )
+        found = places + steps
+        return _rms(found - places), _rms(_registered(found, places) - places)
+
+
+def _rms(error):
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def _registered(places, onto):
+    turn, _ = Rotation.align_vectors(onto - onto.mean(axis=0), places - places.mean(axis=0))
+    return turn.apply(places - places.mean(axis=0)) + onto.mean(axis=0)
+
+
+@pytest.fixture(scope='module')
+def setup():
+    return load_session(REPO / 'bags' / 'factory.mcap').setup
+
+
+def calibrated(session):
+    return calibrate_sessions([session], Options(estimate=KINDS))
+
+
+@pytest.mark.parametrize(('heights', 'most_m'), [((0.084,), 4e-4), ((0.084, 0.15), 1.5e-4)])
+def test_a_plate_of_typed_places_calibrates(setup, heights, most_m):
+    world = World(setup, 5)
+    result = calibrated(world.grid(heights))
+    raw, registered = world.error_m(result.model)
+    assert registered < most_m
+    assert raw < 1e-3
+    assert raw < 3.0 * np.sqrt(3.0) * result.model.shift_sigma_m + 3.0 * most_m
+    assert result.better_than_nominal
+    assert result.fit.noise_t < 1.5 * NOISE_T
+    rows = result.more['emitters_off']
+    found = np.array([row['shift_m'] for row in rows])
+    sigma = np.array([row['shift_sigma_m'] for row in rows])
+    assert (np.abs(found - world.shift) < 4.0 * sigma).mean() > 0.95
+    assert np.corrcoef(found.ravel(), world.shift.ravel())[0, 1] > 0.6
+    assert any('sits' in row['words'] for row in rows)
+    assert 'frame' in result.undetermined[0]
+
+
+def wrongly(session, **parts):
+    (tool,) = session.tools
+    return replace(session, tools=(replace(tool, **parts),))
+
+
+def test_what_was_typed_wrongly_is_named_with_its_size(setup):
+    session = World(setup, 7).grid()
+    (tool,) = session.tools
+    with pytest.raises(
+        FitError, match=r'1\.3\d\d times as far apart as typed: 4\d\.\d\d mm where 31'
+    ):
+        calibrated(wrongly(session, position=tool.position * [0.7408, 0.7408, 1.0]))
+    with pytest.raises(FitError, match=r'points the other way than typed, by 1[78]'):
+        calibrated(wrongly(session, flux=-tool.flux))
+    rest = tool.frames(np.delete(np.arange(49), 16))
+    same = {key: getattr(tool, key)[:48] for key in ('time', 'position', 'rotation')}
+    with pytest.raises(FitError, match=r'one of the typed places 1\d to 1\d was missed'):
+        calibrated(replace(session, tools=(replace(rest, **same),)))
+    for position in (tool.position * [-1.0, 1.0, 1.0], tool.position[:, [1, 0, 2]]):
+        with pytest.raises(FitError, match=r'\d+ mm \(median\) from where it was typed'):
+            calibrated(wrongly(session, position=position))
+
+
+def test_readings_of_no_such_board_are_refused(setup):
+    session = World(setup, 8).grid()
+    (tool,) = session.tools
+    other = 1.0 + 0.03 * np.random.default_rng(8).normal(size=tool.flux.shape)
+    with pytest.raises(FitError, match='one plane'):
+        calibrated(wrongly(session, flux=tool.flux * other))
+
+
+def test_right_places_pass(setup):
+    (tool,) = World(setup, 9).grid().tools
+    points, axes = tool.placed()
+    assert check_typed(tool, points[:, 0], axes[:, 0]) == ''
