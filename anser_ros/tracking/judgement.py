@@ -192,13 +192,16 @@ def _add_gain_error(found: Estimates, coils: Sequence[CoilResult], body: RigidBo
     A coil alone takes a gain for another distance. With the free axis vector n that the normal
     matrix has, a gain is a change of n along itself.
     """
-    for row in body.rows.tolist():
-        one, solution = found[row], coils[row].solution
-        if one.state != states.OK or solution is None:
-            continue
-        own = coil_covariance(solution.normal, solution.axis, 0.0)
-        pull = solution.normal[:, 3:] @ solution.axis
-        pull[3:] = np.cross(solution.axis, pull[3:])
+    solved = [(row, coils[row].solution) for row in body.rows.tolist()]
+    good = [(r, s) for r, s in solved if s is not None and found[r].state == states.OK]
+    if not good:
+        return
+    axes = np.array([solution.axis for _, solution in good])
+    normals = np.array([solution.normal for _, solution in good])
+    pulls = np.einsum('sij,sj->si', normals[:, :, 3:], axes)
+    pulls[:, 3:] = np.cross(axes, pulls[:, 3:])
+    for (row, solution), pull in zip(good, pulls, strict=True):
+        one, own = found[row], coil_covariance(solution.normal, solution.axis, 0.0)
         moved = body.result.gain * (own @ pull)
         one.covariance[:] += np.outer(moved, moved)  # the estimate's own matrix
         found[row] = one.with_sigma(math.sqrt(float(np.trace(one.covariance[:3, :3]))))

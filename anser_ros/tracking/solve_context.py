@@ -8,7 +8,7 @@ weight, and the covariance grows accordingly.
 import hashlib
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -113,6 +113,17 @@ GRID_TOLERANCE = 0.05
 """Relative change of the field up to which a grid may go on serving as a source of starts."""
 
 
+@lru_cache(maxsize=4)
+def _landmarks(volume: TrackedVolume) -> tuple[Array, Array]:
+    """Return 27 places in a volume along each axis: points (P, 3), m, and unit axes (P, 3)."""
+    sides = [
+        np.linspace(a + 0.15 * (b - a), b - 0.15 * (b - a), 3)
+        for a, b in zip(volume.low, volume.high, strict=True)
+    ]
+    points = np.stack([side.ravel() for side in np.meshgrid(*sides, indexing='ij')], axis=1)
+    return along_each_axis(points)
+
+
 class Starts:
     """Makes the cold start's grid in a field when it is needed.
 
@@ -125,11 +136,15 @@ class Starts:
         self._volume, self._spacing_m = volume, spacing_m
         self._before = before
         self._made: tuple[SeedGrid, Array] | None = None
+        # Positions and directions of dipoles, and their coupling with the landmarks.
+        self._coupled: tuple[Array, Array, Array] | None = None
 
     def following(self) -> 'Starts':
         """Make the context for the next model, with the last grid that was made."""
         before = self._before if self._made is None else self
-        return Starts(self._volume, self._spacing_m, before)
+        starts = Starts(self._volume, self._spacing_m, before)
+        starts._coupled = self._coupled
+        return starts
 
     def anew(self) -> 'Starts':
         """Return an empty one, for a field that has nothing in common with this one."""
@@ -139,14 +154,11 @@ class Starts:
         """Return the coupling (P, N) of the dipoles with a few points of the volume; field there,
         (P, 2K).
         """
-        sides = [
-            np.linspace(a + 0.15 * (b - a), b - 0.15 * (b - a), 3)
-            for a, b in zip(self._volume.low, self._volume.high, strict=True)
-        ]
-        points = np.stack([side.ravel() for side in np.meshgrid(*sides, indexing='ij')], axis=1)
-        at, axes = along_each_axis(points)
-        basis = flux_basis(at, axes, None, field.positions, field.directions)
-        return basis, basis @ field.moments
+        places, known = (field.positions, field.directions), self._coupled
+        if known is None or known[0] is not places[0] or known[1] is not places[1]:
+            basis = flux_basis(*_landmarks(self._volume), None, *places)
+            self._coupled = known = *places, basis
+        return known[2], known[2] @ field.moments
 
     def grid(self, field: RealField, sigma: Array) -> SeedGrid:
         """Return the grid of start poses in the field."""
@@ -191,14 +203,13 @@ class ErrorModes:
         """
         if given is None:
             return None
-        there = (given != 0.0).any(axis=2)
+        parts = np.ascontiguousarray(given, dtype=np.complex128).view(np.float64)
+        there = np.einsum('rnk,rnk->rn', parts, parts) != 0.0
         if not there.any():
             return None
         rows, some = np.flatnonzero(there.any(axis=0)), there.any(axis=1)
-        real = np.asarray(given if some.all() else given[some], dtype=np.complex128)
-        if rows.size < len(positions):
-            real = real[:, rows]
-        moments = np.ascontiguousarray(real.swapaxes(0, 1)).view(np.float64)
+        kept = parts if some.all() else parts[some]
+        moments = np.ascontiguousarray(kept.swapaxes(0, 1)[rows])
         places = positions[rows]
         if before is not None and np.array_equal(places, before.places):
             spacing = before.spacing
