@@ -119,6 +119,7 @@ class TestThrottle:
 NODE = '''
 """A node of the tests."""
 import ctypes
+import math
 import sys
 import time
 from dataclasses import dataclass
