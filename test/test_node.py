@@ -1,5 +1,6 @@
 """The base of the nodes: parameter tables, diagnostics, guarded callbacks, start and end."""
 
+import math
 import os
 import signal
 import subprocess
@@ -29,11 +30,11 @@ pytestmark = pytest.mark.light
 
 @dataclass(frozen=True)
 class Table:
-    rate_hz: float = parameter(25.0, 'rate', minimum=1.0, maximum=100.0, live=True)
-    depth: int = parameter(3, 'depth', minimum=0)
+    rate_hz: float = parameter(25.0, 'rate', within=(1.0, 100.0), live=True)
+    depth: int = parameter(3, 'depth', within=(0, math.inf))
     mode: str = parameter('fast', 'mode', choices=('fast', 'slow'))
     names: tuple[str, ...] = parameter((), 'names')
-    centre_m: tuple[float, ...] = parameter((0.0, 0.0, 0.2), 'centre', minimum=-1.0)
+    centre_m: tuple[float, ...] = parameter((0.0, 0.0, 0.2), 'centre', within=(-1.0, math.inf))
     loud: bool = parameter(False, 'loud')
 
 
@@ -118,6 +119,7 @@ class TestThrottle:
 NODE = '''
 """A node of the tests."""
 import ctypes
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -127,7 +129,7 @@ from anser_ros.nodes.runtime.parameters import parameter
 
 @dataclass(frozen=True)
 class Table:
-    rate_hz: float = parameter(25.0, 'rate', minimum=1.0)
+    rate_hz: float = parameter(25.0, 'rate', within=(1.0, math.inf))
 
 class Sample(AnserNode):
     NAME = 'sample'

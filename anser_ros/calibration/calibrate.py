@@ -11,17 +11,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from anser_ros.arrays import Booleans, Integers
+from anser_ros.calibration import readings
 from anser_ros.calibration.held_out import HeldOut, gaps_of, predict_held_out
 from anser_ros.calibration.layout_fit import LayoutFit, LayoutFitter
 from anser_ros.calibration.layouts import FREE_KINDS, Generator, Layout, place
 from anser_ros.calibration.moments import SMALLEST_NOISE_T, Progress
-from anser_ros.calibration.readings import (
-    check_agreement,
-    check_kept,
-    check_measurements,
-    fold_of_frames,
-    with_pose,
-)
 from anser_ros.calibration.result import (
     Calibration,
     Scan,
@@ -78,22 +72,24 @@ def correct_scan(
     Raises `FitError` when the measurements cannot determine a model.
     """
     needed = COUNTS[0] ** 2 if options.layout is None else len(place(options.layout, generator))
-    check_measurements(measurements, needed, not options.estimate)
+    readings.check_measurements(measurements, needed, not options.estimate)
     if not options.estimate:
-        return Scan(tuple(with_pose(m) for m in measurements), options.accuracy)
+        return Scan(tuple(readings.with_pose(m) for m in measurements), options.accuracy)
     fitter = SensorFitter(
         measurements, options.estimate, generator, options.accuracy, progress, steady
     )
     found = fitter.fit()
     sound = [m.frames(kept) for m, kept in zip(measurements, found.kept, strict=True)]
-    check_kept(measurements, sound, needed)
+    readings.check_kept(measurements, sound, needed)
     root = np.sqrt(found.optical.interpolated)
     accuracy = replace(
         options.accuracy,
         optical_position_m=float(root * found.optical.position_m),
         optical_rotation_rad=float(root * found.optical.rotation_rad),
     )
-    corrected = tuple(with_pose(found.errors_of(m.body, m.session).apply(m)) for m in sound)
+    corrected = tuple(
+        readings.with_pose(found.errors_of(m.body, m.session).apply(m)) for m in sound
+    )
     reported = reported_effects(found, measurements)
     return Scan(corrected, accuracy, corrections(found), reported, found)
 
@@ -112,7 +108,7 @@ def fit_scan(
     """
     posed, accuracy, nominal = list(scan.measurements), scan.accuracy, generator.nominal
     thin = thin_frames(posed)
-    folds = fold_of_frames([m.position for m in thin])
+    folds = readings.fold_of_frames([m.position for m in thin])
     selection = choose_layout(thin, folds, generator, accuracy, progress, options.layout)
     chosen, held_out = _winner(selection, thin, folds, generator, accuracy, options.damping)
     layout, damping = chosen.layout, chosen.damping
@@ -122,7 +118,7 @@ def fit_scan(
         return _fitted(LayoutFitter(part, generator, accuracy), chosen).fit.noise_t
 
     if not _is_explained(scan):
-        check_agreement(posed, names, whole.fit.noise_t, alone)
+        readings.check_agreement(posed, names, whole.fit.noise_t, alone)
     sensors = scan.sensor_fit
     flux_error = float(np.hypot(held_out.flux_error_t, scan.field_sigma_t))
     missed = max(whole.fit.noise_t**2 - flux_error**2, 0.0)

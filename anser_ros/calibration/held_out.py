@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.calibration import readings
 from anser_ros.calibration.layout_fit import LayoutFit
 from anser_ros.calibration.least_squares import as_complex
 from anser_ros.calibration.moments import (
@@ -21,13 +22,6 @@ from anser_ros.calibration.moments import (
     PoseWhitener,
     pose_precision,
     pose_terms,
-)
-from anser_ros.calibration.readings import (
-    DipoleSites,
-    basis_rows,
-    frame_blocks,
-    usable_weights,
-    with_pose,
 )
 from anser_ros.field.measurements import Measurements, frame_power
 from anser_ros.field.model import ScanGaps
@@ -54,9 +48,9 @@ def open_moments(fitted: LayoutFit, damping: float) -> Array:
     """Return a factor (N, N) of the moments' covariance, A m^2: a column for each mode."""
     fit, gram = fitted.fit, np.zeros((len(fitted.dipoles),) * 2)
     for part, weights in zip(fit.measurements, fit.weights, strict=True):
-        for block in frame_blocks(*weights.shape):
+        for block in readings.frame_blocks(*weights.shape):
             root = np.sqrt(weights[block].reshape(-1, 1))
-            rows = root * basis_rows(part.frames(block), fitted.dipoles)
+            rows = root * readings.basis_rows(part.frames(block), fitted.dipoles)
             gram += rows.T @ rows
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
@@ -64,9 +58,9 @@ def open_moments(fitted: LayoutFit, damping: float) -> Array:
     return np.asarray(fit.noise_t * vectors / size / scale[:, None])
 
 
-def expected_power(moments: Array, sites: DipoleSites, frames: Measurements) -> Array:
+def expected_power(moments: Array, sites: readings.DipoleSites, frames: Measurements) -> Array:
     """Return by how much frames may be off by what `open_moments` is of dipoles, (F,), T^2."""
-    flux = basis_rows(frames, sites) @ moments
+    flux = readings.basis_rows(frames, sites) @ moments
     return np.asarray((flux**2).sum(axis=1).reshape(len(frames.time), -1).mean(axis=1))
 
 
@@ -157,12 +151,12 @@ def predict_held_out(
     for fold, part_fit in zip(blocks, fits, strict=True):
         left = None if damping is None else open_moments(part_fit, damping)
         for m, f in zip(measurements, folds, strict=True):
-            test = with_pose(m.frames(f == fold))
-            for block in frame_blocks(len(test.time), len(test.sensors)):
+            test = readings.with_pose(m.frames(f == fold))
+            for block in readings.frame_blocks(len(test.time), len(test.sensors)):
                 part = test.frames(block)
                 terms = pose_terms(part, part_fit.dipoles, part_fit.fit.moments)
                 expected = None if left is None else expected_power(left, part_fit.dipoles, part)
-                tally.add(terms, usable_weights(part), part.position, expected, part.flux)
+                tally.add(terms, readings.usable_weights(part), part.position, expected, part.flux)
     return tally.result()
 
 

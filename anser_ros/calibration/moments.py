@@ -19,21 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray
-from anser_ros.calibration.least_squares import (
-    GramFactor,
-    Spectrum,
-    TriangularFactor,
-    as_complex,
-    as_real,
-)
-from anser_ros.calibration.readings import (
-    DipoleSites,
-    basis_rows,
-    flux_slopes,
-    frame_blocks,
-    usable_weights,
-    with_pose,
-)
+from anser_ros.calibration import least_squares, readings
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.settings import Accuracy
@@ -66,12 +52,14 @@ class PoseTerms:
 
 
 def pose_terms(
-    measurements: Measurements, dipoles: DipoleSites, moments: ComplexArray
+    measurements: Measurements, dipoles: readings.DipoleSites, moments: ComplexArray
 ) -> PoseTerms:
     """Evaluate a model at the poses of measurements."""
     points, axes = measurements.placed()
-    flux, by_place, by_axis = flux_slopes(measurements, dipoles, moments)
-    residual = (as_real(measurements.flux) - as_real(flux)).astype(np.float64)
+    flux, by_place, by_axis = readings.flux_slopes(measurements, dipoles, moments)
+    residual = (least_squares.as_real(measurements.flux) - least_squares.as_real(flux)).astype(
+        np.float64
+    )
     return PoseTerms(residual, pose_slopes(points, axes, measurements.position, by_place, by_axis))
 
 
@@ -84,7 +72,7 @@ def pose_slopes(
     (F, 3): the body's origin, m. ``by_place``, ``by_axis`` (F, S, 3, K): derivatives by the
     sensors' centres (T/m) and axes (T).
     """
-    place, turn = as_real(by_place), as_real(by_axis)
+    place, turn = least_squares.as_real(by_place), least_squares.as_real(by_axis)
     arms = points - position[:, None, :]
     out = np.empty((*place.shape[:2], place.shape[3], 6))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -260,15 +248,15 @@ class MomentFitter:
     def __init__(
         self,
         measurements: Sequence[Measurements],
-        dipoles: DipoleSites,
+        dipoles: readings.DipoleSites,
         damping: float,
         accuracy: Accuracy,
         prior: ComplexArray | None = None,
     ) -> None:
         self.dipoles, self.damping, self.accuracy = dipoles, damping, accuracy
-        self.prior = None if prior is None else as_real(prior)
+        self.prior = None if prior is None else least_squares.as_real(prior)
         self.noise_t = self.quadrature_noise_t = accuracy.flux_noise_t
-        self.states = [self._state(with_pose(m)) for m in measurements]
+        self.states = [self._state(readings.with_pose(m)) for m in measurements]
         count = sum(int(state.usable.sum()) for state in self.states)
         if count == 0:
             raise FitError('no reading has a pose: a fit needs fluxes and poses of the same time')
@@ -276,7 +264,7 @@ class MomentFitter:
 
     @staticmethod
     def _state(measured: Measurements) -> _State:
-        usable = usable_weights(measured)
+        usable = readings.usable_weights(measured)
         offset = np.zeros((len(measured.time), 6))
         return _State(measured, measured, offset, usable.copy(), usable)
 
@@ -288,20 +276,20 @@ class MomentFitter:
             for state in other.states
         ]
 
-    def solve(self, exact: bool = True) -> tuple[ComplexArray, list[Spectrum]]:
+    def solve(self, exact: bool = True) -> tuple[ComplexArray, list[least_squares.Spectrum]]:
         """Return the moments (N, K) at the present poses and weights, with each group's spectrum.
 
         With ``exact`` they are solved by QR, otherwise by inner products, which is faster.
         """
-        kind = TriangularFactor if exact else GramFactor
+        kind = least_squares.TriangularFactor if exact else least_squares.GramFactor
         factor = kind(len(self.dipoles), 2 * self.emitters)
         for state in self.states:
             count, sensors = state.weights.shape
-            for block in frame_blocks(count, sensors):
+            for block in readings.frame_blocks(count, sensors):
                 part = state.corrected.frames(block)
                 root = np.sqrt(state.weights[block].reshape(-1, 1))
-                right = as_real(part.flux).reshape(-1, 2 * self.emitters)
-                factor.add(root * basis_rows(part, self.dipoles), root * right)
+                right = least_squares.as_real(part.flux).reshape(-1, 2 * self.emitters)
+                factor.add(root * readings.basis_rows(part, self.dipoles), root * right)
         moments, spectra = np.zeros((len(self.dipoles), 2 * self.emitters)), []
         for emitters, rows in self.dipoles.groups(self.emitters):
             parts = np.repeat(2 * np.array(emitters), 2) + np.tile([0, 1], len(emitters))
@@ -309,9 +297,9 @@ class MomentFitter:
             prior = None if self.prior is None else self.prior[rows]
             moments[np.ix_(rows, parts)] = spectrum.solve(self.damping, prior)[:, parts]
             spectra.append(spectrum)
-        return as_complex(moments), spectra
+        return least_squares.as_complex(moments), spectra
 
-    def freedom(self, spectra: Sequence[Spectrum]) -> float:
+    def freedom(self, spectra: Sequence[least_squares.Spectrum]) -> float:
         """Return the effective number of parameters of an emitter."""
         return float(np.mean([spectrum.freedom(self.damping) for spectrum in spectra]))
 
@@ -323,7 +311,7 @@ class MomentFitter:
         power, turned, count, used = 0.0, 0.0, 0.0, 0.0
         precision = pose_precision(self.accuracy)
         for state in self.states:
-            for block in frame_blocks(*state.weights.shape):
+            for block in readings.frame_blocks(*state.weights.shape):
                 part = state.corrected.frames(block)
                 terms = pose_terms(part, self.dipoles, moments)
                 step, left = most_probable_step(

@@ -13,17 +13,7 @@ from itertools import chain
 import numpy as np
 
 from anser_ros.arrays import Integers
-from anser_ros.diagnosis import decisions
-from anser_ros.diagnosis.choice import (
-    at_floor,
-    choose,
-    doubtful,
-    fluctuation_of,
-    left_over,
-    moves_or_rests,
-    moving_starts,
-    taken_from_others,
-)
+from anser_ros.diagnosis import choice, decisions
 from anser_ros.diagnosis.engine import ForwardSelection, Score, Scorer, is_covered
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Problem, State
@@ -122,11 +112,11 @@ class _FluxSelection(ForwardSelection[Fit]):
         fitted = self._fitted(fit, scorer)
         if not fitted:
             return None
-        gain, best = choose(fitted)
+        gain, best = choice.choose(fitted)
         metal = _metal_beside(best, gain, fitted)
         if metal is not None:
             # A freedom in every frame is no match for metal before that has its shape.
-            shaped = moves_or_rests(self._fitter, metal[1], fitted, self._others, metal[0])
+            shaped = choice.moves_or_rests(self._fitter, metal[1], fitted, self._others, metal[0])
             if scorer.held_out - shaped.held_out() > gain:
                 search.metal_gain = max(search.metal_gain, metal[0])
                 return shaped
@@ -142,7 +132,7 @@ class _FluxSelection(ForwardSelection[Fit]):
             search.metal_gain = max(search.metal_gain, gain)
         search.rivals[term.label] = _rivals(gain, best, fitted)
         if term.effect.family is Family.MOVING_METAL:
-            return moves_or_rests(self._fitter, best, fitted, self._others, gain)
+            return choice.moves_or_rests(self._fitter, best, fitted, self._others, gain)
         near = [f for g, f in fitted if f is not best and g > decisions.STEADY * gain]
         steady = [f.newest for f in near if f.newest.effect.family is Family.STEADY]
         search.close[term.label] = steady
@@ -158,7 +148,7 @@ class _FluxSelection(ForwardSelection[Fit]):
     def is_lost(self, fit: Fit) -> bool:
         """Return whether so many effects are doubtful that something else is the cause."""
         noise = noise_scale(fit.state) ** 2
-        return len(doubtful(self._fitter.problem, fit, noise)) >= decisions.MOST_DOUBTFUL
+        return len(choice.doubtful(self._fitter.problem, fit, noise)) >= decisions.MOST_DOUBTFUL
 
     def superfluous(self, fit: Fit) -> Fit | None:
         """Return the fit without the first effect that the others explain away, but the newest."""
@@ -217,7 +207,7 @@ class _FluxSelection(ForwardSelection[Fit]):
         fluctuations = _fluctuating(fitter.problem, before)
         table += [Candidate(t, t.complexity, g) for g, t in fluctuations]
         starts = _finalists(scored, scorer, self._how)
-        starts += moving_starts(fitter.problem, scored, scorer, fitter.blocks)
+        starts += choice.moving_starts(fitter.problem, scored, scorer, fitter.blocks)
         fitted: list[tuple[float, Fit]] = []
         left = sorted(starts + fluctuations, key=lambda pair: -pair[0])
         while left:
@@ -227,7 +217,7 @@ class _FluxSelection(ForwardSelection[Fit]):
             for (expected, term), fit in zip(some, fits, strict=True):
                 if _is_surpassed(expected, term, fitted):  # by one that was fitted beside it
                     continue
-                gain = scorer.held_out - fit.held_out() - taken_from_others(fit)
+                gain = scorer.held_out - fit.held_out() - choice.taken_from_others(fit)
                 fitted.append((gain, fit))
                 table.append(Candidate(fit.newest, term.complexity, gain, gain))
         self._search.rounds.append(sorted(table, key=lambda c: -c.gain))
@@ -243,7 +233,9 @@ class _FluxSelection(ForwardSelection[Fit]):
 
         def scored(few: slice) -> list[tuple[Term, Score]]:
             least = decisions.DISTINGUISHABLE
-            left = [term for term in candidates[few] if left_over(scorer.state, term) >= least]
+            left = [
+                term for term in candidates[few] if choice.left_over(scorer.state, term) >= least
+            ]
             pairs = [(term, scorer.score(term)) for term in left]
             return [(term, score) for term, score in pairs if score is not None]
 
@@ -255,7 +247,9 @@ def _is_surpassed(expected: float, term: Term, fitted: Sequence[tuple[float, Fit
     """Whether fits gain far more than expected here, or a simpler one leaves but noise."""
     if fitted and expected < decisions.LEAST_PROBE_GAIN * max(gain for gain, _ in fitted):
         return True
-    return any(at_floor(fit) and term.complexity > fit.newest.complexity for _, fit in fitted)
+    return any(
+        choice.at_floor(fit) and term.complexity > fit.newest.complexity for _, fit in fitted
+    )
 
 
 def _candidates(problem: Problem, taken: Sequence[Term], most_metals: int) -> list[Term]:
@@ -287,7 +281,7 @@ def _metal_beside(
     best: Fit, gain: float, fitted: Sequence[tuple[float, Fit]]
 ) -> tuple[float, Fit] | None:
     """Moving metal that explains nearly as much as a fluctuation that leaves something."""
-    if best.newest.effect.family is not Family.FLUCTUATION or at_floor(best):
+    if best.newest.effect.family is not Family.FLUCTUATION or choice.at_floor(best):
         return None
     metals = [
         (g, f)
@@ -306,7 +300,9 @@ def _fluctuating(problem: Problem, before: Fit) -> list[tuple[float, Term]]:
     )
     effects = [e for e in all_effects().values() if e.family is Family.FLUCTUATION]
     terms = [term for effect in effects for term in effect.candidates(problem.apparatus)]
-    found = [fluctuation_of(before.state, t) for t in terms if not is_covered(t, before.terms)]
+    found = [
+        choice.fluctuation_of(before.state, t) for t in terms if not is_covered(t, before.terms)
+    ]
     worth = [pair for pair in found if pair is not None and pair[0] > least]
     return sorted(worth, key=lambda pair: -pair[0])[: decisions.OPEN_FINALISTS]
 

@@ -15,18 +15,7 @@ from anser_ros.arrays import Array, Booleans, ComplexArray, Integers, complex_of
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import FROZEN, Effect, Family, Remedy, Resting, Term, sigmas
 from anser_ros.field.model import Dipoles, EffectRecord
-from anser_ros.metal.body import (
-    BODIES,
-    COMPACT,
-    SPACINGS,
-    ball_modes,
-    body_sizes,
-    centre_sigma,
-    multipoles,
-    sheet_shapes,
-    sheet_sizes,
-    sheet_sources,
-)
+from anser_ros.metal import body
 from anser_ros.metal.scattering import UNIT, Shapes, both_phases
 from anser_ros.physics.constants import MU_0
 
@@ -86,7 +75,7 @@ class StaticMetal(MetalAtRest):
     plausible = {'position_m': (-1.0, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        none = np.zeros(2 * ball_modes().shape[1])
+        none = np.zeros(2 * body.ball_modes().shape[1])
         return [
             Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, none]))
             for place in places(apparatus)
@@ -101,16 +90,16 @@ class StaticMetal(MetalAtRest):
         return np.concatenate([np.full(3, place), np.full(term.theta.size - 3, 10.0)])
 
     def _couplings(self, term: Term) -> ComplexArray:
-        return np.asarray(ball_modes() @ complex_of(term.theta[3:]))
+        return np.asarray(body.ball_modes() @ complex_of(term.theta[3:]))
 
     def _seen(self, centre: Array, view: View) -> tuple[Array, ComplexArray]:
         """Amplitudes of the sensors (F, S, M) and of the emitters (K, M) about a centre."""
-        shapes = multipoles()
+        shapes = body.multipoles()
         ears = shapes.received(centre, view.centres, view.axes, view.sensors.length)
         return ears, shapes.driven(view.illumination.field(centre + shapes.offsets))
 
     def _flux(self, term: Term, centre: Array, view: View) -> ComplexArray:
-        return multipoles().flux(*self._seen(centre, view), self._couplings(term), view.omega)
+        return body.multipoles().flux(*self._seen(centre, view), self._couplings(term), view.omega)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Return derivatives by place (differences) and by polarisability (exact)."""
@@ -120,7 +109,9 @@ class StaticMetal(MetalAtRest):
             for i, step in enumerate(STEP * np.eye(3)):
                 more, less = (self._flux(term, centre + s, view) for s in (step, -step))
                 out[..., i] = (more - less) / (2 * STEP)
-        unit = multipoles().mode_flux(*self._seen(centre, view), ball_modes(), view.omega)
+        unit = body.multipoles().mode_flux(
+            *self._seen(centre, view), body.ball_modes(), view.omega
+        )
         out[..., 3:] = both_phases(unit)
         return out
 
@@ -133,7 +124,7 @@ class StaticMetal(MetalAtRest):
 
     def started(self, term: Term, solution: Array) -> Sequence[Term]:
         """Start with the isotropic scatterer that the probe found at its place."""
-        alpha = np.zeros((2, ball_modes().shape[1]))
+        alpha = np.zeros((2, body.ball_modes().shape[1]))
         alpha[:, 0] = solution
         return (term.with_theta(np.concatenate([term.theta[:3], alpha.ravel()])),)
 
@@ -145,16 +136,18 @@ class StaticMetal(MetalAtRest):
 
     def resting(self, term: Term) -> Resting:
         """Return a compact body at its place; small pieces of an extended one if much is left."""
-        lattices = [(BODIES[kind](), body_sizes(kind)) for kind in SPACINGS]
-        return Resting(term.theta[:3], [(multipoles(), body_sizes(COMPACT))], lattices)
+        lattices = [(body.BODIES[kind](), body.body_sizes(kind)) for kind in body.SPACINGS]
+        return Resting(
+            term.theta[:3], [(body.multipoles(), body.body_sizes(body.COMPACT))], lattices
+        )
 
     def sources(self, term: Term, base: Dipoles, light: Dipoles, omega: Array) -> Dipoles | None:
         if not np.any(term.theta[3:]):
             return None
-        return multipoles().sources(term.theta[:3], self._couplings(term), light, omega)
+        return body.multipoles().sources(term.theta[:3], self._couplings(term), light, omega)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        total = multipoles().polarisability(self._couplings(term))
+        total = body.multipoles().polarisability(self._couplings(term))
         return EffectRecord(
             self.name,
             {
@@ -162,7 +155,7 @@ class StaticMetal(MetalAtRest):
                 'polarizability': pairs_of(total),
                 'groups': (UNIT * term.theta[3:]).tolist(),
             },
-            {'position_m': np.hypot(sigmas(covariance)[:3], centre_sigma(total)).tolist()},
+            {'position_m': np.hypot(sigmas(covariance)[:3], body.centre_sigma(total)).tolist()},
         )
 
     def term(self, record: EffectRecord) -> Term:
@@ -229,12 +222,12 @@ class ConductivePlate(MetalAtRest):
     def resting(self, term: Term) -> Resting:
         """Return what the sheet's currents lack, in waves over the sheet."""
         edge = float(term.theta[1])
-        return Resting(term.theta[[2, 3, 0]], [(sheet_shapes(edge), sheet_sizes(edge))])
+        return Resting(term.theta[[2, 3, 0]], [(body.sheet_shapes(edge), body.sheet_sizes(edge))])
 
     def sources(self, term: Term, base: Dipoles, light: Dipoles, omega: Array) -> Dipoles | None:
         z, edge, x, y, log_ohm = term.theta
         centre, edges = np.array([x, y, z]), np.array([edge, edge])
-        return sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, light, omega)
+        return body.sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, light, omega)
 
     def _flux(self, theta: Array, view: View) -> ComplexArray:
         added = self.sources(Term(self, {}, theta), view.dipoles, view.illumination, view.omega)

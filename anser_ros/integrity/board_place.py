@@ -14,13 +14,7 @@ import numpy as np
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.clean_references import (
-    DRAWING_ERROR,
-    FEWEST_SENSORS,
-    DrawnReadings,
-    FieldAt,
-    survey_errors,
-)
+from anser_ros.integrity import clean_references
 from anser_ros.physics.sensor import SensorTable, along_each_axis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.settings import Accuracy
@@ -79,10 +73,17 @@ class BoardPlace:
     """
 
     def __init__(
-        self, model: FieldModel, field: FieldAt, centres: Array, volume: TrackedVolume,
-        sensors: SensorTable, accuracy: Accuracy,
-    ) -> None:  # fmt: skip
-        self._drawn = DrawnReadings.of(field, sensors.position, sensors.axis, sensors.length)
+        self,
+        model: FieldModel,
+        field: clean_references.FieldAt,
+        centres: Array,
+        volume: TrackedVolume,
+        sensors: SensorTable,
+        accuracy: Accuracy,
+    ) -> None:
+        self._drawn = clean_references.DrawnReadings.of(
+            field, sensors.position, sensors.axis, sensors.length
+        )
         self._roots = _survey_roots(self._drawn, accuracy)
         rows = _rows(self._drawn, centres, np.zeros(3))
         # Coils are the same for both; where the model lies is the model's alone.
@@ -97,7 +98,7 @@ class BoardPlace:
         where too few references have readings.
         """
         good = np.isfinite(flux).all(axis=1)
-        if good.sum() < FEWEST_SENSORS:
+        if good.sum() < clean_references.FEWEST_SENSORS:
             return None
         difference = (flux[good].real - self._drawn.flux[good])[..., None]
         white = np.asarray(np.linalg.solve(self._roots[good], difference)[..., 0], np.float64)
@@ -122,15 +123,15 @@ class BoardPlace:
         return found is not None
 
 
-def _rows(drawn: DrawnReadings, centres: Array, middle: Array) -> Array:
+def _rows(drawn: clean_references.DrawnReadings, centres: Array, middle: Array) -> Array:
     """What coils and a displaced frame do to readings, (S, K, 6 K + 6), T a prior deviation."""
     aside = PRIOR_M * drawn.by_place, PRIOR_RAD * drawn.turned(middle)
     return np.moveaxis(np.concatenate([drawn.by_manufacture(centres), *aside]), 0, 2)
 
 
-def _survey_roots(drawn: DrawnReadings, accuracy: Accuracy) -> Array:
+def _survey_roots(drawn: clean_references.DrawnReadings, accuracy: Accuracy) -> Array:
     """Root (R, K, K) of the covariance of each sensor's readings by its survey and noise."""
-    survey = survey_errors(drawn, accuracy)
+    survey = clean_references.survey_errors(drawn, accuracy)
     count = drawn.flux.shape[1]
     size = np.linalg.norm(drawn.flux, axis=1) / np.sqrt(count)
     noise = accuracy.flux_noise_t**2 + (DRAWN_SHARE * size) ** 2
@@ -139,7 +140,7 @@ def _survey_roots(drawn: DrawnReadings, accuracy: Accuracy) -> Array:
 
 
 def _of_model(
-    model: FieldModel, field: FieldAt, centres: Array, volume: TrackedVolume
+    model: FieldModel, field: clean_references.FieldAt, centres: Array, volume: TrackedVolume
 ) -> tuple[Array, Array]:
     """The same of readings that the model makes along x, y and z in the middle of the volume."""
     low, high = np.array(volume.low), np.array(volume.high)
@@ -148,13 +149,13 @@ def _of_model(
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing='ij'), axis=-1).reshape(-1, 3)
     points, axes = along_each_axis(middle + half * grid)
     lengths = np.zeros(len(points))
-    drawn = DrawnReadings.of(field, points, axes, lengths)
+    drawn = clean_references.DrawnReadings.of(field, points, axes, lengths)
     # A model that lies aside reads at a place what the board makes beside it.
     rows = _rows(drawn, centres, middle)
     difference = model.flux(points, axes, lengths).real - drawn.flux
     size = np.linalg.norm(drawn.flux, axis=1) / np.sqrt(drawn.flux.shape[1])
     weight = np.sqrt(EFFECTIVE_READINGS / len(points)) / np.maximum(
-        MODEL_SHARE * size, DRAWING_ERROR * size.max()
+        MODEL_SHARE * size, clean_references.DRAWING_ERROR * size.max()
     )
     return rows * weight[:, None, None], difference * weight[:, None]
 

@@ -17,15 +17,7 @@ from std_msgs.msg import String
 
 from anser_ros.chain.frame import ChainFrame
 from anser_ros.errors import AnserError, PortError
-from anser_ros.nodes.acquisition_status import (
-    Interval,
-    RecentFaults,
-    clock_troubles,
-    device_words,
-    emitter_statuses,
-    sensor_statuses,
-    signal_troubles,
-)
+from anser_ros.nodes import acquisition_status
 from anser_ros.nodes.acquisition_stream import FluxFrame, FluxStream, MeasuredAccuracy, WallClock
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
@@ -69,37 +61,29 @@ class AcquisitionParameters:
     )
     protocol: str = parameter('anser', 'protocol of the control unit', choices=tuple(PROTOCOLS))
     baud: int = parameter(
-        DEFAULT_BAUD, 'baud rate of the line; ignored over USB', minimum=9600, maximum=50_000_000
+        DEFAULT_BAUD, 'baud rate of the line; ignored over USB', within=(9600, 50_000_000)
     )
     setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')
     channels_file: str = parameter(
         'demo_channels.yaml', 'channel calibration: a path, or a file of config/'
     )
     window_s: float = parameter(
-        0.02, 'length of a demodulation window, s', minimum=0.005, maximum=0.05, live=True
+        0.02, 'length of a demodulation window, s', within=(0.005, 0.05), live=True
     )
     rate_hz: float = parameter(
         0.0,
         'windows a second, may overlap; 0 for the rate of the setup document',
-        minimum=0.0,
-        maximum=1000.0,
+        within=(0.0, 1000.0),
         live=True,
     )
     mains_hz: float = parameter(
-        0.0,
-        'mains whose harmonics are fitted too; 0 for none',
-        minimum=0.0,
-        maximum=400.0,
-        live=True,
+        0.0, 'mains whose harmonics are fitted too; 0 for none', within=(0.0, 400.0), live=True
     )
     set_frequencies: bool = parameter(
         True, 'whether the tones of the setup document are set on the control unit'
     )
     silence_s: float = parameter(
-        SILENCE_S,
-        'time without a byte after which it reports a fault, s',
-        minimum=0.1,
-        maximum=60.0,
+        SILENCE_S, 'time without a byte after which it reports a fault, s', within=(0.1, 60.0)
     )
 
 
@@ -140,7 +124,7 @@ class Acquisition(AnserNode):
         self._refusal = ''
         self._rebuild = False
         self._frame: FluxFrame | None = None
-        self._interval = self._last = Interval(time.monotonic())
+        self._interval = self._last = acquisition_status.Interval(time.monotonic())
         self._past: Counter[str] = Counter()
         self._backlog = Backlog()
         self._published_setup = ''
@@ -150,7 +134,7 @@ class Acquisition(AnserNode):
         self._asked_ns = 0
         self._start_sent_ns: int | None = None
         self.chain: Chain | None = None
-        self._faults = RecentFaults()
+        self._faults = acquisition_status.RecentFaults()
         self._publish_setup(self._setup)
         self._port: ControlUnitPort | None = None
         self._closing = threading.Event()
@@ -338,7 +322,7 @@ class Acquisition(AnserNode):
             self._port.end_stream()
 
     def status(self) -> Status:
-        interval, self._interval = self._interval, Interval(time.monotonic())
+        interval, self._interval = self._interval, acquisition_status.Interval(time.monotonic())
         self._last = interval
         elapsed = max(self._interval.begin_s - interval.begin_s, 1e-3)
         values: dict[str, object] = {
@@ -360,7 +344,7 @@ class Acquisition(AnserNode):
         if device is not None:
             values |= {
                 'device_state': device.state.name.lower(),
-                'device_flags': device_words(device) or 'none',
+                'device_flags': acquisition_status.device_words(device) or 'none',
                 'device_dropped_blocks': device.dropped_blocks,
                 'device_temperature_deg_c': device.temperature_deg_c,
             }
@@ -381,7 +365,9 @@ class Acquisition(AnserNode):
         else:  # rclpy allows one severity a line of code
             self.get_logger().error(f'{device}: {message}')
 
-    def _verdict(self, interval: Interval, rises: dict[str, int]) -> tuple[Level, str]:
+    def _verdict(
+        self, interval: acquisition_status.Interval, rises: dict[str, int]
+    ) -> tuple[Level, str]:
         port = self._port
         if self._refusal or self._control.refusal:
             return Level.ERROR, self._refusal or self._control.refusal
@@ -399,15 +385,17 @@ class Acquisition(AnserNode):
         slow = too_slow(rises.get('windows_skipped', 0), frames)
         if slow:
             self.warn('seconds_too_slow', slow)
-        own = device_words(self._device) if self._device is not None else ''
+        own = acquisition_status.device_words(self._device) if self._device is not None else ''
         # Causes stand before the counters of what was lost, as long lines are cut.
         said = (slow, f'control unit: {own}' if own else '')
         troubles = [(Level.WARN, words) for words in said if words]
         troubles += [(self._faults.level, self._faults.words)] if self._faults.words else []
         if self._stream is not None:
             coils = self._setup.emitter.coils
-            troubles += clock_troubles(self._stream)
-            troubles += signal_troubles(coils, self._stream, self._frame, interval)
+            troubles += acquisition_status.clock_troubles(self._stream)
+            troubles += acquisition_status.signal_troubles(
+                coils, self._stream, self._frame, interval
+            )
         if troubles:
             return max(level for level, _ in troubles), '; '.join(words for _, words in troubles)
         if frames == 0:
@@ -420,8 +408,8 @@ class Acquisition(AnserNode):
         if stream is None or frame is None or len(frame.flags) != len(stream.sensors):
             return []
         return [
-            *emitter_statuses(self._setup.emitter.coils, stream, frame),
-            *sensor_statuses(stream, frame, self._last),
+            *acquisition_status.emitter_statuses(self._setup.emitter.coils, stream, frame),
+            *acquisition_status.sensor_statuses(stream, frame, self._last),
         ]
 
 

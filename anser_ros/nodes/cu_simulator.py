@@ -49,57 +49,59 @@ class CuSimulatorParameters:
         'of the board: 0 for the nominal one, which the nominal model fits; 1 for that of '
         'demo_model.yaml and bags/; any other number for one with random manufacturing '
         'tolerances',
-        minimum=0,
+        within=(0, math.inf),
     )
     sample_rate_hz: float = parameter(
-        FrontEnd.sample_rate_hz, 'samples a second and channel', minimum=16e3, maximum=100e3
+        FrontEnd.sample_rate_hz, 'samples a second and channel', within=(16e3, 100e3)
     )
-    block_samples: int = parameter(
-        BLOCK_SAMPLES, 'sampling instants a block', minimum=1, maximum=600
-    )
+    block_samples: int = parameter(BLOCK_SAMPLES, 'sampling instants a block', within=(1, 600))
     noise_codes: float = parameter(
-        FrontEnd.noise_codes,
-        'white noise before the converter, codes rms',
-        minimum=0.0,
-        maximum=1000.0,
+        FrontEnd.noise_codes, 'white noise before the converter, codes rms', within=(0.0, 1000.0)
     )
     current_drift: float = parameter(
         FrontEnd.current_drift,
         'share by which the currents fall as the coils warm up',
-        minimum=0.0,
-        maximum=0.5,
+        within=(0.0, 0.5),
     )
     metal: bool = parameter(True, 'whether a steel disc comes and goes')
-    metal_radius_m: float = parameter(0.06, 'of the disc, m', minimum=0.005, maximum=0.3)
+    metal_radius_m: float = parameter(0.06, 'of the disc, m', within=(0.005, 0.3))
     metal_near_m: tuple[float, ...] = parameter(
-        (0.05, -0.03, -0.08), 'nearest position of the disc in fg, m', minimum=-2.0, maximum=2.0
+        (0.05, -0.03, -0.08), 'nearest position of the disc in fg, m', within=(-2.0, 2.0)
     )
     metal_start_s: float = parameter(
-        12.0, 'when the disc starts to move, s after the first start of the stream', minimum=0.0
+        12.0,
+        'when the disc starts to move, s after the first start of the stream',
+        within=(0.0, math.inf),
     )
-    metal_travel_s: float = parameter(4.0, 'time of its way in, and out, s', minimum=0.1)
-    metal_stay_s: float = parameter(6.0, 'time that it stays near, s', minimum=0.0)
+    metal_travel_s: float = parameter(
+        4.0, 'time of its way in, and out, s', within=(0.1, math.inf)
+    )
+    metal_stay_s: float = parameter(6.0, 'time that it stays near, s', within=(0.0, math.inf))
     metal_period_s: float = parameter(
-        30.0, 'period of its visits; 0 for a single one, s', minimum=0.0
+        30.0, 'period of its visits; 0 for a single one, s', within=(0.0, math.inf)
     )
     optical_rate_hz: float = parameter(
-        60.0, 'poses a second of the optical truth', minimum=1.0, maximum=200.0
+        60.0, 'poses a second of the optical truth', within=(1.0, 200.0)
     )
     optical_noise_m: float = parameter(
-        0.0, 'jitter of the optical position, m rms an axis', minimum=0.0, maximum=0.01
+        0.0, 'jitter of the optical position, m rms an axis', within=(0.0, 0.01)
     )
     path_phase_rad: float = parameter(
-        0.0, "phase at which the tools' paths begin; another value gives another path", minimum=0.0
+        0.0,
+        "phase at which the tools' paths begin; another value gives another path",
+        within=(0.0, math.inf),
     )
     fault: str = parameter(line.NONE, 'fault of the line', choices=line.FAULTS, live=True)
     fault_period_s: float = parameter(
-        5.0, 'from one fault to the next, s', minimum=0.1, maximum=3600.0, live=True
+        5.0, 'from one fault to the next, s', within=(0.1, 3600.0), live=True
     )
-    seed: int = parameter(0, 'of noise and faults', minimum=0)
+    seed: int = parameter(0, 'of noise and faults', within=(0, math.inf))
     effect: str = parameter(
         NO_EFFECT, 'effect in the raw signals: none, random, or one of its catalogue'
     )
-    effect_seed: int = parameter(0, 'of the effect; 0 for another one every time', minimum=0)
+    effect_seed: int = parameter(
+        0, 'of the effect; 0 for another one every time', within=(0, math.inf)
+    )
     optical: str = optical_parameter()
     effect_file: str = parameter('', 'file (.json) to write the chosen effect to; empty for none')
 

@@ -16,24 +16,7 @@ from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.nodes.field_model_io import (
-    CONFIRM_S,
-    KeptBaseline,
-    MetalView,
-    ModelOutput,
-    PlaceWatch,
-    ToolWitnesses,
-)
-from anser_ros.nodes.field_model_refit import (
-    ACTIVE,
-    PREPARING,
-    TROUBLED,
-    ActiveRefit,
-    activity,
-    model_values,
-    no_baseline,
-    reference_statuses,
-)
+from anser_ros.nodes import field_model_io, field_model_refit
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter, stated, stated_by
@@ -81,13 +64,13 @@ class FieldModelParameters:
         False, 'whether the first readings are the distortion-free ones'
     )
     baseline_s: float = parameter(
-        1.0, 'time that a baseline is averaged over, s', minimum=0.05, maximum=60.0
+        1.0, 'time that a baseline is averaged over, s', within=(0.05, 60.0)
     )
     keep_state: bool = parameter(
         True, 'whether baseline and tables are kept on disk for a node that is started again'
     )
     refit_rate_hz: float = parameter(
-        MOST_RATE_HZ, 'most refits a second, by the stamps', minimum=2.0, maximum=1000.0, live=True
+        MOST_RATE_HZ, 'most refits a second, by the stamps', within=(2.0, 1000.0), live=True
     )
     witnesses: bool = parameter(
         False, 'whether contradictions among the coils of rigid tools show metal, too'
@@ -139,20 +122,24 @@ class FieldModelNode(AnserNode):
         self._model: FieldModel | None = None
         self._frozen = self._unfit = False
         self._announced: tuple[bool, ...] = ()
-        self._place = PlaceWatch()
+        self._place = field_model_io.PlaceWatch()
         self._trouble = Trouble()
         self._frames: Intake | None = None
         self._stamp_ns, self._received_s = 0, 0.0
-        self._output = ModelOutput(self)
-        self._metal = MetalView(self)
+        self._output = field_model_io.ModelOutput(self)
+        self._metal = field_model_io.MetalView(self)
         setups = setup_source(self, self._on_setup)
         self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
         name = self.get_fully_qualified_name()
         folder = kept_folder(table.keep_state)
         ahead = ReadAhead(folder, self._file_model if table.refit else None)
-        kept = KeptBaseline(folder, name, self._fluxes.sender)
-        witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)
-        self._refit = ActiveRefit(witnesses, Pace(table.refit_rate_hz), self.count, kept, ahead)
+        kept = field_model_io.KeptBaseline(folder, name, self._fluxes.sender)
+        witnesses = field_model_io.ToolWitnesses(
+            self, table.witnesses, lambda: self._frame_id, self._refuse
+        )
+        self._refit = field_model_refit.ActiveRefit(
+            witnesses, Pace(table.refit_rate_hz), self.count, kept, ahead
+        )
         self.step = self.given(self._take_frame, LONGEST_WAIT_S)
         self.witnessed = self.given(witnesses.note, LONGEST_WAIT_S)
         self._sources = [setups, self._fluxes, *witnesses.sources]
@@ -161,7 +148,7 @@ class FieldModelNode(AnserNode):
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)
         self.create_service(Trigger, 'field_model/set_baseline', self._on_set_baseline)
         self.create_timer(LOOK_S, self._look, clock=self.steady_clock)
-        self.create_timer(CONFIRM_S, self._refit.confirm, clock=self.steady_clock)
+        self.create_timer(field_model_io.CONFIRM_S, self._refit.confirm, clock=self.steady_clock)
         if self._file_model is not None:
             self._base = self._file_model
             self._output.name_origin(self._file_model)
@@ -204,7 +191,7 @@ class FieldModelNode(AnserNode):
         elif len(self._references) and table.refit:
             self._look()
             if not (table.baseline_at_start or self._refit.is_making):
-                self.get_logger().warning(no_baseline(self.get_namespace()))
+                self.get_logger().warning(field_model_refit.no_baseline(self.get_namespace()))
 
     def _on_flux(self, message: PointCloud2) -> None:
         if self._setup is None:
@@ -337,7 +324,7 @@ class FieldModelNode(AnserNode):
         """Refit to what differs from a baseline, shape (S, K), T, as soon as that can be done."""
         self._refit.begin(baseline)
         if self._refit.current is None:
-            self.get_logger().info(PREPARING)
+            self.get_logger().info(field_model_refit.PREPARING)
         self._no_baseline = ''
         self._announce_changes()
         self.count('baselines')
@@ -348,7 +335,7 @@ class FieldModelNode(AnserNode):
             if not self._refit.take():
                 return
             self._received_s = time.monotonic()
-            self.get_logger().info(ACTIVE)
+            self.get_logger().info(field_model_refit.ACTIVE)
         except FitError as error:
             self._refuse_baseline(error)
         self._announce_changes()
@@ -375,7 +362,7 @@ class FieldModelNode(AnserNode):
     ) -> None:
         """Prepare for references, ``again`` for those that there is a baseline of."""
         place = board_place_of(base, references, setup)
-        self._place = PlaceWatch(place, self._fluxes.publishers)
+        self._place = field_model_io.PlaceWatch(place, self._fluxes.publishers)
         self._refit.prepare(setup, base, references, self.parameters.refit, again)
 
     def _serve_start(self, base: FieldModel) -> None:
@@ -449,11 +436,11 @@ class FieldModelNode(AnserNode):
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values['fingerprint'] = '' if self._base is None else self._base.fingerprint
-        values |= model_values(model, self.parameters.model_file)
+        values |= field_model_refit.model_values(model, self.parameters.model_file)
         values |= {'stamp_ns': self._stamp_ns, 'freeze': self._frozen}
         values['refit_time_s'] = self._refit.update_s
         is_wanted, refused = self.parameters.refit, self._no_baseline
-        words = activity(self._refit, self._frozen, is_wanted, refused, values)
+        words = field_model_refit.activity(self._refit, self._frozen, is_wanted, refused, values)
         if self._is_uncalibrated:
             words = f'{states.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {words}'
         dead = '' if self._frames is None else ', '.join(self._frames.dead)
@@ -469,13 +456,15 @@ class FieldModelNode(AnserNode):
         silent_s, setup = time.monotonic() - self._received_s, self._setup
         if setup is not None and self._follows and silent_s > setup.refit.references_age_s:
             return Status('', Level.ERROR, f'{lost} for {silent_s:.1f} s', values)
-        is_troubled = values.get('refit_state') in TROUBLED or bool(refused and is_wanted)
+        is_troubled = values.get('refit_state') in field_model_refit.TROUBLED or bool(
+            refused and is_wanted
+        )
         is_troubled |= self._is_uncalibrated or (self._refit.is_awaited and self._follows)
         return Status('', Level.WARN if is_troubled else Level.OK, words, values)
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every reference sensor that the refit looks at."""
-        return reference_statuses(self._refit.result)
+        return field_model_refit.reference_statuses(self._refit.result)
 
     def stop_working(self) -> bool:
         """End what is worked on aside, a refit that is being made among it."""

@@ -1,5 +1,6 @@
 """Shows a live table of sensors, rates and latencies."""
 
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -43,20 +44,19 @@ LEVELS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
 @dataclass(frozen=True)
 class MonitorParameters:
     duration_s: float = parameter(
-        0.0, 'time from the first pose until it ends by itself; 0 for never, s', minimum=0.0
+        0.0,
+        'time from the first pose until it ends by itself; 0 for never, s',
+        within=(0.0, math.inf),
     )
     patience_s: float = parameter(
-        0.0, 'time without a pose after which it gives up; 0 for never, s', minimum=0.0
+        0.0, 'time without a pose after which it gives up; 0 for never, s', within=(0.0, math.inf)
     )
     compare: str = parameter('', 'namespace of a second tracker to show as well; empty for none')
     compare_note: str = parameter('', 'what is special about the second tracker, in words')
     optical: str = optical_parameter()
     output: str = parameter('', 'file (.npz) to write all poses and errors to at the end')
     period_s: float = parameter(
-        0.25,
-        'interval of the table; without a terminal one line a second, s',
-        minimum=0.05,
-        maximum=10.0,
+        0.25, 'interval of the table; without a terminal one line a second, s', within=(0.05, 10.0)
     )
 
 

@@ -181,7 +181,7 @@ class RecorderParameters:
     )
     autostart: bool = parameter(True, 'record from the start on')
     flush_period_s: float = parameter(
-        0.25, 'longest time that a crash may lose, s', minimum=0.05, maximum=1.0
+        0.25, 'longest time that a crash may lose, s', within=(0.05, 1.0)
     )
     optical: str = optical_parameter()
     tracked: str = tracked_parameter()

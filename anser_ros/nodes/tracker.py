@@ -4,6 +4,7 @@ A pose is published only in the state ``ok``; ``/diagnostics`` gives the reason 
 state.
 """
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -26,14 +27,8 @@ from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import STALE_AFTER_S, parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
+from anser_ros.nodes.streams import one_source
 from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
-from anser_ros.nodes.streams.one_source import (
-    NewestSource,
-    OneSource,
-    sender_words,
-    setup_source,
-    too_slow,
-)
 from anser_ros.nodes.streams.readiness import digest_of
 from anser_ros.nodes.tracker_models import ModelIntake, ModelReader
 from anser_ros.physics.volume import TrackedVolume
@@ -85,15 +80,13 @@ class TrackerParameters:
     gate: float = parameter(
         TrackerSettings.gate,
         'largest residual of a pose, in units of the expected one',
-        minimum=1.0,
-        maximum=NO_GATE,
+        within=(1.0, NO_GATE),
         live=True,
     )
     max_sigma_m: float = parameter(
         TrackerSettings.max_sigma_m,
         'largest uncertainty of a pose, m',
-        minimum=1e-5,
-        maximum=1.0,
+        within=(1e-5, 1.0),
         live=True,
     )
     volume_low_m: tuple[float, ...] = parameter(
@@ -105,27 +98,24 @@ class TrackerParameters:
     grid_spacing_m: float = parameter(
         TrackerSettings.grid_spacing_m,
         'spacing of the cold start at 0.1 m height, m',
-        minimum=0.005,
-        maximum=0.2,
+        within=(0.005, 0.2),
     )
     warm_age_s: float = parameter(
         TrackerSettings.warm_age_s,
         'largest age of a good pose that a solve starts from, s',
-        minimum=0.01,
-        maximum=60.0,
+        within=(0.01, 60.0),
         live=True,
     )
     stale_after_s: float = parameter(
         STALE_AFTER_S,
         'time without fluxes after which a sensor is stale, s',
-        minimum=0.02,
+        within=(0.02, math.inf),
         live=True,
     )
     model_wait_s: float = parameter(
         0.1,
         'longest time that a frame waits for its model while field_model refits, s',
-        minimum=0.0,
-        maximum=10.0,
+        within=(0.0, 10.0),
         live=True,
     )
     publish_tf: bool = parameter(True, 'whether /tf is published where tf2_msgs is installed')
@@ -204,15 +194,15 @@ class TrackerNode(AnserNode):
         self._model_age_ns = 0
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
-        setups = setup_source(self, self._on_setup)
+        setups = one_source.setup_source(self, self._on_setup)
         # The executor takes topics in this order, so a model finds its uncertainty there.
         take_error = partial(self._take_model, self._intake.take_error)
         self.create_subscription(PointCloud2, 'field_model_error', take_error, qos.MODEL_ERRORS)
         take = partial(self._take_model, self._intake.take)
-        self._models = OneSource(
+        self._models = one_source.OneSource(
             self, PointCloud2, 'field_model', take, qos.MODELS, lasting=self._lasting
         )
-        self._fluxes = NewestSource(
+        self._fluxes = one_source.NewestSource(
             self,
             'tool/flux',
             self._on_flux,
@@ -362,7 +352,7 @@ class TrackerNode(AnserNode):
         if half is None:
             return []
         begin_s, (stamp_ns, readings) = time.perf_counter(), frame
-        conflict = sender_words(self._sources)
+        conflict = one_source.sender_words(self._sources)
         if half.answer.follows:
             self._model_age_ns = max(self._model_age_ns, stamp_ns - half.answer.stamp_ns)
         try:
@@ -424,7 +414,7 @@ class TrackerNode(AnserNode):
         self._diagnosed_s = time.monotonic()
         before = self._counted
         self._counted = skipped, frames = self.counters['frames_skipped'], self.counters['frames']
-        slow = too_slow(skipped - before[0], frames - before[1])
+        slow = one_source.too_slow(skipped - before[0], frames - before[1])
         if slow:
             self.warn('seconds_too_slow', slow)
         half, newest = self._half, self._intake.newest
@@ -439,7 +429,7 @@ class TrackerNode(AnserNode):
         self._model_age_ns = 0
         if tracker is not None:
             values |= {name: count for name, count in tracker.counters.items() if name != 'frames'}
-        conflict = sender_words(self._sources)
+        conflict = one_source.sender_words(self._sources)
         if conflict:
             return Status('', Level.ERROR, f'{TWO_SOURCES}: {conflict}', values)
         if self._setup is None:

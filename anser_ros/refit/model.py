@@ -12,19 +12,10 @@ import numpy as np
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.field.model import FieldModel
 from anser_ros.pose_states import OTHER_PLACE, REFERENCES_DOUBTFUL, REFERENCES_LOST
-from anser_ros.refit import health
+from anser_ros.refit import health, posterior
 from anser_ros.refit.health import ReferenceHealth
 from anser_ros.refit.hypotheses import BackgroundTask
 from anser_ros.refit.layer import Layer, component_rows
-from anser_ros.refit.posterior import (
-    Bank,
-    ErrorLevel,
-    FrameEvidence,
-    PosteriorModes,
-    error_level,
-    error_modes,
-    make_room,
-)
 from anser_ros.refit.witness import FIRST_SAMPLE_STEP, Witness
 
 NEGLIGIBLE = 0.01
@@ -50,8 +41,8 @@ class Assembly:
 
     def __init__(self, model: FieldModel, phase: ComplexArray, unit: float, n_modes: int) -> None:
         self.base, self._scale, self._n_modes = model, phase * unit, n_modes
-        self._modes: dict[tuple[object, ...], PosteriorModes] = {}
-        self._coming: dict[tuple[object, ...], BackgroundTask[PosteriorModes]] = {}
+        self._modes: dict[tuple[object, ...], posterior.PosteriorModes] = {}
+        self._coming: dict[tuple[object, ...], BackgroundTask[posterior.PosteriorModes]] = {}
         self._last: _ErrorBefore | None = None
         self._interim: tuple[object, Uncertainty] | None = None
         self._whole: dict[tuple[object, ...], tuple[int, Uncertainty]] = {}
@@ -63,7 +54,7 @@ class Assembly:
         self._last = self._interim = None
 
     def model(
-        self, stamp_ns: int, bank: Bank, seen: FrameEvidence, weights: Array,
+        self, stamp_ns: int, bank: posterior.Bank, seen: posterior.FrameEvidence, weights: Array,
         drift: ComplexArray, typical: float, witness: Witness | None = None,
     ) -> FieldModel:  # fmt: skip
         """Return the refitted model of one frame.
@@ -115,7 +106,7 @@ class Assembly:
         best = ranked[0]
         rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
-        level = error_level(change.seen, best)
+        level = posterior.error_level(change.seen, best)
         names = tuple(bank.prior(h).name for h in ranked[:1] + ([] if rival is None else [rival]))
         key = (bank.rows.tobytes(), names, level, steps, *change.place.rows)
         self._count += 1
@@ -141,7 +132,7 @@ class Assembly:
         if witness is None:
             self._last = _ErrorBefore(bank.rows.tobytes(), best, names[0], level, errors)
             self._interim = None
-            make_room(self._whole, MOST_MODES)
+            posterior.make_room(self._whole, MOST_MODES)
             self._whole[key] = (self._count, whole)
         return whole
 
@@ -155,25 +146,25 @@ class Assembly:
         return own if len(own) else None, float(np.hypot(self.base.flux_error_t, rest))
 
     def _error(
-        self, change: '_Change', hypothesis: int, level: ErrorLevel, count: int
-    ) -> PosteriorModes | None:
+        self, change: '_Change', hypothesis: int, level: posterior.ErrorLevel, count: int
+    ) -> posterior.PosteriorModes | None:
         """Return the error of a hypothesis in units of the noise; None until it is known."""
         bank = change.bank
         key = (bank.rows.tobytes(), bank.prior(hypothesis).name, level, count)
         if key in self._modes:
             return self._modes[key]
         if key not in self._coming:
-            make_room(self._coming, MOST_MODES)
-            work = partial(error_modes, bank, bank.posterior(hypothesis), level, count)
+            posterior.make_room(self._coming, MOST_MODES)
+            work = partial(posterior.error_modes, bank, bank.posterior(hypothesis), level, count)
             self._coming[key] = BackgroundTask(work, change.stamp_ns)
         if not self._coming[key].is_due(change.stamp_ns):
             return None
-        make_room(self._modes, MOST_MODES)
+        posterior.make_room(self._modes, MOST_MODES)
         self._modes[key] = self._coming.pop(key).result()
         return self._modes[key]
 
     def _until_known(
-        self, change: '_Change', best: int, level: ErrorLevel, n_modes: int
+        self, change: '_Change', best: int, level: posterior.ErrorLevel, n_modes: int
     ) -> tuple[ComplexArray, float]:
         """Return an error for as long as that of the best hypothesis is being worked out.
 
@@ -206,8 +197,8 @@ class _Change:
     """One frame's hypotheses and what each of them adds to the calibrated model, A m^2."""
 
     stamp_ns: int
-    bank: Bank
-    seen: FrameEvidence
+    bank: posterior.Bank
+    seen: posterior.FrameEvidence
     weights: Array
     parts: dict[int, ComplexArray]
     scale: ComplexArray
@@ -223,7 +214,7 @@ class _Change:
         return self.place.rows[self.bank.prior(hypothesis).layer.name]
 
     def modes(
-        self, errors: PosteriorModes, hypothesis: int, n_modes: int
+        self, errors: posterior.PosteriorModes, hypothesis: int, n_modes: int
     ) -> tuple[ComplexArray, float]:
         """Return a hypothesis' error as modes (R, N, K) of the model, and what they leave, T."""
         own = np.zeros((n_modes, *self.shape), dtype=complex)
@@ -257,8 +248,8 @@ class _ErrorBefore:
     coils: bytes
     hypothesis: int
     name: str
-    level: ErrorLevel
-    errors: PosteriorModes
+    level: posterior.ErrorLevel
+    errors: posterior.PosteriorModes
 
     def holds(self, change: _Change) -> bool:
         """Return whether the hypothesis is still there, and the model has its dipoles."""
@@ -303,7 +294,7 @@ class Metal:
 
 
 def locate_metal(
-    bank: Bank, seen: FrameEvidence, weights: Array, flux_noise_t: float
+    bank: posterior.Bank, seen: posterior.FrameEvidence, weights: Array, flux_noise_t: float
 ) -> Metal | None:
     """Return the sources under the most probable hypothesis with metal; None when all are zero.
 

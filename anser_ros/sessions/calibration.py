@@ -16,14 +16,8 @@ from scipy.spatial import cKDTree
 
 from anser_ros import extensions
 from anser_ros.arrays import Booleans, ComplexArray
+from anser_ros.calibration import disturbances
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
-from anser_ros.calibration.disturbances import (
-    at_strength,
-    emitter_strength,
-    outside,
-    spans_of,
-    unsteady_references,
-)
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.readings import check_single_coils, with_pose
@@ -85,7 +79,7 @@ def without_resting_metal(
         spans = [
             span
             for row, tool in zip(rows, session.tools, strict=True)
-            for span in spans_of(tool.time, ~scan.sensor_fit.steady[row])
+            for span in disturbances.spans_of(tool.time, ~scan.sensor_fit.steady[row])
         ]
         if not spans or session.reference is None:
             continue
@@ -258,10 +252,12 @@ def at_constant_strength(
     for session in sessions:
         reference = session.reference
         if options.estimate and reference is not None:
-            strength = emitter_strength(reference)
+            strength = disturbances.emitter_strength(reference)
             if (strength != 1.0).any():
-                tools = tuple(at_strength(m, reference.time, strength) for m in session.tools)
-                constant = at_strength(reference, reference.time, strength)
+                tools = tuple(
+                    disturbances.at_strength(m, reference.time, strength) for m in session.tools
+                )
+                constant = disturbances.at_strength(reference, reference.time, strength)
                 session = replace(session, tools=tools, reference=constant)
                 records += drift_records(strength)
         found.append(session)
@@ -323,8 +319,8 @@ def _steady(session: Session, tool: Measurements) -> Booleans:
     """Which frames of a tool lie outside the times in which the session's references changed."""
     if session.reference is None:
         return np.ones(tool.time.size, dtype=bool)
-    changed = unsteady_references(session.reference)
-    return outside(tool.time, spans_of(session.reference.time, changed))
+    changed = disturbances.unsteady_references(session.reference)
+    return disturbances.outside(tool.time, disturbances.spans_of(session.reference.time, changed))
 
 
 def _fit_drawn(

@@ -19,17 +19,8 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
 from anser_ros.stamps import stamp_fault
+from anser_ros.wire import recorded
 from anser_ros.wire.bag_writer import FLUX_TOPICS, SessionWriter
-from anser_ros.wire.recorded import (
-    BODY,
-    ENDING,
-    OPTICAL,
-    TRACKED,
-    optical_topic,
-    pose_setup,
-    tracked_topic,
-    unit_quaternions,
-)
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
 from anser_ros.wire.table_names import LENGTH_M, TIME_NS
@@ -225,12 +216,12 @@ class _Import:
         if not self._entries:
             raise ParameterError('the tables have no complete row')
         if self._setup is None:
-            names = {kind: self._names_of(kind) for kind in (TRACKED, OPTICAL)}
-            body = names[OPTICAL][0] if names[OPTICAL] else BODY
-            self._setup_text = pose_setup(names[TRACKED], body)
+            names = {kind: self._names_of(kind) for kind in (recorded.TRACKED, recorded.OPTICAL)}
+            body = names[recorded.OPTICAL][0] if names[recorded.OPTICAL] else recorded.BODY
+            self._setup_text = recorded.pose_setup(names[recorded.TRACKED], body)
 
     def _names_of(self, kind: str) -> list[str]:
-        return [t[len(kind) : -len(ENDING)] for t in self._messages if t.startswith(kind)]
+        return [t[len(kind) : -len(recorded.ENDING)] for t in self._messages if t.startswith(kind)]
 
     def write(self, out: Path) -> dict[str, int]:
         """Write all by its stamps."""
@@ -312,7 +303,7 @@ class _Import:
         table, name = self._table(entry), read_name(entry.needed(key), what)
         if self._setup is not None and name not in self._setup.bodies:
             raise ParameterError(f'{what}: the setup has no body {name}')
-        topic = tracked_topic(name) if is_tracked else optical_topic(name)
+        topic = recorded.tracked_topic(name) if is_tracked else recorded.optical_topic(name)
         scale, order = entry.choice('unit', LENGTH_M, 'm'), entry.get('order')
         if order not in ORDERS:
             raise ParameterError(f'{what}: order must be {" or ".join(ORDERS)}, got {order!r}')
@@ -323,12 +314,12 @@ class _Import:
         )
         quaternion = quaternion[:, ORDERS[order]]
         good = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1)
-        unit = np.isfinite(unit_quaternions(quaternion)).all(axis=1)
+        unit = np.isfinite(recorded.unit_quaternions(quaternion)).all(axis=1)
         none = good & (quaternion == 0.0).all(axis=1)
         if 2 * np.count_nonzero(none) > len(stamps) or (good & ~unit & ~none).any():
             raise ParameterError(f'{table.path}: quaternions are not of unit length')
         good &= unit
-        quaternion[good] = unit_quaternions(quaternion[good])
+        quaternion[good] = recorded.unit_quaternions(quaternion[good])
         if lacking := len(stamps) - int(good.sum()):
             words = f'{lacking} pose{"s" * (lacking > 1)} without numbers or rotation left out'
             self.notes.append(f'{table.path}: {words}')

@@ -28,17 +28,11 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import Withheld
 from anser_ros.stamps import NANO
+from anser_ros.tracking import rigid
 from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, track_body
 from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTracks, track_coil
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
-from anser_ros.tracking.rigid import (
-    BodyCoils,
-    common_factor,
-    solve_body,
-    start_from_grid,
-    step_to_coils,
-)
 from anser_ros.tracking.solve_context import (
     FEWEST_EMITTERS,
     ReducedScene,
@@ -98,7 +92,7 @@ class TrackedScene:
     correction: Correction | None = None  # Of the model's effects
     table: SensorTable = field(init=False)  # The sensors as the model's effects have them
     # Rows and coils of the bodies whose six degrees of freedom their coils see
-    bodies: dict[str, tuple[Integers, BodyCoils]] = field(init=False)
+    bodies: dict[str, tuple[Integers, rigid.BodyCoils]] = field(init=False)
     # The context of the last frame in which emitters were dead
     reduced: ReducedScene | None = None
 
@@ -109,7 +103,7 @@ class TrackedScene:
         self.bodies = {}
         for body in dict.fromkeys(table.body):
             rows = np.array([i for i, name in enumerate(table.body) if name == body])
-            coils = BodyCoils(
+            coils = rigid.BodyCoils(
                 table.position[rows], table.axis[rows], table.length[rows],
                 None if changes is None else changes[:, rows],
             )  # fmt: skip
@@ -402,18 +396,20 @@ def warm_up() -> None:
 def warm_up_bodies(model: FieldModel) -> None:
     """Solve a small made-up body alone, which `warm_up` comes to last."""
     context = build_context(model, TrackerSettings())
-    coils = BodyCoils(np.zeros((3, 3)), np.eye(3), np.zeros(3))
+    coils = rigid.BodyCoils(np.zeros((3, 3)), np.eye(3), np.zeros(3))
     flux = model.flux(coils.offsets + [0.0, 0.0, 0.15], coils.axes, coils.lengths).view(np.float64)
     weights = np.tile(1.0 / context.sigma, (3, 1))
-    common = common_factor(np.zeros((3, 0, context.sigma.size)), weights)
+    common = rigid.common_factor(np.zeros((3, 0, context.sigma.size)), weights)
     normals, took_part = np.tile(np.eye(6), (3, 1, 1)), np.ones(3, dtype=bool)
-    for start in start_from_grid(context.grid, context.field, coils, flux):
-        found = solve_body(
+    for start in rigid.start_from_grid(context.grid, context.field, coils, flux):
+        found = rigid.solve_body(
             context.field, coils, flux, weights, common, *start, context.low, context.high
         )
         body = found.position, found.rotation
         own = coils.offsets + found.position, coils.axes @ found.rotation.T
-        step_to_coils(*body, coils.offsets, coils.axes, *own, normals, context.low, context.high)
+        rigid.step_to_coils(
+            *body, coils.offsets, coils.axes, *own, normals, context.low, context.high
+        )
         distances(
             (*body, np.eye(6)), coils.offsets, coils.axes, (*own, normals), took_part,
             SurveyErrors(1e-4, 1e-3, 1e-3),

@@ -17,20 +17,10 @@ import numpy as np
 from anser_ros.apps.lab.one_place import calibrate_at_one_place
 from anser_ros.apps.lab.still import STILL_ONLY, calibrate_still
 from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.calibration import readings
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import PoseWhitener, Progress, pose_precision, pose_terms
-from anser_ros.calibration.readings import (
-    FEWEST_FRAMES_OF_MANY,
-    FEWEST_SCAN_FRAMES,
-    MANY_SENSORS,
-    DipoleSites,
-    check_single_coils,
-    fold_of_frames,
-    frame_blocks,
-    usable_frames,
-    with_pose,
-)
 from anser_ros.calibration.result import Calibration, with_provenance
 from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN
 from anser_ros.errors import FitError
@@ -102,7 +92,7 @@ def with_source_sizes(calibration: Calibration) -> Calibration:
         return calibration
     if scores[POINT] < scores[SIZED] * (1.0 + LEAST_GAIN):
         return calibration
-    folds = fold_of_frames([m.position for m in scan.measurements])
+    folds = readings.fold_of_frames([m.position for m in scan.measurements])
     blocks = np.unique(np.concatenate(folds))
     sources = _SizedSources.of(calibration.model, layout.count)
     for _ in range(STEPS):
@@ -135,12 +125,12 @@ def _sums(
     """Normal equations of each block, (B, 8K, 8K) and (B, 8K)."""
     ways = np.diag(np.tile(WAYS, len(sources.sizes_m2)))
     here, size = sources.dipoles(), len(ways)
-    sites = DipoleSites(here.positions, here.directions)
+    sites = readings.DipoleSites(here.positions, here.directions)
     normal, right = np.zeros((blocks.size, size, size)), np.zeros((blocks.size, size))
     scan, fit = calibration.scan, calibration.fit
     precision = pose_precision(scan.accuracy)
     for measured, weights, fold in zip(scan.measurements, fit.weights, folds, strict=True):
-        for some in frame_blocks(*weights.shape):
+        for some in readings.frame_blocks(*weights.shape):
             part = measured.frames(some)
             terms = pose_terms(part, sites, here.moments)
             white = PoseWhitener(terms.slope, weights[some], fit.noise_t, precision)
@@ -183,9 +173,9 @@ def _is_free(sessions: Sequence[Session], options: Options) -> bool:
 
 def is_at_one_place(measurements: Sequence[Measurements], accuracy: Accuracy) -> bool:
     """Return whether one body with many sensors rested at one place in all frames."""
-    if len(measurements) != 1 or len(measurements[0].sensors) < MANY_SENSORS:
+    if len(measurements) != 1 or len(measurements[0].sensors) < readings.MANY_SENSORS:
         return False
-    one = with_pose(measurements[0])
+    one = readings.with_pose(measurements[0])
     if not len(one.time):
         return False
     moved = np.ptp(one.position, axis=0).max() > STILL * accuracy.optical_position_m
@@ -199,8 +189,13 @@ def _accepts_one_place(sessions: Sequence[Session], options: Options) -> bool:
 
 def is_still(measurements: Sequence[Measurements]) -> bool:
     """Return whether there are few poses of one body with many sensors, and no more."""
-    many = len(measurements) == 1 and len(measurements[0].sensors) >= MANY_SENSORS
-    return many and FEWEST_FRAMES_OF_MANY <= usable_frames(measurements) < FEWEST_SCAN_FRAMES
+    many = len(measurements) == 1 and len(measurements[0].sensors) >= readings.MANY_SENSORS
+    return (
+        many
+        and readings.FEWEST_FRAMES_OF_MANY
+        <= readings.usable_frames(measurements)
+        < readings.FEWEST_SCAN_FRAMES
+    )
 
 
 def _accepts_still(sessions: Sequence[Session], options: Options) -> bool:
@@ -225,7 +220,7 @@ def _fitted(
 def _fit_still(
     sessions: Sequence[Session], options: Options, progress: Progress | None = None
 ) -> Calibration:
-    check_single_coils(_tools(sessions))
+    readings.check_single_coils(_tools(sessions))
     if options.damping is not None:
         raise FitError(
             'damping: few poses of many sensors are fitted with sizes of moments that the '
@@ -241,9 +236,9 @@ ENGINES = (
         _fit_still,
         True,
         STILL_ONLY,
-        f'{FEWEST_FRAMES_OF_MANY} to {FEWEST_SCAN_FRAMES - 1} poses of one body with at least '
-        f'{MANY_SENSORS} sensors, over emitters without a drawing, and with no layout of dipoles '
-        'stated',
+        f'{readings.FEWEST_FRAMES_OF_MANY} to {readings.FEWEST_SCAN_FRAMES - 1} poses of one body '
+        f'with at least {readings.MANY_SENSORS} sensors, over emitters without a drawing, and '
+        'with no layout of dipoles stated',
     ),
     Engine(_is_free, lambda *scan: with_source_sizes(SCAN.fit(*scan))),
 )

@@ -9,17 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from anser_ros.apps.lab import metal_track
 from anser_ros.apps.lab.metal_lattice import Coils, KnownMetal
 from anser_ros.apps.lab.metal_learning import real_parts
-from anser_ros.apps.lab.metal_track import (
-    MetalState,
-    Scene,
-    field_of,
-    near_points,
-    posed,
-    predicted,
-    updated,
-)
 from anser_ros.arrays import Array
 from anser_ros.chain.frame import Answer, ChainFrame
 from anser_ros.chain.model_half import poses_of, tool_readings
@@ -60,7 +52,7 @@ def places_around(volume: TrackedVolume, known: KnownMetal) -> Array:
 
 
 def likely_starts(
-    scene: Scene, reading: ToolReading, places: Array, most: int
+    scene: metal_track.Scene, reading: ToolReading, places: Array, most: int
 ) -> tuple[list[Array], float]:
     """Return poses (6,) of the metal that explain a tool's readings best, the best first, apart,
     and the logarithm of how much more likely the first makes the readings than no metal does.
@@ -69,7 +61,7 @@ def likely_starts(
     """
     sigma = coil_spread(len(reading.table), scene.tools)
     # What a pose that is off leaves beyond the first order would be taken for metal.
-    reading = posed(scene, scene.model, reading, 0.0 * sigma, np.diag(sigma**2))
+    reading = metal_track.posed(scene, scene.model, reading, 0.0 * sigma, np.diag(sigma**2))
     rows = linearised(reading, scene.model, scene.model.moments, scene.turn)
     own = real_parts(rows.own) * sigma
     pose = real_parts(rows.pose)
@@ -124,7 +116,7 @@ MODES = 24
 class _Track:
     """A state, the mean misfit, and the logarithm of its likelihood so far."""
 
-    state: MetalState
+    state: metal_track.MetalState
     ratio: float = 1.0
     likelihood: float = 0.0
 
@@ -132,7 +124,7 @@ class _Track:
 class KnownMetalFollower:
     """Follows the known metal of a scene by the tools alone, outside the tracked volume."""
 
-    def __init__(self, scene: Scene, volume: TrackedVolume) -> None:
+    def __init__(self, scene: metal_track.Scene, volume: TrackedVolume) -> None:
         self.model, self._scene = scene.model, scene
         self._places = places_around(volume, scene.known)
         self._tracks: list[_Track] = []
@@ -150,9 +142,9 @@ class KnownMetalFollower:
         seconds = self._seconds_to(stamp_ns)
         if self._chosen is None:
             return self.model, None
-        state = predicted(self._chosen.state, seconds)
+        state = metal_track.predicted(self._chosen.state, seconds)
         growth = max(self._chosen.ratio, 1.0)
-        model, placed = field_of(self._scene, state, self._near, MODES, growth)
+        model, placed = metal_track.field_of(self._scene, state, self._near, MODES, growth)
         reason, known = '', self._scene.known
         driven = placed.strongest_t() / known.strongest_t
         nearest = placed.nearest_m(Coils(self._near, np.zeros_like(self._near), None))
@@ -191,7 +183,7 @@ class KnownMetalFollower:
                 self._choose()
         elif (stamp_ns - self._searched_ns) * NANO > SEARCH_AGAIN_S:
             self._search(stamp_ns, readings)
-        self._near = near_points(readings) if near is None else near
+        self._near = metal_track.near_points(readings) if near is None else near
 
     def _seconds_to(self, stamp_ns: int) -> float:
         """Return the time since the last readings, and forget the metal where it is too long."""
@@ -215,10 +207,10 @@ class KnownMetalFollower:
             self._advance(track, 0.0, readings)
 
     def _advance(self, track: _Track, seconds: float, readings: Sequence[ToolReading]) -> None:
-        state = predicted(track.state, seconds) if seconds > 0.0 else track.state
+        state = metal_track.predicted(track.state, seconds) if seconds > 0.0 else track.state
         keep = math.exp(-self._step_s / MISFIT_MEMORY_S)
         for reading in readings:
-            outcome = updated(self._scene, state, reading, self._step_s)
+            outcome = metal_track.updated(self._scene, state, reading, self._step_s)
             state = outcome.state
             track.likelihood += outcome.log_likelihood
             track.ratio = keep * track.ratio + (1.0 - keep) * outcome.ratio
@@ -263,7 +255,7 @@ class KnownMetalModels(FrameModels):
             prepared.model, prepared.nominal.field, stated_volume(session.setup)
         )
         self._correction = prepared.correction
-        scene = Scene(
+        scene = metal_track.Scene(
             known, prepared.model, excitation, self._correction.sensors(),
             session.setup.refit.tools, tracking_noise(session.setup),
         )  # fmt: skip

@@ -16,15 +16,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.lab.metal_lattice import (
-    Coils,
-    KnownMetal,
-    Lattice,
-    PlacedLattice,
-    Setting,
-    moved,
-    step_between,
-)
+from anser_ros.apps.lab import metal_lattice
 from anser_ros.apps.lab.metal_learning import real_parts
 from anser_ros.arrays import Array, Integers
 from anser_ros.field.model import FieldModel
@@ -74,7 +66,7 @@ class MetalState:
         """Return the state after a step of all that it holds."""
         ends = 12 + len(self.answers)
         return replace(
-            self, pose=moved(self.pose, step[:6]), rates=self.rates + step[RATES],
+            self, pose=metal_lattice.moved(self.pose, step[:6]), rates=self.rates + step[RATES],
             answers=self.answers + step[12:ends], own=self.own + step[ends:],
         )  # fmt: skip
 
@@ -82,7 +74,7 @@ class MetalState:
         """Return the step that leads to another state."""
         return np.concatenate(
             [
-                step_between(self.pose, other.pose), other.rates - self.rates,
+                metal_lattice.step_between(self.pose, other.pose), other.rates - self.rates,
                 other.answers - self.answers, other.own - self.own,
             ]
         )  # fmt: skip
@@ -97,7 +89,7 @@ class Scene:
 
     def __init__(
         self,
-        known: KnownMetal,
+        known: metal_lattice.KnownMetal,
         model: FieldModel,
         excitation: Excitation,
         sensors: SensorTable,
@@ -105,7 +97,7 @@ class Scene:
         noise_t: float,
     ) -> None:
         self.known, self.model, self.noise_t, self.tools = known, model, noise_t, tools
-        self.setting = Setting(excitation, known.lattice.tilt(model.frequencies_hz))
+        self.setting = metal_lattice.Setting(excitation, known.lattice.tilt(model.frequencies_hz))
         self.turn = excitation.phase.conj() / noise_t
         self.noise = math.hypot(noise_t, model.flux_error_t) / noise_t
         self.misfit = max(MISFIT_ELSEWHERE * known.misfit, LEAST_MISFIT)
@@ -126,7 +118,7 @@ class Scene:
             pose, np.zeros(6), np.zeros(d), np.zeros(len(self._own_sigma)), np.diag(sigma**2)
         )
 
-    def lattice(self, answers: Array) -> Lattice:
+    def lattice(self, answers: Array) -> metal_lattice.Lattice:
         """Return the lattice with other answers, exact or near ones to first order."""
         known = self.known
         off = answers - self._about
@@ -165,7 +157,7 @@ def predicted(state: MetalState, seconds: float) -> MetalState:
     which = np.arange(6)
     covariance[which + 6, which + 6] += gained
     covariance[which, which] += gained * seconds**2 / 3.0
-    pose = moved(state.pose, state.rates * seconds)
+    pose = metal_lattice.moved(state.pose, state.rates * seconds)
     return replace(state, pose=pose, rates=keep * state.rates, covariance=covariance)
 
 
@@ -247,13 +239,17 @@ class _Linearised(NamedTuple):
 
 
 def _rows(
-    scene: Scene, lattice: Lattice, state: MetalState, reading: ToolReading, columns: Any
+    scene: Scene,
+    lattice: metal_lattice.Lattice,
+    state: MetalState,
+    reading: ToolReading,
+    columns: Any,
 ) -> _Linearised:
     setting, noise = scene.setting, scene.noise_t
     placed = setting.placed(lattice, state.pose)
     whole = setting.in_field(lattice, placed, scene.model)
     rows = linearised(reading, whole, whole.moments, scene.turn)
-    coils = Coils(rows.at, rows.axes, reading.table.length)
+    coils = metal_lattice.Coils(rows.at, rows.axes, reading.table.length)
     count = len(rows.left)
     by_pose = setting.pose_columns(lattice, state.pose, coils).reshape(count, -1) / noise
     by = setting.answer_columns(lattice, placed, coils).reshape(count, -1)
@@ -272,7 +268,7 @@ def _rows(
 
 def field_of(
     scene: Scene, state: MetalState, near: Array, modes: int, growth: float
-) -> tuple[FieldModel, PlacedLattice]:
+) -> tuple[FieldModel, metal_lattice.PlacedLattice]:
     """Return the field with the metal of a state, and its uncertainty as modes.
 
     ``near`` (P, 3): where tools are, m: the modes are right there. ``growth``: factor on the
@@ -282,7 +278,7 @@ def field_of(
     placed = setting.placed(lattice, state.pose)
     model = setting.in_field(lattice, placed, scene.model)
     at = np.unique(np.round(surroundings(near), 4), axis=0)
-    coils = Coils(*along_each_axis(at), None)
+    coils = metal_lattice.Coils(*along_each_axis(at), None)
     by_pose = setting.pose_columns(lattice, state.pose, coils)
     by = setting.answer_columns(lattice, placed, coils) @ scene.known.directions
     effect = np.concatenate([by_pose, by], axis=2)

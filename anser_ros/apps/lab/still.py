@@ -17,16 +17,9 @@ import numpy as np
 from anser_ros.apps.lab.still_fit import STILL_STEPS, StillFit, StillFitter, figures_of
 from anser_ros.apps.lab.still_model import POSE
 from anser_ros.arrays import Array, Booleans
+from anser_ros.calibration import moments
 from anser_ros.calibration.held_out import HeldOut, HeldOutTally, rms
 from anser_ros.calibration.layouts import Generator, Layout
-from anser_ros.calibration.moments import (
-    PoseTerms,
-    Progress,
-    most_probable_step,
-    moved,
-    pose_precision,
-    pose_terms,
-)
 from anser_ros.calibration.population import LEAST_EVIDENCE, OpticalNoise, Posterior
 from anser_ros.calibration.readings import (
     basis_rows,
@@ -69,7 +62,7 @@ def calibrate_still(
     generator: Generator,
     kinds: Sequence[str],
     accuracy: Accuracy,
-    progress: Progress | None = None,
+    progress: moments.Progress | None = None,
 ) -> Calibration:
     """Fit field, sensors, poses and bends of a body's frames.
 
@@ -172,7 +165,7 @@ def _held_out(
         parameters, values, *_ = _parameters(part, fit)
         sound = parameters.errors_of(part.body, values).apply(part)
         if is_as_stated:
-            terms = pose_terms(sound, fit.sites, fit.moments)
+            terms = moments.pose_terms(sound, fit.sites, fit.moments)
         else:
             terms = _where_the_other_half_finds_it(sound, fit, accuracy)
         tally.add(terms, usable_weights(sound), sound.position)
@@ -181,7 +174,7 @@ def _held_out(
 
 def _where_the_other_half_finds_it(
     sound: Measurements, fit: StillFit, accuracy: Accuracy
-) -> PoseTerms:
+) -> moments.PoseTerms:
     """Readings of each half of the sensors less those at the pose that the other half finds.
 
     A sensor of several channels is in one half as a whole; the halves take turns over the body.
@@ -190,23 +183,25 @@ def _where_the_other_half_finds_it(
     for sensor, channels in enumerate(clusters_of(sound.sensors)):
         halves[channels] = sensor % 2 == 1
     one, other = (
-        pose_terms(_at_best_pose(sound, fit, accuracy, half), fit.sites, fit.moments)
+        moments.pose_terms(_at_best_pose(sound, fit, accuracy, half), fit.sites, fit.moments)
         for half in (halves, ~halves)
     )
     residual = np.where(halves[:, None], other.residual, one.residual)
-    return PoseTerms(residual, np.where(halves[:, None, None], other.slope, one.slope))
+    return moments.PoseTerms(residual, np.where(halves[:, None, None], other.slope, one.slope))
 
 
 def _at_best_pose(
     sound: Measurements, fit: StillFit, accuracy: Accuracy, seen: Booleans
 ) -> Measurements:
     """The frame at the pose that the readings of these sensors make most probable."""
-    weights, precision = usable_weights(sound) * seen, pose_precision(accuracy)
+    weights, precision = usable_weights(sound) * seen, moments.pose_precision(accuracy)
     offset = np.zeros((len(sound.time), POSE))
     for _ in range(POSE_STEPS):
-        terms = pose_terms(moved(sound, offset), fit.sites, fit.moments)
-        offset += most_probable_step(terms, weights, fit.widths.noise_t, precision, offset)[0]
-    return moved(sound, offset)
+        terms = moments.pose_terms(moments.moved(sound, offset), fit.sites, fit.moments)
+        offset += moments.most_probable_step(
+            terms, weights, fit.widths.noise_t, precision, offset
+        )[0]
+    return moments.moved(sound, offset)
 
 
 def _scan(

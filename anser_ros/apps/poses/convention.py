@@ -7,18 +7,10 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.poses import start
 from anser_ros.apps.poses.effect import Role, effect_with
 from anser_ros.apps.poses.problem import PoseProblem
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession
-from anser_ros.apps.poses.start import (
-    coarse_offset,
-    first_cost,
-    first_fit,
-    is_at_rest,
-    longest_recording,
-    pose_problem,
-    turn_misfit,
-)
 from anser_ros.arrays import Array
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
@@ -111,7 +103,7 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     is_turned = cost < POOR_M and _is_turned(as_written)
     if cost < POOR_M and not is_turned:
         return as_written, record
-    offset = coarse_offset(_few(as_written))  # which no reading of the tracked poses changes
+    offset = start.coarse_offset(_few(as_written))  # which no reading of the tracked poses changes
     trials = [
         (_cost(reading.applied(session), None if reading.stream == REFERENCE else offset), reading)
         for reading in _readings(unit)
@@ -120,7 +112,7 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     if best < (TURNED_SHARE if is_turned else RIGHT_MISFIT_SHARE) * cost:
         return reading.applied(session), reading.record(cost, best, ratio)
     if cost > HOPELESS_M:
-        reach = longest_recording(pose_problem(session))
+        reach = start.longest_recording(start.pose_problem(session))
         raise PlausibilityError(
             f'{session.path}: tracked and optical poses do not belong together: hand-eye is off '
             f'by {1e3 * cost:.0f} mm in the median at the best offset of their clocks, up to '
@@ -163,15 +155,15 @@ def _readings(unit: str) -> Iterator[PoseReading]:
 
 
 def _few(session: PoseSession) -> PoseProblem:
-    problem = pose_problem(session)
+    problem = start.pose_problem(session)
     step = max(1, max(poses.size for poses in problem.sensors) // FEW_POSES)
     return problem.rows([np.arange(0, poses.size, step) for poses in problem.sensors])
 
 
 def _cost(session: PoseSession, offset: float | None = None) -> float:
     problem = _few(session)
-    offset = coarse_offset(problem) if offset is None else offset
-    return first_cost(first_fit(problem, offset, False))
+    offset = start.coarse_offset(problem) if offset is None else offset
+    return start.first_cost(start.first_fit(problem, offset, False))
 
 
 def _is_turned(session: PoseSession) -> bool:
@@ -180,22 +172,22 @@ def _is_turned(session: PoseSession) -> bool:
     Half of all orders and senses fit alike: a turn of quaternions makes them of each other, and
     the other half is their mirror image.
     """
-    problem = pose_problem(session)
-    offset, misfits = coarse_offset(problem), []
+    problem = start.pose_problem(session)
+    offset, misfits = start.coarse_offset(problem), []
     for poses in problem.sensors:
         _, turn, _, known = problem.path.at(poses.time - offset)
         optical = Rotation.from_matrix(turn[known]).as_quat()
         tracked = poses.quaternion[known]
         if len(tracked):
-            misfits.append([turn_misfit(t, optical) for t in (tracked, tracked * CONJUGATE)])
+            misfits.append([start.turn_misfit(t, optical) for t in (tracked, tracked * CONJUGATE)])
     as_written, other = np.mean(misfits, axis=0) if misfits else (0.0, 0.0)
     return bool(other < TURNS_SHARE * as_written)
 
 
 def _extent_ratio(session: PoseSession) -> float:
     """Extent of the tracked positions over that of the optical ones at the same times."""
-    problem = pose_problem(session)
-    if session.reference is not None and is_at_rest(session.reference):
+    problem = start.pose_problem(session)
+    if session.reference is not None and start.is_at_rest(session.reference):
         return 1.0  # of noise, which tells no unit
     ratios = []
     for poses in problem.sensors:

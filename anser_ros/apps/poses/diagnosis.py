@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.poses import start
 from anser_ros.apps.poses.convention import read_rightly
 from anser_ros.apps.poses.effect import PoseTerm, PoseView, Role, pose_effects
 from anser_ros.apps.poses.fit import (
@@ -34,16 +35,6 @@ from anser_ros.apps.poses.problem import (
 )
 from anser_ros.apps.poses.search import LEAST_MAP_M, PoseSearch, frame_terms, search_effects
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSession
-from anser_ros.apps.poses.start import (
-    coarse_offset,
-    first_fit,
-    frames_from_places,
-    pose_problem,
-    put_back,
-    swapped_spans,
-    train_blocks,
-    untangled,
-)
 from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.diagnosis.problem import TEST_EVERY
 from anser_ros.errors import PlausibilityError
@@ -141,7 +132,7 @@ def _registered(frames: PoseFit, unseen: PoseProblem) -> list[Array]:
         optical, place = fitted.view.optical[fitted.used], fitted.view.measured[fitted.used]
         off = part.view.measured[part.used]
         if len(place):
-            rotation = frames_from_places(place, optical)
+            rotation = start.frames_from_places(place, optical)
             shift = np.mean(place - optical @ rotation.T, axis=0)
             off = off - part.view.optical[part.used] @ rotation.T - shift
         squares.append(np.sum(off**2, axis=1))
@@ -269,22 +260,22 @@ def diagnose_poses(
         session, convention = read_rightly(session)
     except PlausibilityError:
         # Nothing fits all of a session whose sensors were exchanged for half of it.
-        session, exchanged = untangled(session)
+        session, exchanged = start.untangled(session)
         if not exchanged:
             raise
         session, convention = read_rightly(session)
-    problem = pose_problem(session)
-    train, test = train_blocks(problem)
+    problem = start.pose_problem(session)
+    train, test = start.train_blocks(problem)
     say('hand-eye')
     alone = session.reference is None
     training = problem.in_blocks(train)
-    first = first_fit(training, coarse_offset(training), alone)
-    swaps = swapped_spans(problem, first)
-    session, swapped = put_back(session, swaps)
+    first = start.first_fit(training, start.coarse_offset(training), alone)
+    swaps = start.swapped_spans(problem, first)
+    session, swapped = start.put_back(session, swaps)
     if swaps:
-        problem = pose_problem(session)
+        problem = start.pose_problem(session)
         training = problem.in_blocks(train)
-        first = first_fit(training, coarse_offset(training), alone)
+        first = start.first_fit(training, start.coarse_offset(training), alone)
     search = search_effects(first, session, say, is_searched)
     say('held out')
     state = search.fit.state

@@ -25,18 +25,9 @@ from anser_ros.errors import BagError, ParameterError
 from anser_ros.physics.rotations import nearest_rotation
 from anser_ros.sessions.table_import import SCHEMA
 from anser_ros.stamps import NANO, RECENT_NS, SECOND_NS, stamp_fault
+from anser_ros.wire import recorded
 from anser_ros.wire.bag import Salvage, published_poses
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.recorded import (
-    BODY,
-    ENDING,
-    OPTICAL,
-    TRACKED,
-    legal_name,
-    optical_topic,
-    pose_setup,
-    tracked_topic,
-)
 from anser_ros.wire.table_names import LENGTH_M, TIME_NS, UNITS, meaning_of, pose_columns
 from anser_ros.wire.tables import Table, read_table
 from anser_ros.wire.text_files import read_text
@@ -289,7 +280,7 @@ def _advice(table: Table, error: ParameterError) -> str:
         'schema': SCHEMA, 'time': {'unit': units.get('time') or 's', 'start_ns': 0},
         'tracked': [{
             'file': path.name, 'stamp': stamp,
-            'sensor': legal_name(path.stem),
+            'sensor': recorded.legal_name(path.stem),
             'position': [seen.get(('place', axis), '?') for axis in 'xyz'],
             'unit': units.get('place') or 'm',
             'quaternion': [seen.get(('turn', axis), '?') for axis in 'xyzw'], 'order': 'xyzw',
@@ -377,7 +368,7 @@ def _called(found: Sequence[str], names: Mapping[str, str]) -> dict[str, str]:
     unknown = sorted(set(names) - set(sensors))
     if unknown:
         raise ParameterError(f'no sensor {", ".join(unknown)}; there are: {", ".join(sensors)}')
-    called = {name: names.get(name) or legal_name(name) for name in sensors}
+    called = {name: names.get(name) or recorded.legal_name(name) for name in sensors}
     new = list(called.values())
     if len(set(new)) < len(new) or REFERENCE in new:
         raise ParameterError(f'sensors must differ in name, and from optical: {", ".join(new)}')
@@ -556,11 +547,11 @@ def read_pose_session(
     if not set(named) <= set(streams):  # poses of another type, of which there may be more
         streams |= {t: s for t, s in published_poses(path, named).items() if s.stamp_ns.size}
     chosen = tracked or {
-        topic[len(TRACKED) : -len(ENDING)]: topic
+        topic[len(recorded.TRACKED) : -len(recorded.ENDING)]: topic
         for topic in sorted(streams)
-        if topic.startswith(TRACKED) and topic.endswith(ENDING)
+        if topic.startswith(recorded.TRACKED) and topic.endswith(recorded.ENDING)
     }
-    optics = [t for t in streams if t.startswith(OPTICAL) and t.endswith(ENDING)]
+    optics = [t for t in streams if t.startswith(recorded.OPTICAL) and t.endswith(recorded.ENDING)]
     if not optical and len(optics) > 1:
         raise BagError(f'{name}: several references, name one: {", ".join(sorted(optics))}')
     reference = optical or next(iter(optics), None)
@@ -571,7 +562,8 @@ def read_pose_session(
             raise BagError(f'{name}: no poses on {topic}; topics of poses: {known}')
     if not chosen:
         raise BagError(
-            f'{name}: no tracked poses, which are expected on {TRACKED}<sensor>{ENDING}'
+            f'{name}: no tracked poses, which are expected on '
+            f'{recorded.TRACKED}<sensor>{recorded.ENDING}'
         )
     start = min(int(streams[topic].stamp_ns.min()) for topic in topics)
 
@@ -590,9 +582,9 @@ def write_pose_session(path: Path, session: PoseSession) -> None:
 
     Raises `BagError` when the file exists already.
     """
-    sequences = [(tracked_topic(n), s) for n, s in session.sensors.items()]
+    sequences = [(recorded.tracked_topic(n), s) for n, s in session.sensors.items()]
     if session.reference is not None:
-        sequences.append((optical_topic(BODY), session.reference))
+        sequences.append((recorded.optical_topic(recorded.BODY), session.reference))
     messages: list[tuple[int, str, list[float], list[float]]] = []
     for topic, poses in sequences:
         stamps, late = (
@@ -604,7 +596,7 @@ def write_pose_session(path: Path, session: PoseSession) -> None:
         messages += [(stamp, topic, [np.nan] * 3, [np.nan] * 4) for stamp in late]
     messages.sort(key=lambda message: message[0])
     with SessionWriter(path, frame_id='tracker') as writer:
-        setup = pose_setup(session.sensors, BODY)
+        setup = recorded.pose_setup(session.sensors, recorded.BODY)
         writer.write_setup(setup, messages[0][0] if messages else session.start_ns)
         for stamp, topic, position, quaternion in messages:
             writer.write_pose(topic, stamp, position, quaternion)

@@ -31,8 +31,7 @@ class Rule:
 
     description: str  # one line for the operator, with the unit
     # inclusive bounds of a number, or of every number of a list
-    minimum: float | None = None
-    maximum: float | None = None
+    within: tuple[float, float] = (-math.inf, math.inf)
     choices: tuple[str, ...] = ()  # the allowed texts; empty when any will do
     live: bool = False  # whether it may change while the node runs
 
@@ -103,10 +102,12 @@ def _check(name: str, kind: Any, rule: Rule, value: Any) -> Any:
         raise ParameterError(f'parameter {name}: {value!r} is not a {kind.__name__}')
     if kind is float and math.isnan(value):
         raise ParameterError(f'parameter {name}: not a number')
-    if rule.minimum is not None and value < rule.minimum:
-        raise ParameterError(f'parameter {name}: {value} is below {rule.minimum}')
-    if rule.maximum is not None and value > rule.maximum:
-        raise ParameterError(f'parameter {name}: {value} is above {rule.maximum}')
+    if kind in (int, float):
+        low, high = rule.within
+        if value < low:
+            raise ParameterError(f'parameter {name}: {value} is below {low}')
+        if value > high:
+            raise ParameterError(f'parameter {name}: {value} is above {high}')
     if rule.choices and value not in rule.choices:
         raise ParameterError(
             f'parameter {name}: {value!r} is none of {", ".join(map(repr, rule.choices))}'
@@ -120,10 +121,8 @@ def describe(table: type) -> str:
     for field in dataclasses.fields(table):
         rule = field.metadata['rule']
         limits = list(rule.choices)
-        if rule.minimum is not None or rule.maximum is not None:
-            low = '-inf' if rule.minimum is None else f'{rule.minimum:g}'
-            high = 'inf' if rule.maximum is None else f'{rule.maximum:g}'
-            limits.append(f'{low} to {high}')
+        if rule.within != Rule.within:
+            limits.append('{:g} to {:g}'.format(*rule.within))
         default = list(field.default) if isinstance(field.default, tuple) else field.default
         notes = f' [{" | ".join(limits)}]' if limits else ''
         notes += ' (may change while it runs)' if rule.live else ''
@@ -136,7 +135,7 @@ def stated(name: str) -> Any:
     item = VALUES[name]
     meaning, high = item.metadata['meaning'], item.metadata['high']
     text = f'{meaning}; 0 for that of the setup document, or {item.default:.4g} without one'
-    return parameter(item.type(0), text, minimum=0.0, maximum=high)  # type: ignore[operator]
+    return parameter(item.type(0), text, within=(0.0, high))  # type: ignore[operator]
 
 
 def stated_by(table: Any) -> dict[str, float]:

@@ -7,16 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from anser_ros.apps.lab.comparison import FEWEST_BLOCKS, compare, read_errors
 from anser_ros.cli.main import main
 from anser_ros.errors import ParameterError
 from anser_ros.pose_states import OK
-from anser_ros.sessions.evaluation_files import (
-    ERRORS_FILE,
-    FEWEST_BLOCKS,
-    compare,
-    read_errors,
-    write_tables,
-)
+from anser_ros.sessions.evaluation_files import ERRORS_FILE, write_tables
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries
 
 STEP_NS = 40_000_000

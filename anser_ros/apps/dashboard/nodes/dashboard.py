@@ -121,7 +121,7 @@ class DashboardParameters:
         "address that the page is served on; any other than this machine's own needs a token",
     )
     port: int = parameter(
-        LIVE_VIEW, 'TCP port of the page; 0 for any that is free', minimum=0, maximum=65535
+        LIVE_VIEW, 'TCP port of the page; 0 for any that is free', within=(0, 65535)
     )
     token_file: str = parameter(
         '', 'file with the token that browsers have to know; empty: a new one, printed at the '

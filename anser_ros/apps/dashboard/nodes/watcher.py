@@ -67,18 +67,14 @@ class WatcherParameters:
         '', 'distortion-free recording of the same board; without one the references are not used'
     )
     window_s: float = parameter(
-        20.0, 'length of the stretch that it diagnoses, s', minimum=5.0, maximum=120.0
+        20.0, 'length of the stretch that it diagnoses, s', within=(5.0, 120.0)
     )
-    frames: int = parameter(100, 'flux frames of it that are used', minimum=40, maximum=400)
+    frames: int = parameter(100, 'flux frames of it that are used', within=(40, 400))
     period_s: float = parameter(
-        5.0,
-        'shortest time from one diagnosis to the next, s',
-        minimum=0.1,
-        maximum=600.0,
-        live=True,
+        5.0, 'shortest time from one diagnosis to the next, s', within=(0.1, 600.0), live=True
     )
     cpu_share: float = parameter(
-        0.2, 'largest share of one processor on average', minimum=0.01, maximum=1.0, live=True
+        0.2, 'largest share of one processor on average', within=(0.01, 1.0), live=True
     )
     flux_noise_t: float = stated('flux_noise_t')
     optical_position_m: float = stated('optical_position_m')

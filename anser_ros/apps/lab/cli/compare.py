@@ -10,24 +10,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_json,
-    add_out,
-    make_folder,
-    number,
-    terminal_table,
-    write_files,
-)
-from anser_ros.physics.constants import DEGREES
-from anser_ros.sessions.evaluation_files import (
+from anser_ros.apps.lab.comparison import (
     Compared,
     check_same_recording,
     compare,
     read_errors,
     read_states,
 )
+from anser_ros.cli import output
+from anser_ros.physics.constants import DEGREES
 
 SCHEMA = 'anser_comparison/1'
 SEED = 1
@@ -46,13 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('first', type=Path, help='folder that anser evaluate has written')
     parser.add_argument('second', type=Path, help='another one, of the same session')
-    add_out(parser, 'comparison.json and comparison.png', required=False)
-    add_json(parser, 'comparison.json on stdout')
+    output.add_out(parser, 'comparison.json and comparison.png', required=False)
+    output.add_json(parser, 'comparison.json on stdout')
 
 
-def work(args: argparse.Namespace, tell: Tell) -> Result:
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Compare the two evaluations."""
-    make_folder(args.out)
+    output.make_folder(args.out)
     check_same_recording(args.first, args.second)
     one, two = read_errors(args.first), read_errors(args.second)
     tell('resampling')
@@ -67,17 +58,21 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
            for kind, all_of in everything.items()},
     }  # fmt: skip
     picture = None if args.out is None else draw(found, shares)
-    written = write_files(args.out, {'comparison.json': document, 'comparison.png': picture})
+    written = output.write_files(
+        args.out, {'comparison.json': document, 'comparison.png': picture}
+    )
     ends = ['first', 'second', 'difference, 95 %', 'better']
     tables = [
-        terminal_table(['name', 'pairs', *ends], _rows(found[kind], scale, 4),
+        output.terminal_table(['name', 'pairs', *ends], _rows(found[kind], scale, 4),
                        title=f'{kind} error, RMSE, {unit}')
         for kind, scale, unit in KINDS
     ]  # fmt: skip
     rows = _rows(shares, 100.0, 2)
-    tables.append(terminal_table(['name', 'frames', *ends], rows, title='frames with a pose, %'))
+    tables.append(
+        output.terminal_table(['name', 'frames', *ends], rows, title='frames with a pose, %')
+    )
     shown = (*tables, verdict(everything), alone(found['position']))
-    return Result(document, (), shown, written)
+    return output.Result(document, (), shown, written)
 
 
 def _plain(one: Compared) -> dict[str, Any]:
@@ -117,7 +112,8 @@ def _rows(found: Mapping[str, Compared], scale: float, digits: int) -> list[list
     for name, one in found.items():
         interval = f'{scale * one.low:+.{digits}f} .. {scale * one.high:+.{digits}f}'
         rows.append([
-            name, str(one.n), *(number(value, scale, f'.{digits}f') for value in (one.a, one.b)),
+            name, str(one.n),
+            *(output.number(value, scale, f'.{digits}f') for value in (one.a, one.b)),
             '-' if np.isnan(one.low) else interval, WORDS[one.verdict],
         ])  # fmt: skip
     return rows

@@ -7,16 +7,7 @@ from pathlib import Path
 
 from anser_ros.apps.lab.metal_follower import KnownMetalModels
 from anser_ros.apps.lab.metal_lattice import load_known_metal, save_known_metal
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_json,
-    add_model,
-    add_stated_values,
-    check_file,
-    loss_notes,
-    stated_values,
-)
+from anser_ros.cli import output
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.follower import FrameModels
 from anser_ros.sessions.prepared import PreparedSession, prepare
@@ -35,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='bag in which one rigid piece of metal moves, seen by reference sensors and a tool '
         'with optical poses',
     )  # fmt: skip
-    add_model(parser, required=True)
+    output.add_model(parser, required=True)
     parser.add_argument(
         '--baseline', required=True, help='recording of the same board without the metal'
     )
@@ -43,18 +34,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--out', required=True, type=Path, help='file to write; its folder is made if missing'
     )
-    add_stated_values(parser, 'accuracy', 'refit', 'tools')
-    add_json(parser, 'what was learnt on stdout')
+    output.add_stated_values(parser, 'accuracy', 'refit', 'tools')
+    output.add_json(parser, 'what was learnt on stdout')
 
 
-def work(args: argparse.Namespace, tell: Tell) -> Result:
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Learn the metal of the session, and write it."""
     if not args.name.strip():
         raise ParameterError('--name must not be empty')
-    session = load_session(args.session).with_stated(stated_values(args))
+    session = load_session(args.session).with_stated(output.stated_values(args))
     model = model_for(args.model, session)
     prepared = prepare(session, model, load_session(args.baseline))
-    check_file(args.out)
+    output.check_file(args.out)
     # Loaded here, as each evaluation would pay for it, which asks this module for its option.
     from anser_ros.apps.lab.metal_learning import learn
 
@@ -73,7 +64,9 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         f'{" x ".join(f"{side * 1e2:.0f}" for side in size)} cm; in frames that took no part '
         f"{known.misfit:.1%} of the references' readings are left"
     )
-    return Result(document, loss_notes(args.session, session.lost), (words,), (args.out,))
+    return output.Result(
+        document, output.loss_notes(args.session, session.lost), (words,), (args.out,)
+    )
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

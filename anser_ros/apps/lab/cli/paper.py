@@ -13,15 +13,7 @@ from anser_ros.apps.lab.experiments.recordings import (
 from anser_ros.apps.lab.experiments.report import draw_all, write_report
 from anser_ros.apps.lab.experiments.study import Study
 from anser_ros.apps.lab.measured.recipe import shared_folder
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_json,
-    add_out,
-    make_folder,
-    terminal_table,
-    write_files,
-)
+from anser_ros.cli import output
 
 SHOWN_TABLES = (
     'table_2',
@@ -39,15 +31,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = 'example: anser paper --simulate --out paper/'
     words = 'folder of the recordings; by default the shared ones, or simulated'
     parser.add_argument('--sessions', type=Path, help=words)
-    add_out(parser, 'the report', required=False, default=Path('out/paper'))
+    output.add_out(parser, 'the report', required=False, default=Path('out/paper'))
     parser.add_argument('--simulate', action='store_true', help='simulate the recordings anyway')
     parser.add_argument('--seed', type=int, default=1, help='seed of the simulated recordings')
-    add_json(parser, 'paper.json on stdout')
+    output.add_json(parser, 'paper.json on stdout')
 
 
-def work(args: argparse.Namespace, tell: Tell) -> Result:
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Redo the experiments."""
-    make_folder(args.out)
+    output.make_folder(args.out)
     with tempfile.TemporaryDirectory() as scratch:
         study = Study(_recordings(args, Path(scratch)), tell)
         results = study.run()
@@ -65,9 +57,9 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         for method, errors in results.tracking[experiment].items()
     ]
     title = f'position RMSE, mm; simulated data ({results.origin})'
-    shown = terminal_table(['experiment', 'method', 'Y', 'Z'], rows, title=title)
-    return Result(
-        document, (), (shown,), (report, *write_files(args.out, {'paper.json': document}))
+    shown = output.terminal_table(['experiment', 'method', 'Y', 'Z'], rows, title=title)
+    return output.Result(
+        document, (), (shown,), (report, *output.write_files(args.out, {'paper.json': document}))
     )
 
 

@@ -15,16 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.lab.measured.recipe import (
-    Recipe,
-    ReportRow,
-    calibrations,
-    existing,
-    figure,
-    ran,
-    vector,
-    write_frames,
-)
+from anser_ros.apps.lab.measured import recipe
 from anser_ros.arrays import Array, Booleans, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
@@ -74,7 +65,7 @@ class Epoch:
 
 def load(folder: Path) -> Epoch:
     """Read the file ``hpi_coils.npz``; raises `FitError` when it, or an array, is missing."""
-    path = existing(folder / 'hpi_coils.npz')
+    path = recipe.existing(folder / 'hpi_coils.npz')
     with np.load(path) as part:
         try:
             return Epoch(
@@ -131,11 +122,14 @@ def setup_of(epoch: Epoch) -> Setup:
         centre = points.mean(axis=0)
         axis = epoch.normals[row][used][0] / np.linalg.norm(epoch.normals[row][used][0])
         windings = tuple(
-            (*vector(point - centre), float(w)) for point, w in zip(points, weight, strict=True)
+            (*recipe.vector(point - centre), float(w))
+            for point, w in zip(points, weight, strict=True)
         )
-        spec = SensorSpec(row, f'{BODY}/{name}', BODY, vector(centre), vector(axis), 0.0, windings)
+        spec = SensorSpec(
+            row, f'{BODY}/{name}', BODY, recipe.vector(centre), recipe.vector(axis), 0.0, windings
+        )
         specs.append(spec)
-    middle = vector(np.array([0.0, 0.0, HEIGHT_M]))
+    middle = recipe.vector(np.array([0.0, 0.0, HEIGHT_M]))
     coils = tuple(Coil(f'hpi{k}', middle, 0.0, tone) for k, tone in enumerate(TONES_HZ))
     rate = FRAMES * epoch.rate_hz / epoch.samples.shape[1]
     return Setup('fg', rate, Emitter('head_coil', {}, coils), tuple(specs), VOLUME, STATED)
@@ -145,7 +139,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write the epoch as a session; return its file. Raises `BagError` when it exists."""
     epoch, path = load(folder), into / f'{NAME}.mcap'
     pose = np.tile([0.0, 0.0, HEIGHT_M], (FRAMES, 1)), np.tile([0.0, 0.0, 0.0, 1.0], (FRAMES, 1))
-    write_frames(path, setup_of(epoch), fluxes(epoch), {BODY: pose})
+    recipe.write_frames(path, setup_of(epoch), fluxes(epoch), {BODY: pose})
     return [path]
 
 
@@ -177,15 +171,15 @@ def inverted(epoch: Epoch) -> Booleans:
     return np.asarray(np.sum(own * epoch.stored, axis=0) < 0.0)
 
 
-def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
+def rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
     """Return how the coils lie, and how many inverted channels are named."""
     epoch = load(folder)
     places, named, errors = [], [], []
     for kind in ('plain', 'full'):
-        document = ran(out / kind, 'calibration.json')
+        document = recipe.ran(out / kind, 'calibration.json')
         found = np.array([source['position_m'] for source in document['sources']])
         places.append(distance_mm(found, epoch.digitised_m))
-        errors.append(1e12 * figure(document, 'heldout_flux_rmse_t'))
+        errors.append(1e12 * recipe.figure(document, 'heldout_flux_rmse_t'))
         effects = [e for e in document['effects'] if e['name'] == 'sensor_polarity']
         channels = {c for effect in effects for c in effect['parameters']['channels']}
         named.append(np.isin(np.arange(len(epoch.names)), list(channels)))
@@ -195,22 +189,22 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     chosen = 'the signals alone'
     return [
         *(
-            ReportRow(
+            recipe.ReportRow(
                 NAME, f'{distance} (before: {words})', before, places[1], 'mm', chosen,
                 TARGET_MM, met, SPECIAL_MM,
             )
             for words, before in (("vendor's fit", vendor), ('sensors as stated', places[0]))
         ),
-        ReportRow(
+        recipe.ReportRow(
             NAME, f'of {truth.sum()} inverted channels, named', float((truth & named[0]).sum()),
             float((truth & named[1]).sum()), '', chosen, float(truth.sum()),
             bool((named[1] | ~truth).all()), SPECIAL_INVERTED,
         ),
-        ReportRow(
+        recipe.ReportRow(
             NAME, 'a fifth of the channels predicted by the others, RMSE', errors[0], errors[1],
             'pT', 'field and signs on the others',
         ),
-        ReportRow(
+        recipe.ReportRow(
             NAME, 'channels falsely named inverted', float((named[0] & ~truth).sum()),
             float((named[1] & ~truth).sum()), '', chosen, 0.0, bool((truth | ~named[1]).all()),
         ),
@@ -219,7 +213,7 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
 
 def commands(bags: list[Path], out: Path) -> list[list[str]]:
     """Return the commands that calibrate the recording."""
-    return calibrations(bags[0], out)
+    return recipe.calibrations(bags[0], out)
 
 
-RECIPE = Recipe(NAME, write_sessions, commands, rows)
+RECIPE = recipe.Recipe(NAME, write_sessions, commands, rows)

@@ -22,16 +22,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.lab.measured.recipe import (
-    Recipe,
-    ReportRow,
-    calibrations,
-    existing,
-    figure,
-    ran,
-    vector,
-    write_frames,
-)
+from anser_ros.apps.lab.measured import recipe
 from anser_ros.arrays import Array
 from anser_ros.errors import FitError
 from anser_ros.stamps import SECOND_NS
@@ -80,7 +71,7 @@ def read_poses(path: Path, magnet: str) -> dict[str, Array]:
 
     Raises `FitError` when a column is missing, or the rows are not whole poses.
     """
-    table = read_table(existing(path))
+    table = read_table(recipe.existing(path))
     if len(table.cells) % SENSORS:
         raise FitError(f'{path.name}: {len(table.cells)} rows are not poses of {SENSORS} sensors')
     groups = {
@@ -120,7 +111,7 @@ def as_recording(name: str, parts: dict[str, Array], background_t: Array) -> Rec
 def load(folder: Path, name: str) -> Recording:
     """Read one file of poses, its own background subtracted."""
     parts = read_poses(folder / f'{name}.csv', 'm')
-    table = read_table(existing(folder / f'{name}_background_uT.csv'))
+    table = read_table(recipe.existing(folder / f'{name}_background_uT.csv'))
     background = table.numbers(table.names) * 1e-6
     if background.shape != (SENSORS, 3):
         raise FitError(f'{name}: background of shape {background.shape}, expected (16, 3)')
@@ -159,8 +150,8 @@ def setup_of(
             3 * k + axis,
             f'{BODY}/s{k + 1}/{AXES[axis]}',
             BODY,
-            vector(place[k]),
-            vector(turn[k, :, axis] / np.linalg.norm(turn[k, :, axis])),
+            recipe.vector(place[k]),
+            recipe.vector(turn[k, :, axis] / np.linalg.norm(turn[k, :, axis])),
             0.0,
         )
         for k in range(len(place))
@@ -178,7 +169,7 @@ def write_session(recording: Recording, path: Path, setup: Setup | None = None) 
     flux = recording.field_t.reshape(len(stamps), -1, 1).astype(np.complex128)
     quaternion = Rotation.from_matrix(turn).as_quat()
     poses = {BODY: (place, quaternion)}
-    write_frames(path, setup or setup_of(recording), flux, poses, stamps)
+    recipe.write_frames(path, setup or setup_of(recording), flux, poses, stamps)
 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
@@ -210,12 +201,12 @@ def commands(bags: list[Path], out: Path) -> list[list[str]]:
     return found
 
 
-def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
+def rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
     """Return the errors before and after, on files that took no part."""
     made = []
     for bag, other in itertools.permutations(bags, 2):
         learnt, tracked = (path.stem.removeprefix('magnet_') for path in (bag, other))
-        found = ran(out / f'{bag.stem}_full', 'calibration.json')['effects']
+        found = recipe.ran(out / f'{bag.stem}_full', 'calibration.json')['effects']
         chosen = f'{", ".join(e["name"] for e in found)}: on {learnt} alone; scored on {tracked}'
         for k, (kind, unit, scale, goal) in enumerate(
             (
@@ -225,14 +216,14 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
         ):
             key = f'{kind}_rmse_{"m" if kind == "position" else "rad"}'
             before, after = (
-                figure(
-                    ran(out / f'{bag.stem}_{model}_{other.stem}', 'evaluation.json'),
+                recipe.figure(
+                    recipe.ran(out / f'{bag.stem}_{model}_{other.stem}', 'evaluation.json'),
                     'sources', BODY, key,
                 )
                 for model in ('plain', 'full')
             )  # fmt: skip
             made.append(
-                ReportRow(
+                recipe.ReportRow(
                     NAME, f'learnt on {learnt}, {tracked} tracked: {kind} RMSE', scale * before,
                     scale * after, unit, chosen, goal, bool(scale * after <= goal),
                     SPECIAL.get((learnt, tracked), (None, None))[k],
@@ -241,7 +232,7 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     return made
 
 
-RECIPE = Recipe(NAME, write_sessions, commands, rows)
+RECIPE = recipe.Recipe(NAME, write_sessions, commands, rows)
 
 
 STEP, STEP_FILE = 'magnet_step', 'step1'
@@ -263,22 +254,22 @@ def write_step(folder: Path, into: Path) -> list[Path]:
 
 def step_commands(bags: list[Path], out: Path) -> list[list[str]]:
     """Return the commands that model the robot's file, with sensors as stated and as found."""
-    return calibrations(bags[0], out)
+    return recipe.calibrations(bags[0], out)
 
 
-def step_rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
+def step_rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
     """Return the errors of the field at blocks of poses that took no part."""
     before, after = (
-        1e6 * figure(ran(out / kind, 'calibration.json'), 'heldout_flux_rmse_t')
+        1e6 * recipe.figure(recipe.ran(out / kind, 'calibration.json'), 'heldout_flux_rmse_t')
         for kind in ('plain', 'full')
     )
     chosen = 'everything on the other blocks of poses; scored on the block left out'
     return [
-        ReportRow(
+        recipe.ReportRow(
             STEP, 'field at poses left out, RMSE', before, after, 'uT', chosen,
             special=STEP_SPECIAL_UT,
         )
     ]  # fmt: skip
 
 
-STEP_RECIPE = Recipe(STEP, write_step, step_commands, step_rows, folder=NAME)
+STEP_RECIPE = recipe.Recipe(STEP, write_step, step_commands, step_rows, folder=NAME)

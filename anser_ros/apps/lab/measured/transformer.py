@@ -12,14 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 
-from anser_ros.apps.lab.measured.recipe import (
-    Recipe,
-    ReportRow,
-    existing,
-    ran,
-    vector,
-    write_frames,
-)
+from anser_ros.apps.lab.measured import recipe
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.sessions.session import load_session
@@ -50,7 +43,7 @@ def read(folder: Path) -> tuple[Array, ComplexArray]:
 
     Raises `FitError` when the file is missing, or is no table of nine columns.
     """
-    path = existing(folder / 'data_set.txt')
+    path = recipe.existing(folder / 'data_set.txt')
     found = read_table(path)
     table = found.numbers(found.names)
     if table.shape[1] != COLUMNS:
@@ -68,7 +61,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write the planes to calibrate with and the one that judges; return the two files."""
     place, field = read(folder)
     sensors = tuple(
-        SensorSpec(k, f'{PROBE}/{axis}', PROBE, (0.0, 0.0, 0.0), vector(unit), 0.0)
+        SensorSpec(k, f'{PROBE}/{axis}', PROBE, (0.0, 0.0, 0.0), recipe.vector(unit), 0.0)
         for k, (axis, unit) in enumerate(zip('xyz', np.eye(3), strict=True))
     )
     coil = Coil(NAME, (0.0, 0.0, 0.0), 0.0, 50.0)
@@ -79,7 +72,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
         count = int(chosen.sum())
         path = into / f'{NAME}_{name}.mcap'
         pose = (place[chosen], np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
-        write_frames(path, setup, field[chosen][:, :, None], {PROBE: pose})
+        recipe.write_frames(path, setup, field[chosen][:, :, None], {PROBE: pose})
         paths.append(path)
     return paths
 
@@ -93,7 +86,7 @@ def commands(bags: list[Path], out: Path) -> list[list[str]]:
     ]
 
 
-def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
+def rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
     """Return the error of the model on the plane left out, beside that of an interpolation."""
     known, judge = (load_session(bag).tools[0] for bag in bags)
     parts = known.flux[:, :, 0].view(float)
@@ -106,14 +99,14 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
         error = (flux.reshape(count, channels) - judge.flux[:, :, 0]).view(float)
         return float(1e6 * np.sqrt(np.mean(error**2)))
 
-    named = ran(out / 'diagnosis', 'diagnosis.json')['effects']
+    named = recipe.ran(out / 'diagnosis', 'diagnosis.json')['effects']
     chosen = 'everything on three planes; scored on the plane between them'
     figures = (
         ('field on the plane left out, interpolated and by the model, RMSE', rmse_ut(between),
          rmse_ut(predicted), 'uT'),
         ('effects named on the plane left out', float('nan'), float(len(named)), ''),
     )  # fmt: skip
-    return [ReportRow(NAME, *values, chosen) for values in figures]
+    return [recipe.ReportRow(NAME, *values, chosen) for values in figures]
 
 
-RECIPE = Recipe(NAME, write_sessions, commands, rows)
+RECIPE = recipe.Recipe(NAME, write_sessions, commands, rows)

@@ -16,16 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.poses.assessment.intervals import (
-    IntervalEstimate,
-    blocks_of_time,
-    cluster_weights,
-    equal_parts,
-    mitk_statistics,
-    summarised,
-    vertex_weights,
-    widest,
-)
+from anser_ros.apps.poses.assessment import intervals
 from anser_ros.apps.poses.assessment.rest import StillPoint
 from anser_ros.apps.poses.sequence import PoseSequence
 from anser_ros.arrays import Array, Integers
@@ -63,7 +54,7 @@ class ErrorGroup:
     descriptions: tuple[str, ...]
     errors: Array  # (n,), sizes, as MITK's ``distanceError``
     signed: Array  # (n,), measured less true
-    summary: dict[str, IntervalEstimate]  # of the sizes
+    summary: dict[str, intervals.IntervalEstimate]  # of the sizes
 
 
 @dataclass(frozen=True)
@@ -206,7 +197,7 @@ def _group(
     if alike:
         ends = np.array(pairs, dtype=np.float64)
         # Strips of the board that the middle of each distance is in.
-        clusters += [equal_parts(ends[:, k] + ends[:, k + 2], PARTS) for k in (0, 1)]
+        clusters += [intervals.equal_parts(ends[:, k] + ends[:, k + 2], PARTS) for k in (0, 1)]
     return grouped('mm', words, np.array(signed), clusters, rng)
 
 
@@ -217,10 +208,12 @@ def grouped(
     """Return errors with intervals from resamples of clusters, the widest of several ways."""
     size = np.abs(signed)
     found = [
-        summarised(size, cluster_weights(labels, rng), int(np.unique(labels).size))
+        intervals.summarised(
+            size, intervals.cluster_weights(labels, rng), int(np.unique(labels).size)
+        )
         for labels in clusters
     ]
-    return ErrorGroup(unit, tuple(words), size, signed, widest(found))
+    return ErrorGroup(unit, tuple(words), size, signed, intervals.widest(found))
 
 
 def matching_error(place: Array, grid: Grid) -> float:
@@ -280,7 +273,7 @@ ALONE = 0.5
 
 def single_point(
     poses: PoseSequence, rng: np.random.Generator
-) -> tuple[ErrorGroup, dict[str, IntervalEstimate]]:
+) -> tuple[ErrorGroup, dict[str, intervals.IntervalEstimate]]:
     """Return distances of the readings from their mean, mm, and the largest between two, m.
 
     ``poses``: of the tip, while it stays at one location. Raises `FitError` when there are too few
@@ -300,8 +293,8 @@ def single_point(
         )
     size = 1e3 * np.linalg.norm(place - place.mean(axis=0), axis=1)
     group = grouped('mm', [f'Reading at {t:.2f} s' for t in time], size,
-                    [blocks_of_time(time)], rng)  # fmt: skip
-    return group, {'span_m': IntervalEstimate(_span(place))}
+                    [intervals.blocks_of_time(time)], rng)  # fmt: skip
+    return group, {'span_m': intervals.IntervalEstimate(_span(place))}
 
 
 def _span(place: Array) -> float:
@@ -313,7 +306,7 @@ def _span(place: Array) -> float:
 
 def point_to_point(
     points: Sequence[StillPoint], true: Array, rng: np.random.Generator
-) -> tuple[ErrorGroup, dict[str, IntervalEstimate]]:
+) -> tuple[ErrorGroup, dict[str, intervals.IntervalEstimate]]:
     """Return errors of all distances between points, mm, and what a rigid fit leaves, m.
 
     ``true`` (n, 3): places of the points on the phantom, m, in any frame, in the same order.
@@ -336,17 +329,19 @@ def point_to_point(
         )
     pairs = np.stack([first, second], axis=1)
     words = tuple(f'Distance {a + 1} to {b + 1}' for a, b in pairs)
-    weights = vertex_weights(pairs, rng)
-    group = ErrorGroup('mm', words, size, signed, summarised(size, weights, len(points)))
-    mean = summarised(signed, weights, len(points))['Mean']
+    weights = intervals.vertex_weights(pairs, rng)
+    group = ErrorGroup('mm', words, size, signed, intervals.summarised(size, weights, len(points)))
+    mean = intervals.summarised(signed, weights, len(points))['Mean']
     return group, {
-        'mean_error_m': IntervalEstimate(1e-3 * mean.value, 1e-3 * mean.low, 1e-3 * mean.high),
-        'standard_deviation_of_error_m': IntervalEstimate(
-            1e-3 * mitk_statistics(signed)['Sample Standard Deviation']
+        'mean_error_m': intervals.IntervalEstimate(
+            1e-3 * mean.value, 1e-3 * mean.low, 1e-3 * mean.high
         ),
-        'least_error_m': IntervalEstimate(1e-3 * float(signed.min())),
-        'greatest_error_m': IntervalEstimate(1e-3 * float(signed.max())),
-        'rigid_fit_m': IntervalEstimate(rigid_distance(true, place)),
+        'standard_deviation_of_error_m': intervals.IntervalEstimate(
+            1e-3 * intervals.mitk_statistics(signed)['Sample Standard Deviation']
+        ),
+        'least_error_m': intervals.IntervalEstimate(1e-3 * float(signed.min())),
+        'greatest_error_m': intervals.IntervalEstimate(1e-3 * float(signed.max())),
+        'rigid_fit_m': intervals.IntervalEstimate(rigid_distance(true, place)),
     }
 
 

@@ -6,30 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anser_ros.apps.poses.assessment.distances import (
-    ORDERS,
-    RING_STEP_DEG,
-    ROTATION,
-    SPACING_M,
-    ErrorGroup,
-    Grid,
-    distance_errors,
-    grid_points,
-    have_common_errors,
-    matching_error,
-    point_to_point,
-    rotation_errors,
-    single_point,
-    standing_alone,
-)
-from anser_ros.apps.poses.assessment.intervals import (
-    BLOCKS,
-    LEVEL,
-    IntervalEstimate,
-    blocks_of_time,
-    cluster_weights,
-    summarised,
-)
+from anser_ros.apps.poses.assessment import distances, intervals
 from anser_ros.apps.poses.assessment.rest import (
     AllanCurve,
     PauseRule,
@@ -61,14 +38,16 @@ class SpeedGroup:
     speed_high_m_s: float
     speed_mean_m_s: float
     n: int
-    error_rms_m: IntervalEstimate  # with the clocks' offset taken out
-    error_live_rms_m: IntervalEstimate  # of poses that are taken for those of their stamps
-    latency_s: IntervalEstimate  # against the reference, the common offset included
+    error_rms_m: intervals.IntervalEstimate  # with the clocks' offset taken out
+    error_live_rms_m: (
+        intervals.IntervalEstimate
+    )  # of poses that are taken for those of their stamps
+    latency_s: intervals.IntervalEstimate  # against the reference, the common offset included
 
 
 def assess_motion(
     found: HandEye, sensor: str, rng: np.random.Generator
-) -> tuple[dict[str, IntervalEstimate], tuple[SpeedGroup, ...]]:
+) -> tuple[dict[str, intervals.IntervalEstimate], tuple[SpeedGroup, ...]]:
     """Return figures of a moving sensor whose frames and clocks are known, and the same by speed.
 
     A late pose is where the tool was, back along its velocity: the error along the velocity over
@@ -91,43 +70,45 @@ def assess_motion(
     offset, sigma = found.offset_s
     error = np.linalg.norm(rest, axis=1)
     error_live = np.linalg.norm(rest - offset * velocity, axis=1)
-    clusters = blocks_of_time(part.view.time[used])
+    clusters = intervals.blocks_of_time(part.view.time[used])
     edges = np.quantile(speed, np.linspace(0, 1, GROUPS + 1))
     groups = []
     for k in range(GROUPS):
         inside = (speed >= edges[k]) & ((speed < edges[k + 1]) | (k == GROUPS - 1))
-        weights = cluster_weights(clusters[inside], rng)
+        weights = intervals.cluster_weights(clusters[inside], rng)
         count = int(np.unique(clusters[inside]).size)
         late = _latency(rest[inside], velocity[inside], weights, offset, sigma)
         groups.append(
             SpeedGroup(
                 float(edges[k]), float(edges[k + 1]), float(speed[inside].mean()),
-                int(inside.sum()), summarised(error[inside], weights, count)['RMS'],
-                summarised(error_live[inside], weights, count)['RMS'], late,
+                int(inside.sum()), intervals.summarised(error[inside], weights, count)['RMS'],
+                intervals.summarised(error_live[inside], weights, count)['RMS'], late,
             )
         )  # fmt: skip
-    weights = cluster_weights(clusters, rng)
-    whole = summarised(error, weights, BLOCKS)
+    weights = intervals.cluster_weights(clusters, rng)
+    whole = intervals.summarised(error, weights, intervals.BLOCKS)
     estimates = {
         'dynamic_error_rms_m': whole['RMS'],
         'dynamic_error_prc95_m': whole['P95'],
-        'dynamic_error_live_rms_m': summarised(error_live, weights, BLOCKS)['RMS'],
+        'dynamic_error_live_rms_m': intervals.summarised(error_live, weights, intervals.BLOCKS)[
+            'RMS'
+        ],
         'latency_s': _latency(rest, velocity, weights, offset, sigma),
-        'speed_prc95_m_s': IntervalEstimate(float(np.percentile(speed, 95))),
+        'speed_prc95_m_s': intervals.IntervalEstimate(float(np.percentile(speed, 95))),
     }
     return estimates, tuple(groups)
 
 
 def _latency(
     rest: Array, velocity: Array, weights: Array, offset: float, sigma: float
-) -> IntervalEstimate:
+) -> intervals.IntervalEstimate:
     """The offset and what is left beside it, s, with the offset's own uncertainty."""
     along, square = np.sum(rest * velocity, axis=1), np.sum(velocity**2, axis=1)
     value = offset - float(along.sum() / max(square.sum(), 1e-300))
     drawn = offset - (weights @ along) / np.maximum(weights @ square, 1e-300)
-    low, high = np.quantile(drawn, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
+    low, high = np.quantile(drawn, [0.5 - intervals.LEVEL / 2, 0.5 + intervals.LEVEL / 2])
     wide = 1.96 * sigma
-    return IntervalEstimate(
+    return intervals.IntervalEstimate(
         value,
         value - float(np.hypot(value - low, wide)),
         value + float(np.hypot(high - value, wide)),
@@ -148,9 +129,9 @@ class ProtocolOptions:
     # rows and columns of a board that is not one of the protocol's
     grid: tuple[int, int] | None = None
     # of the board's holes, and of the ring's
-    spacing_m: float = SPACING_M
-    step_deg: float = RING_STEP_DEG
-    order: str = ORDERS[0]  # one of `ORDERS`: how a board was gone over
+    spacing_m: float = distances.SPACING_M
+    step_deg: float = distances.RING_STEP_DEG
+    order: str = distances.ORDERS[0]  # one of `ORDERS`: how a board was gone over
     axis: Array | None = None  # (3,), or None, direction of a sensor without roll
     # (n, 3), or None, places of a phantom's points, m; None: the recording's optical reference
     truth: Array | None = None
@@ -177,9 +158,9 @@ class Assessment:
     body: str
     recordings: tuple[str, ...]
     start_ns: int  # stamp at which the first recording begins
-    estimates: dict[str, IntervalEstimate]  # figures by name; units are in the names
+    estimates: dict[str, intervals.IntervalEstimate]  # figures by name; units are in the names
     # errors of a kind, under MITK's names where it has them
-    groups: dict[str, ErrorGroup] = field(default_factory=dict)
+    groups: dict[str, distances.ErrorGroup] = field(default_factory=dict)
     points: tuple[StillPoint, ...] = ()
     allan: dict[str, AllanCurve] = field(default_factory=dict)
     speeds: tuple[SpeedGroup, ...] = ()
@@ -276,38 +257,42 @@ def _rest(empty: Assessment, given: _Given) -> Assessment:
 
 def _grid(empty: Assessment, given: _Given) -> Assessment:
     points = given.points
-    grid = Grid.of(len(points), given.options.grid, given.options.spacing_m)
-    place = grid_points(points, grid, given.options.order)
+    grid = distances.Grid.of(len(points), given.options.grid, given.options.spacing_m)
+    place = distances.grid_points(points, grid, given.options.order)
     estimates = {
-        'grid_matching_fre_m': IntervalEstimate(matching_error(place, grid)),
+        'grid_matching_fre_m': intervals.IntervalEstimate(distances.matching_error(place, grid)),
         'point_jitter_rms_m': _jitter(points),
     }
     notes: tuple[str, ...] = ()
-    if have_common_errors(place, grid):
+    if distances.have_common_errors(place, grid):
         notes = (
             'neighbouring lines of holes seem to have the same error, as in a distorted field: '
             'intervals come from thirds of the board, and are wide',
         )
-    groups = distance_errors(place, grid, given.rng)
+    groups = distances.distance_errors(place, grid, given.rng)
     return replace(empty, estimates=estimates, groups=groups, points=tuple(points), notes=notes)
 
 
-def _jitter(points: Sequence[StillPoint]) -> IntervalEstimate:
-    return IntervalEstimate(float(np.sqrt(np.mean([p.jitter_m**2 for p in points]))))
+def _jitter(points: Sequence[StillPoint]) -> intervals.IntervalEstimate:
+    return intervals.IntervalEstimate(float(np.sqrt(np.mean([p.jitter_m**2 for p in points]))))
 
 
 def _rotation(empty: Assessment, given: _Given) -> Assessment:
     points = given.points
-    group = rotation_errors(points, given.options.step_deg, given.options.axis, given.rng)
+    group = distances.rotation_errors(
+        points, given.options.step_deg, given.options.axis, given.rng
+    )
     place = np.array([p.position for p in points])
     estimates = {
         # The ring turns the sensor about a place that hardly moves: how far it seems to.
-        'position_spread_rms_m': IntervalEstimate(
+        'position_spread_rms_m': intervals.IntervalEstimate(
             float(np.sqrt(np.mean(np.sum((place - place.mean(axis=0)) ** 2, axis=1))))
         ),
         'point_jitter_rms_m': _jitter(points),
     }
-    return replace(empty, estimates=estimates, groups={ROTATION: group}, points=tuple(points))
+    return replace(
+        empty, estimates=estimates, groups={distances.ROTATION: group}, points=tuple(points)
+    )
 
 
 def _metal(empty: Assessment, given: _Given) -> Assessment:
@@ -318,7 +303,7 @@ def _metal(empty: Assessment, given: _Given) -> Assessment:
 
 
 def _single_point(empty: Assessment, given: _Given) -> Assessment:
-    group, estimates = single_point(given.recordings[0].poses, given.rng)
+    group, estimates = distances.single_point(given.recordings[0].poses, given.rng)
     return replace(empty, estimates=estimates, groups={'single point deviations': group})
 
 
@@ -341,8 +326,8 @@ def _point_to_point(empty: Assessment, given: _Given) -> Assessment:
         )
     else:
         points = given.points
-    group, estimates = point_to_point(points, true, given.rng)
-    alone = standing_alone(np.array([p.position for p in points]), true)
+    group, estimates = distances.point_to_point(points, true, given.rng)
+    alone = distances.standing_alone(np.array([p.position for p in points]), true)
     if alone is not None:
         number, before, after = alone
         notes.append(

@@ -39,16 +39,7 @@ from anser_ros.apps.poses.assessment.source import read_poses
 from anser_ros.apps.poses.cli.pose_source import add_source_options, source_of
 from anser_ros.apps.poses.corrector import as_document
 from anser_ros.apps.poses.sequence import missing_words
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_json,
-    add_list,
-    add_out,
-    make_folder,
-    terminal_table,
-    write_files,
-)
+from anser_ros.cli import output
 from anser_ros.cli.page import (
     heading,
     legend_below,
@@ -115,16 +106,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'this one there',
     )  # fmt: skip
     words = 'largest size of a figure, beyond which the session fails'
-    add_list(parser, '--limit', metavar='FIGURE=VALUE', help=words)
-    add_out(parser, 'accuracy.json and report.html', required=False)
-    add_json(parser, 'accuracy.json on stdout')
+    output.add_list(parser, '--limit', metavar='FIGURE=VALUE', help=words)
+    output.add_out(parser, 'accuracy.json and report.html', required=False)
+    output.add_json(parser, 'accuracy.json on stdout')
 
 
-def work(args: argparse.Namespace, tell: Tell) -> Result:
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Assess the recordings of the arguments, and judge them where that is wanted."""
     options, tolerances = _options(args), _tolerances(args.limit)
-    make_folder(args.out)
-    make_folder(args.history)
+    output.make_folder(args.out)
+    output.make_folder(args.history)
     wanted = source_of(args)
     recordings = []
     for k, path in enumerate(args.recordings):
@@ -140,12 +131,12 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     verdict = judge(found, args.history, tolerances) if is_judged else None
     document = to_document(found, verdict)
     report = render(found, document, verdict) if args.out else None
-    written = write_files(args.out, {'accuracy.json': document, 'report.html': report})
+    written = output.write_files(args.out, {'accuracy.json': document, 'report.html': report})
     if verdict is not None and args.history is not None:
         written = (*written, keep(found, args.history, verdict.figures))
     lost = [one.session for one in recordings if one.session.lost]
     notes = tuple(f'{session.path}: {session.lost}' for session in lost)
-    return Result(document, notes, _shown(found, document), written)
+    return output.Result(document, notes, _shown(found, document), written)
 
 
 def _shown(found: Assessment, document: dict[str, Any]) -> tuple[Any, ...]:
@@ -157,7 +148,12 @@ def _shown(found: Assessment, document: dict[str, Any]) -> tuple[Any, ...]:
     if not qa:
         head, rows = head[:-1], [row[:-1] for row in rows]
     points = [f'{len(found.points)} points'] if found.points else []
-    return (terminal_table(head, rows), *points, *found.notes, *([qa_words(qa)] if qa else []))
+    return (
+        output.terminal_table(head, rows),
+        *points,
+        *found.notes,
+        *([qa_words(qa)] if qa else []),
+    )
 
 
 def _options(args: argparse.Namespace) -> ProtocolOptions:

@@ -16,16 +16,7 @@ from anser_ros.apps.poses.corrector import as_document
 from anser_ros.apps.poses.hand_eye import HandEye, fit_hand_eye, turn_of
 from anser_ros.apps.poses.importing import import_poses
 from anser_ros.apps.poses.sequence import PoseSession, missing_words
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_json,
-    add_out,
-    make_folder,
-    number,
-    terminal_table,
-    write_files,
-)
+from anser_ros.cli import output
 from anser_ros.cli.page import heading, listed, page, paragraph, picture, table, top
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
@@ -61,14 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'clocks',
     )  # fmt: skip
     add_form_options(parser, 'for files: ')
-    add_out(parser, 'handeye.yaml, handeye.json and report.html', required=False)
-    add_json(parser, 'handeye.json on stdout')
+    output.add_out(parser, 'handeye.yaml, handeye.json and report.html', required=False)
+    output.add_json(parser, 'handeye.json on stdout')
 
 
-def work(args: argparse.Namespace, tell: Tell) -> Result:
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Fit both streams."""
     session = _session(args)
-    make_folder(args.out)
+    output.make_folder(args.out)
     found = fit_hand_eye(session, pairs=args.pairs, progress=tell)
     document = to_document(found)
     written: tuple[Path, ...] = ()
@@ -77,18 +68,20 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
             'handeye.yaml': yaml.safe_dump(document, sort_keys=False, default_flow_style=None),
             'handeye.json': document, 'report.html': render(found, document),
         }  # fmt: skip
-        written = write_files(args.out, files)
+        written = output.write_files(args.out, files)
     notes = [session.lost] if session.lost else []
     if found.convention is not None:
         notes.append(reading_words(found.convention))
     notes += filter(None, map(missing_words, session.streams.values()))
     rows = [[row[column] for column in SHOWN_COLUMNS] for row in _rows(document, 1)]
-    table = terminal_table([HEAD[column] for column in SHOWN_COLUMNS], rows)
+    table = output.terminal_table([HEAD[column] for column in SHOWN_COLUMNS], rows)
     for column in table.columns:
         column.no_wrap = True
     lines = (*clock_words(document), *left_out_words(document))
     shown = (table, *lines, *(f'not determined: {words}' for words in found.undetermined))
-    return Result(document, tuple(f'{session.path}: {note}' for note in notes), shown, written)
+    return output.Result(
+        document, tuple(f'{session.path}: {note}' for note in notes), shown, written
+    )
 
 
 def _session(args: argparse.Namespace) -> PoseSession:
@@ -168,15 +161,15 @@ HEAD = ('sensor', 'lever arm, mm', '1 sigma', 'mount, deg', '1 sigma', 'rms, mm'
 
 def _rows(document: dict[str, Any], digits: int) -> list[list[str]]:
     def triple(values: list[float | None] | None, scale: float) -> str:
-        return ' '.join(number(v, scale, f'.{digits}f') for v in values or [None])
+        return ' '.join(output.number(v, scale, f'.{digits}f') for v in values or [None])
 
     return [
         [
             name, triple(one['lever_arm_m'], 1e3), triple(one['lever_arm_sigma_m'], 1e3),
             triple(one['mount_rotation_deg'], 1.0), triple(one['mount_rotation_sigma_deg'], 1.0),
-            number(one['position_rmse_m'], 1e3, '.2f'),
-            number(one['heldout_position_rmse_m'], 1e3, '.2f'),
-            number(one['heldout_orientation_rmse_rad'], DEGREES, '.2f'),
+            output.number(one['position_rmse_m'], 1e3, '.2f'),
+            output.number(one['heldout_position_rmse_m'], 1e3, '.2f'),
+            output.number(one['heldout_orientation_rmse_rad'], DEGREES, '.2f'),
         ]
         for name, one in document['sensors'].items()
     ]  # fmt: skip
@@ -211,7 +204,7 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
         table(
             ['axis', 'translation, mm', '1 sigma', 'rotation vector, deg', '1 sigma'],
             [
-                [axis, *(number(values[k], scale) for values, scale in columns)]
+                [axis, *(output.number(values[k], scale) for values, scale in columns)]
                 for k, axis in enumerate('xyz')
             ],
         ),

@@ -12,15 +12,7 @@ from anser_ros.apps.poses.assessment.pivot import PivotFit, PivotLimits, fit_piv
 from anser_ros.apps.poses.assessment.source import AssessedPoses, read_poses
 from anser_ros.apps.poses.cli.pose_source import add_source_options, live_poses, source_of
 from anser_ros.apps.poses.sequence import missing_words
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_json,
-    add_out,
-    make_folder,
-    terminal_table,
-    write_files,
-)
+from anser_ros.cli import output
 from anser_ros.cli.page import legend_beside, page, picture, table, top
 from anser_ros.errors import FitError, ParameterError, SetupError
 from anser_ros.wire.setup import parse_setup, topic_of
@@ -53,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--setup', type=Path, metavar='FILE', help='setup document that the tip is written into'
     )
-    add_out(parser, 'pivot.json, tips.yaml and report.html', required=False)
+    output.add_out(parser, 'pivot.json, tips.yaml and report.html', required=False)
     limits = PivotLimits()
     parser.add_argument(
         '--max-sigma-mm', type=float, default=1e3 * limits.sigma_m,
@@ -63,10 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--max-rms-mm', type=float, default=1e3 * limits.rms_m,
         help=f'largest rms distance of the poses from one point ({1e3 * limits.rms_m:g})',
     )  # fmt: skip
-    add_json(parser, 'pivot.json on stdout')
+    output.add_json(parser, 'pivot.json on stdout')
 
 
-def work(args: argparse.Namespace, tell: Tell) -> Result:
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Find the tip, and write it."""
     if args.live == bool(args.recording):
         raise ParameterError('give a recording, or --live with --topic')
@@ -75,7 +67,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     if not (args.max_sigma_mm > 0 and args.max_rms_mm > 0):
         raise ParameterError('--max-sigma-mm and --max-rms-mm must be positive')
     text = read_text(args.setup) if args.setup else ''
-    make_folder(args.out)
+    output.make_folder(args.out)
     if args.live:
         found = live_poses(args.topic, args.seconds, tell)
     else:
@@ -93,8 +85,8 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     notes = tuple(
         f'{found.session.path}: {words}' for words in (found.session.lost, missing) if words
     )
-    shown = terminal_table(HEAD, _rows(fit)), _agreement(fit, document)
-    return Result(document, notes, shown, written)
+    shown = output.terminal_table(HEAD, _rows(fit)), _agreement(fit, document)
+    return output.Result(document, notes, shown, written)
 
 
 def _agreement(fit: PivotFit, document: dict[str, Any]) -> str:
@@ -168,7 +160,7 @@ def _write(
     tips_yaml = yaml.safe_dump(tips, sort_keys=False, default_flow_style=None)
     report = render(fit, document)
     files = {'pivot.json': document, 'tips.yaml': tips_yaml, 'report.html': report}
-    return (*written, *write_files(args.out, files))
+    return (*written, *output.write_files(args.out, files))
 
 
 def _rows(fit: PivotFit) -> list[list[str]]:

@@ -23,17 +23,8 @@ from anser_ros.apps.poses.importing import read_pose_session
 from anser_ros.apps.poses.problem import PoseState, jitter, predicted
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.arrays import Array
+from anser_ros.cli import output
 from anser_ros.cli.diagnosis_words import short_ones, value_text
-from anser_ros.cli.output import (
-    Result,
-    Tell,
-    add_list,
-    loss_notes,
-    make_folder,
-    number,
-    terminal_table,
-    write_files,
-)
 from anser_ros.cli.page import (
     AFTER,
     BEFORE,
@@ -231,8 +222,8 @@ def _by_sensor(document: dict[str, Any]) -> Html:
          'with mount, deg', 'with effects, deg'],
         [
             [
-                name, *(number(row[key], 1e3, '.2f') for key in places),
-                *(number(row[key], DEGREES, '.2f') for key in turns),
+                name, *(output.number(row[key], 1e3, '.2f') for key in places),
+                *(output.number(row[key], DEGREES, '.2f') for key in turns),
             ]
             for name, row in document['sensors'].items()
         ],
@@ -247,7 +238,8 @@ def _effects(document: dict[str, Any]) -> Html:
         rows.append([
             effect['name'], str(evidence.get('summary') or ''),
             '\n'.join(sizes(effect['parameters'], effect['uncertainty'])),
-            '' if pair == [None, None] else ' to '.join(number(v, 1e3, '.2f') for v in pair),
+            '' if pair == [None, None]
+            else ' to '.join(output.number(v, 1e3, '.2f') for v in pair),
             str(evidence.get('advice') or ''),
         ])  # fmt: skip
     if not rows:
@@ -301,7 +293,7 @@ def _by_distance(state: PoseState, before: PoseState, after: PoseState) -> Html:
                         for half in (~is_fast, is_fast)]  # fmt: skip
             sizes = [np.sqrt(one.mean()) if one.size > FEWEST else None for one in squares]
             rows.append([whole.view.sensor, f'{low:.0f} to {high:.0f}',
-                         *(number(size, 1e3, '.2f') for size in sizes)])  # fmt: skip
+                         *(output.number(size, 1e3, '.2f') for size in sizes)])  # fmt: skip
     head = ['sensor', 'from the field generator, mm', 'error before, mm', 'error after, mm',
             'noise of a coordinate, slow half, mm', 'fast half, mm']  # fmt: skip
     return table(head, rows)
@@ -381,7 +373,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def add_topic_options(parser: argparse.ArgumentParser, what: str, when: str = '') -> None:
     """Declare the options that name topics of poses in a bag."""
-    add_list(
+    output.add_list(
         parser, '--tracked', metavar='NAME=TOPIC', dest='topics',
         help=f'{when}a tracked {what} and its topic, by default all /tracked/<sensor>/pose',
     )  # fmt: skip
@@ -402,17 +394,17 @@ def load_poses(path: Path | str, args: argparse.Namespace) -> PoseSession:
     return read_pose_session(path, topics or None, args.optical)
 
 
-def diagnose(args: argparse.Namespace, tell: Tell) -> Result:
+def diagnose(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Diagnose a session of poses, corrected by a model if one is given, into the folder."""
     session, model = _session(args, ('baseline',))
     baseline = load_poses(args.baseline, args) if args.baseline else None
-    make_folder(args.out)
+    output.make_folder(args.out)
     if model:
         session = corrected(session, model)
         baseline = baseline and corrected(baseline, model)
     found = diagnose_poses(session, tell, baseline)
     document = to_document(found)
-    written = write_files(
+    written = output.write_files(
         args.out,
         {
             'diagnosis.json': document,
@@ -422,15 +414,15 @@ def diagnose(args: argparse.Namespace, tell: Tell) -> Result:
     )
     head = ['with lever arms, mm', 'corrected, mm', 'corrected, deg']
     shown = _by_sensor_text(document, head), pose_verdict(document)
-    return Result(document, loss_notes(args.session, session.lost), shown, written)
+    return output.Result(document, output.loss_notes(args.session, session.lost), shown, written)
 
 
-def evaluate(args: argparse.Namespace, tell: Tell) -> Result:
+def evaluate(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Report the errors of a session of poses, before and after a model's correction if one is
     given, into the folder of the arguments; nothing is searched for.
     """
     session, model = _session(args, ())
-    make_folder(args.out)
+    output.make_folder(args.out)
     first = found = diagnose_poses(session, tell, is_searched=False)
     if model:
         found = diagnose_poses(corrected(session, model), tell, is_searched=False)
@@ -438,7 +430,7 @@ def evaluate(args: argparse.Namespace, tell: Tell) -> Result:
     found = replace(found, registered=first.registered, states=states)
     diagnosis = to_document(found)
     document = _evaluation(found, diagnosis)
-    written = write_files(args.out, {'evaluation.json': document})
+    written = output.write_files(args.out, {'evaluation.json': document})
     _write_poses(args.out / 'poses.csv', found)
     head, words = (
         ['with lever arms, mm', '', 'deg'],
@@ -448,8 +440,8 @@ def evaluate(args: argparse.Namespace, tell: Tell) -> Result:
         head = ['before, mm', 'after, mm', 'after, deg']
         sizes = [f'{1e3 * one.position_m:.2f} mm' for one in (found.before, found.after)]
         words = f'Held out, the error is {sizes[0]} before and {sizes[1]} after the model.'
-    return Result(
-        document, loss_notes(args.session, session.lost),
+    return output.Result(
+        document, output.loss_notes(args.session, session.lost),
         (_by_sensor_text(diagnosis, head), words), (*written, args.out / 'poses.csv'),
     )  # fmt: skip
 
@@ -477,12 +469,15 @@ def _by_sensor_text(diagnosis: dict[str, Any], head: Sequence[str]) -> Table:
     rows = [
         [
             name,
-            *(number(row[f'position_rmse_{key}_m'], 1e3) for key in ('registration_only', *when)),
-            number(row['orientation_rmse_after_rad'], DEGREES),
+            *(
+                output.number(row[f'position_rmse_{key}_m'], 1e3)
+                for key in ('registration_only', *when)
+            ),
+            output.number(row['orientation_rmse_after_rad'], DEGREES),
         ]
         for name, row in diagnosis['sensors'].items()
     ]
-    return terminal_table(['sensor', 'registered, mm', *filter(None, head)], rows)
+    return output.terminal_table(['sensor', 'registered, mm', *filter(None, head)], rows)
 
 
 def _evaluation(found: PoseDiagnosis, document: dict[str, Any]) -> dict[str, Any]:

@@ -9,16 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.apps.poses.effect import (
-    Frames,
-    NumberEffect,
-    PoseEffect,
-    PoseSetting,
-    PoseSite,
-    PoseTerm,
-    PoseView,
-    Role,
-)
+from anser_ros.apps.poses import effect
 from anser_ros.apps.poses.effects.episodes import LooseMount
 from anser_ros.apps.poses.sequence import OpticalPath, filtered
 from anser_ros.arrays import Array
@@ -26,20 +17,20 @@ from anser_ros.effects.base import Remedy
 from anser_ros.field.model import EffectRecord
 
 
-class FrameConvention(PoseEffect):
+class FrameConvention(effect.PoseEffect):
     """States how a stream's numbers are meant, as `anser_ros.apps.poses.convention` finds out."""
 
     name = 'frame_convention'
     summary = 'the poses follow another convention than the stream states'
-    role = Role.READING
+    role = effect.Role.READING
 
 
-class SwappedSensors(PoseEffect):
+class SwappedSensors(effect.PoseEffect):
     """States whose poses are whose, as `anser_ros.apps.poses.start` finds out."""
 
     name = 'swapped_sensors'
     summary = 'two sensors are exchanged'
-    role = Role.SWAP
+    role = effect.Role.SWAP
 
 
 FREE = 1e3
@@ -47,7 +38,7 @@ FREE = 1e3
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameTerm(PoseTerm):
+class FrameTerm(effect.PoseTerm):
     """Holds a frame as a start and a step from it."""
 
     # (3, 3), rotation that theta's turn (its last three, rad) comes on top of, from the left.
@@ -69,16 +60,16 @@ class FrameTerm(PoseTerm):
         return np.asarray(turn.as_rotvec(degrees=True))
 
 
-class _Frame(PoseEffect):
+class _Frame(effect.PoseEffect):
     """Theta is a translation (m) and a turn (rad)."""
 
     typical = FREE  # nothing is known of the frame before
 
-    def at_frame(self, site: PoseSite, place: Array, turn: Array) -> PoseTerm:
+    def at_frame(self, site: effect.PoseSite, place: Array, turn: Array) -> effect.PoseTerm:
         """Return the frame with a turn of zero from a rotation matrix."""
         return FrameTerm(self, site, np.array([*place, 0, 0, 0]), start=turn)
 
-    def bounded(self, term: PoseTerm) -> PoseTerm:
+    def bounded(self, term: effect.PoseTerm) -> effect.PoseTerm:
         frame = _frame(term)
         return replace(frame, theta=np.array([*frame.translation, 0, 0, 0]), start=frame.rotation)
 
@@ -88,13 +79,15 @@ class OpticalFrame(_Frame):
 
     name = 'registration'
     summary = "the optical frame is not aligned with the tracker's"
-    role = Role.REGISTRATION
+    role = effect.Role.REGISTRATION
 
-    def framed(self, term: PoseTerm, sensor: str, frames: Frames) -> Frames:
+    def framed(self, term: effect.PoseTerm, sensor: str, frames: effect.Frames) -> effect.Frames:
         frame = _frame(term)
         return replace(frames, rotation=frame.rotation, translation=frame.translation)
 
-    def moved(self, before: PoseTerm, after: PoseTerm, middle: Array) -> EffectRecord:
+    def moved(
+        self, before: effect.PoseTerm, after: effect.PoseTerm, middle: Array
+    ) -> EffectRecord:
         """Record the turn, and the shift where the poses are.
 
         A turn about the far origin of a camera moves that by decimetres.
@@ -108,7 +101,7 @@ class OpticalFrame(_Frame):
         summary = 'tracker and reference have moved against each other since the watch began'
         return EffectRecord(self.name, values, {}, {'summary': summary})
 
-    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
+    def slopes(self, term: effect.PoseTerm, view: effect.PoseView) -> Array | None:
         """Return the derivative by a shift of all poses and a turn about the tracker's origin."""
         out = np.zeros((view.time.size, 6, 6))
         out[:, :3, :3] = np.eye(3)
@@ -122,15 +115,17 @@ class Mount(_Frame):
 
     name = 'hand_eye'
     summary = 'the two unknown frames; no effect, always fitted'
-    role = Role.MOUNT
+    role = effect.Role.MOUNT
 
-    def framed(self, term: PoseTerm, sensor: str, frames: Frames) -> Frames:
+    def framed(self, term: effect.PoseTerm, sensor: str, frames: effect.Frames) -> effect.Frames:
         if not term.acts_on(sensor):
             return frames
         frame = _frame(term)
         return replace(frames, mount=frame.rotation, lever=frame.translation)
 
-    def moved(self, before: PoseTerm, after: PoseTerm, middle: Array) -> EffectRecord:
+    def moved(
+        self, before: effect.PoseTerm, after: effect.PoseTerm, middle: Array
+    ) -> EffectRecord:
         """Record how far the sensor has moved on the body, as a mount that is loose."""
         first, last = _frame(before), _frame(after)
         values = {
@@ -141,7 +136,7 @@ class Mount(_Frame):
         summary = 'the sensor sits elsewhere on the body than when the watch began'
         return EffectRecord(LooseMount.name, values, {}, {'summary': summary})
 
-    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
+    def slopes(self, term: effect.PoseTerm, view: effect.PoseView) -> Array | None:
         """Return the derivative of this sensor's poses by shift and turn in the body's frame."""
         if not term.acts_on(view.sensor):
             return None
@@ -161,12 +156,12 @@ def _cross(vectors: Array) -> Array:
     return out
 
 
-def _frame(term: PoseTerm) -> FrameTerm:
+def _frame(term: effect.PoseTerm) -> FrameTerm:
     assert isinstance(term, FrameTerm)
     return term
 
 
-class PoseTimeOffset(NumberEffect):
+class PoseTimeOffset(effect.NumberEffect):
     """Applies the optical pose stamped t - theta at stamp t of a tracked pose, s."""
 
     name = 'time_offset'
@@ -175,23 +170,23 @@ class PoseTimeOffset(NumberEffect):
     units = {'offset_s': 's'}
     plausible = {'offset_s': (-3600.0, 3600.0)}  # a clock may be off by an hour of the day
     remedy = Remedy.OPTICAL
-    role = Role.OFFSET
+    role = effect.Role.OFFSET
     key = 'offset_s'
     typical = 0.3  # s: offsets are some tenths of a second
 
-    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
-        own = [PoseTerm(self, {'sensor': s}, np.zeros(1)) for s in setting.sensors]
-        return [PoseTerm(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
+    def sites(self, setting: effect.PoseSetting) -> Sequence[effect.PoseTerm]:
+        own = [effect.PoseTerm(self, {'sensor': s}, np.zeros(1)) for s in setting.sensors]
+        return [effect.PoseTerm(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
 
-    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
+    def slopes(self, term: effect.PoseTerm, view: effect.PoseView) -> Array | None:
         """Return minus the velocity of the predicted pose, or None for other sensors."""
         return -view.velocity[:, :, None] if term.acts_on(view.sensor) else None
 
-    def clock(self, term: PoseTerm, sensor: str, time: Array) -> Array:
+    def clock(self, term: effect.PoseTerm, sensor: str, time: Array) -> Array:
         return time - term.theta[0] if term.acts_on(sensor) else time
 
 
-class PoseClockRate(NumberEffect):
+class PoseClockRate(effect.NumberEffect):
     """Theta is the rate, 1e-3, by which the tracked clock gains on the optical one."""
 
     name = 'clock_rate'
@@ -202,26 +197,26 @@ class PoseClockRate(NumberEffect):
     units = {'rate_ppm': '1e-6'}
     plausible = {'rate_ppm': (-3e3, 3e3)}
     remedy = Remedy.OPTICAL
-    role = Role.RATE
+    role = effect.Role.RATE
     key, factor = 'rate_ppm', 1e3
     typical = 2.0  # rates err by some parts in a thousand
 
-    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
+    def sites(self, setting: effect.PoseSetting) -> Sequence[effect.PoseTerm]:
         middle = setting.start + 0.5 * setting.duration
-        return [PoseTerm(self, {'middle_s': middle}, np.zeros(1))]
+        return [effect.PoseTerm(self, {'middle_s': middle}, np.zeros(1))]
 
-    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
+    def slopes(self, term: effect.PoseTerm, view: effect.PoseView) -> Array | None:
         """Return minus the velocity, the more the farther from the session's middle."""
         apart = 1e-3 * (view.time - term.site['middle_s']) / (1 + 1e-3 * term.theta[0]) ** 2
         return np.asarray(-(view.velocity * apart[:, None])[:, :, None])
 
-    def clock(self, term: PoseTerm, sensor: str, time: Array) -> Array:
+    def clock(self, term: effect.PoseTerm, sensor: str, time: Array) -> Array:
         """Return the stamps, s, without what their clock gains: a rate of r makes times 1 + r."""
         middle = term.site['middle_s']
         return np.asarray(middle + (time - middle) / (1 + 1e-3 * term.theta[0]))
 
 
-class PoseOpticalScale(NumberEffect):
+class PoseOpticalScale(effect.NumberEffect):
     """Theta is the scale of the optical positions less one, in 1e-3."""
 
     name = 'optical_scale'
@@ -231,23 +226,23 @@ class PoseOpticalScale(NumberEffect):
     plausible = {'scale': (0.9, 1.1)}
     remedy = Remedy.OPTICAL
     blocks_in_space = True
-    role = Role.SCALE
+    role = effect.Role.SCALE
     key, base, factor = 'scale', 1.0, 1e-3
     typical = 30.0  # scales are off by some percent
 
-    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
-        return [PoseTerm(self, {}, np.zeros(1))]
+    def sites(self, setting: effect.PoseSetting) -> Sequence[effect.PoseTerm]:
+        return [effect.PoseTerm(self, {}, np.zeros(1))]
 
-    def is_scale(self, term: PoseTerm) -> bool:
+    def is_scale(self, term: effect.PoseTerm) -> bool:
         return True
 
-    def slopes(self, term: PoseTerm, view: PoseView) -> Array | None:
+    def slopes(self, term: effect.PoseTerm, view: effect.PoseView) -> Array | None:
         """Shrink positions towards the optical origin; the registration takes the rest."""
         out = np.zeros((view.time.size, 6, 1))
         out[:, :3, 0] = -1e-3 * view.optical @ view.frame.T / (1 + 1e-3 * term.theta[0])
         return out
 
-    def seen(self, term: PoseTerm, position: Array) -> Array:
+    def seen(self, term: effect.PoseTerm, position: Array) -> Array:
         return position / (1 + 1e-3 * float(term.theta[0]))
 
 
@@ -256,7 +251,7 @@ TAUS_S = (0.015, 0.03, 0.06, 0.12, 0.24)
 a delay, beyond a quarter nobody would work with the tracker."""
 
 
-class TrackerLag(NumberEffect):
+class TrackerLag(effect.NumberEffect):
     """Theta is the time constant, s, of a first-order low pass on position and rotation.
 
     To first order a filter is a delay, so only its smoothing distinguishes it from one: it has no
@@ -269,19 +264,19 @@ class TrackerLag(NumberEffect):
     units = {'tau_s': 's'}
     plausible = {'tau_s': (0.0, 1.0)}
     remedy = Remedy.NONE
-    role = Role.FILTER
+    role = effect.Role.FILTER
     key = 'tau_s'
     typical = 0.1  # s: lags are some tenths of a second
 
-    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
-        return [PoseTerm(self, {}, np.array([tau])) for tau in TAUS_S]
+    def sites(self, setting: effect.PoseSetting) -> Sequence[effect.PoseTerm]:
+        return [effect.PoseTerm(self, {}, np.array([tau])) for tau in TAUS_S]
 
-    def filter(self, term: PoseTerm, path: OpticalPath) -> OpticalPath:
+    def filter(self, term: effect.PoseTerm, path: OpticalPath) -> OpticalPath:
         return filtered(path, float(term.theta[0]), 'two_sided' in term.site)
 
-    def rival(self, term: PoseTerm) -> PoseTerm:
+    def rival(self, term: effect.PoseTerm) -> effect.PoseTerm:
         """Return the same smoothing without a sense of time."""
-        return PoseTerm(self, {'two_sided': True}, term.theta)
+        return effect.PoseTerm(self, {'two_sided': True}, term.theta)
 
 
 EFFECTS = (

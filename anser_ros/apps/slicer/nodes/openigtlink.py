@@ -237,19 +237,18 @@ WATCH_PERIOD_S = 0.05
 @dataclass(frozen=True)
 class OpenIGTLinkParameters:
     host: str = parameter('127.0.0.1', 'address to listen on; 0.0.0.0 lets other machines in')
-    port: int = parameter(OPENIGTLINK, 'TCP port, 0 for a free one', minimum=0, maximum=65535)
+    port: int = parameter(OPENIGTLINK, 'TCP port, 0 for a free one', within=(0, 65535))
     stale_after_s: float = parameter(
         STALE_AFTER_S,
         'time without a pose after which a sensor is reported, s',
-        minimum=0.02,
+        within=(0.02, math.inf),
         live=True,
     )
     version: int = parameter(
         1,
         'version of the headers for a client that has sent nothing; 2 has TransformStatus, and '
         'is read by OpenIGTLink 3 only; a client that sends version 2 gets version 2',
-        minimum=1,
-        maximum=2,
+        within=(1, 2),
     )
     body_name: str = parameter(
         '{body}', "name of a body's device, 20 characters; e.g. {body}ToTracker"
