@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from anser_ros.wire.bag import Salvage, iter_messages
-from anser_ros.wire.bag_folder import BagFolder, Limits, Message, Ring, Topic, make_room
+from anser_ros.wire.bag_folder import BagFolder, Message, Ring, Topic, make_room
 from anser_ros.wire.bag_writer import qos_profile
 from anser_ros.wire.cdr import DEFINITIONS, string_bytes
 
@@ -27,9 +27,9 @@ def seen(messages):
     return [(m.topic.name, m.log_time_ns / SECOND) for m in messages]
 
 
-@pytest.mark.parametrize('limits', [Limits(duration_s=2.0), Limits(size_bytes=3000)])
+@pytest.mark.parametrize('limits', [{'max_duration_s': 2.0}, {'max_bytes': 3000}])
 def test_each_file_of_a_split_bag_has_what_is_latched(tmp_path, limits):
-    bag = BagFolder(tmp_path / 'bag', 'jazzy', limits)
+    bag = BagFolder(tmp_path / 'bag', 'jazzy', **limits)
     for of in (SETUP, POSE):
         bag.add_topic(of)
     bag.write(message(SETUP, 0.0, 'schema'))

@@ -5,6 +5,7 @@ the node subscribes to topics as they appear.
 """
 
 import importlib
+import math
 import os
 import statistics
 import struct
@@ -28,7 +29,7 @@ from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, tra
 from anser_ros.nodes.runtime.process import main
 from anser_ros.pose_states import FRAMES_IN, OK
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.bag_folder import SNAPSHOT, BagFolder, Limits, Message, Ring, Topic, make_room
+from anser_ros.wire.bag_folder import SNAPSHOT, BagFolder, Message, Ring, Topic, make_room
 from anser_ros.wire.bag_writer import BagRecord, qos_profile
 
 # What rosbag2 and mcap put between the definitions of a message and of its parts.
@@ -216,6 +217,9 @@ STAMPED = (
 )
 
 
+FROM_0 = 0, math.inf
+
+
 @dataclass(frozen=True)
 class RecorderParameters:
     directory: str = parameter('recordings', 'folder that gets one folder per bag')
@@ -234,23 +238,19 @@ class RecorderParameters:
         'last parts of names of topics that are not recorded; the default takes 100 kB each '
         'time that metal moves, and evaluate computes it from the fluxes',
     )
-    max_bagfile_size: int = parameter(
-        0, 'size at which a bag goes on in a new file, bytes; 0: never', minimum=0
-    )
+    max_bagfile_size: int = parameter(0, 'size of a file of a bag, bytes; 0: any', within=FROM_0)
     max_bagfile_duration: float = parameter(
-        0.0, 'duration at which a bag goes on in a new file, s; 0: never', minimum=0.0
+        0.0, 'duration of a file of a bag, s; 0: any', within=FROM_0
     )
     snapshot_duration: float = parameter(
-        60.0, 'seconds before a fault that a snapshot holds; 0: no snapshots', minimum=0.0
+        60.0, 'seconds before a fault in a snapshot; 0: no snapshots', within=FROM_0
     )
-    snapshot_duration_after: float = parameter(
-        5.0, 'seconds after a fault that a snapshot holds', minimum=0.0
-    )
+    snapshot_duration_after: float = parameter(5.0, 'seconds after a fault in it', within=FROM_0)
     max_cache_size: int = parameter(
-        100 * 2**20, 'most memory for the seconds before a fault, bytes', minimum=0
+        100 * 2**20, 'most memory for the seconds before a fault, bytes', within=FROM_0
     )
     max_total_storage_mb: float = parameter(
-        500.0, 'most that snapshots may take on disk, MB: the oldest are removed', minimum=0.0
+        500.0, 'most disk for snapshots, MB: the oldest are removed', within=FROM_0
     )
 
 
@@ -306,9 +306,10 @@ class Recorder(AnserNode):
         Raises `BagError`: the bag cannot be made.
         """
         folder = self._new_folder(self.parameters.name or time.strftime('anser_%Y%m%d_%H%M%S'))
-        limits = Limits(self.parameters.max_bagfile_size, self.parameters.max_bagfile_duration)
-        self._error = ''
-        self._bag = BagFolder(folder, ROS_DISTRO, limits)
+        table, self._error = self.parameters, ''
+        self._bag = BagFolder(
+            folder, ROS_DISTRO, table.max_bagfile_size, table.max_bagfile_duration
+        )
         self._logs = {name: TopicLog(max(log.n_publishers, 1)) for name, log in self._logs.items()}
         self._fill(self._bag, self._ring.latched(time.time_ns()))
         self.get_logger().info(f'recording to {folder}')
@@ -328,28 +329,35 @@ class Recorder(AnserNode):
         self.get_logger().info('\n    '.join((self._last_report, *faults)))
         return self._last_report
 
-    def snapshot(self, why: str) -> Path:
-        """Begin a bag of the last seconds, which those after now are added to; return its folder.
+    def snapshot(self, why: str) -> tuple[bool, str]:
+        """Begin a bag of the last seconds, which those after now are added to.
 
-        One that is being written is the answer too. Raises `BagError` and OSError: it cannot be
-        written.
+        Returns whether there is one, and its folder or what hinders it; one that is being written
+        is the answer too.
         """
-        if self._snapshot is not None:
-            return self._snapshot.path
-        directory = Path(self.parameters.directory).expanduser()
+        if self._snapshot is None:
+            try:
+                self._begin_snapshot(Path(self.parameters.directory).expanduser(), why)
+            except (BagError, OSError) as error:
+                self._end_snapshot()
+                self.warn('snapshot_errors', _reason(error))
+                return False, _reason(error)
+        assert self._snapshot is not None
+        return True, str(self._snapshot.path)
+
+    def _begin_snapshot(self, directory: Path, why: str) -> None:
         most_mb = self.parameters.max_total_storage_mb
         # The new one has at most as much as the memory, as what is written is compressed.
         removed = make_room(directory, round(most_mb * 1e6) - self._ring.bytes)
         if removed:
             names = ', '.join(folder.name for folder in removed)
             self.get_logger().warning(f'more than {most_mb:g} MB of snapshots: {names} removed')
-        bag = BagFolder(self._new_folder(time.strftime(f'{SNAPSHOT}%Y%m%d_%H%M%S')), ROS_DISTRO)
-        self._snapshot = bag
-        self._fill(bag, self._ring.take(time.time_ns()))
+        folder = self._new_folder(time.strftime(f'{SNAPSHOT}%Y%m%d_%H%M%S'))
+        self._snapshot = BagFolder(folder, ROS_DISTRO)
+        self._fill(self._snapshot, self._ring.take(time.time_ns()))
         self._snapshot_ends_s = time.monotonic() + self.parameters.snapshot_duration_after
         self.count('snapshots')
-        self.get_logger().warning(f'snapshot to {bag.path}: {why}')
-        return bag.path
+        self.get_logger().warning(f'snapshot to {folder}: {why}')
 
     def _fill(self, bag: BagFolder, messages: list[Message]) -> None:
         for topic in self._topics.values():
@@ -384,24 +392,14 @@ class Recorder(AnserNode):
         return response
 
     def _on_snapshot(self, _request: Any, response: Any) -> Any:
-        """As rosbag2's service of that name."""
-        try:
-            response.message, response.success = str(self.snapshot('asked for')), True
-        except (BagError, OSError) as error:
-            self._end_snapshot()
-            response.message = _reason(error)
+        response.success, response.message = self.snapshot('asked for')
         return response
 
     def _look(self, data: bytes) -> None:
         """Take a message of /diagnostics, and begin a snapshot on a fault."""
         fault = self._faults.look(statuses_in(deserialize_message(data, DiagnosticArray)))
-        if not fault or not self.parameters.snapshot_duration:
-            return
-        try:
+        if fault and self.parameters.snapshot_duration:
             self.snapshot(fault)
-        except (BagError, OSError) as error:
-            self._end_snapshot()
-            self.warn('snapshot_errors', _reason(error))
 
     def _flush(self) -> None:
         if self._snapshot is not None and time.monotonic() >= self._snapshot_ends_s:

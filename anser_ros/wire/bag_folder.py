@@ -6,7 +6,6 @@ Names are those of rosbag2: `max_bagfile_size`, `max_bagfile_duration`, `max_cac
 import shutil
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,24 +102,19 @@ class Ring:
         self._before.add(message)
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Says when a bag goes on in a new file; 0 for never."""
-
-    size_bytes: int = 0
-    duration_s: float = 0.0
-
-
 class BagFolder:
     """Writes one bag: a folder with files NAME_0.mcap, NAME_1.mcap and their ``metadata.yaml``.
 
-    Each file begins with what latched topics said last, so that it can be read alone. Raises
-    `BagError`: a file cannot be made; OSError: it cannot be written.
+    A file with so many bytes or seconds, if that is not 0, is followed by another. Each begins
+    with what latched topics said last, so that it can be read alone. Raises `BagError`: a file
+    cannot be made; OSError: it cannot be written.
     """
 
-    def __init__(self, path: Path, ros_distro: str, limits: Limits | None = None) -> None:
-        self.path = path
-        self._distro, self._limits = ros_distro, limits or Limits()
+    def __init__(
+        self, path: Path, ros_distro: str, max_bytes: int = 0, max_duration_s: float = 0.0
+    ) -> None:
+        self.path, self._distro = path, ros_distro
+        self._max_bytes, self._max_duration_s = max_bytes, max_duration_s
         self._files: dict[str, BagRecord] = {}
         self._topics: list[Topic] = []
         self._channels: dict[str, int] = {}
@@ -153,9 +147,9 @@ class BagFolder:
     def flush(self) -> None:
         """Hand all messages to the system, and go on in a new file where this one is full."""
         self._bag.flush()
-        record, size = self._bag.record, self._limits.size_bytes
-        is_long = 0 < self._limits.duration_s <= record.duration_s
-        if is_long or 0 < size <= self._bag.path.stat().st_size:
+        record = self._bag.record
+        is_long = 0 < self._max_duration_s <= record.duration_s
+        if is_long or 0 < self._max_bytes <= self._bag.path.stat().st_size:
             self._bag.close()
             self._open()
             for message in list(self._latched.at(record.last_ns)):
