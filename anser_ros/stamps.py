@@ -1,6 +1,7 @@
 """Converts stamps: whole nanoseconds, from a ROS message and back, and what makes them seconds."""
 
 import struct
+import time
 from datetime import UTC, datetime
 from enum import Enum
 from typing import Any
@@ -91,7 +92,8 @@ def stamp_fault(first_ns: int, last_ns: int) -> str:
     words = f'times of {day:%Y-%m-%d}, beyond what a ROS stamp holds (2038-01-19)'
     for name, start_s in EPOCHS.items():
         start_ns = start_s * SECOND_NS
-        if first_ns + start_ns >= RECENT_NS and last_ns + start_ns <= LATEST_NS:
+        # What was recorded was not recorded later than now.
+        if first_ns + start_ns >= RECENT_NS and last_ns + start_ns <= time.time_ns():
             remedy = f'start_ns: {start_ns}, or import_poses --shift {start_s}'
             return f'{words}: seconds since {name}? {remedy}'
     return f'{words}; they cannot be stamps of a bag: is the unit of time right?'

@@ -2,7 +2,10 @@
 
 ros2 launch anser_ros anser.launch.py device:=/dev/ttyACM0 setup:=my_setup.yaml
 ros2 launch anser_ros anser.launch.py simulate:=true baseline:=clean.mcap openigtlink:=true
+ros2 launch anser_ros anser.launch.py replay:=recordings/scan model:=my_model.yaml
 """
+
+from pathlib import Path
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction, OpaqueFunction, Shutdown
@@ -14,6 +17,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from anser_ros.apps.dashboard.extension import LIVE_VIEW
 from anser_ros.apps.slicer.extension import OPENIGTLINK
 from anser_ros.cli.commands import NODES
+from anser_ros.errors import BagError
 from anser_ros.nodes.runtime.parameters import checked
 from anser_ros.wire.text_files import config_path
 
@@ -34,10 +38,11 @@ ARGUMENTS = {
     'baseline': ('', 'distortion-free recording of the board; empty: call set_baseline'),
     'board_seed': ('0', "the simulated unit's board: 0 as drawn, 1 that of demo_model.yaml"),
     'simulate': ('false', 'whether a simulated control unit replaces the real one'),
+    'replay': ('', 'bag that is played in place of a control unit'),
     'composed': ('false', 'whether acquisition, field model and tracker are one process, live'),
     'optical': ('/optical', 'namespace of the optical poses'),
     'frame_prefix': ('', 'prefix of the frames of poses and of /tf'),
-    'record': ('true', 'whether a bag is recorded'),
+    'record': ('', 'whether a bag is recorded; by default true, but for a replay'),
     'directory': ('recordings', 'folder of the bags'),
     'watch': ('false', 'whether effects that the model lacks are reported in /diagnostics'),
     'dashboard': ('false', 'whether the live view is served to a browser on this machine'),
@@ -63,6 +68,16 @@ def find_files(context):
     # As IfCondition reads it.
     is_simulated = given['simulate'].lower() in ('true', '1')
     given['allow_uncalibrated'] = given['allow_uncalibrated'] or str(is_simulated).lower()
+    is_played = bool(given['replay'])
+    if is_played:
+        bag = Path(given['replay']).expanduser().absolute()
+        if not bag.exists():
+            raise BagError(f'{bag}: no such bag')
+        given.update(replay=str(bag), simulate='false', composed='false')
+    given['record'] = given['record'] or str(not is_played).lower()
+    given['is_played'] = str(is_played).lower()
+    is_apart = given['composed'].lower() not in ('true', '1')
+    given['is_acquired'] = str(is_apart and not is_played).lower()
     if not given['device']:
         simulated = SIMULATED.format(namespace=given['namespace'].strip('/').replace('/', '_'))
         given['device'] = simulated if is_simulated else DEVICE
@@ -75,7 +90,7 @@ def end_all_if_refused(event, context):
     return [Shutdown(reason=f'{event.process_name} refuses what it was given, see its line')]
 
 
-def process(name, condition=None, **parameters):
+def process(name, condition=None, arguments=(), **parameters):
     """Return a process with the common parameter file, and values that override it.
 
     It is not given a name: that of `live` would be each of its nodes'.
@@ -85,6 +100,7 @@ def process(name, condition=None, **parameters):
         package=PACKAGE,
         executable=name,
         parameters=[common, parameters] if parameters else [common],
+        arguments=list(arguments),
         condition=condition,
         output='screen',
         emulate_tty=True,
@@ -107,6 +123,7 @@ def generate_launch_description():
         'baseline_file': ParameterValue(value('baseline'), value_type=str),
         'allow_uncalibrated': ParameterValue(value('allow_uncalibrated'), value_type=bool),
     }
+    optical = {'optical': value('optical')}
     prefix = {'frame_prefix': ParameterValue(value('frame_prefix'), value_type=str)}
     return LaunchDescription(
         [
@@ -123,7 +140,7 @@ def generate_launch_description():
                         wanted('simulate'),
                         link=value('device'),
                         board_seed=value('board_seed'),
-                        optical=value('optical'),
+                        **optical,
                         **board,
                     ),
                     process(
@@ -135,23 +152,19 @@ def generate_launch_description():
                         **baseline,
                         **prefix,
                     ),
-                    process('acquisition', apart, device=value('device'), **board),
+                    process('replay', wanted('is_played'), [value('replay')], **optical),
+                    process('acquisition', wanted('is_acquired'), device=value('device'), **board),
                     process('field_model', apart, **model, **baseline),
                     process('tracker', apart, **model, **prefix),
-                    process(
-                        'recorder',
-                        wanted('record'),
-                        directory=value('directory'),
-                        optical=value('optical'),
-                    ),
+                    process('recorder', wanted('record'), directory=value('directory'), **optical),
                     process(
                         'dashboard',
                         wanted('dashboard'),
                         directory=value('directory'),
-                        optical=value('optical'),
+                        **optical,
                         port=value('dashboard_port'),
                     ),
-                    process('watcher', wanted('watch'), optical=value('optical'), **model),
+                    process('watcher', wanted('watch'), **optical, **model),
                     process(
                         'openigtlink',
                         wanted('openigtlink'),

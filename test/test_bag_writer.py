@@ -188,7 +188,7 @@ class TestFullDisk:
 def test_metadata_is_what_rosbag2_reads(tmp_path):
     qos = [qos_profile(latched=True)]
     topic = TopicRecord('/anser/setup', 'std_msgs/msg/String', 'RIHS01_00', qos, 3)
-    write_metadata(tmp_path / 'a_0.mcap', BagRecord({1: topic}, 3, 100, 600), 'jazzy')
+    write_metadata(tmp_path, {'a_0.mcap': BagRecord({1: topic}, 3, 100, 600)}, 'jazzy')
     text = (tmp_path / 'metadata.yaml').read_text()
     assert '&' not in text
     info = yaml.safe_load(text)['rosbag2_bagfile_information']

@@ -61,7 +61,7 @@ def check_parameter_file(document):
 @pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
 def test_every_node_and_key_is_known_and_setups_are_valid(path):
     document = yaml.safe_load(path.read_text())
-    if is_parameter_file(document):
+    if path.name != 'diagnostics.yaml' and is_parameter_file(document):
         check_parameter_file(document)
     elif str(document.get('schema', '')).startswith('anser_setup'):
         parse_setup(path.read_text())
@@ -79,6 +79,17 @@ def test_every_node_and_key_is_known_and_setups_are_valid(path):
 def test_what_rclpy_would_drop_is_found(document, said):
     with pytest.raises(ParameterError, match=said):
         check_parameter_file(document)
+
+
+def test_every_node_has_its_group_in_the_aggregated_diagnostics():
+    document = yaml.safe_load((CONFIG / 'diagnostics.yaml').read_text())
+    groups = document['/**']['ros__parameters']
+    assert groups.pop('path') == 'Anser'
+    found = sorted(name for group in groups.values() for name in group['contains'])
+    assert found == sorted(f'/{name}' for name in NODES)
+    assert {group['type'] for group in groups.values()} == {
+        'diagnostic_aggregator/GenericAnalyzer'
+    }
 
 
 def test_the_main_file_is_as_it_is_written():
@@ -154,6 +165,19 @@ def test_a_simulated_unit_has_a_port_that_anybody_may_make(launched):
     first, second = (launched(simulate='true', namespace=name) for name in ('anser', '/or/two'))
     assert first['device'] == '/tmp/anser_cu_anser' and second['device'] == '/tmp/anser_cu_or_two'
     assert launched(simulate='true', device='mine')['device'] == 'mine'
+
+
+def test_a_bag_is_played_in_place_of_a_control_unit(launched, tmp_path):
+    (tmp_path / 'scan').mkdir()
+    played = launched(replay='scan', simulate='true', composed='true')
+    assert played['replay'] == str(tmp_path / 'scan')
+    wanted = 'is_played', 'is_acquired', 'simulate', 'composed', 'record'
+    assert [played[name] for name in wanted] == ['true', 'false', 'false', 'false', 'false']
+    assert launched(replay='scan', record='true')['record'] == 'true'
+    assert [launched()[name] for name in wanted] == ['false', 'true', 'false', 'false', 'true']
+    assert launched(composed='true')['is_acquired'] == 'false'
+    with pytest.raises(AnserError, match='nowhere: no such bag'):
+        launched(replay='nowhere')
 
 
 def test_a_parameter_file_and_a_model_are_taken_from_here_or_from_the_package(launched, tmp_path):

@@ -6,10 +6,12 @@ import signal
 import subprocess
 import time
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 import yaml
 from conftest import ask, diagnostics, spin_until, wait
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
@@ -17,7 +19,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import BagError
-from anser_ros.nodes.recorder import TopicLog, definition, message_class, report
+from anser_ros.nodes.recorder import Faults, TopicLog, definition, message_class, report
+from anser_ros.nodes.runtime.diagnostics import LastStatus, Level, Status, diagnostic_array
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_writer import BagRecord
 from anser_ros.wire.cdr import DEFINITIONS
@@ -159,6 +162,73 @@ def test_services_start_and_stop_and_no_bag_is_written_over(start, source, tmp_p
     assert (tmp_path / 'bag_1' / 'bag_1_0.mcap').is_file()
     assert (tmp_path / 'bag_2' / 'bag_2_0.mcap').is_file()
     assert (tmp_path / 'bag' / 'bag_0.mcap').read_bytes() == b'precious'
+
+
+def test_a_fault_leaves_a_bag_of_the_seconds_around_it(start, source, tmp_path):
+    """Not a node that lacks much at its start, nor another system's; with what was latched."""
+    reports = source.create_publisher(DiagnosticArray, '/diagnostics', 10)
+
+    def report(*statuses):
+        time = source.get_clock().now().to_msg()
+        reports.publish(diagnostic_array('anser/tracker', statuses, time))
+
+    options = 'autostart:=false', 'snapshot_duration:=30.0', 'snapshot_duration_after:=1.0'
+    process = begin(start, source, tmp_path, *options)
+    assert spin_until(source, lambda: reports.get_subscription_count() == 1)
+    report(Status('', Level.WARN, 'no setup yet'), Status('tip', Level.STALE, 'stale'))
+    for _ in range(20):
+        source.send()
+        report(Status('', Level.OK, '1 of 1 tracked'), Status('tip', Level.OK, 'ok'))
+        time.sleep(0.02)
+    assert not list(tmp_path.glob('snapshot_*'))
+    report(Status('tip', Level.WARN, 'residual'))
+
+    def there():
+        for path in tmp_path.glob('snapshot_*/metadata.yaml'):
+            info = yaml.safe_load(path.read_text())['rosbag2_bagfile_information']
+            if info['custom_data']['closed'] == 'true':
+                return path.parent
+        return None
+
+    sent = source.sent
+    assert wait(there, lambda: (source.send(), time.sleep(0.02)))
+    messages = list(iter_messages(there(), Salvage()))
+    topics = [message.topic for message in messages]
+    assert topics.count('/anser/setup') == 1
+    assert topics.count('/optical/tool_a/pose') > sent == 20, 'those after it, too'
+    assert 'anser/tracker: tip: residual' in process.output
+    asked = call(source, '/anser/recorder/snapshot')
+    assert asked.success and asked.message.startswith(str(tmp_path / 'snapshot_'))
+    assert process.interrupt() == 0
+    assert sum('/setup' in m.topic for m in iter_messages(Path(asked.message), Salvage())) == 1
+
+
+class TestFaults:
+    @pytest.mark.parametrize(
+        ('before', 'now', 'words'),
+        [
+            ({'n: tip': (0, 'ok', {})}, {'n: tip': (1, 'no_signal', {})}, 'anser/n: tip: no_sig'),
+            ({'n: tip': (3, 'stale', {})}, {'n: tip': (1, 'no_signal', {})}, ''),
+            ({'n: tip': (0, 'ok', {'frames_residual': '1', 'frames_ok': '5'})},
+             {'n: tip': (0, 'ok', {'frames_residual': '2', 'frames_ok': '9'})}, 'anser/n: tip'),
+            ({'n: tip': (0, 'ok', {'frames_ok': '5'})},
+             {'n: tip': (0, 'ok', {'frames_ok': '9'})}, ''),
+            ({}, {'n': (1, 'no setup', {}), 'n: tip': (3, 'stale', {})}, ''),
+            ({'n': (1, 'found', {})}, {'n: metal': (1, 'new', {})}, 'anser/n: metal: new'),
+            ({'n': (0, 'ok', {})}, {'n': (3, 'ended', {})}, ''),
+            ({'recorder': (0, 'ok', {})}, {'recorder': (2, 'full', {})}, ''),
+        ],
+    )  # fmt: skip
+    def test_what_is_one(self, before, now, words):
+        faults = Faults('/anser', 'recorder')
+        for statuses, expected in ((before, ''), (now, words)):
+            given = {f'anser/{name}': LastStatus(*one) for name, one in statuses.items()}
+            assert (faults.look(given) or ' ').startswith(expected or ' ')
+        foreign = Faults('/other', 'recorder')
+        assert not any(
+            foreign.look({f'anser/{name}': LastStatus(*one) for name, one in statuses.items()})
+            for statuses in (before, now)
+        )
 
 
 def test_a_full_disk_ends_only_the_recording(start, source, small_disk):

@@ -2,7 +2,9 @@
 
 import io
 import json
+import runpy
 import sys
+from unittest.mock import MagicMock
 
 import pytest
 import yaml
@@ -182,6 +184,41 @@ def test_another_board_in_another_namespace(tmp_path, capsys):
     assert manager['Global Options']['Fixed Frame'] == 'left_fg'
     grid = manager['Displays'][0]
     assert grid['Plane Cell Count'] * grid['Cell Size'] == pytest.approx(0.5)
+
+
+def test_the_scene_of_slicer_hides_a_tool_without_a_pose(tmp_path, monkeypatch):
+    """Run with stand-ins of Slicer's modules, which are not here."""
+    (tmp_path / 'two.yaml').write_text(TWO_TOOLS)
+    command = ['views', str(tmp_path / 'two.yaml'), '--out', str(tmp_path), '--slicer']
+    assert main(command) == 0
+    modules = {name: MagicMock() for name in ('qt', 'slicer', 'vtk')}
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    slicer = modules['slicer']
+    slicer.mrmlScene.AddNewNodeByClass.side_effect = lambda *_: MagicMock()
+    scene = runpy.run_path(str(tmp_path / 'slicer_view.py'))
+    devices = {device.name: device for device in scene['anser_devices']}
+    assert list(devices) == ['pen', 'probe', 'pen/tip', 'probe/0/x', 'probe/0/z']
+    slicer.mrmlScene.AddNewNodeByClass.assert_called_with('vtkMRMLIGTLConnectorNode', 'anser')
+    pen, model, other = devices['pen'], MagicMock(), MagicMock()
+    model.GetTransformNodeID.return_value = pen.transform.GetID.return_value
+    slicer.util.getNodesByClass.return_value = [model, other]
+
+    def seen(state=None):
+        if state is not None:
+            pen.text.GetText.return_value = state
+            pen.on_state()
+        return model.SetDisplayVisibility.call_args.args[0]
+
+    pen.show()
+    assert not seen()
+    pen.on_pose()
+    assert not seen('no pose yet') and seen('ok') and not seen('residual')
+    assert slicer.util.showStatusMessage.call_args.args == ('pen: residual',)
+    assert seen('ok')
+    pen.on_silence()
+    assert not seen(), 'the connection may be gone'
+    other.SetDisplayVisibility.assert_not_called()
 
 
 def test_a_namespace_that_is_none(tmp_path, capsys):

@@ -37,6 +37,7 @@ DIALECTS = {
     'a blank behind the comma': text_of(', '),
     'quotes': text_of('","').replace('\n', '"\n"')[:-1].join(['"', '']),
     'CRLF': PLAIN.replace('\n', '\r\n'),
+    'bars': text_of('|'),
     'capitals': PLAIN.upper().replace('E-', 'e-'),
     'empty rows at the end': PLAIN + ',,,,,,,\n,,,,,,,\n\n',
     'a separator behind every row': PLAIN.replace('\n', ',\n'),
@@ -162,6 +163,15 @@ REFUSED = {
         rows_of('t,x,y,z,qx,qy,qz,qw', *((3842844800.5 + r[1], *r[1:]) for r in ROWS)),
         'since 1904 (LabVIEW)? start_ns: -2082844800000000000',
     ),
+    '1900': (
+        rows_of('t,x,y,z,qx,qy,qz,qw', *((3968988800.5 + r[1], *r[1:]) for r in ROWS)),
+        'since 1900 (NTP)? start_ns: -2208988800000000000',
+    ),
+    'days': (
+        rows_of('', *((739899.3 + 2.9e-7 * k, *r[1:]) for k, r in enumerate(ROWS)), separator=' '),
+        '2.9e-07 s apart: days (MATLAB, Excel)?',
+    ),
+    'a separator that is none': (text_of('~'), 'no row of numbers'),
     '1601': (
         rows_of('t,x,y,z,qx,qy,qz,qw', *((1.34e10 + 0.5 * k, *ROWS[k][1:]) for k in range(9))),
         'since 1601 (Windows)?',
@@ -234,6 +244,7 @@ def test_bodies_side_by_side_and_rows_that_are_no_pose(tmp_path):
 @pytest.mark.parametrize('text', [
     'x_mm,y_mm,z_mm\n0,0,0\n60,40,0\n', 'X_mm; Y_mm; Z_mm\n0,0;0,0;0,0\n60,0;40,0;0,0\n;;\n',
     'id,x (cm),y (cm),z (cm)\n1,0,0,0\n2,6,4,0\n', 'x\ty\tz\nmm\tmm\tmm\n0\t0\t0\n60\t40\t0\n',
+    'x_um,y_um,z_um\n0,0,0\n60000,40000,0\n',
     'x_mm\ty_mm\tz_mm\n\t0\t0\n60\t40\t0\n', 'x_mm,y_mm,z_mm\n"0,060",0,0\n60,40,0\n',
 ])  # fmt: skip
 def test_places_of_any_unit(tmp_path, text):

@@ -1,4 +1,4 @@
-"""Write the views of RViz and Foxglove for a setup: board, tools, coils, references, metal."""
+"""Write views of RViz, Foxglove, 3D Slicer for a setup: board, tools, coils, references, metal."""
 
 import argparse
 import copy
@@ -16,7 +16,7 @@ from anser_ros.wire.setup import SensorSpec, Setup, parse_setup, topic_of
 from anser_ros.wire.text_files import read_config
 
 SCHEMA = 'anser_views/1'
-RVIZ, FOXGLOVE = 'anser.rviz', 'foxglove_layout.json'
+RVIZ, FOXGLOVE, SLICER = 'anser.rviz', 'foxglove_layout.json', 'slicer_view.py'
 """Files that are written; those of `config/`, of the demo's setup, are also what is begun with."""
 CELL_M = 0.05
 """Side of a square of the grid that stands for the board, m: half a coil of the usual boards."""
@@ -30,10 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('setup', help='setup document: a path, or a file of config/')
     add_out(parser)
     parser.add_argument('--namespace', default='anser', help='of the nodes (%(default)s)')
-    words = 'namespace of the optical poses (%(default)s)'
-    parser.add_argument('--optical', default='/optical', help=words)
-    words = "the tracker's frame_prefix, if there are several boards"
-    parser.add_argument('--frame-prefix', default='', help=words)
+    parser.add_argument('--optical', default='/optical', help='namespace of the optical poses')
+    parser.add_argument('--frame-prefix', default='', help="the tracker's, for several boards")
+    words = 'also a scene of 3D Slicer that hides a tool without a pose'
+    parser.add_argument('--slicer', action='store_true', help=words)
     add_json(parser, 'the written files as JSON')
 
 
@@ -43,10 +43,12 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         raise ParameterError(f'{args.namespace!r} is not a namespace')
     setup = parse_setup(read_config(args.setup))
     make_folder(args.out)
-    frame = f'{args.frame_prefix}{setup.frame_id}'
-    topics = Topics(space, args.optical.rstrip('/'), frame)
+    topics = Topics(space, args.optical.rstrip('/'), f'{args.frame_prefix}{setup.frame_id}')
     rviz = yaml.safe_dump(rviz_view(setup, topics), sort_keys=False, allow_unicode=True)
-    written = write_files(args.out, {RVIZ: rviz, FOXGLOVE: foxglove_view(setup, topics)})
+    names = [name[-20:] for name in (*setup.bodies, *(s.name for s in setup.tool_sensors))]
+    scene = re.sub('(?m)^DEVICES = .*', f'DEVICES = {names}', read_config(SLICER))
+    views = {RVIZ: rviz, FOXGLOVE: foxglove_view(setup, topics)}
+    written = write_files(args.out, views | ({SLICER: scene} if args.slicer else {}))
     return Result({'schema': SCHEMA, 'files': list(map(str, written))}, written=written)
 
 
@@ -141,15 +143,13 @@ def foxglove_view(setup: Setup, topics: Topics) -> dict[str, Any]:
     shown |= {topics.optical(body): optical_style for body in setup.bodies}
     for sensor in setup.tool_sensors:
         shown[topics.pose(sensor.name)] = {**coil_style, 'visible': _is_shown(sensor, setup)}
-    shown[topics.own('field_model')] = model_style
-    shown[topics.own('reference/flux')] = reference_style
-    shown[topics.own('metal')] = {'visible': True}
-    scene['topics'] = shown
+    others = {'field_model': model_style, 'reference/flux': reference_style}
+    shown |= {topics.own(name): style for name, style in others.items()}
+    scene['topics'] = shown | {topics.own('metal'): {'visible': True}}
     plotted = bodies[0] if bodies else setup.tool_sensors[0].name
     panels['Plot!position']['title'] = f'Position of {plotted}'
-    for panel, ending in (
-        ('Plot!position', 'pose'), ('Plot!variance', 'pose_with_covariance'),
-    ):  # fmt: skip
+    plots = {'Plot!position': 'pose', 'Plot!variance': 'pose_with_covariance'}
+    for panel, ending in plots.items():
         for path in panels[panel]['paths']:
             field = path['value'].split('.', 1)[1]
             path['value'] = f'{topics.pose(plotted, ending)}.{field}'

@@ -5,6 +5,7 @@ the node subscribes to topics as they appear.
 """
 
 import importlib
+import math
 import os
 import statistics
 import struct
@@ -16,15 +17,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import AnserError, BagError
+from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, tracked_parameter
 from anser_ros.nodes.runtime.process import main
+from anser_ros.pose_states import FRAMES_IN, OK
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.bag_writer import BagRecord, BagWriter, qos_profile, write_metadata
+from anser_ros.wire.bag_folder import SNAPSHOT, BagFolder, Message, Ring, Topic, make_room
+from anser_ros.wire.bag_writer import BagRecord, qos_profile
 
 # What rosbag2 and mcap put between the definitions of a message and of its parts.
 SEPARATOR = '=' * 80
@@ -158,6 +164,44 @@ def report(
     return f'{text}; {words} (named in the log)', faults
 
 
+class Faults:
+    """Finds what has gone wrong between two messages of ``/diagnostics`` of one namespace."""
+
+    def __init__(self, namespace: str, own: str) -> None:
+        self._begin = f'{namespace}/'.lstrip('/')
+        self._own = self._begin + own  # what the recorder says of itself is no fault
+        self._last: dict[str, LastStatus] = {}
+
+    def look(self, statuses: Mapping[str, LastStatus]) -> str:
+        """Return the first fault in words; empty for none.
+
+        It is a fault when a node or a part that was fine is so no more, when a pose was withheld
+        meanwhile, and when a node finds something new.
+        """
+        faults = [
+            f'{name}: {now.message}'
+            for name, now in statuses.items()
+            if name.startswith(self._begin) and name != self._own and self._is_new(name, now)
+        ]
+        self._last.update(statuses)
+        return faults[0] if faults else ''
+
+    def _is_new(self, name: str, now: LastStatus) -> bool:
+        before = self._last.get(name)
+        if now.message == 'ended':
+            return False
+        if before is None:  # a node that starts lacks much
+            return now.level in (Level.WARN, Level.ERROR) and name.partition(': ')[0] in self._last
+        was_fine = before.level == Level.OK
+        return was_fine and (now.level != Level.OK or _withheld(now) > _withheld(before))
+
+
+def _withheld(status: LastStatus) -> int:
+    """Return in how many frames a pose was withheld."""
+    counts = {key: value for key, value in status.values.items() if key.startswith(FRAMES_IN)}
+    return sum(int(value) for key, value in counts.items() if key != f'{FRAMES_IN}{OK}')
+
+
 # How often new topics are looked for, s: what they say before they are found is lost.
 DISCOVERY_PERIOD_S = 0.25
 # How old metadata.yaml may be when the process is killed.
@@ -171,6 +215,9 @@ STAMPED = (
     'geometry_msgs/msg/PoseStamped',
     'geometry_msgs/msg/PoseWithCovarianceStamped',
 )
+
+
+FROM_0 = 0, math.inf
 
 
 @dataclass(frozen=True)
@@ -191,6 +238,20 @@ class RecorderParameters:
         'last parts of names of topics that are not recorded; the default takes 100 kB each '
         'time that metal moves, and evaluate computes it from the fluxes',
     )
+    max_bagfile_size: int = parameter(0, 'size of a file of a bag, bytes; 0: any', within=FROM_0)
+    max_bagfile_duration: float = parameter(
+        0.0, 'duration of a file of a bag, s; 0: any', within=FROM_0
+    )
+    snapshot_duration: float = parameter(
+        60.0, 'seconds before a fault in a snapshot; 0: no snapshots', within=FROM_0
+    )
+    snapshot_duration_after: float = parameter(5.0, 'seconds after a fault in it', within=FROM_0)
+    max_cache_size: int = parameter(
+        100 * 2**20, 'most memory for the seconds before a fault, bytes', within=FROM_0
+    )
+    max_total_storage_mb: float = parameter(
+        500.0, 'most disk for snapshots, MB: the oldest are removed', within=FROM_0
+    )
 
 
 class Recorder(AnserNode):
@@ -203,7 +264,12 @@ class Recorder(AnserNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._bag: BagWriter | None = None
+        self._bag: BagFolder | None = None
+        self._snapshot: BagFolder | None = None  # being written
+        self._snapshot_ends_s = 0.0
+        self._ring = Ring(self.parameters.snapshot_duration, self.parameters.max_cache_size)
+        self._faults = Faults(self.get_namespace(), self.NAME)
+        self._topics: dict[str, Topic] = {}
         self._logs: dict[str, TopicLog] = {}
         self._topic_subscriptions: dict[str, Any] = {}
         self._subscribe: dict[str, partial[Any]] = {}  # makes a subscription to a topic
@@ -212,6 +278,7 @@ class Recorder(AnserNode):
         self._described_s = 0.0
         self.create_service(Trigger, 'recorder/start', self._on_start)
         self.create_service(Trigger, 'recorder/stop', self._on_stop)
+        self.create_service(Trigger, 'recorder/snapshot', self._on_snapshot)
         clock = self.steady_clock
         self.create_timer(DISCOVERY_PERIOD_S, self._discover, clock=clock)
         self.create_timer(self.parameters.flush_period_s, self._flush, clock=clock)
@@ -225,7 +292,7 @@ class Recorder(AnserNode):
             return Status('', Level.OK, 'not recording', {'last': self._last_report})
         record = self._bag.record
         values = {
-            'bag': str(self._bag.path.parent),
+            'bag': str(self._bag.path),
             'messages': record.messages,
             'topics': len(record.topics),
             'duration_s': record.duration_s,
@@ -238,9 +305,13 @@ class Recorder(AnserNode):
 
         Raises `BagError`: the bag cannot be made.
         """
-        folder = self._new_folder()
-        self._error = ''
-        self._bag = BagWriter(folder / f'{folder.name}_0.mcap')
+        folder = self._new_folder(self.parameters.name or time.strftime('anser_%Y%m%d_%H%M%S'))
+        table, self._error = self.parameters, ''
+        self._bag = BagFolder(
+            folder, ROS_DISTRO, table.max_bagfile_size, table.max_bagfile_duration
+        )
+        self._logs = {name: TopicLog(max(log.n_publishers, 1)) for name, log in self._logs.items()}
+        self._fill(self._bag, self._ring.latched(time.time_ns()))
         self.get_logger().info(f'recording to {folder}')
         self._discover()
         return folder
@@ -250,22 +321,62 @@ class Recorder(AnserNode):
         bag, self._bag = self._bag, None
         if bag is None:
             return 'not recording'
-        for subscription in filter(None, self._topic_subscriptions.values()):
-            self.destroy_subscription(subscription)
-        self._topic_subscriptions.clear()
-        self._counts.clear()
         try:
             bag.close()
-            write_metadata(bag.path, bag.record, ROS_DISTRO)
         except OSError as error:
             self._error = self._error or _reason(error)
-        logs, self._logs = self._logs, {}
-        self._last_report, faults = report(bag.path.parent, bag.record, logs)
+        self._last_report, faults = report(bag.path, bag.record, self._logs)
         self.get_logger().info('\n    '.join((self._last_report, *faults)))
         return self._last_report
 
+    def snapshot(self, why: str) -> tuple[bool, str]:
+        """Begin a bag of the last seconds, which those after now are added to.
+
+        Returns whether there is one, and its folder or what hinders it; one that is being written
+        is the answer too.
+        """
+        if self._snapshot is None:
+            try:
+                self._begin_snapshot(Path(self.parameters.directory).expanduser(), why)
+            except (BagError, OSError) as error:
+                self._end_snapshot()
+                self.warn('snapshot_errors', _reason(error))
+                return False, _reason(error)
+        assert self._snapshot is not None
+        return True, str(self._snapshot.path)
+
+    def _begin_snapshot(self, directory: Path, why: str) -> None:
+        most_mb = self.parameters.max_total_storage_mb
+        # The new one has at most as much as the memory, as what is written is compressed.
+        removed = make_room(directory, round(most_mb * 1e6) - self._ring.bytes)
+        if removed:
+            names = ', '.join(folder.name for folder in removed)
+            self.get_logger().warning(f'more than {most_mb:g} MB of snapshots: {names} removed')
+        folder = self._new_folder(time.strftime(f'{SNAPSHOT}%Y%m%d_%H%M%S'))
+        self._snapshot = BagFolder(folder, ROS_DISTRO)
+        self._fill(self._snapshot, self._ring.take(time.time_ns()))
+        self._snapshot_ends_s = time.monotonic() + self.parameters.snapshot_duration_after
+        self.count('snapshots')
+        self.get_logger().warning(f'snapshot to {folder}: {why}')
+
+    def _fill(self, bag: BagFolder, messages: list[Message]) -> None:
+        for topic in self._topics.values():
+            bag.add_topic(topic)
+        for message in messages:
+            bag.write(message)
+        bag.flush()
+
+    def _end_snapshot(self) -> None:
+        bag, self._snapshot = self._snapshot, None
+        if bag is not None:
+            try:
+                bag.close()
+            except OSError as error:
+                self.warn('snapshot_errors', f'{bag.path}: {_reason(error)}')
+
     def close(self) -> None:
         self.stop_recording()
+        self._end_snapshot()
 
     # Callbacks ----------------------------------------------------------------------------
 
@@ -280,12 +391,24 @@ class Recorder(AnserNode):
         response.message = f'{self._error}; {words}' if self._error else words
         return response
 
+    def _on_snapshot(self, _request: Any, response: Any) -> Any:
+        response.success, response.message = self.snapshot('asked for')
+        return response
+
+    def _look(self, data: bytes) -> None:
+        """Take a message of /diagnostics, and begin a snapshot on a fault."""
+        fault = self._faults.look(statuses_in(deserialize_message(data, DiagnosticArray)))
+        if fault and self.parameters.snapshot_duration:
+            self.snapshot(fault)
+
     def _flush(self) -> None:
+        if self._snapshot is not None and time.monotonic() >= self._snapshot_ends_s:
+            self._end_snapshot()
         if self._bag is None:
             return
         try:
             self._bag.flush()
-        except OSError as error:
+        except (BagError, OSError) as error:
             self._error = _reason(error)
             self.count('write_errors')
             self.get_logger().error(f'recording stopped: {self._error}')
@@ -295,17 +418,15 @@ class Recorder(AnserNode):
         if time.monotonic() - self._described_s >= METADATA_PERIOD_S:
             self._describe(self._bag)
 
-    def _describe(self, bag: BagWriter) -> None:
+    def _describe(self, bag: BagFolder) -> None:
         """Write what the running bag holds so far, for whoever finds it after a crash."""
         self._described_s = time.monotonic()
         try:
-            write_metadata(bag.path, bag.record, ROS_DISTRO, is_closed=False)
+            bag.describe()
         except OSError as error:  # the next flush will stop the recording
             self.warn('metadata_errors', _reason(error))
 
     def _discover(self) -> None:
-        if self._bag is None:
-            return
         added = False
         for topic, type_names in self.get_topic_names_and_types():
             if topic in self._topic_subscriptions:
@@ -316,7 +437,7 @@ class Recorder(AnserNode):
                     self._match(topic)
             elif self._wanted(topic) and len(type_names) == 1:
                 added = self._add(topic, type_names[0]) or added
-        if added:
+        if added and self._bag is not None:
             self._describe(self._bag)
 
     def _wanted(self, topic: str) -> bool:
@@ -333,7 +454,7 @@ class Recorder(AnserNode):
         """Subscribe to one topic; return whether it is recorded from now on."""
         publishers = self.get_publishers_info_by_topic(topic)
         offered = [info.qos_profile for info in publishers]
-        if not offered or self._bag is None:
+        if not offered:
             return False  # only somebody who listens
         try:
             message, text = message_class(type_name), definition(type_name)
@@ -352,21 +473,30 @@ class Recorder(AnserNode):
         ]
         type_hash = str(publishers[0].topic_type_hash)
         known_hash = type_hash if type_hash.startswith('RIHS') else ''
-        channel = self._bag.add_topic(topic, type_name, text, profiles, known_hash)
-        log = self._logs[topic] = TopicLog(len(offered))
+        described = Topic(topic, type_name, text, profiles, known_hash)
+        self._topics[topic] = described
+        for bag in filter(None, (self._bag, self._snapshot)):
+            bag.add_topic(described)
+        self._logs[topic] = TopicLog(len(offered))
         is_stamped = type_name in STAMPED
 
         def write(data: bytes, info: dict[str, int]) -> None:
-            if self._bag is None:
-                return
             received_ns = info.get('received_timestamp') or time.time_ns()
-            self._bag.write(channel, received_ns, data, info.get('source_timestamp') or None)
+            self._take(Message(described, received_ns, data, info.get('source_timestamp') or None))
             stamp_ns = _stamp_ns(data) if is_stamped else None
-            log.add(info.get('publication_sequence_number'), stamp_ns)
+            self._logs[topic].add(info.get('publication_sequence_number'), stamp_ns)
 
         self._subscribe[topic] = partial(self.create_subscription, message, topic, write, raw=True)
         self._topic_subscriptions[topic] = self._subscribe[topic](qos_profile=_matching(offered))
         return True
+
+    def _take(self, message: Message) -> None:
+        """Put a message into the ring and into the bags that are open."""
+        self._ring.add(message)
+        for bag in filter(None, (self._bag, self._snapshot)):
+            bag.write(message)
+        if message.topic.name == '/diagnostics':
+            self._look(message.data)
 
     def _match(self, topic: str) -> None:
         """Subscribe anew where a publisher has come that the subscription does not match."""
@@ -378,9 +508,8 @@ class Recorder(AnserNode):
                 self.destroy_subscription(known)
                 self._topic_subscriptions[topic] = self._subscribe[topic](qos_profile=wanted)
 
-    def _new_folder(self) -> Path:
+    def _new_folder(self, name: str) -> Path:
         parent = Path(self.parameters.directory).expanduser()
-        name = self.parameters.name or time.strftime('anser_%Y%m%d_%H%M%S')
         folder, number = parent / name, 0
         while folder.exists():
             number += 1
@@ -407,8 +536,8 @@ def _stamp_ns(data: bytes) -> int | None:
     return int(sec) * SECOND_NS + int(nanosec)
 
 
-def _reason(error: OSError) -> str:
-    return error.strerror or type(error).__name__
+def _reason(error: Exception) -> str:
+    return getattr(error, 'strerror', None) or str(error) or type(error).__name__
 
 
 if __name__ == '__main__':

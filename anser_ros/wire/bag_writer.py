@@ -11,7 +11,7 @@ import contextlib
 import io
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -75,32 +75,54 @@ class BagRecord:
         return (self.last_ns - self.first_ns) * 1e-9
 
 
-def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bool = True) -> None:
-    """Write ``metadata.yaml`` of a folder with one MCAP file, which may not be closed yet."""
-    times = {
+def together(records: list[BagRecord]) -> BagRecord:
+    """Return what the files of a bag hold together."""
+    topics: dict[str, TopicRecord] = {}
+    for topic in (topic for record in records for topic in record.topics.values()):
+        before = topics.get(topic.name)
+        topics[topic.name] = replace(
+            topic, messages=topic.messages + (0 if before is None else before.messages)
+        )
+    full = [record for record in records if record.messages] or records[:1]
+    return BagRecord(
+        dict(enumerate(topics.values())),
+        sum(record.messages for record in records),
+        min(record.first_ns for record in full),
+        max(record.last_ns for record in full),
+    )
+
+
+def _times(record: BagRecord) -> dict[str, Any]:
+    return {
         'duration': {'nanoseconds': record.last_ns - record.first_ns},
         'starting_time': {'nanoseconds_since_epoch': record.first_ns},
         'message_count': record.messages,
     }
+
+
+def write_metadata(
+    folder: Path, files: Mapping[str, BagRecord], ros_distro: str, is_closed: bool = True
+) -> None:
+    """Write ``metadata.yaml`` of a folder with MCAP files, the last of which may not be closed."""
+    record = together(list(files.values()))
     document = {
         'rosbag2_bagfile_information': {
             'version': METADATA_VERSION,
             'storage_identifier': 'mcap',
-            **times,
+            **_times(record),
             'topics_with_message_count': [_topic(topic) for topic in record.topics.values()],
             'compression_format': '',
             'compression_mode': '',
-            'relative_file_paths': [path.name],
-            'files': [{'path': path.name, **times}],
+            'relative_file_paths': list(files),
+            'files': [{'path': name, **_times(record)} for name, record in files.items()],
             'custom_data': {'closed': 'true' if is_closed else 'false'},
             'ros_distro': ros_distro,
         }
     }
-    target = path.with_name('metadata.yaml')
-    draft = path.with_name('.metadata.yaml.new')
+    draft = folder / '.metadata.yaml.new'
     try:
         draft.write_text(plain_yaml(document), encoding='utf-8')
-        draft.replace(target)
+        draft.replace(folder / 'metadata.yaml')
     finally:
         draft.unlink(missing_ok=True)
 

@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 
 from anser_ros.errors import ParameterError
 
-LENGTH_M = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'inch': 0.0254}
+LENGTH_M = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'inch': 0.0254}
 """Metres in a unit of length."""
 TIME_NS = {'s': 1e9, 'ms': 1e6, 'us': 1e3, 'ns': 1.0}
 """Nanoseconds in a unit of time."""
 _WORDS = {
     'm': 'm meter meters metre metres', 'cm': 'cm centimeter centimeters centimetres',
     'mm': 'mm millimeter millimeters millimetre millimetres', 'inch': 'in inch inches',
+    'um': 'um μm micron microns micrometer micrometers micrometre micrometres',
     's': 's sec secs second seconds', 'ms': 'ms msec millisec milliseconds',
     'us': 'us usec microseconds', 'ns': 'ns nsec nanosec nanoseconds nsecs nanosecs',
     'deg': 'deg degree degrees', 'rad': 'rad radian radians',

@@ -24,7 +24,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.wire.table_names import LENGTH_M, is_unit, meaning_of, triples
 from anser_ros.wire.text_files import read_text
 
-SEPARATORS = ('\t', ';', ',', None)
+SEPARATORS = ('\t', ';', ',', '|', None)
 """Between cells, in the order in which they are preferred; None: any blanks."""
 COMMENTS = ('#', '%')
 TITLE_LINES = 60
@@ -116,7 +116,7 @@ def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
     name = os.fspath(path)
     text = read_text(path, any_letters=True)
     every = [(n, line.strip(' ')) for n, line in enumerate(text.splitlines(), 1)]
-    lines = [one for one in every if one[1].strip('\t ,;') and not one[1].startswith(COMMENTS)]
+    lines = [one for one in every if one[1].strip('\t ,;|') and not one[1].startswith(COMMENTS)]
     texts = [line for _, line in lines]
     if not lines:
         raise ParameterError(f'{name}: no rows')
@@ -188,7 +188,9 @@ def _find_rows(lines: list[str]) -> tuple[str | None, int]:
     usual = float(np.median([count(line, separator) for line in sample]))
     counts = [count(line, separator) for line in lines[:TITLE_LINES]]
     first = next((i for i, n in enumerate(counts) if n >= max(0.6 * usual, 1.0)), len(lines))
-    width = len(_cells(lines[first], separator)) if first < len(lines) else 0
+    if first == len(lines):
+        return separator, first
+    width = len(_cells(lines[first], separator))
     # Rows with gaps may come before the first whole one.
     while first and counts[first - 1] and len(_cells(lines[first - 1], separator)) == width:
         first -= 1

@@ -178,6 +178,9 @@ CALIBRATE, DIAGNOSE = 'calibrate', 'diagnose'
 SETTLING_S = 2.0
 """Time, s, after a change of the model that the figures after it leave out: warm starts and
 averages of before have their end in it."""
+PAUSE = 'poses pause until all nodes have taken it'
+TRACKED, DROP_PERCENT = 'tracked_percent', 10.0
+"""Key of the share of tracked frames, and how far, %, it may fall before Undo is offered."""
 
 
 class Found(NamedTuple):
@@ -191,6 +194,7 @@ class Found(NamedTuple):
     folder: Path
     words: str
     rows: tuple[tuple[str, str, str], ...]
+    passing: tuple[str, ...] = ()  # effects that belong to the time of the recording
 
     @property
     def model(self) -> Path:
@@ -244,14 +248,44 @@ class CorrectionLoop:
     def is_running(self) -> bool:
         return self.job is not None and self.job.exit_code is None
 
-    @property
-    def can_load(self) -> bool:
-        """Return whether there is a model to load that is not active."""
-        return self.found is not None and str(self.found.model) != self.model
+    def obstacles(self, status: Mapping[str, Any]) -> dict[str, str]:
+        """Return for each button why it cannot be used now, in words; empty where it can.
+
+        ``status`` is that of `ViewSource`.
+        """
+        found, recording = self.found, status['recording']
+        runs = 'a command is already running' if self.is_running else ''
+        command = runs or ('' if self.chosen else 'there is no recording yet')
+        return {
+            'record': 'it records already' if recording else _there(status, 'recorder'),
+            'stop': '' if recording else 'nothing is recorded',
+            'baseline': _there(status, 'field_model'),
+            'calibrate': command,
+            'diagnose': command,
+            'report': '' if found else 'nothing was calibrated or diagnosed yet',
+            'load': self._why_not_load(),
+            'undo': '' if self._loaded else 'no model was loaded from this page',
+        }
+
+    def _why_not_load(self) -> str:
+        if self.found is None:
+            return 'there is no model to load yet'
+        if self.found.passing:
+            names = ', '.join(self.found.passing)
+            return f'{names} belongs to the time of that recording and corrects no other'
+        return 'this model is active' if str(self.found.model) == self.model else ''
 
     @property
-    def can_undo(self) -> bool:
-        return bool(self._loaded)
+    def warning(self) -> str:
+        """Return that fewer frames are tracked since a model was loaded; empty otherwise."""
+        if not self._loaded:
+            return ''
+        last = self._loaded[-1]
+        before = last.figures.get(TRACKED)
+        now = self._live.figures(last.at_s + SETTLING_S).get(TRACKED)
+        if before is None or now is None or before - now < DROP_PERCENT:
+            return ''
+        return f'tracked frames fell from {before:.0f} to {now:.0f} % with this model: Undo?'
 
     @property
     def model_name(self) -> str:
@@ -293,14 +327,15 @@ class CorrectionLoop:
 
     @_step
     async def load(self) -> str:
-        if self.found is None:
-            raise ParameterError('there is no model to load yet')
+        why = self._why_not_load()
+        if self.found is None or why:
+            raise ParameterError(why)
         before = await self._chain.model_files()
         figures = self._live.figures(0.0)
         await self._exchange(before, dict.fromkeys(before, str(self.found.model)))
         self._loaded.append(Loaded(before, figures, time.time()))
         self._live.mark('model loaded')
-        return 'the new model is active'
+        return f'the new model is active; {PAUSE}'
 
     @_step
     async def undo(self) -> str:
@@ -309,7 +344,7 @@ class CorrectionLoop:
         await self._exchange(await self._chain.model_files(), self._loaded[-1].before)
         self._loaded.pop()
         self._live.mark('undone')
-        return 'the previous model is active again'
+        return f'the previous model is active again; {PAUSE}'
 
     def refresh_names(self) -> None:
         self.names = tuple(self.folder.recordings())
@@ -351,7 +386,7 @@ class CorrectionLoop:
             return
         document = json.loads((job.folder / f'{_NOUN[job.kind]}.json').read_text('utf-8'))
         words, rows = _READ[job.kind](document)
-        self.found = Found(job.kind, name, job.folder, words, rows)
+        self.found = Found(job.kind, name, job.folder, words, rows, _passing(document))
         self.message, self.is_trouble = f'{job.kind} {name}: done in {job.seconds:.0f} s', False
 
     async def _exchange(self, present: Mapping[str, str], wanted: Mapping[str, str]) -> None:
@@ -379,7 +414,7 @@ class CorrectionLoop:
 
 
 LIVE_ROWS = (
-    ('tracked frames, %', 'tracked_percent', 0),
+    ('tracked frames, %', TRACKED, 0),
     ('error, mm rms', 'error_mm', 2),
     ('residual, pT rms', 'residual_pt', 0),
 )
@@ -401,6 +436,19 @@ def _read_diagnosis(document: dict[str, Any]) -> tuple[str, tuple[tuple[str, str
         before, after = held[f'{key}_before_{unit}'], held[f'{key}_after_{unit}']
         rows.append((label, _text(before, digits, scale), _text(after, digits, scale)))
     return verdict(document), tuple(rows)
+
+
+def _there(status: Mapping[str, Any], node: str) -> str:
+    return '' if status[node] else f'no {node} runs'
+
+
+def _passing(document: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the effects that have a beginning, an end or a path in the recording's time."""
+    bound = 't_start_s', 't_end_s', 'path'
+    return tuple(
+        effect['name'] for effect in document.get('effects', ())
+        if any(key in effect['parameters'] for key in bound)
+    )  # fmt: skip
 
 
 def _read_calibration(document: dict[str, Any]) -> tuple[str, tuple[tuple[str, str, str], ...]]:

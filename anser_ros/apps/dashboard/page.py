@@ -11,7 +11,7 @@ from typing import Any
 from nicegui import app, ui
 from nicegui.element import Element
 
-from anser_ros.apps.dashboard.loop import CALIBRATE, CorrectionLoop
+from anser_ros.apps.dashboard.loop import CALIBRATE, PAUSE, CorrectionLoop
 from anser_ros.apps.dashboard.nodes.view_source import ViewSource
 from anser_ros.errors import AnserError
 
@@ -62,9 +62,9 @@ class Screen:
         loop = self._loop
         _heading('1  Record')
         with ui.element('div').classes('row'):
-            self._record = _button('Record', loop.record, 'fiber_manual_record')
-            self._stop = _button('Stop', loop.stop, 'stop')
-            self._baseline = _button('Set baseline', loop.set_baseline, 'flag').tooltip(
+            record = _button('Record', loop.record, 'fiber_manual_record')
+            stop = _button('Stop', loop.stop, 'stop')
+            baseline = _button('Set baseline', loop.set_baseline, 'flag').tooltip(
                 'No metal near: what the references read now is taken for undistorted'
             )
         _heading('2  Find what is wrong')
@@ -74,10 +74,10 @@ class Screen:
             )
             self._pick.classes('pick').mark('recordings')
         with ui.element('div').classes('row').style('margin-top:6px'):
-            self._calibrate = _button('Calibrate', loop.calibrate, 'tune').tooltip(
+            calibrate = _button('Calibrate', loop.calibrate, 'tune').tooltip(
                 'Fit a field model to this recording, which has optical poses'
             )
-            self._diagnose = _button('Diagnose', loop.diagnose, 'search').tooltip(
+            diagnose = _button('Diagnose', loop.diagnose, 'search').tooltip(
                 'Find what the active model lacks on this recording'
             )
             self._cancel = _button('Cancel', loop.cancel, 'close', flat=True)
@@ -87,9 +87,13 @@ class Screen:
         self._held_out = ui.html(sanitize=False).mark('held_out')
         _heading('3  Use it')
         with ui.element('div').classes('row'):
-            self._report = _button('Report', self._open_report, 'description')
-            self._load = _button('Load corrected model', loop.load, 'check')
-            self._undo = _button('Undo', loop.undo, 'undo')
+            report = _button('Report', self._open_report, 'description')
+            load = _button('Load corrected model', loop.load, 'check').tooltip(PAUSE)
+            undo = _button('Undo', loop.undo, 'undo')
+        self._buttons = {
+            'record': record, 'stop': stop, 'baseline': baseline, 'calibrate': calibrate,
+            'diagnose': diagnose, 'report': report, 'load': load, 'undo': undo,
+        }  # fmt: skip
         self._model = ui.label().classes('words path').mark('model')
         self._live = ui.html(sanitize=False).mark('live')
         _heading('Watcher')
@@ -160,16 +164,17 @@ class Screen:
             f'<div class="finding dot {LEVELS[level]}">{escape(words)}</div>'
             for level, words in status['findings']
         ))  # fmt: skip
-        self._once(self._record.set_enabled, status['recorder'] and not status['recording'])
-        self._once(self._stop.set_enabled, bool(status['recording']))
-        self._once(self._baseline.set_enabled, status['field_model'])
+        self._once(self._show_obstacles, self._loop.obstacles(status))
+
+    def _show_obstacles(self, obstacles: dict[str, str]) -> None:
+        for name, why in obstacles.items():
+            button = self._buttons[name]
+            button.set_enabled(not why)
+            button.props(f'title="{why.replace(chr(34), chr(39))}"')
 
     def _show_loop(self) -> None:
         loop, job, found = self._loop, self._loop.job, self._loop.found
         self._once(self._offer, (loop.names, loop.chosen))
-        ready = bool(loop.chosen) and not loop.is_running
-        self._once(self._calibrate.set_enabled, ready)
-        self._once(self._diagnose.set_enabled, ready)
         self._once(self._cancel.set_visibility, loop.is_running)
         self._once(self._progress.set_visibility, loop.is_running)
         message = loop.message
@@ -177,16 +182,14 @@ class Screen:
             known = not math.isnan(job.share)
             self._once(self._show_share, job.share if known else -1.0)
             message = f'{job.kind}: {job.stage or "begins"}, {job.seconds:.0f} s'
-        self._once(self._message.set_text, message)
-        self._once(self._show_trouble, loop.is_trouble)
+        warning = '' if loop.is_running else loop.warning
+        self._once(self._message.set_text, warning or message)
+        self._once(self._show_trouble, bool(warning) or loop.is_trouble)
         self._once(self._verdict.set_text, '' if found is None else found.words)
         self._once(self._verdict.set_visibility, found is not None)
         self._once(
             self._held_out.set_content, '' if found is None else _table('held out', found.rows)
         )
-        self._once(self._report.set_enabled, found is not None)
-        self._once(self._load.set_enabled, loop.can_load)
-        self._once(self._undo.set_enabled, loop.can_undo)
         self._once(self._model.set_text, f'active: {loop.model_name}' if loop.model else '')
         self._once(self._live.set_content, _table('live, last 10 s', loop.comparison()))
 

@@ -56,8 +56,8 @@ MOST_FALLS = 0.1
 """Share of times before the one above them from which a column is no time."""
 FARTHEST_M = 3.0
 """Median distance, m, from which on positions without a stated unit are not in metres."""
-LONGEST_INTERVAL_S = 2.0
-"""Interval of a tracker's poses, s, from which on times without a stated unit are no seconds."""
+SHORTEST_INTERVAL_S, LONGEST_INTERVAL_S = 1e-5, 2.0
+"""Intervals of a tracker's poses, s: outside them times without a stated unit are no seconds."""
 UNITS_OF_TIME = ((9e17, 2.2e18, 'ns'), (9e14, 2.2e15, 'us'), (9e11, 2.2e12, 'ms'))
 """What numbers must be whose name states no unit, by their range, if they count since 1970."""
 TITLE_LINES = 20  # lines that a program may write before its poses
@@ -261,6 +261,11 @@ def _check_times(path: Path, time: Array) -> None:
         raise ParameterError(
             f'{path}: the times do not ascend: {np.count_nonzero(steps < 0)} of {steps.size} are '
             'before the one above them; is the first column a time?'
+        )
+    apart = float(np.median(steps[steps > 0])) if np.any(steps > 0) else SHORTEST_INTERVAL_S
+    if apart < SHORTEST_INTERVAL_S:
+        raise ParameterError(
+            f'{path}: times are {apart:.2g} s apart: days (MATLAB, Excel)? Give seconds'
         )
 
 

@@ -19,7 +19,7 @@ from rclpy.serialization import serialize_message
 from tracking_world import certain_model
 
 from anser_ros.apps.dashboard import loop as loop_module
-from anser_ros.apps.dashboard.loop import RESULTS, CorrectionLoop, Job, RecordingFolder
+from anser_ros.apps.dashboard.loop import RESULTS, CorrectionLoop, Found, Job, RecordingFolder
 from anser_ros.apps.dashboard.nodes import live_view
 from anser_ros.apps.dashboard.nodes.dashboard import (
     ChainClient,
@@ -219,7 +219,7 @@ class FakeChain:
     def __init__(self):
         self.files = {'field_model': 'nominal', 'tracker': ''}
         self.refuses = ''
-        self.asked, self.marks = [], []
+        self.asked, self.marks, self.tracked = [], [], 100.0
 
     async def trigger(self, service):
         self.asked.append(service)
@@ -240,7 +240,7 @@ class FakeChain:
         return 'clean.mcap'
 
     def figures(self, since_s):
-        return {'tracked_percent': 50.0 if since_s == 0.0 else 100.0, 'error_mm': None}
+        return {'tracked_percent': 50.0 if since_s == 0.0 else self.tracked, 'error_mm': None}
 
     def mark(self, words):
         self.marks.append(words)
@@ -255,6 +255,42 @@ DIAGNOSIS = {
     'effects': [{'name': 'sensor_gain', 'parameters': {'channel': 3, 'gain': 1.1}}],
     'unexplained': {'fraction': 0.0, 'depends_on': []},
 }  # fmt: skip
+
+
+STATUS = {'recorder': True, 'field_model': False, 'recording': ''}
+
+
+def test_buttons_say_why_they_cannot_be_used(tmp_path):
+    chain = FakeChain()
+    loop = CorrectionLoop(chain, chain, RecordingFolder(tmp_path))
+    assert loop.obstacles(STATUS) == {
+        'record': '', 'stop': 'nothing is recorded', 'baseline': 'no field_model runs',
+        'calibrate': 'there is no recording yet', 'diagnose': 'there is no recording yet',
+        'report': 'nothing was calibrated or diagnosed yet',
+        'load': 'there is no model to load yet', 'undo': 'no model was loaded from this page',
+    }  # fmt: skip
+    running = loop.obstacles(STATUS | {'recorder': True, 'recording': 'one 3 s'})
+    assert (running['record'], running['stop']) == ('it records already', '')
+    assert loop.obstacles(STATUS | {'recorder': False})['record'] == 'no recorder runs'
+
+
+@pytest.mark.parametrize(
+    'parameters', [{'t_start_s': 3.0, 't_end_s': 5.0}, {'path': {'time_s': [0.0]}}]
+)
+def test_what_belongs_to_a_time_is_no_correction(tmp_path, parameters):
+    """Metal that came and went: a model with it would withhold the poses of every other time."""
+    effects = [*DIAGNOSIS['effects'], {'name': 'moving_metal', 'parameters': parameters}]
+    chain = FakeChain()
+    loop = CorrectionLoop(chain, chain, RecordingFolder(tmp_path))
+    passing = loop_module._passing(DIAGNOSIS | {'effects': effects})
+    loop.found = Found('diagnose', 'one', tmp_path, '', (), passing)
+    words = 'moving_metal belongs to the time of that recording and corrects no other'
+    assert loop.obstacles(STATUS)['load'] == words
+    asyncio.run(loop.load())
+    assert (loop.message, loop.is_trouble) == (words, True)
+    assert set(chain.files.values()) == {'nominal', ''}, 'nothing was loaded'
+    loop.found = loop.found._replace(passing=loop_module._passing(DIAGNOSIS))
+    assert not loop.obstacles(STATUS)['load']
 
 
 def test_the_loop_from_recording_to_undo(tmp_path, monkeypatch):
@@ -296,13 +332,18 @@ def test_the_loop_from_recording_to_undo(tmp_path, monkeypatch):
         chain.refuses = ''
         await loop.load()
         assert set(chain.files.values()) == {str(loop.found.model)}
-        assert not loop.can_load
+        assert loop.obstacles(STATUS)['load'] == 'this model is active'
+        assert loop.message.endswith('poses pause until all nodes have taken it')
+        assert loop.warning == '', 'more is tracked than before'
+        chain.tracked = 12.0
+        assert loop.warning == 'tracked frames fell from 50 to 12 % with this model: Undo?'
+        chain.tracked = 100.0
         assert loop.comparison()[0] == ('tracked frames, %', '50', '100')
         await loop.undo()
         assert chain.files == {'field_model': 'nominal', 'tracker': ''}
         assert chain.marks == ['model loaded', 'undone']
-        assert loop.can_load
-        assert not loop.can_undo
+        assert not loop.obstacles(STATUS)['load'] and loop.warning == ''
+        assert loop.obstacles(STATUS)['undo'] == 'no model was loaded from this page'
 
     asyncio.run(closed())
     assert chain.asked == ['recorder/start', 'recorder/stop']

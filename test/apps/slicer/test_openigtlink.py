@@ -27,7 +27,7 @@ from anser_ros.apps.slicer.nodes.openigtlink import (
     OpenIGTLink,
     OpenIGTLinkParameters,
     check_templates,
-    devices_of,
+    named_in,
 )
 from anser_ros.errors import ParameterError, PortError
 from anser_ros.wire.setup import parse_setup
@@ -225,7 +225,8 @@ def read(client, count):
 
 def test_replies_of_the_node(ros, tracker):
     """What it can, how it is, and the poses of all that are tracked, but none that is no pose."""
-    values = {'port': 0, 'coil_name': '{sensor}Of{body}'}
+    body_name = '{body}InTheOperatingRoom'
+    values = {'port': 0, 'coil_name': '{sensor}Of{body}', 'body_name': body_name}
     node = OpenIGTLink(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()])
     try:
         with socket.create_connection(('127.0.0.1', node._server.port)) as client:
@@ -252,7 +253,10 @@ def test_replies_of_the_node(ros, tracker):
                 kinds.setdefault(kind, []).append((device, body))
             assert kinds['TRANSFORM'][0][0] == '0/xOftool_a'
             states = [(d, struct.unpack('>H', b[:2])[0]) for d, b in kinds['STATUS']]
-            assert states[-1] == ('0/xOftool_a', igtl.OK) and ('tool_a', igtl.NOT_READY) in states
+            assert states[-1] == ('0/xOftool_a', igtl.OK)
+            assert ('_aInTheOperatingRoom', igtl.NOT_READY) in states
+            assert node.counters['tool_a_cut'], 'and not the coil, whose name has room'
+            assert not node.counters['tool_a/0/x_cut']
             ((_, data),) = kinds['TDATA']
             assert len(kinds['TRANSFORM'][0][1]) == 48, 'no metadata: it has asked in version 1'
             assert len(data) == 70, 'one instrument: the body has no pose'
@@ -272,7 +276,7 @@ def take(client):
 
 class TestNames:
     def named(self, text=SETUP, **values):
-        return devices_of(parse_setup(text), OpenIGTLinkParameters(**values))
+        return igtl.device_names(named_in(parse_setup(text), OpenIGTLinkParameters(**values)))
 
     def test_templates_name_coils_bodies_and_tips(self):
         assert self.named() == {'tool_a/0/x': 'tool_a/0/x', 'tool_a': 'tool_a'}
@@ -283,7 +287,7 @@ class TestNames:
             check_templates(OpenIGTLinkParameters(body_name='{tool}'))
         setup = parse_setup(SETUP).with_tips({'tool_a': TipSpec((0.01, -0.02, -0.15), (0.0,) * 6)})
         table = OpenIGTLinkParameters(coils=False)
-        assert set(devices_of(setup, table)) == {'tool_a', 'tool_a/tip'}
+        assert set(named_in(setup, table)) == {'tool_a', 'tool_a/tip'}
 
     def test_two_devices_of_one_name_are_refused(self):
         with pytest.raises(ParameterError, match="both become the device 'pen'"):

@@ -112,6 +112,8 @@ NEWEST = QoSProfile(
 )
 """Poses as they come; the newest matters, and there is room for those of a tick at 200 Hz."""
 SILENT_S = 3.5
+# The share of the setup's rate below which the header warns.
+SLOW = 0.5
 """Time, s, after which a node that says nothing counts as silent; it speaks once a second."""
 MOST_MARKS = 20
 """Moments that are marked in the curves: more words than these cover the curves."""
@@ -291,14 +293,16 @@ class ViewSource:
         tracker = self._statuses.get(f'{space}/tracker', LastStatus(1, 'no tracker', {}))
         good = sum(view.last_status(target.name).level == 0 for target in view.targets)
         rates = view.rate_hz[view.rate_hz > 0]
+        rate_hz = sorted(rates)[len(rates) // 2] if len(rates) else 0.0
+        is_slow = rate_hz < SLOW * view.setup.flux_rate_hz
         recorder, recording = self._statuses.get(f'{space}/recorder'), ''
         if recorder is not None and recorder.message == 'recording':
             name = recorder.values.get('bag', '').rpartition('/')[2]
             recording = f'{name} {float(recorder.values.get("duration_s", 0.0)):.0f} s'
         return status | {
             'tracked': f'{good} of {len(view.targets)} tracked',
-            'level': tracker.level if good == len(view.targets) else max(1, tracker.level),
-            'rate': f'{sorted(rates)[len(rates) // 2]:.0f}' if len(rates) else '0',
+            'level': max(tracker.level, int(is_slow or good < len(view.targets))),
+            'rate': f'{rate_hz:.0f}',
             'latency': '–' if math.isnan(view.latency_s) else f'{1e3 * view.latency_s:.1f} ms',
             'why': view.reasons(),
             'nodes': self._nodes(),

@@ -307,8 +307,11 @@ class OpenIGTLink(AnserNode):
 
     def _on_setup(self, message: String) -> None:
         try:
-            self._devices = devices_of(parse_setup(message.data), self.parameters)
-            self._refused = ''
+            named = named_in(parse_setup(message.data), self.parameters)
+            self._devices, self._refused = igtl.device_names(named), ''
+            for name, device in self._devices.items():
+                if device != named[name]:
+                    self.warn(f'{name}_cut', f'{name}: {named[name]!r} is cut to {device!r}')
         except AnserError as error:
             self._devices, self._refused = {}, str(error)
             self.warn('setups_refused', str(error))
@@ -410,18 +413,15 @@ def check_templates(table: OpenIGTLinkParameters) -> None:
             ) from error
 
 
-def devices_of(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
-    """Return the device of each body, of its tip and, where they are wanted, of each coil.
-
-    Raises `ParameterError` as `anser_ros.apps.slicer.igtl.device_names`.
-    """
+def named_in(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
+    """Return what each body, its tip and, where they are wanted, each coil is to be called."""
     named = {}
     for coil in setup.tool_sensors if table.coils else ():
         own = coil.name.removeprefix(f'{coil.body}/')
         named[coil.name] = table.coil_name.format(name=coil.name, body=coil.body, sensor=own)
     bodies = (*setup.bodies, *map(tip_name, setup.tips))
     named |= {body: table.body_name.format(body=body) for body in bodies}
-    return igtl.device_names(named)
+    return named
 
 
 if __name__ == '__main__':
