@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import math
 from pathlib import Path
 
 import yaml
@@ -35,10 +36,8 @@ def section(name):
         if isinstance(value, float) and '.' not in text:  # 1e-3 would be read as text
             text = f'{value:.12f}'.rstrip('0')
         limits = ' | '.join(rule.choices)
-        if rule.minimum is not None or rule.maximum is not None:
-            low = '' if rule.minimum is None else f'{rule.minimum:g}'
-            high = '' if rule.maximum is None else f'{rule.maximum:g}'
-            limits = f'{low}..{high}'
+        if rule.within != type(rule).within:
+            limits = '..'.join(f'{end:g}' if math.isfinite(end) else '' for end in rule.within)
         lines.append(f'    # {rule.description}{f" [{limits}]" if limits else ""}')
         lines.append(f'    {field.name}: {text.strip()}')
     return '\n'.join(lines)
