@@ -6,8 +6,7 @@ from conftest import REPO
 
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.signals import demodulation
-from anser_ros.signals.demodulation import Demodulator
-from anser_ros.signals.flux import FluxConverter, FluxRates
+from anser_ros.signals.demodulation import Demodulator, FluxConverter, FluxRates
 
 RATE = 40e3
 TONES = np.array([6000.0, 6170.0, 6340.0, 6510.0, 6690.0, 6860.0, 7030.0, 7200.0])

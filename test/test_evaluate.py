@@ -20,11 +20,10 @@ from anser_ros.errors import BagError, ParameterError
 from anser_ros.field.model import EffectRecord
 from anser_ros.pose_states import OK
 from anser_ros.sessions.baseline import baseline_flux
-from anser_ros.sessions.evaluation_files import to_document
 from anser_ros.sessions.follower import RefitSummary, parse_references, with_references
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
-from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, track_session
+from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, to_document, track_session
 from anser_ros.tracking.estimate import TrackerSettings
 
 pytestmark = pytest.mark.usefixtures('shared_tables')

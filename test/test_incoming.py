@@ -12,9 +12,8 @@ from std_msgs.msg import String
 
 from anser_ros.errors import LayoutError
 from anser_ros.nodes.pose_output import PackedMessage
-from anser_ros.nodes.runtime import incoming, qos
-from anser_ros.nodes.runtime.incoming import opened
-from anser_ros.nodes.runtime.node import AnserNode
+from anser_ros.nodes.runtime import node, qos
+from anser_ros.nodes.runtime.node import AnserNode, opened
 from anser_ros.nodes.streams.clouds import flux_cloud
 from anser_ros.wire.cdr import cloud_bytes, string_bytes
 from anser_ros.wire.points import FLOAT32, MOST_POINTS, FluxPoints, encode_flux, flux_fields
@@ -35,7 +34,7 @@ def test_a_message_within_its_bounds_is_opened():
 
 
 def test_what_is_too_large_is_refused_unopened(monkeypatch):
-    monkeypatch.setattr(incoming, 'deserialize_message', None)  # would fail if it were called
+    monkeypatch.setattr(node, 'deserialize_message', None)  # would fail if it were called
     with pytest.raises(LayoutError, match='bytes is refused'):
         opened(string_bytes('x' * 1_000_001), String)
     with pytest.raises(LayoutError, match='bytes is refused'):

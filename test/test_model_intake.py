@@ -7,7 +7,7 @@ import pytest
 from clouds_of import message_of
 from tracking_world import certain_model, setup_of, triaxial_tool
 
-from anser_ros.chain.order import MOST_LATE, AnsweredFrames
+from anser_ros.chain.frame import MOST_LATE, AnsweredFrames
 from anser_ros.nodes.streams.clouds import ModelWriter
 from anser_ros.nodes.tracker_models import ModelIntake, ModelReader
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from anser_ros.api.model import Model
 from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.pose_states import OK
-from anser_ros.sessions.evaluation_files import to_document
 from anser_ros.sessions.session import Session
-from anser_ros.sessions.tracked_session import PoseSeries, track_session
+from anser_ros.sessions.tracked_session import PoseSeries, to_document, track_session
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import TrackerSettings
 

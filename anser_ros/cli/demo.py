@@ -251,9 +251,12 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
                 supervisor.start(name, command)
             for said in _asked(args).values():
                 _say(said, args)
-            monitor = supervisor.start(
-                'monitor', _monitor(folder / DATA, args), on_terminal=not args.json
-            )
+            # Quoted, as a colon has a meaning to ROS.
+            command = node_command(
+                'monitor', duration_s=float(args.duration), patience_s=PATIENCE_S, compare=FROZEN,
+                compare_note=f'"{MEANINGS[FROZEN]}"', output=folder / DATA,
+            )  # fmt: skip
+            monitor = supervisor.start('monitor', command, on_terminal=not args.json)
             while not stopped:
                 ended = supervisor.ended()
                 if ended is not None:
@@ -378,11 +381,3 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, l
         'recorder': node_command('recorder', directory=folder, name='bag'),
         **{name: node_command(name, directory=folder) for name in _asked(args)},
     }  # fmt: skip
-
-
-def _monitor(data: Path, args: argparse.Namespace) -> list[str]:
-    note = f'"{MEANINGS[FROZEN]}"'  # quoted: a colon has a meaning to ROS
-    return node_command(
-        'monitor', duration_s=float(args.duration), patience_s=PATIENCE_S, compare=FROZEN,
-        compare_note=note, output=data,
-    )  # fmt: skip

@@ -16,11 +16,17 @@ from anser_ros.cli import page as html
 from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
-from anser_ros.sessions.evaluation_files import recording_of, to_document, write_tables
 from anser_ros.sessions.follower import parse_references, with_references
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
-from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, track_session
+from anser_ros.sessions.tracked_session import (
+    Evaluation,
+    PoseSeries,
+    recording_of,
+    to_document,
+    track_session,
+    write_tables,
+)
 from anser_ros.tracking.estimate import TrackerSettings
 
 MOST_POINTS = 4000

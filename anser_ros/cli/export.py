@@ -20,7 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def work(args: argparse.Namespace, tell: Tell) -> Result:
     make_folder(args.out)
     tell(f'reading {args.bag}')
-    found = export_bag(args.bag, args.out, args.format)
-    document = {'schema': SCHEMA, 'rows': found.rows, 'lost': found.lost}
-    written = tuple(args.out / name for name in found.rows)
-    return Result(document, loss_notes(args.bag, found.lost), (), written)
+    rows, lost = export_bag(args.bag, args.out, args.format)
+    document = {'schema': SCHEMA, 'rows': rows, 'lost': lost}
+    return Result(
+        document, loss_notes(args.bag, lost), (), tuple(args.out / name for name in rows)
+    )

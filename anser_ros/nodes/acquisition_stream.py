@@ -19,8 +19,7 @@ from anser_ros.errors import FitError, SetupError
 from anser_ros.nodes.streams.clouds import FLUX_NOISE, STAMP_SIGMA
 from anser_ros.settings import Accuracy
 from anser_ros.signals.clock import SampleClock
-from anser_ros.signals.demodulation import Demodulator
-from anser_ros.signals.flux import FluxConverter, FluxRates, FluxWindow
+from anser_ros.signals.demodulation import Demodulator, FluxConverter, FluxRates, FluxWindow
 from anser_ros.signals.repetition import RepetitionWatch
 from anser_ros.signals.window import TickCheck, Window, WindowCutter
 from anser_ros.wire.channel_calibration import ChannelCalibration

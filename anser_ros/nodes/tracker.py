@@ -16,8 +16,7 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
-from anser_ros.chain.frame import FrameReadings
-from anser_ros.chain.order import AnsweredFrames
+from anser_ros.chain.frame import AnsweredFrames, FrameReadings
 from anser_ros.chain.tracking_half import TrackingHalf
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.field.model import FieldModel

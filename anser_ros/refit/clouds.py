@@ -188,12 +188,6 @@ class Excitation:
     field: FieldFunction  # from points (P, 3), m, to the field there, (P, K, 3), T
 
 
-def model_field(model: FieldModel, points: Array) -> ComplexArray:
-    """Return the field of a model's emitters, shape (P, K, 3), T."""
-    basis = field_basis(points, model.positions, model.directions)
-    return np.asarray(np.einsum('pna,nk->pka', basis, model.moments, optimize=True))
-
-
 def region_of(field: Callable[[Array], AnyArray]) -> Region:
     """Return the board's extent: the square with 98 % of its field's power over the surface.
 
@@ -226,7 +220,8 @@ def excitation_for(
     """
 
     def own(points: Array) -> ComplexArray:
-        return model_field(model, points)
+        basis = field_basis(points, model.positions, model.directions)
+        return np.asarray(np.einsum('pna,nk->pka', basis, model.moments, optimize=True))
 
     region = replace(region_of(own if drawing is None else drawing), stated=volume)
     points = region.volume.samples()

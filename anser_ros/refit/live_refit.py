@@ -26,13 +26,6 @@ from anser_ros.refit import health
 from anser_ros.refit import tables as refit_tables
 from anser_ros.refit.clouds import FieldFunction
 from anser_ros.refit.frame import Average, BaselineCheck, NoiseLevel, NoiseUnits, checked_baseline
-from anser_ros.refit.health import (
-    ReferenceHealth,
-    ReferenceWatch,
-    distance_of,
-    evidence_without,
-    left_out,
-)
 from anser_ros.refit.hypotheses import SLOTS, Banks, Belief, BodySlots
 from anser_ros.refit.jumps import (
     LARGEST_RATE,
@@ -102,8 +95,8 @@ class LiveRefit:
         bank, slots = self._bank()
         readings = np.zeros((len(bank.rows), 2))
         seen = bank.evaluate(readings, 1.0)
-        left_out(bank, seen)
-        evidence_without(bank, seen, np.arange(1))
+        health.left_out(bank, seen)
+        health.evidence_without(bank, seen, np.arange(1))
         slots.warm_up(readings, 1.0)
         weights = np.zeros(len(bank.names))
         weights[1] = 1.0
@@ -129,7 +122,7 @@ class LiveRefit:
         settings = self.settings
         self._noise = NoiseLevel(settings.accuracy.flux_noise_t)
         self._average = Average(settings.average_frames)
-        self._watch = ReferenceWatch(len(self.references), settings.hold_frames)
+        self._watch = health.ReferenceWatch(len(self.references), settings.hold_frames)
         self._freshness = Freshness()
         self._courses = Courses(*self.baseline.shape)
         self._belief = Belief(1 + len(self._tables.priors) + SLOTS, settings.persistence)
@@ -230,7 +223,7 @@ class LiveRefit:
             used = values[coils].reshape(-1, 2)
             slots.fill(used, noise, stamp_ns)
             seen = bank.evaluate(used, noise)
-            self._distance, self._residual = left_out(bank, seen)
+            self._distance, self._residual = health.left_out(bank, seen)
             if len(coils) <= self.settings.min_references:
                 return bank, seen
             power = np.einsum('ij,ij->i', *[used.reshape(len(coils), -1)] * 2) / noise**2
@@ -252,7 +245,7 @@ class LiveRefit:
         k = bank.width
         for coil in np.flatnonzero(self._watch.excluded & readable):
             rows = coil * k + np.arange(k)
-            distance = distance_of(bank, seen, rows, values[coil], level)
+            distance = health.distance_of(bank, seen, rows, values[coil], level)
             self._watch.agreed(int(coil), distance < health.AGREEMENT_CHI2 * 2 * k)
         self._watch.readmit()
 
@@ -332,7 +325,7 @@ class LiveRefit:
             stamp_ns, self.model, state, self._healths(), 0.0, {}, noise_t, drift, reason
         )
 
-    def _healths(self) -> Callable[[], tuple[ReferenceHealth, ...]]:
+    def _healths(self) -> Callable[[], tuple[health.ReferenceHealth, ...]]:
         """Return a function that computes the references' health in this frame."""
         distance, residual, used = self._distance, self._residual, self._in_use()
         reason = self._watch.reason.copy()

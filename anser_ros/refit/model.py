@@ -13,7 +13,6 @@ from anser_ros.arrays import Array, ComplexArray
 from anser_ros.field.model import FieldModel
 from anser_ros.pose_states import OTHER_PLACE, REFERENCES_DOUBTFUL, REFERENCES_LOST
 from anser_ros.refit import health, posterior
-from anser_ros.refit.health import ReferenceHealth
 from anser_ros.refit.hypotheses import BackgroundTask
 from anser_ros.refit.layer import Layer, component_rows
 from anser_ros.refit.witness import FIRST_SAMPLE_STEP, Witness
@@ -319,7 +318,7 @@ class RefitResult:
     stamp_ns: int
     model: FieldModel  # the active model; the calibrated one itself while nothing has changed
     state: str  # one of `STATES`, and the `reason` why
-    judge: Callable[[], tuple[ReferenceHealth, ...]] = field(repr=False)
+    judge: Callable[[], tuple[health.ReferenceHealth, ...]] = field(repr=False)
     log_odds: float  # natural logarithm of the odds that something has changed
     weights: dict[str, float]  # probability of every cloud, and of ``nothing``
     noise_t: float  # measured noise of the references' phasor components, T
@@ -340,7 +339,7 @@ class RefitResult:
         return not self.withheld
 
     @cached_property
-    def references(self) -> tuple[ReferenceHealth, ...]:
+    def references(self) -> tuple[health.ReferenceHealth, ...]:
         """Return the health of every reference, computed when first asked for."""
         return self.judge()
 

@@ -91,16 +91,11 @@ FORMATS = (CSV, TUM, MAT)
 POSE_COLUMNS = ('stamp_ns', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
 
 
-@dataclass(frozen=True)
-class ExportedBag:
-    """Holds how many rows each file got, by its name, and in words what could not be read."""
+def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> tuple[dict[str, int], str]:
+    """Write a file for each topic of poses and of fluxes; raises `BagError` when there is none.
 
-    rows: dict[str, int]
-    lost: str
-
-
-def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBag:
-    """Write a file for each topic of poses and of fluxes; raises `BagError` when there is none."""
+    Return how many rows each file got, by its name, and in words what could not be read.
+    """
     if form not in FORMATS:
         raise ParameterError(f'format must be among {", ".join(FORMATS)}, got {form!r}')
     salvage = Salvage()
@@ -118,7 +113,7 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBa
     if not written:
         words = f'nothing to export as {form}; there are: {salvage.topic_words()}'
         raise BagError(f'{os.fspath(path)}: {words}')
-    return ExportedBag(written, salvage.lost)
+    return written, salvage.lost
 
 
 def _write_poses(path: Path, poses: PoseStream, form: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from anser_ros.arrays import Array, Integers
 from anser_ros.errors import ParameterError
 from anser_ros.pose_states import OK
-from anser_ros.sessions import evaluation_files as files
+from anser_ros.sessions import tracked_session as files
 from anser_ros.wire.tables import Table, read_table
 from anser_ros.wire.text_files import read_text
 

@@ -17,8 +17,7 @@ from std_msgs.msg import String
 
 from anser_ros.integrity.streams import Senders
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.incoming import opened
-from anser_ros.nodes.runtime.node import AnserNode
+from anser_ros.nodes.runtime.node import AnserNode, opened
 from anser_ros.nodes.streams.clouds import without_measured
 from anser_ros.stamps import NANO, SECOND_NS, is_live, stamp_of
 

@@ -11,8 +11,7 @@ from anser_ros.apps.lab.comparison import FEWEST_BLOCKS, compare, read_errors
 from anser_ros.cli.main import main
 from anser_ros.errors import ParameterError
 from anser_ros.pose_states import OK
-from anser_ros.sessions.evaluation_files import ERRORS_FILE, write_tables
-from anser_ros.sessions.tracked_session import Evaluation, PoseSeries
+from anser_ros.sessions.tracked_session import ERRORS_FILE, Evaluation, PoseSeries, write_tables
 
 STEP_NS = 40_000_000
 FRAMES = 750

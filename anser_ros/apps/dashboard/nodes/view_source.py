@@ -21,7 +21,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from anser_ros.apps.dashboard.nodes.live_view import LiveView, known
 from anser_ros.errors import AnserError, LayoutError
-from anser_ros.nodes.runtime import incoming, qos
+from anser_ros.nodes.runtime import node, qos
 from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
 from anser_ros.nodes.streams.one_source import take_waiting
 from anser_ros.wire.recorded import optical_topic
@@ -94,7 +94,7 @@ class Polled:
         found = []
         for data, _ in self.take():
             try:
-                found.append(incoming.opened(data, self._type))
+                found.append(node.opened(data, self._type))
             except LayoutError as error:
                 refused(str(error))
         return found
