@@ -1,8 +1,9 @@
 """Calibrates sessions that cannot determine a free field, with a drawn board as the prior.
 
-A plate's typed places, in one plane even (`calibration.drawn_fit`). Where the drawn board puts
-each coil is compared with what was typed first: places of another pitch, a place that was missed,
-or a probe upside down are refused by name.
+A plate's typed places, in one plane even, or a tool that was moved by hand without an optical
+tracker (`calibration.drawn_fit`). Where the drawn board puts each coil is compared with what was
+typed first: places of another pitch, a place that was missed, or a probe upside down are refused
+by name.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.drawn_fit import DrawnFit, DrawnFitter, evenly
 from anser_ros.calibration.held_out import HeldOutTally
@@ -31,8 +31,13 @@ from anser_ros.calibration.result import Calibration, Scan, corrections, residua
 from anser_ros.calibration.sensor_fit import SensorFit
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
-from anser_ros.physics.rotations import nearest_rotation
+from anser_ros.physics.rotations import (
+    nearest_rotation,
+    quaternion_of_axis,
+    rotation_of_quaternion,
+)
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import track_session
@@ -54,66 +59,98 @@ CLEAR = 2.0
 
 
 def is_for_drawing(sessions: Sequence[Session], options: Options) -> bool:
-    """Return whether typed places leave a field open that the drawn board closes.
+    """Return whether sessions leave a field open that the drawn board closes.
 
-    They are fewer than the dipoles of a free field, or all in one plane, and belong to one plate.
+    That is a tool without any stated pose, or typed places that are fewer than the dipoles of a
+    free field, or all in one plane.
     """
     tools = [tool for session in sessions for tool in session.tools]
-    if options.layout is not None or not options.estimate or len(sessions) != 1:
+    if options.layout is not None or not options.estimate or not tools:
         return False
-    if any(tool.is_followed or not tool.sensors.is_single.all() for tool in tools):
+    if any(tool.is_followed for tool in tools) or NominalBoard.of(sessions[0].setup).model is None:
         return False
-    if not all(tool.has_pose.any() for tool in tools) or usable_frames(tools) < FEWEST_SCAN_FRAMES:
-        return False
-    few = sum(int(m.usable.sum()) for m in tools) < RICH.count**2
-    return (few or not is_thick(tools)) and NominalBoard.of(sessions[0].setup).model is not None
+    posed = [tool for tool in tools if tool.has_pose.any()]
+    if usable_frames(posed) < FEWEST_SCAN_FRAMES or len(posed) < len(tools):
+        return len(posed) < len(tools) and all(tool.sensors.is_single.all() for tool in tools)
+    return not is_thick(posed) or sum(int(m.usable.sum()) for m in posed) < RICH.count**2
 
 
 def fit_to_drawing(
-    session: Session, generator: Generator, options: Options, progress: Progress | None = None
-) -> Calibration | None:
-    """Fit the drawn board; None where its field cannot be that of the readings, as near metal.
+    sessions: Sequence[Session], generator: Generator, options: Options,
+    progress: Progress | None = None,
+) -> Calibration | None:  # fmt: skip
+    """Fit the drawn board; None where its field cannot be the readings' and typed places can tell.
 
-    Raises `FitError` with what was typed wrongly.
+    Raises `FitError` with what was typed wrongly, or when unknown poses leave no such board.
     """
-    assert generator.nominal is not None
-    session = replace(session, tools=tuple(evenly(session.tools)), reference=None)
-    settings = TrackerSettings(gate=NO_GATE, max_sigma_m=1.0)
-    tracked = track_session(session, generator.nominal, settings).sensors
-    typed = [with_pose(tool) for tool in session.tools]
-    for tool, one in zip(session.tools, typed, strict=True):
-        series = tracked[tool.sensors.name[0]]
-        rows = np.flatnonzero(np.isin(tool.time, one.time))
-        found = [series.estimates[row] for row in rows.tolist()]
-        known = series.ok[rows]
-        places = np.array([estimate.position for estimate in found])
-        places = np.where(known[:, None], places, np.nan)
-        axes = np.array([estimate.axis for estimate in found])
-        if contradiction := check_typed(one, places, axes):
-            if is_thick([one]):
-                return None  # metal moves them as well, and a free field says so
-            raise FitError(contradiction)
+    found, typed = [], []
+    for whole in sessions:
+        session = replace(whole, tools=tuple(evenly(whole.tools)), reference=None)
+        starts = _drawn_poses(session, generator.nominal)
+        for tool, start in zip(session.tools, starts, strict=True):
+            typed.append(bool(tool.has_pose.any()))
+            if typed[-1] and (contradiction := check_typed(with_pose(tool), start)):
+                if is_thick([with_pose(tool)]):
+                    return None  # metal moves them as well, and a free field says so
+                raise FitError(contradiction)
+            found.append(with_pose(tool if typed[-1] else start))
+    fewest = min(len(m.time) for m in found)
+    if fewest < FEWEST_SCAN_FRAMES:
+        raise FitError(
+            f'a calibration needs at least {FEWEST_SCAN_FRAMES} frames whose coils the drawn '
+            f'board places, got {fewest}'
+        )
     noise_t = options.accuracy.flux_noise_t
-    fit = DrawnFitter(typed, generator, options.estimate, noise_t).fit(progress)
+    fit = DrawnFitter(found, typed, generator, options.estimate, noise_t).fit(progress)
     if fit.noise_t > MOST_NOISE * noise_t:
-        return None
-    names = [Path(session.path).name for _ in session.tools]
-    return with_provenance(_calibration(fit, typed, generator, options), names)
+        if all(typed):
+            return None
+        raise FitError(
+            f'no board like the drawn one explains the readings: {fit.noise_t:.2g} T are left, '
+            f'{noise_t:.2g} T are noise. Is metal near, or are coils exchanged?'
+        )
+    names = [Path(session.path).name for session in sessions for _ in session.tools]
+    return with_provenance(_calibration(fit, found, typed, generator, options), names)
 
 
-def check_typed(typed: Measurements, there: Array, axes: Array) -> str:
+def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measurements]:
+    """The tools at the poses where the drawn board puts them, as far as it does."""
+    assert nominal is not None
+    settings = TrackerSettings(gate=NO_GATE, max_sigma_m=1.0)
+    tracked, out = track_session(session, nominal, settings), []
+    for tool in session.tools:
+        position, rotation = np.full((len(tool.time), 3), np.nan), tool.rotation.copy()
+        single = tool.sensors.name[0] if len(tool.sensors) == 1 else ''
+        series = tracked.sensors[single] if single else tracked.bodies[tool.body]
+        for row in np.flatnonzero(series.ok).tolist():
+            one = series.estimates[row]
+            turn = one.rotation
+            if turn is None:
+                there, own = (
+                    rotation_of_quaternion(np.array(quaternion_of_axis(axis)))
+                    for axis in (one.axis, tool.sensors.axis[0])
+                )
+                turn = there @ own.T
+            rotation[row] = turn
+            position[row] = one.position - (turn @ tool.sensors.position[0] if single else 0.0)
+        out.append(
+            replace(tool, position=position, rotation=rotation, has_pose=series.ok, track=None)
+        )
+    return out
+
+
+def check_typed(typed: Measurements, drawn: Measurements) -> str:
     """Return in words how far typed places are from where the drawn board puts them, if they are.
 
     Raises `FitError` with the size where that has a reason with a name.
 
-    ``there``, ``axes`` (F, 3): where the drawn board puts the body's first coil, m, NaN where it
-    does not say, and its axis.
+    ``drawn`` are all frames of the same body at the poses that the drawn board gives them.
     """
-    stated, pointing = (of_all[:, 0] for of_all in typed.placed())
-    known, places = np.isfinite(there).all(axis=1), stated
+    found = drawn.frames(np.isin(drawn.time, typed.time))
+    known, places, there = found.has_pose, typed.position, found.position
     if known.sum() < FEWEST_SCAN_FRAMES:
         return ''
-    alike = np.einsum('fi,fi->f', pointing, axes)[known]
+    alike = np.einsum('fsi,fsi->fs', typed.placed()[1], found.placed()[1])[known]
     if np.median(alike) < 0.0:
         raise FitError(
             f'{typed.body}: the coil points the other way than typed, by '
@@ -151,7 +188,8 @@ def check_typed(typed: Measurements, there: Array, axes: Array) -> str:
 
 
 def _calibration(
-    fit: DrawnFit, typed: Sequence[Measurements], generator: Generator, options: Options
+    fit: DrawnFit, found: Sequence[Measurements], typed: Sequence[bool], generator: Generator,
+    options: Options,
 ) -> Calibration:  # fmt: skip
     """The result of a fit in the form of every calibration's."""
     jitter = OpticalNoise(float(fit.jitter[0]), float(fit.jitter[3]))
@@ -160,7 +198,7 @@ def _calibration(
         optical_rotation_rad=jitter.rotation_rad,
     )  # fmt: skip
     now = tuple(part.now for part in fit.parts)
-    steady = tuple(np.ones(len(m.time), dtype=bool) for m in typed)
+    steady = tuple(np.ones(len(m.time), dtype=bool) for m in found)
     sensors = SensorFit(
         fit.sensors, fit.posterior, (), fit.evidence, fit.noise_t, jitter,
         Population(fit.sensors).alone, steady, steady, 0.0, {}, fit.model.shift_sigma_m,
@@ -175,7 +213,8 @@ def _calibration(
         alternations=fit.steps,
     )  # fmt: skip
     corrected = corrections(sensors)
-    assert generator.nominal is not None
+    stated = [m for m, one in zip(found, typed, strict=True) if one]
+    nominal = generator.nominal
     model = replace(fit.model, effects=corrected)
     frame = (
         f'the frame is that of the drawing, to {1e3 * model.shift_sigma_m:.2f} mm along each axis'
@@ -185,14 +224,14 @@ def _calibration(
         layout=Layout('drawn', len(model.positions), 1.0, 0.0, 'nominal', words=WORDS),
         damping=0.0, n_measurements=sum(int(m.usable.sum()) for m in now),
         residuals=residuals(now, model),
-        scan=Scan(now, accuracy, corrected, (), sensors),
-        nominal_rmse_t=residuals(typed, generator.nominal).rmse_t,
+        scan=Scan(now, accuracy, corrected, (), sensors if all(typed) else None),
+        nominal_rmse_t=residuals(stated, nominal).rmse_t if all(typed) and nominal else None,
         undetermined=(frame,), more={
             'emitters_off': emitter_rows(fit, generator),
             'plate': {
                 'shift_m': fit.plate[:3].tolist(), 'turn_rad': fit.plate[3:6].tolist(),
                 'scale': float(1.0 + fit.plate[6]),
-            },
+            } if any(typed) else None,
         },
     )  # fmt: skip
 
