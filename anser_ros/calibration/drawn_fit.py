@@ -10,7 +10,7 @@ solved again at each estimate. The widths of populations are those that make the
 the field near the drawing, many make it free, and the covariance says which.
 
 What no reading determines is the frame: field and poses may move together by six numbers, which
-only the prior holds. They are stated apart (`DrawnFit.frame`).
+only the prior holds. They are stated apart (`FieldModel.shift_sigma_m`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -175,10 +175,8 @@ class _Part:
     """Frames of one body of one fold."""
 
     stated: Measurements  # at the poses that are stated, or to start from
-    body: int  # which of the measurements they are of
     fold: int
     is_typed: bool  # whether their poses are stated
-    jitter: Array  # (6,): of the poses
     offset: Array  # (F, 6): of the poses from those stated on the plate
     weights: Array  # (F, S)
     now: Measurements  # corrected by the present estimate
@@ -230,7 +228,7 @@ class DrawnFitter:
         kinds: Sequence[str],
         noise_t: float,
     ) -> None:
-        self.drawing, self.noise_t, self.generator = Drawing(generator), noise_t, generator
+        self.drawing, self.noise_t, self.jitter = Drawing(generator), noise_t, PLACE
         # A single coil's place and gain are the plate's and the board's.
         one = all(len(m.sensors) == 1 for m in measurements)
         kept = [kind for kind in kinds if kind in SENSORS and (kind == 'axes' or not one)]
@@ -305,7 +303,8 @@ class DrawnFitter:
     def _sums(self, part: _Part) -> _Sums:
         now, size = part.now, self.values.size
         terms, made = self._terms(now)
-        white = PoseWhitener(terms.slope, part.weights, self.noise_t, part.jitter**-2.0)
+        jitter = self.jitter if part.is_typed else FREE
+        white = PoseWhitener(terms.slope, part.weights, self.noise_t, jitter**-2.0)
         by_size = self._by_size(now, made[0])
         shared = self._shared(part, terms, made, by_size)
         root = (np.sqrt(part.weights) / self.noise_t)[:, :, None]
@@ -403,18 +402,15 @@ class DrawnFitter:
         return float((np.abs(change) / np.maximum(found.sigma, 1e-15)).max())
 
     def _learn_jitter(self, sums: Sequence[_Sums]) -> None:
-        typed = [i for i, part in enumerate(self.parts) if part.is_typed]
-        if not typed:
-            return
-        offset = np.concatenate([self.parts[i].offset for i in typed])
-        jitter = self.parts[typed[0]].jitter
-        ratio = np.concatenate([sums[i].variance for i in typed]) / jitter**2
-        new = [
-            _learnt(offset[:, own], ratio[:, own], float(PLACE[own][0]))
-            for own in (slice(0, 3), slice(3, 6))
-        ]
-        for i in typed:
-            self.parts[i].jitter = np.repeat(new, 3)
+        typed = [(p, one) for p, one in zip(self.parts, sums, strict=True) if p.is_typed]
+        if typed:
+            offset = np.concatenate([part.offset for part, _ in typed])
+            ratio = np.concatenate([one.variance for _, one in typed]) / self.jitter**2
+            new = [
+                _learnt(offset[:, own], ratio[:, own], float(PLACE[own][0]))
+                for own in (slice(0, 3), slice(3, 6))
+            ]
+            self.jitter = np.repeat(new, 3)
 
     def _weigh(self, used: float, is_learning: bool) -> None:
         """Weigh the readings, and estimate the noise, less ``used`` degrees of freedom."""
@@ -453,10 +449,9 @@ class DrawnFitter:
             without = self.width.copy()
             without[self.sensed.start + self.sensors.rows(kind)] = 1e-12
             evidence[kind] = found.evidence - solve(likelihood, without).evidence
-        jitter = next((p.jitter for p in self.parts if p.is_typed), FREE)
         return DrawnFit(
             model, self.board, found.sigma[self.own].reshape(self.count, OWN),
-            found.values[self.plate], self.sensors, sensed, evidence, self.noise_t, jitter,
+            found.values[self.plate], self.sensors, sensed, evidence, self.noise_t, self.jitter,
             tuple(self.parts), tuple(held_out),
             float((found.covariance * likelihood.information).sum()), steps,
         )  # fmt: skip
@@ -529,10 +524,7 @@ def evenly(measurements: Sequence[Measurements]) -> list[Measurements]:
 def _parts(measurements: Sequence[Measurements], typed: Sequence[bool]) -> Iterator[_Part]:
     """The frames, those of each fold apart."""
     folds = fold_of_frames([m.position for m in measurements])
-    for body, (whole, fold) in enumerate(zip(measurements, folds, strict=True)):
+    for whole, fold, stated in zip(measurements, folds, typed, strict=True):
         for one in np.unique(fold).tolist():
             m = whole.frames(fold == one)
-            jitter = PLACE if typed[body] else FREE
-            yield _Part(
-                m, body, one, typed[body], jitter, np.zeros((len(m.time), 6)), usable_weights(m), m
-            )
+            yield _Part(m, one, stated, np.zeros((len(m.time), 6)), usable_weights(m), m)

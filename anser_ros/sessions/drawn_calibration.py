@@ -33,11 +33,9 @@ from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
-from anser_ros.physics.rotations import (
-    nearest_rotation,
-    quaternion_of_axis,
-    rotation_of_quaternion,
-)
+from anser_ros.physics.rotations import nearest_rotation
+from anser_ros.physics.sensor import SAME_CENTRE_M
+from anser_ros.pose_states import INCONSISTENT, OK
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import track_session
@@ -114,27 +112,36 @@ def fit_to_drawing(
 
 
 def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measurements]:
-    """The tools at the poses where the drawn board puts them, as far as it does."""
+    """The tools at the poses where the drawn board puts most of their coils, each by itself.
+
+    A turn about a single axis stays open, and is any.
+    """
     assert nominal is not None
     settings = TrackerSettings(gate=NO_GATE, max_sigma_m=1.0)
-    tracked, out = track_session(session, nominal, settings), []
+    tracked, out = track_session(session, nominal, settings).sensors, []
     for tool in session.tools:
-        position, rotation = np.full((len(tool.time), 3), np.nan), tool.rotation.copy()
-        single = tool.sensors.name[0] if len(tool.sensors) == 1 else ''
-        series = tracked.sensors[single] if single else tracked.bodies[tool.body]
-        for row in np.flatnonzero(series.ok).tolist():
-            one = series.estimates[row]
-            turn = one.rotation
-            if turn is None:
-                there, own = (
-                    rotation_of_quaternion(np.array(quaternion_of_axis(axis)))
-                    for axis in (one.axis, tool.sensors.axis[0])
-                )
-                turn = there @ own.T
-            rotation[row] = turn
-            position[row] = one.position - (turn @ tool.sensors.position[0] if single else 0.0)
+        series = [tracked[name].estimates for name in tool.sensors.name]
+        # Coils that are a little off contradict their body, which is no fault of their places.
+        known = np.array([[e.state in (OK, INCONSISTENT) for e in one] for one in series]).T
+        places = np.array([[e.position for e in one] for one in series]).swapaxes(0, 1)
+        axes = np.array([[e.axis for e in one] for one in series]).swapaxes(0, 1)
+        enough = 2 * known.sum(axis=1) > len(series)
+        position = np.full((len(tool.time), 3), np.nan)
+        rotation = np.tile(np.eye(3), (len(tool.time), 1, 1))
+        for row in np.flatnonzero(enough).tolist():
+            own = known[row]
+            there, arms = places[row, own], tool.sensors.position[own]
+            ways, drawn = there - there.mean(axis=0), arms - arms.mean(axis=0)
+            size = max(float((drawn**2).sum(axis=1).mean()), SAME_CENTRE_M**2)
+            turn = nearest_rotation(
+                axes[row, own].T @ tool.sensors.axis[own] + ways.T @ drawn / size
+            )
+            middles = there - arms @ turn.T
+            position[row], rotation[row] = np.median(middles, axis=0), turn
+            off = np.linalg.norm(middles - position[row], axis=1)
+            enough[row] = np.median(off) < NEAR_M
         out.append(
-            replace(tool, position=position, rotation=rotation, has_pose=series.ok, track=None)
+            replace(tool, position=position, rotation=rotation, has_pose=enough, track=None)
         )
     return out
 
@@ -147,7 +154,8 @@ def check_typed(typed: Measurements, drawn: Measurements) -> str:
     ``drawn`` are all frames of the same body at the poses that the drawn board gives them.
     """
     found = drawn.frames(np.isin(drawn.time, typed.time))
-    known, places, there = found.has_pose, typed.position, found.position
+    known = found.has_pose
+    places, there = (of_all.placed()[0][:, 0] for of_all in (typed, found))
     if known.sum() < FEWEST_SCAN_FRAMES:
         return ''
     alike = np.einsum('fsi,fsi->fs', typed.placed()[1], found.placed()[1])[known]
