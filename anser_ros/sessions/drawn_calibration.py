@@ -255,16 +255,18 @@ def emitter_rows(fit: DrawnFit, generator: Generator) -> list[dict[str, object]]
     rows = []
     for name, error, sigma in zip(generator.emitters, fit.errors, fit.sigma, strict=True):
         words = [
-            f'sits {1e3 * abs(error[j]):.1f} mm further {WAYS[j][int(error[j] > 0.0)]} than drawn'
+            f'sits {1e3 * abs(error[j]):.1f} ± {1e3 * sigma[j]:.1f} mm further '
+            f'{WAYS[j][int(error[j] > 0.0)]} than drawn'
             for j in np.argsort(-np.abs(error[:3]))[:1]
             if abs(error[j]) > CLEAR * sigma[j]
         ]
         tilt, of_tilt = np.linalg.norm(error[3:5]), np.linalg.norm(sigma[3:5]) / np.sqrt(2.0)
         if tilt > CLEAR * of_tilt:
-            words.append(f'is tilted by {DEGREES * tilt:.1f} deg')
+            words.append(f'is tilted by {DEGREES * tilt:.1f} ± {DEGREES * of_tilt:.1f} deg')
         if abs(error[6]) > CLEAR * sigma[6]:
             words.append(
-                f'is {100 * abs(error[6]):.1f} % {"stronger" if error[6] > 0 else "weaker"}'
+                f'is {100 * abs(error[6]):.1f} ± {100 * sigma[6]:.1f} % '
+                f'{"stronger" if error[6] > 0 else "weaker"}'
             )
         rows.append(
             {
