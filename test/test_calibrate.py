@@ -133,7 +133,10 @@ def refusal(capsys, *arguments):
     ],
 )
 def test_a_bag_that_lacks_something_is_refused(factory, tmp_path, capsys, part, message):
-    bag = write_bag(tmp_path / 'b.mcap', factory.setup, factory.tools[0], **{part: False})
+    # With a drawing, a tool needs no poses.
+    emitter = replace(factory.setup.emitter, kind='something_else', geometry={})
+    setup = replace(factory.setup, emitter=emitter)
+    bag = write_bag(tmp_path / 'b.mcap', setup, factory.tools[0], **{part: False})
     assert message in refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
     assert not (tmp_path / 'm.yaml').exists()
 

@@ -1,17 +1,21 @@
-"""Calibration from what leaves a free field open: typed places of a plate.
+"""Calibration from what leaves a free field open: a plate's places, and a tool moved by hand.
 
 The worlds are boards whose coils are each a little off, by Biot and Savart along their tracks.
 """
 
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibration_world import hand, tool_of
 from conftest import REPO
 from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.sensor_parameters import KINDS
+from anser_ros.cli.main import main
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.board import loop_field
@@ -21,6 +25,8 @@ from anser_ros.sessions.calibration import calibrate_sessions
 from anser_ros.sessions.drawn_calibration import check_typed
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.sessions.session import Session, load_session
+from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.tracked_session import track_session
 
 NOISE_T, START = 40e-12, 1_700_000_000_000_000_000
 PROBE = SensorTable(
@@ -87,6 +93,17 @@ class World:
         flat = np.tile(np.eye(3), (len(typed), 1, 1))
         return self.session('probe', PROBE, flux, typed, flat)
 
+    def waved(self, seconds):
+        """A tool of nine coils, each a little off, moved by hand without a camera."""
+        rng, table = self.rng, tool_of(9)
+        true = replace(
+            table, position=table.position + 2e-4 * rng.normal(size=(9, 3)),
+            axis=tilted(table.axis, 0.01 * rng.normal(size=(9, 2))),
+        )  # fmt: skip
+        position, turn = hand(np.arange(0.0, seconds, 0.1))
+        flux = self.flux(*true.placed(position, turn.as_matrix()))
+        return self.session('tool', table, flux * (1.0 + 0.01 * rng.normal(size=9))[:, None])
+
     def error_m(self, model):
         """How far coils are found off, m: as they are, and after one rigid registration."""
         places = self.rng.uniform([-0.11, -0.11, 0.1], [0.11, 0.11, 0.2], (200, 3))
@@ -143,8 +160,41 @@ def test_a_plate_of_typed_places_calibrates(setup, heights, most_m):
     sigma = np.array([row['shift_sigma_m'] for row in rows])
     assert (np.abs(found - world.shift) < 4.0 * sigma).mean() > 0.95
     assert np.corrcoef(found.ravel(), world.shift.ravel())[0, 1] > 0.6
-    assert any('sits' in row['words'] for row in rows)
+    words = ' '.join(row['words'] for row in rows)
+    assert re.search(r'coil\d sits 0\.\d ± 0\.\d mm further \w+ than drawn', words)
     assert 'frame' in result.undetermined[0]
+
+
+def test_a_tool_moved_by_hand_calibrates_without_a_camera(setup):
+    world = World(setup, 6)
+    result = calibrated(world.waved(15.0))
+    raw, registered = world.error_m(result.model)
+    assert registered < 2e-4
+    assert raw < 1.5e-3
+    names = {effect.name for effect in result.model.effects}
+    assert {'sensor_gain_spread', 'sensor_axis_spread', 'sensor_place_spread'} <= names
+
+
+@pytest.mark.long
+def test_the_command_calibrates_a_tool_that_was_waved(shared, tmp_path):
+    folder, out = shared / 'sessions' / 'nocamera', tmp_path / 'model.yaml'
+    waved = str(folder / 'waved_short.mcap')
+    assert main(['calibrate', waved, '--out', str(out), '--report', str(tmp_path)]) == 0
+    document = json.loads((tmp_path / 'calibration.json').read_text())
+    assert len(document['emitters_off']) == 8
+    session, true = load_session(folder / 'check_tool.mcap'), folder / 'check_tool_truth.npz'
+    tracked = track_session(session, load_model(out)).sensors.values()
+    error, sigma, known = [], [], []
+    for series, places in zip(tracked, np.load(true)['p'].swapaxes(0, 1), strict=True):
+        known.append(series.ok)
+        found = [e for e, ok in zip(series.estimates, series.ok, strict=True) if ok]
+        error.append((np.array([e.position for e in found]), places[series.ok]))
+        sigma += [np.sqrt(np.trace(e.covariance[:3, :3])) for e in found]
+    found, places = (np.concatenate(part) for part in zip(*error, strict=True))
+    assert np.mean(known) > 0.99
+    assert _rms(_registered(found, places) - places) < 1.3e-4
+    assert _rms(found - places) < 6e-4
+    assert np.mean(np.linalg.norm(found - places, axis=1) > 3.0 * np.array(sigma)) < 0.01
 
 
 def wrongly(session, **parts):
@@ -159,8 +209,16 @@ def test_what_was_typed_wrongly_is_named_with_its_size(setup):
         FitError, match=r'1\.3\d\d times as far apart as typed: 4\d\.\d\d mm where 31'
     ):
         calibrated(wrongly(session, position=tool.position * [0.7408, 0.7408, 1.0]))
-    with pytest.raises(FitError, match=r'points the other way than typed, by 1[78]'):
-        calibrated(wrongly(session, flux=-tool.flux))
+    with pytest.raises(FitError, match=r'0\.001 times as far apart as typed: 4\d\.\d\d mm'):
+        calibrated(wrongly(session, position=1e3 * tool.position))
+    over = np.diag([1.0, -1.0, -1.0])
+    below = {
+        'position': tool.position @ over + [0.0, 0.0, 0.168],
+        'rotation': tool.rotation @ over,
+    }
+    for wrong in ({'flux': -tool.flux}, below):
+        with pytest.raises(FitError, match=r'points the other way than typed, by 1[78]'):
+            calibrated(wrongly(session, **wrong))
     rest = tool.frames(np.delete(np.arange(49), 16))
     same = {key: getattr(tool, key)[:48] for key in ('time', 'position', 'rotation')}
     with pytest.raises(FitError, match=r'one of the typed places 1\d to 1\d was missed'):
@@ -176,9 +234,12 @@ def test_readings_of_no_such_board_are_refused(setup):
     other = 1.0 + 0.03 * np.random.default_rng(8).normal(size=tool.flux.shape)
     with pytest.raises(FitError, match='one plane'):
         calibrated(wrongly(session, flux=tool.flux * other))
+    session = World(setup, 8).waved(8.0)
+    (tool,) = session.tools
+    with pytest.raises(FitError, match=r'no board like the drawn one|frames whose coils'):
+        calibrated(wrongly(session, flux=tool.flux[:, :, [1, 0, 2, 3, 4, 5, 6, 7]]))
 
 
 def test_right_places_pass(setup):
     (tool,) = World(setup, 9).grid().tools
-    points, axes = tool.placed()
-    assert check_typed(tool, points[:, 0], axes[:, 0]) == ''
+    assert check_typed(tool, tool) == ''

@@ -1,13 +1,13 @@
-"""Fits a drawn board, every coil of which is a little off, to readings at typed places.
+"""Fits a drawn board, every coil of which is a little off, to whatever readings there are.
 
 The drawing is the prior: a coil's place, tilt and strength have the spread of manufacturing,
 and a layer of weak dipoles stands for leads and windings that the drawing lacks. Errors of the
-sensors, of the plate that the places belong to, and of every frame's typed pose are unknown
-besides. Poses are eliminated frame by frame, and one linear-Gaussian problem remains (Tarantola,
-Inverse Problem Theory, section 3.2), solved again at each estimate. The widths of populations are
-those that make the data most probable (MacKay, Neural Computation 1992), with the stated width as
-`STATED` values more: few data leave the field near the drawing, many make it free, and the
-covariance says which.
+sensors, of the plate that typed places belong to, and every frame's pose are unknown besides.
+Poses are eliminated frame by frame, whatever their prior (typed to a tenth of a millimetre, or
+unknown), and one linear-Gaussian problem remains (Tarantola, Inverse Problem Theory, section 3.2),
+solved again at each estimate. The widths of populations are those that make the data most probable
+(MacKay, Neural Computation 1992), with the stated width as `STATED` values more: few data leave
+the field near the drawing, many make it free, and the covariance says which.
 
 What no reading determines is the frame: field and poses may move together by six numbers, which
 only the prior holds. They are stated apart (`FieldModel.shift_sigma_m`).
@@ -56,16 +56,21 @@ REST_MODES = 24
 """Its combinations that are fitted; at `LOWEST_M` others make a thousandth."""
 HEIGHTS_M = LOWEST_M * np.array([1.0, 1.5, 2.5, 4.0])
 """Heights over the board at which its field is looked at."""
-COIL = {'shift': SHIFT_M, 'turn': TILT_RAD, 'strength': GAIN, 'rest': REST}
+COIL = {'shift': SHIFT_M, 'turn': TILT_RAD, 'strength': GAIN, 'size': 1e-3, 'rest': REST}
 """Standard deviations of a coil's errors: m, rad, and relative."""
 SENSORS = {'gains': 0.02, 'axes': 0.02, 'places': 5e-4}
 """The same of the sensors': relative, rad, m, those of coils wound and glued by hand."""
-LEVEL = 0.02
-"""The same of a factor that all readings share, such as a coil's turns, relative."""
+LEVEL = np.array([0.02, 0.02, 0.01])
+"""The same of what all coils share, relative: strength (real, imaginary), as by a sensor's turns,
+and size of the windings, where a drawing counts half a track more or less."""
 PLATE = np.array([1.5e-3] * 3 + [0.01] * 3 + [3e-4])
 """The same of a plate's place (m), turn (rad) and scale: laid by eye, drilled well."""
 PLACE = np.array([1.5e-4] * 3 + [5e-3] * 3)
 """The same of a place on a plate (m, rad): a probe has some play in it."""
+FREE = np.array([0.1] * 3 + [1.0] * 3)
+"""The same of a pose that nothing states, m and rad."""
+SCALE = 7e-4
+"""The same of the scale that all coils' places share: a board is made in one piece."""
 STATED = 12.0
 """Values of a population that its stated width counts as when it is learnt."""
 WIDEST = 3.0
@@ -76,21 +81,24 @@ SETTLING = 2
 """Steps before widths, noise and weights are learnt: first the board comes to where it is."""
 SMALL = 0.05
 """Step, in standard deviations, that ends the iteration."""
-MOST_READINGS = 4000
+FINE = 4e-5
+"""Relative misfit of the dipoles that stand for a drawn coil: below the noise near the board."""
+MOST_READINGS = 1000
 """Readings of coils that are used at most, of frames evenly spread: more change no pose."""
 MOST_MODES = 64
 """Modes of the model's covariance: what more would add is below a hundredth of the noise."""
-SIDE_STEP = 1e-5
-"""Step of the differences by a coil's place (m) and turn (rad)."""
+STEP = 1e-5
+"""Step of the differences by a coil's place (m), turn (rad) and size."""
 
 KINDS = {
     'shift': slice(0, 3),
     'turn': slice(3, 6),
     'strength': slice(6, 8),
-    'rest': slice(8, None),
+    'size': slice(8, 9),
+    'rest': slice(9, None),
 }
 """Where the parameters of these kinds stand among a coil's own."""
-OWN = 8 + REST_MODES
+OWN = 9 + REST_MODES
 """Parameters of a coil."""
 
 
@@ -110,7 +118,7 @@ class Drawing:
     """A board's drawing as N dipoles, coil by coil, and L more for what it lacks.
 
     The errors of its K coils are a table (K, `OWN`): shift (m), turn (rad) about the centre,
-    complex strength less one, and amplitudes of the combinations of the L dipoles.
+    complex strength less one, size less one, and amplitudes of the combinations of the L dipoles.
     """
 
     def __init__(self, generator: Generator) -> None:
@@ -130,8 +138,9 @@ class Drawing:
         """Return the dipoles (N + L) of a board with such errors."""
         turns, own = _turned(errors[:, 3:6])[self.owner], self.centres[self.owner]
         arms = np.einsum('nij,nj->ni', turns, self.nominal.positions - own)
+        arms *= 1.0 + errors[self.owner, 8, None]
         along = np.einsum('nij,nj->ni', turns, self.nominal.directions)
-        moments = np.concatenate([self.nominal.moments, self.rest @ errors[:, 8:].T])
+        moments = np.concatenate([self.nominal.moments, self.rest @ errors[:, 9:].T])
         return Dipoles(
             np.concatenate([own + errors[self.owner, :3] + arms, self.layer.positions]),
             np.concatenate([along, self.layer.directions]),
@@ -145,18 +154,18 @@ class Drawing:
         rest = np.concatenate([np.zeros((len(self.owner), REST_MODES)), self.rest])
         for k in range(len(errors)):
             pairs = []
-            for j in range(6):
+            for j in (*range(6), 8):
                 step = np.zeros_like(errors)
-                step[k, j] = SIDE_STEP
+                step[k, j] = STEP
                 ahead, behind = (
                     self.dipoles(errors + sign * step).flux(*self.lattice, None)[:, k]
                     for sign in (1.0, -1.0)
                 )
-                pairs.append((ahead - behind) / (2.0 * SIDE_STEP))
+                pairs.append((ahead - behind) / (2.0 * STEP))
             found = moments_of_field(*self.lattice, as_real(np.stack(pairs, axis=1)), sites)
             own, strength = here.moments[:, k, None], 1.0 + errors[k, 6] + 1j * errors[k, 7]
             by_strength = own / strength
-            parts = [found, by_strength, 1j * by_strength, strength * rest]
+            parts = [found[:, :6], by_strength, 1j * by_strength, found[:, 6:], strength * rest]
             out.append(np.concatenate(parts, axis=1))
         return np.stack(out)
 
@@ -165,8 +174,9 @@ class Drawing:
 class _Part:
     """Frames of one body of one fold."""
 
-    stated: Measurements  # at the poses that are typed
+    stated: Measurements  # at the poses that are stated, or to start from
     fold: int
+    is_typed: bool  # whether their poses are stated
     offset: Array  # (F, 6): of the poses from those stated on the plate
     weights: Array  # (F, S)
     now: Measurements  # corrected by the present estimate
@@ -207,12 +217,13 @@ class DrawnFit:
 class DrawnFitter:
     """Fits a drawn board and the errors of sensors, plate and poses.
 
-    ``measurements``: of bodies whose typed places belong to one plate, all frames with a pose.
+    ``measurements``: all frames with a pose, stated or to start from, as ``typed`` says of each.
     """
 
     def __init__(
         self,
         measurements: Sequence[Measurements],
+        typed: Sequence[bool],
         generator: Generator,
         kinds: Sequence[str],
         noise_t: float,
@@ -222,16 +233,19 @@ class DrawnFitter:
         one = all(len(m.sensors) == 1 for m in measurements)
         kept = [kind for kind in kinds if kind in SENSORS and (kind == 'axes' or not one)]
         self.sensors = SensorParameters(measurements, kept, generator.frequencies_hz)
-        self.parts = list(_parts(measurements))
+        self.parts = list(_parts(measurements, typed))
         self.middle = np.mean(np.concatenate([p.stated.position for p in self.parts]), axis=0)
         self.count = len(generator.centres)
-        ends = np.cumsum([OWN * self.count, 2, 7, len(self.sensors)]).tolist()
+        ends = np.cumsum([OWN * self.count, 3, 7, len(self.sensors)]).tolist()
         self.own, self.level, self.plate, self.sensed = (
             slice(*pair) for pair in zip([0, *ends[:3]], ends, strict=True)
         )
-        self.values, self.width = np.zeros(ends[3]), np.full(ends[3], LEVEL)
-        self.width[self.plate] = PLATE
+        self.values, self.width = np.zeros(ends[3]), np.zeros(ends[3])
+        self.width[self.level], self.width[self.plate] = LEVEL, PLATE
         table = np.arange(OWN * self.count).reshape(self.count, OWN)
+        arms = generator.centres - generator.middle
+        self.scale = np.zeros(ends[3])
+        self.scale[table[:, :3].ravel()] = arms.ravel() / (arms**2).sum()
         self.groups = [(table[:, at].ravel(), COIL[kind]) for kind, at in KINDS.items()]
         start = self.sensed.start
         self.groups += [(start + rows, SENSORS[kind]) for kind, rows in self.sensors.groups()]
@@ -254,10 +268,12 @@ class DrawnFitter:
         return self._result([self._sums(part) for part in self.parts], step + 1)
 
     def errors(self, values: Array) -> Array:
-        """Return the coils' errors (K, OWN); the factor that all share is in their strengths."""
+        """Return the coils' errors (K, OWN) with what they share."""
         errors = values[self.own].reshape(self.count, OWN).copy()
-        strength = (1.0 + errors[:, 6] + 1j * errors[:, 7]) * (1.0 + values[self.level] @ [1, 1j])
+        real, imaginary, size = values[self.level]
+        strength = (1.0 + errors[:, 6] + 1j * errors[:, 7]) * (1.0 + real + 1j * imaginary)
         errors[:, 6], errors[:, 7] = strength.real - 1.0, strength.imag
+        errors[:, 8] += size
         return errors
 
     def _place(self, values: Array) -> None:
@@ -267,12 +283,12 @@ class DrawnFitter:
         shift, turn, scale = np.split(values[self.plate], [3, 6])
         rotation = _turned(turn)
         for part in self.parts:
-            arms = (1.0 + scale) * (part.stated.position - self.middle) @ rotation.T
-            there = replace(
-                part.stated,
-                position=self.middle + shift + arms,
-                rotation=rotation @ part.stated.rotation,
-            )
+            there = part.stated
+            if part.is_typed:
+                arms = (1.0 + scale) * (there.position - self.middle) @ rotation.T
+                there = replace(
+                    there, position=self.middle + shift + arms, rotation=rotation @ there.rotation
+                )
             errors = self.sensors.errors_of(there.body, values[self.sensed])
             part.now = moved(errors.apply(there), part.offset)
 
@@ -287,14 +303,16 @@ class DrawnFitter:
     def _sums(self, part: _Part) -> _Sums:
         now, size = part.now, self.values.size
         terms, made = self._terms(now)
-        white = PoseWhitener(terms.slope, part.weights, self.noise_t, self.jitter**-2.0)
-        shared = self._shared(part, terms, made)
+        jitter = self.jitter if part.is_typed else FREE
+        white = PoseWhitener(terms.slope, part.weights, self.noise_t, jitter**-2.0)
+        by_size = self._by_size(now, made[0])
+        shared = self._shared(part, terms, made, by_size)
         root = (np.sqrt(part.weights) / self.noise_t)[:, :, None]
         frames, sensors = part.weights.shape
         slope = white.slope.reshape(frames, sensors, -1, 6)
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         mixed = np.zeros((frames, 6, size))
-        for k, own in enumerate(self._of_coils(now, made)):
+        for k, own in enumerate(self._of_coils(now, made, by_size)):
             pair = slice(2 * k, 2 * k + 2)
             rows = np.concatenate([own, shared[:, :, pair]], axis=3) * root[..., None]
             rows = rows.reshape(frames, 2 * sensors, -1)
@@ -312,14 +330,25 @@ class DrawnFitter:
         variance = np.diagonal(white.inverse, axis1=1, axis2=2)
         return _Sums((normal + normal.T) / 2.0, gradient, answer, step, variance, white.freedom)
 
-    def _shared(self, part: _Part, terms: PoseTerms, made: tuple[ComplexArray, ...]) -> Array:
+    def _by_size(self, now: Measurements, flux: ComplexArray) -> ComplexArray:
+        """Derivatives (F, S, K) of fluxes by the size of the windings."""
+        points, axes = (of_all.reshape(-1, 3) for of_all in now.placed())
+        larger = self.drawing.dipoles(self.board + STEP * (np.arange(OWN) == 8))
+        lengths = np.tile(now.sensors.length, len(now.time))
+        made = larger.flux(points, axes, lengths).reshape(flux.shape)
+        return np.asarray((made - flux) / STEP)
+
+    def _shared(
+        self, part: _Part, terms: PoseTerms, made: tuple[ComplexArray, ...], by_size: ComplexArray
+    ) -> Array:
         """Derivatives (F, S, 2K, .) by what all coils share: level, plate and sensors."""
         now, flux = part.now, made[0]
-        level = np.stack([as_real(flux), as_real(1j * flux)], axis=-1)
+        level = np.stack([as_real(one) for one in (flux, 1j * flux, by_size)], axis=-1)
         ways = np.zeros((len(now.time), 6, 7))
-        ways[:, :3, :6] = _carried(now.position, self.middle)
-        ways[:, 3:, 3:6] = np.eye(3)
-        ways[:, :3, 6] = now.position - self.middle
+        if part.is_typed:
+            ways[:, :3, :6] = _carried(now.position, self.middle)
+            ways[:, 3:, 3:6] = np.eye(3)
+            ways[:, :3, 6] = now.position - self.middle
         plate = np.einsum('fsci,fij->fscj', terms.slope, ways, optimize=True)
         still = np.zeros((len(now.time), 6))
         by_sensors = as_real(
@@ -327,7 +356,9 @@ class DrawnFitter:
         ).transpose(0, 1, 3, 2)
         return np.concatenate([level, plate, by_sensors], axis=3)
 
-    def _of_coils(self, now: Measurements, made: tuple[ComplexArray, ...]) -> Iterator[Array]:
+    def _of_coils(
+        self, now: Measurements, made: tuple[ComplexArray, ...], by_size: ComplexArray
+    ) -> Iterator[Array]:
         """Yield the derivatives (F, S, 2, OWN) of each coil's fluxes by its own errors."""
         flux, by_place, by_axis = made
         points, axes = now.placed()
@@ -339,14 +370,17 @@ class DrawnFitter:
             turn = np.cross(arms, by_place[..., k]) + np.cross(axes, by_axis[..., k])
             strength = 1.0 + errors[6] + 1j * errors[7]
             own = flux[..., k, None] / strength
-            each = [-by_place[..., k], -turn, own, 1j * own, strength * rest]
+            size = by_size[..., k, None]
+            each = [-by_place[..., k], -turn, own, 1j * own, size, strength * rest]
             whole = np.concatenate(each, axis=-1)
             yield np.stack([whole.real, whole.imag], axis=2)
 
     def _likelihood(self, sums: Sequence[_Sums]) -> Likelihood:
         normal = np.sum([one.normal for one in sums], axis=0)
         gradient = np.sum([one.gradient for one in sums], axis=0)
-        return Likelihood(normal, gradient + normal @ self.values)
+        # Of the scale, whose most probable value is none: it is no part of the natural values.
+        prior = np.outer(self.scale, self.scale) / SCALE**2
+        return Likelihood(normal + prior, gradient + normal @ self.values)
 
     def _step(self, sums: Sequence[_Sums], is_learning: bool) -> float:
         """Take a step; return its size in standard deviations."""
@@ -368,13 +402,15 @@ class DrawnFitter:
         return float((np.abs(change) / np.maximum(found.sigma, 1e-15)).max())
 
     def _learn_jitter(self, sums: Sequence[_Sums]) -> None:
-        offset = np.concatenate([part.offset for part in self.parts])
-        ratio = np.concatenate([one.variance for one in sums]) / self.jitter**2
-        new = [
-            _learnt(offset[:, own], ratio[:, own], float(PLACE[own][0]))
-            for own in (slice(0, 3), slice(3, 6))
-        ]
-        self.jitter = np.repeat(new, 3)
+        typed = [(p, one) for p, one in zip(self.parts, sums, strict=True) if p.is_typed]
+        if typed:
+            offset = np.concatenate([part.offset for part, _ in typed])
+            ratio = np.concatenate([one.variance for _, one in typed]) / self.jitter**2
+            new = [
+                _learnt(offset[:, own], ratio[:, own], float(PLACE[own][0]))
+                for own in (slice(0, 3), slice(3, 6))
+            ]
+            self.jitter = np.repeat(new, 3)
 
     def _weigh(self, used: float, is_learning: bool) -> None:
         """Weigh the readings, and estimate the noise, less ``used`` degrees of freedom."""
@@ -398,10 +434,10 @@ class DrawnFitter:
             held_out.append(self._terms(part.now)[0])
         # A gain that all sensors share is the board's.
         gains, common = self.sensors.by_rule(found.values[self.sensed])
-        level = (1.0 + found.values[self.level] @ [1.0, 1j]) * common
+        level = (1.0 + found.values[self.level] @ [1.0, 1j, 0.0]) * common
         self.values = found.values.copy()
         self.values[self.sensed] = gains
-        self.values[self.level] = level.real - 1.0, level.imag
+        self.values[self.level][:2] = level.real - 1.0, level.imag
         self._place(self.values)
         model = self._model(found.covariance)
         sensed = replace(
@@ -430,7 +466,8 @@ class DrawnFitter:
         basis = flux_basis(*drawing.lattice, None, here.positions, here.directions)
         lift = np.zeros((size, len(covariance)))
         lift[:, :size] = np.eye(size)
-        lift[6:size:OWN, self.level.start] = lift[7:size:OWN, self.level.start + 1] = 1.0
+        for j in range(3):
+            lift[6 + j : size : OWN, self.level.start + j] = 1.0
         motion = np.zeros((self.count, OWN, 6))
         motion[:, :3] = _carried(drawing.centres + self.board[:, :3], self.middle)
         motion[:, 3:6, 3:] = np.eye(3)
@@ -484,10 +521,10 @@ def evenly(measurements: Sequence[Measurements]) -> list[Measurements]:
     return [m.frames(slice(None, None, step)) for m in measurements]
 
 
-def _parts(measurements: Sequence[Measurements]) -> Iterator[_Part]:
+def _parts(measurements: Sequence[Measurements], typed: Sequence[bool]) -> Iterator[_Part]:
     """The frames, those of each fold apart."""
     folds = fold_of_frames([m.position for m in measurements])
-    for whole, fold in zip(measurements, folds, strict=True):
+    for whole, fold, stated in zip(measurements, folds, typed, strict=True):
         for one in np.unique(fold).tolist():
             m = whole.frames(fold == one)
-            yield _Part(m, one, np.zeros((len(m.time), 6)), usable_weights(m), m)
+            yield _Part(m, one, stated, np.zeros((len(m.time), 6)), usable_weights(m), m)

@@ -89,7 +89,7 @@ def _nodes(shape: Array, count: int, spread: float) -> tuple[Array, Array]:
     return positions, directions
 
 
-def _coil_dipoles(shape: Array, current_a: float) -> _CoilDipoles:
+def _coil_dipoles(shape: Array, current_a: float, good: float) -> _CoilDipoles:
     """Return the fewest nodes, at their best spread, that reproduce a coil's field well."""
     points = _points(shape, 1200)
     train, held = points[:600], points[600:]
@@ -103,7 +103,7 @@ def _coil_dipoles(shape: Array, current_a: float) -> _CoilDipoles:
             misfit = float(np.std(matrix @ _solve(matrix, right) - right))
             if best is None or misfit < best[0]:
                 best = (misfit, count, spread)
-        if best is not None and best[0] < GOOD_MISFIT / np.sqrt(3.0):
+        if best is not None and best[0] < good / np.sqrt(3.0):
             break
     assert best is not None
     positions, directions = _nodes(shape, best[1], best[2])
@@ -129,14 +129,16 @@ def _changes(shape: Array, current_a: float, dipoles: _CoilDipoles) -> Array:
     return np.array(changes)
 
 
-def nominal_model(board: Board) -> FieldModel:
+def nominal_model(board: Board, good: float = GOOD_MISFIT) -> FieldModel:
     """Express the field of a drawn board by dipoles; its tolerances become the model's ``modes``.
+
+    ``good`` is the relative misfit at which no more dipoles are tried.
 
     The provenance holds ``heldout_relative_rms`` and ``heldout_relative_max``, the misfit relative
     to a coil's field at points above `LOWEST_M` that took no part in the fit. Raises `FitError`
     when the dipoles miss the field of a coil by more than `LARGEST_MISFIT`.
     """
-    coil = _coil_dipoles(board.shape, board.current_a)
+    coil = _coil_dipoles(board.shape, board.current_a, good)
     if not coil.misfit < LARGEST_MISFIT:
         raise FitError(f'dipoles miss the nominal field of a coil by {100 * coil.misfit:.3g} %')
     changes = _changes(board.shape, board.current_a, coil)

@@ -18,6 +18,7 @@ from anser_ros import extensions
 from anser_ros.arrays import Booleans, ComplexArray
 from anser_ros.calibration import disturbances
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
+from anser_ros.calibration.drawn_fit import FINE
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.readings import check_single_coils, with_pose
@@ -31,9 +32,10 @@ from anser_ros.effects.effect import Remedy, Term, effect_named
 from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
+from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.drawn_calibration import fit_to_drawing, is_for_drawing
-from anser_ros.sessions.nominal_board import NominalBoard
+from anser_ros.sessions.nominal_board import NominalBoard, board_of
 from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
 from anser_ros.wire.setup import Setup
@@ -328,8 +330,9 @@ def _fit_drawn(
 ) -> Calibration:
     """Fit the drawn board; where its field is not the readings', a free one."""
     setup = sessions[0].setup
-    generator = replace(generator_of(setup), nominal=NominalBoard.of(setup).model)
-    found = fit_to_drawing(sessions[0], generator, options, progress)
+    nominal = nominal_model(board_of(setup), FINE)
+    generator = replace(generator_of(setup), nominal=nominal)
+    found = fit_to_drawing(sessions, generator, options, progress)
     return _fit_as_scan(sessions, options, progress) if found is None else found
 
 

@@ -1,8 +1,9 @@
 """Calibrates sessions that cannot determine a free field, with a drawn board as the prior.
 
-A plate's typed places, in one plane even (`calibration.drawn_fit`). Where the drawn board puts
-each coil is compared with what was typed first: places of another pitch, a place that was missed,
-or a probe upside down are refused by name.
+A plate's typed places, in one plane even, or a tool that was moved by hand without an optical
+tracker (`calibration.drawn_fit`). Where the drawn board puts each coil is compared with what was
+typed first: places of another pitch, a place that was missed, or a probe upside down are refused
+by name.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.drawn_fit import DrawnFit, DrawnFitter, evenly
 from anser_ros.calibration.held_out import HeldOutTally
@@ -31,8 +31,11 @@ from anser_ros.calibration.result import Calibration, Scan, corrections, residua
 from anser_ros.calibration.sensor_fit import SensorFit
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.physics.rotations import nearest_rotation
+from anser_ros.physics.sensor import SAME_CENTRE_M
+from anser_ros.pose_states import INCONSISTENT, OK
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import track_session
@@ -54,66 +57,108 @@ CLEAR = 2.0
 
 
 def is_for_drawing(sessions: Sequence[Session], options: Options) -> bool:
-    """Return whether typed places leave a field open that the drawn board closes.
+    """Return whether sessions leave a field open that the drawn board closes.
 
-    They are fewer than the dipoles of a free field, or all in one plane, and belong to one plate.
+    That is a tool without any stated pose, or typed places that are fewer than the dipoles of a
+    free field, or all in one plane.
     """
     tools = [tool for session in sessions for tool in session.tools]
-    if options.layout is not None or not options.estimate or len(sessions) != 1:
+    if options.layout is not None or not options.estimate or not tools:
         return False
-    if any(tool.is_followed or not tool.sensors.is_single.all() for tool in tools):
+    if any(tool.is_followed for tool in tools) or NominalBoard.of(sessions[0].setup).model is None:
         return False
-    if not all(tool.has_pose.any() for tool in tools) or usable_frames(tools) < FEWEST_SCAN_FRAMES:
-        return False
-    few = sum(int(m.usable.sum()) for m in tools) < RICH.count**2
-    return (few or not is_thick(tools)) and NominalBoard.of(sessions[0].setup).model is not None
+    posed = [tool for tool in tools if tool.has_pose.any()]
+    if usable_frames(posed) < FEWEST_SCAN_FRAMES or len(posed) < len(tools):
+        return len(posed) < len(tools) and all(tool.sensors.is_single.all() for tool in tools)
+    return not is_thick(posed) or sum(int(m.usable.sum()) for m in posed) < RICH.count**2
 
 
 def fit_to_drawing(
-    session: Session, generator: Generator, options: Options, progress: Progress | None = None
-) -> Calibration | None:
-    """Fit the drawn board; None where its field cannot be that of the readings, as near metal.
+    sessions: Sequence[Session], generator: Generator, options: Options,
+    progress: Progress | None = None,
+) -> Calibration | None:  # fmt: skip
+    """Fit the drawn board; None where its field cannot be the readings' and typed places can tell.
 
-    Raises `FitError` with what was typed wrongly.
+    Raises `FitError` with what was typed wrongly, or when unknown poses leave no such board.
     """
-    assert generator.nominal is not None
-    session = replace(session, tools=tuple(evenly(session.tools)), reference=None)
-    settings = TrackerSettings(gate=NO_GATE, max_sigma_m=1.0)
-    tracked = track_session(session, generator.nominal, settings).sensors
-    typed = [with_pose(tool) for tool in session.tools]
-    for tool, one in zip(session.tools, typed, strict=True):
-        series = tracked[tool.sensors.name[0]]
-        rows = np.flatnonzero(np.isin(tool.time, one.time))
-        found = [series.estimates[row] for row in rows.tolist()]
-        known = series.ok[rows]
-        places = np.array([estimate.position for estimate in found])
-        places = np.where(known[:, None], places, np.nan)
-        axes = np.array([estimate.axis for estimate in found])
-        if contradiction := check_typed(one, places, axes):
-            if is_thick([one]):
-                return None  # metal moves them as well, and a free field says so
-            raise FitError(contradiction)
+    found, typed = [], []
+    for whole in sessions:
+        session = replace(whole, tools=tuple(evenly(whole.tools)), reference=None)
+        starts = _drawn_poses(session, generator.nominal)
+        for tool, start in zip(session.tools, starts, strict=True):
+            typed.append(bool(tool.has_pose.any()))
+            if typed[-1] and (contradiction := check_typed(with_pose(tool), start)):
+                if is_thick([with_pose(tool)]):
+                    return None  # metal moves them as well, and a free field says so
+                raise FitError(contradiction)
+            found.append(with_pose(tool if typed[-1] else start))
+    fewest = min(len(m.time) for m in found)
+    if fewest < FEWEST_SCAN_FRAMES:
+        raise FitError(
+            f'a calibration needs at least {FEWEST_SCAN_FRAMES} frames whose coils the drawn '
+            f'board places, got {fewest}'
+        )
     noise_t = options.accuracy.flux_noise_t
-    fit = DrawnFitter(typed, generator, options.estimate, noise_t).fit(progress)
+    fit = DrawnFitter(found, typed, generator, options.estimate, noise_t).fit(progress)
     if fit.noise_t > MOST_NOISE * noise_t:
-        return None
-    names = [Path(session.path).name for _ in session.tools]
-    return with_provenance(_calibration(fit, typed, generator, options), names)
+        if all(typed):
+            return None
+        raise FitError(
+            f'no board like the drawn one explains the readings: {fit.noise_t:.2g} T are left, '
+            f'{noise_t:.2g} T are noise. Is metal near, or are coils exchanged?'
+        )
+    names = [Path(session.path).name for session in sessions for _ in session.tools]
+    return with_provenance(_calibration(fit, found, typed, generator, options), names)
 
 
-def check_typed(typed: Measurements, there: Array, axes: Array) -> str:
+def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measurements]:
+    """The tools at the poses where the drawn board puts most of their coils, each by itself.
+
+    A turn about a single axis stays open, and is any.
+    """
+    assert nominal is not None
+    settings = TrackerSettings(gate=NO_GATE, max_sigma_m=1.0)
+    tracked, out = track_session(session, nominal, settings).sensors, []
+    for tool in session.tools:
+        series = [tracked[name].estimates for name in tool.sensors.name]
+        # Coils that are a little off contradict their body, which is no fault of their places.
+        known = np.array([[e.state in (OK, INCONSISTENT) for e in one] for one in series]).T
+        places = np.array([[e.position for e in one] for one in series]).swapaxes(0, 1)
+        axes = np.array([[e.axis for e in one] for one in series]).swapaxes(0, 1)
+        enough = 2 * known.sum(axis=1) > len(series)
+        position = np.full((len(tool.time), 3), np.nan)
+        rotation = np.tile(np.eye(3), (len(tool.time), 1, 1))
+        for row in np.flatnonzero(enough).tolist():
+            own = known[row]
+            there, arms = places[row, own], tool.sensors.position[own]
+            ways, drawn = there - there.mean(axis=0), arms - arms.mean(axis=0)
+            size = max(float((drawn**2).sum(axis=1).mean()), SAME_CENTRE_M**2)
+            turn = nearest_rotation(
+                axes[row, own].T @ tool.sensors.axis[own] + ways.T @ drawn / size
+            )
+            middles = there - arms @ turn.T
+            position[row], rotation[row] = np.median(middles, axis=0), turn
+            off = np.linalg.norm(middles - position[row], axis=1)
+            enough[row] = np.median(off) < NEAR_M
+        out.append(
+            replace(tool, position=position, rotation=rotation, has_pose=enough, track=None)
+        )
+    return out
+
+
+def check_typed(typed: Measurements, drawn: Measurements) -> str:
     """Return in words how far typed places are from where the drawn board puts them, if they are.
 
     Raises `FitError` with the size where that has a reason with a name.
 
-    ``there``, ``axes`` (F, 3): where the drawn board puts the body's first coil, m, NaN where it
-    does not say, and its axis.
+    ``drawn`` are all frames of the same body at the poses that the drawn board gives them.
     """
-    stated, pointing = (of_all[:, 0] for of_all in typed.placed())
-    known, places = np.isfinite(there).all(axis=1), stated
+    found = drawn.frames(np.isin(drawn.time, typed.time))
+    known = found.has_pose
+    places, there = (of_all.placed()[0][:, 0] for of_all in (typed, found))
     if known.sum() < FEWEST_SCAN_FRAMES:
         return ''
-    alike = np.einsum('fi,fi->f', pointing, axes)[known]
+    alike = np.einsum('fsi,fsi->fs', typed.placed()[1], found.placed()[1])[known]
     if np.median(alike) < 0.0:
         raise FitError(
             f'{typed.body}: the coil points the other way than typed, by '
@@ -151,7 +196,8 @@ def check_typed(typed: Measurements, there: Array, axes: Array) -> str:
 
 
 def _calibration(
-    fit: DrawnFit, typed: Sequence[Measurements], generator: Generator, options: Options
+    fit: DrawnFit, found: Sequence[Measurements], typed: Sequence[bool], generator: Generator,
+    options: Options,
 ) -> Calibration:  # fmt: skip
     """The result of a fit in the form of every calibration's."""
     jitter = OpticalNoise(float(fit.jitter[0]), float(fit.jitter[3]))
@@ -160,7 +206,7 @@ def _calibration(
         optical_rotation_rad=jitter.rotation_rad,
     )  # fmt: skip
     now = tuple(part.now for part in fit.parts)
-    steady = tuple(np.ones(len(m.time), dtype=bool) for m in typed)
+    steady = tuple(np.ones(len(m.time), dtype=bool) for m in found)
     sensors = SensorFit(
         fit.sensors, fit.posterior, (), fit.evidence, fit.noise_t, jitter,
         Population(fit.sensors).alone, steady, steady, 0.0, {}, fit.model.shift_sigma_m,
@@ -175,7 +221,8 @@ def _calibration(
         alternations=fit.steps,
     )  # fmt: skip
     corrected = corrections(sensors)
-    assert generator.nominal is not None
+    stated = [m for m, one in zip(found, typed, strict=True) if one]
+    nominal = generator.nominal
     model = replace(fit.model, effects=corrected)
     frame = (
         f'the frame is that of the drawing, to {1e3 * model.shift_sigma_m:.2f} mm along each axis'
@@ -185,14 +232,14 @@ def _calibration(
         layout=Layout('drawn', len(model.positions), 1.0, 0.0, 'nominal', words=WORDS),
         damping=0.0, n_measurements=sum(int(m.usable.sum()) for m in now),
         residuals=residuals(now, model),
-        scan=Scan(now, accuracy, corrected, (), sensors),
-        nominal_rmse_t=residuals(typed, generator.nominal).rmse_t,
+        scan=Scan(now, accuracy, corrected, (), sensors if all(typed) else None),
+        nominal_rmse_t=residuals(stated, nominal).rmse_t if all(typed) and nominal else None,
         undetermined=(frame,), more={
             'emitters_off': emitter_rows(fit, generator),
             'plate': {
                 'shift_m': fit.plate[:3].tolist(), 'turn_rad': fit.plate[3:6].tolist(),
                 'scale': float(1.0 + fit.plate[6]),
-            },
+            } if any(typed) else None,
         },
     )  # fmt: skip
 
@@ -208,16 +255,18 @@ def emitter_rows(fit: DrawnFit, generator: Generator) -> list[dict[str, object]]
     rows = []
     for name, error, sigma in zip(generator.emitters, fit.errors, fit.sigma, strict=True):
         words = [
-            f'sits {1e3 * abs(error[j]):.1f} mm further {WAYS[j][int(error[j] > 0.0)]} than drawn'
+            f'sits {1e3 * abs(error[j]):.1f} ± {1e3 * sigma[j]:.1f} mm further '
+            f'{WAYS[j][int(error[j] > 0.0)]} than drawn'
             for j in np.argsort(-np.abs(error[:3]))[:1]
             if abs(error[j]) > CLEAR * sigma[j]
         ]
         tilt, of_tilt = np.linalg.norm(error[3:5]), np.linalg.norm(sigma[3:5]) / np.sqrt(2.0)
         if tilt > CLEAR * of_tilt:
-            words.append(f'is tilted by {DEGREES * tilt:.1f} deg')
+            words.append(f'is tilted by {DEGREES * tilt:.1f} ± {DEGREES * of_tilt:.1f} deg')
         if abs(error[6]) > CLEAR * sigma[6]:
             words.append(
-                f'is {100 * abs(error[6]):.1f} % {"stronger" if error[6] > 0 else "weaker"}'
+                f'is {100 * abs(error[6]):.1f} ± {100 * sigma[6]:.1f} % '
+                f'{"stronger" if error[6] > 0 else "weaker"}'
             )
         rows.append(
             {
