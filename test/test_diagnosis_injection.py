@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
 from anser_ros.diagnosis.screening import clean_start, outlying_share
+from anser_ros.effects.effect import all_effects
 from anser_ros.physics.pose_track import PoseTrack
 
 
@@ -60,6 +61,36 @@ def test_what_nothing_describes_stays_unexplained(name):
     assert not {f.record.name for f in result.findings} & set(CATALOGUE)
     assert result.unexplained > 0.9
     assert result.depends_on
+
+
+def test_what_drifts_is_named_with_its_size():
+    """The phase of one emitter, and the strength of all."""
+    size = {'coil_phase_drift': 0.003, 'common_drift': 0.01}
+    for name, amount in size.items():
+        effect, made = all_effects()[name], world(1, 375, 3)
+        term = effect.candidates(made.problem().apparatus)[-1].with_theta([amount, np.log(5.0)])
+        factor = effect.emitter_matrix(term, made.tool.time, np.ones(3))
+        for one in ('tool', 'reference'):
+            old = getattr(made, one)
+            setattr(made, one, replace(old, flux=np.einsum('fab,fsb->fsa', factor, old.flux)))
+        [record] = [f.record for f in diagnose(made.problem(), made.model).findings]
+        assert (record.name, record.parameters.get('coil')) == (name, term.site.get('coil'))
+        assert record.parameters[effect.size] == pytest.approx(amount, rel=0.05)
+
+
+@pytest.mark.parametrize('quarter', [0.0, 90.0])
+def test_a_body_and_a_frame_that_stand_elsewhere_are_named_as_such(quarter):
+    made, turn = world(1, 375, 3), Rotation.from_rotvec([1.0, quarter, 0.5], degrees=True)
+    track, moved = made.tool.track, Rotation.from_rotvec([0.03, 0.0, -0.02])
+    stated = moved * Rotation.from_quat(track.quaternion) * turn.inv()
+    place = moved.apply(track.position) + [0.002, 0.0, -0.003]
+    made.track(PoseTrack(track.time, place, stated.as_quat()))
+    records = {f.record.name: f.record for f in diagnose(made.problem(), made.model).findings}
+    assert set(records) == {'body_turned', 'registration'}
+    found = records['body_turned'].parameters['rotation_deg']
+    np.testing.assert_allclose(found, [1.0, quarter, 0.5], atol=0.1)
+    found = records['registration'].parameters
+    np.testing.assert_allclose(np.radians(found['rotation_deg']), [0.03, 0, -0.02], atol=2e-3)
 
 
 CHANNEL, HIT = 2, np.arange(20, 500, 40)

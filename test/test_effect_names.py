@@ -33,13 +33,13 @@ ALLOWED = {
 GENERAL = {'base', 'correction', 'effect'}
 """Modules in the room of effects that are about no single one; others may import these."""
 MAY_IMPORT = {
-    'diagnosis/wiring.py': {'seen'},
+    'diagnosis/wiring.py': {'seen', 'sensors'},
     'diagnosis/diagnose.py': {'seen'},
     'diagnosis/fit.py': {'metal_at_rest'},
     'diagnosis/departure.py': {'moving_metal'},
 }
 """Modules of single effects that a file may import, as it makes their terms without the search:
-wiring, noise and outliers are seen directly, and have no parameter whose fit could propose them;
+wiring, quarter turns, noise and outliers are seen directly, as no fit could propose them;
 the remainder is fitted beside metal at rest, whichever effect that is; departed metal is asked for
 by a calibration alone, from a way that no search starts from."""
 FILES = sorted(

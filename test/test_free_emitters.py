@@ -176,6 +176,10 @@ def test_sessions_that_turn_about_one_axis_each_determine_a_lever_arm_together()
     assert not has_turned(about[:1]) and has_turned(about)
     assert 'lever_arm' not in SensorParameters(about[:1], KINDS).kinds
     assert 'lever_arm' in SensorParameters(about, KINDS).kinds
+    assert 'axes' in SensorParameters(about[:1], KINDS).kinds
+    rests = replace(whole, rotation=np.tile(np.eye(3), (60, 1, 1)))
+    kinds = [SensorParameters([m], KINDS).kinds for m in (rests, rests.sensors_only([0]))]
+    assert ['axes' in own for own in kinds] == [True, False]
 
 
 def stood(measured, frame, mount, session):

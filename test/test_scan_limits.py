@@ -53,6 +53,7 @@ def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
     size = len(found.parameters)
     nothing, much = (Likelihood(told * np.eye(size), np.zeros(size)) for told in (0.0, 1e14))
     assert population.shift_sigma_m(nothing, population.fit(nothing)) == SURVEYED_M
+    assert population.shift_sigma_m(nothing, population.fit(nothing), 2e-4) == 2e-4
     assert population.shift_sigma_m(much, population.fit(much)) < 1e-5, 'its setup knew the coils'
 
 

@@ -35,6 +35,7 @@ from anser_ros.calibration.selection import (
     thin_frames,
 )
 from anser_ros.calibration.sensor_fit import SensorFitter
+from anser_ros.calibration.sensor_parameters import SURVEYED_M
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
@@ -51,6 +52,7 @@ class Options:
     """Holds the options of a calibration."""
 
     accuracy: Accuracy = field(default_factory=Accuracy)  # flux noise and pose jitter
+    surveyed_m: float = SURVEYED_M  # error of a coil's place in its body along each axis
     layout: Layout | None = None  # layout of the dipoles; chosen by held-out error by default
     damping: float | None = None  # damping of the moments; chosen by held-out error by default
     # kinds of errors of sensors and clock that are estimated together with the field; whatever is,
@@ -76,8 +78,9 @@ def correct_scan(
     if not options.estimate:
         return Scan(tuple(readings.with_pose(m) for m in measurements), options.accuracy)
     fitter = SensorFitter(
-        measurements, options.estimate, generator, options.accuracy, progress, steady
-    )
+        measurements, options.estimate, generator, options.accuracy, progress, steady,
+        options.surveyed_m,
+    )  # fmt: skip
     found = fitter.fit()
     sound = [m.frames(kept) for m, kept in zip(measurements, found.kept, strict=True)]
     readings.check_kept(measurements, sound, needed)

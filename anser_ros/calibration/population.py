@@ -199,7 +199,9 @@ class Population:
             out[kind] = float(np.sqrt(np.mean(variance)))
         return out
 
-    def shift_sigma_m(self, likelihood: Likelihood, found: Posterior) -> float:
+    def shift_sigma_m(
+        self, likelihood: Likelihood, found: Posterior, surveyed_m: float = SURVEYED_M
+    ) -> float:
         """Return how well a shift of all of a body's sensors is known, m along each axis."""
         parameters, sigmas = self.parameters, self._data_sigmas(likelihood)
         if SHARED_SHIFT not in parameters.asked:
@@ -208,9 +210,9 @@ class Population:
             variance = np.diag(found.covariance)[parameters.rows(SHARED_SHIFT)].reshape(-1, 3)
             return float(np.sqrt(variance.mean(axis=1).min()))
         if 'places' not in sigmas or all(len(table) < 2 for table in parameters.tables):
-            return SURVEYED_M
+            return surveyed_m
         width = np.sqrt(np.mean(found.width[parameters.rows('places')] ** 2))
-        return float(min(SURVEYED_M, AS_PLACES * np.hypot(width, sigmas['places'])))
+        return float(min(surveyed_m, AS_PLACES * np.hypot(width, sigmas['places'])))
 
     def _power(self, likelihood: Likelihood, found: Posterior, kind: str) -> float:
         """What a kind of error does to the fluxes, in the power of their noise."""

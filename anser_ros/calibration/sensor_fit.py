@@ -76,6 +76,7 @@ from anser_ros.calibration.sensor_parameters import (
     EACH,
     PRIOR,
     STANDS,
+    SURVEYED_M,
     USEFUL,
     BodyErrors,
     SensorParameters,
@@ -245,8 +246,9 @@ class SensorFitter:
         accuracy: Accuracy,
         progress: Progress | None = None,
         steady: Sequence[Booleans] | None = None,
+        surveyed_m: float = SURVEYED_M,
     ) -> None:
-        self.measured = list(measurements)
+        self.measured, self.surveyed_m = list(measurements), surveyed_m
         every = [np.ones(len(m.time), dtype=bool) for m in measurements]
         self.steady = every if steady is None else list(steady)
         self.generator, self.accuracy, self.nominal = generator, accuracy, generator.nominal
@@ -325,7 +327,7 @@ class SensorFitter:
         )
         kept, reflected = self._all_frames(steady)
         mean = self.optical.mean_sigma_m(sum(int(mask.sum()) for mask in kept))
-        shift = self.population.shift_sigma_m(self.likelihood, whole)
+        shift = self.population.shift_sigma_m(self.likelihood, whole, self.surveyed_m)
         return SensorFit(
             self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
             self.population.alone, kept, steady, reflected, self._undetermined(),

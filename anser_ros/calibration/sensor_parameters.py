@@ -119,8 +119,8 @@ class BodyErrors:
         return replace(out, track=track, position=position, rotation=rotation, has_pose=seen)
 
 
-def has_turned(measurements: Sequence[Measurements]) -> bool:
-    """Return whether a body turned about two axes, without which a lever arm shifts the field.
+def has_turned(measurements: Sequence[Measurements], axes: int = 2) -> bool:
+    """Return whether a body turned about so many axes; two, or a lever arm shifts the field.
 
     ``measurements``: of the body, in all sessions: several that turn about one axis each will do.
     """
@@ -129,7 +129,7 @@ def has_turned(measurements: Sequence[Measurements]) -> bool:
         return False
     turns = Rotation.from_matrix(rotation[0].T @ rotation).as_rotvec()
     about = np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False) / np.sqrt(len(turns))
-    return bool(about[1] > TURNED_RAD)
+    return bool(about[axes - 1] > TURNED_RAD)
 
 
 def velocity_of(measurements: Measurements) -> Array:
@@ -161,8 +161,10 @@ class SensorParameters:
             set(kinds) if all(m.is_followed for m in measurements) else {*kinds} - {*CLOCKS}
         )
         bodies = {m.body for m in measurements}
-        if not all(has_turned([m for m in measurements if m.body == body]) for body in bodies):
-            estimated -= {SHARED_SHIFT}
+        for own in ([m for m in measurements if m.body == body] for body in bodies):
+            estimated -= set() if has_turned(own) else {SHARED_SHIFT}
+            if len(own[0].sensors) == 1 and not has_turned(own, 1):
+                estimated -= {'axes'}  # a tilt that all poses share is the field's too
         if not self.omega.any():
             estimated -= {'delays'}
         # Of all bodies, and of each.

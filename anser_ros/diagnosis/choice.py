@@ -16,7 +16,7 @@ from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.engine import BlockSums, Score, Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, parts
-from anser_ros.diagnosis.screening import noise_scale
+from anser_ros.diagnosis.screening import known_variance, noise_scale
 from anser_ros.effects.base import View
 from anser_ros.effects.effect import INEXACT, Family, Term, all_effects
 from anser_ros.parallel import in_order
@@ -415,12 +415,13 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
     return Confirmation(power, 0.0, np.inf, stays, alike=_crowd(fit, term))
 
 
-def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmation, Term]]:
+def doubtful(problem: Problem, fit: Fit) -> list[tuple[Confirmation, Term]]:
     """Return a fit's effects that are not confirmed, the one with the least power first."""
+    noise, white = known_variance(fit.state), noise_scale(fit.state) ** 2
     fitted = [term for term in fit.effects if term.theta.size]
     free = [term for term in fit.terms if term.effect.family is Family.FLUCTUATION]
     checks = [(_checked(problem, fit, term, noise), term) for term in fitted]
-    checks += [(_checked_open(problem, fit, term, noise), term) for term in free]
+    checks += [(_checked_open(problem, fit, term, white), term) for term in free]
     checks += _unsteady(problem, fit)
     bad = [(check, term) for check, term in checks if not check.holds]
     return sorted(bad, key=lambda pair: pair[0].power)

@@ -276,7 +276,7 @@ def _settled(
 ) -> tuple[Fit, tuple[tuple[Term, Confirmation], ...]]:
     """The joint fit, by ``last``, of the effects that are the same in all parts of the data."""
     fit, refused = search.fit, []
-    while bad := doubtful(fitter.problem, fit, screening.noise_scale(fit.state) ** 2):
+    while bad := doubtful(fitter.problem, fit):
         # Metal that is doubtful costs much to fit again and is hardly ever more than a stand-in.
         metal = [pair for pair in bad if pair[1].effect.family.is_metal]
         crowd = [pair for pair in bad if pair[0].alike >= decisions.MANY]

@@ -144,6 +144,16 @@ def noise_scale(state: State) -> float:
     return float(np.sqrt(_noise(tool_parts(state))))
 
 
+def known_variance(state: State) -> float:
+    """Return the variance of the tools' residuals that is known of: noise, and what the model
+    says that it may be wrong by, which is alike at places close to each other.
+    """
+    noise, spread = noise_scale(state) ** 2, state.problem.spread
+    weight = np.concatenate([part.whitener.weight.ravel() for part in tool_parts(state)])
+    own = float(np.mean(np.maximum(1.0 - (spread.noise_t * weight[weight > 0]) ** 2, 0.0)))
+    return max(noise, min(noise + own, 1.0))
+
+
 def noise_t(state: State) -> float:
     """Return the noise of a phasor component, T: the white part.
 

@@ -17,7 +17,6 @@ from anser_ros.diagnosis import choice, decisions
 from anser_ros.diagnosis.engine import ForwardSelection, Score, Scorer, is_covered
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Problem, State
-from anser_ros.diagnosis.screening import noise_scale
 from anser_ros.effects.effect import Family, Term, all_effects
 from anser_ros.parallel import in_order, sharing, slices
 
@@ -124,11 +123,14 @@ class _FluxSelection(ForwardSelection[Fit]):
         if not is_worthwhile(gain, term.complexity, best):
             return None
         if term.effect.family.is_metal:
-            if gain < decisions.REMNANT * search.metal_gain or _may_be_the_model_s(gain, best):
+            if gain < decisions.REMNANT * search.metal_gain:
                 return None
-            if self._is_installed_anew(fit, best, gain):
+            is_own = _may_be_the_model_s(gain, best)
+            if is_own and fit.misfit < decisions.COMPLETE:
+                return None
+            if is_own or self._is_installed_anew(fit, best, gain):
                 self._most_metals = 0
-                return self.addition(fit)
+                return self._stood_anew(fit, gain) or self.addition(fit)
             search.metal_gain = max(search.metal_gain, gain)
         search.rivals[term.label] = _rivals(gain, best, fitted)
         if term.effect.family is Family.MOVING_METAL:
@@ -147,8 +149,9 @@ class _FluxSelection(ForwardSelection[Fit]):
 
     def is_lost(self, fit: Fit) -> bool:
         """Return whether so many effects are doubtful that something else is the cause."""
-        noise = noise_scale(fit.state) ** 2
-        return len(choice.doubtful(self._fitter.problem, fit, noise)) >= decisions.MOST_DOUBTFUL
+        if self._most_metals == 0:  # several parts were set up anew, and some are not named yet
+            return False
+        return len(choice.doubtful(self._fitter.problem, fit)) >= decisions.MOST_DOUBTFUL
 
     def superfluous(self, fit: Fit) -> Fit | None:
         """Return the fit without the first effect that the others explain away, but the newest."""
@@ -163,6 +166,13 @@ class _FluxSelection(ForwardSelection[Fit]):
                 return without
         return None
 
+    def _anew(self, before: Fit) -> list[Term]:
+        """Return what may stand anew and is not fitted already."""
+        apparatus = self._fitter.problem.apparatus
+        effects = [effect for effect in all_effects().values() if effect.installed]
+        every = [term for effect in effects for term in effect.candidates(apparatus)]
+        return [term for term in every if not is_covered(term, before.terms)]
+
     def _is_installed_anew(self, before: Fit, metal: Fit, gain: float) -> bool:
         """Whether metal at rest stands in for parts of the system that were set up anew.
 
@@ -171,13 +181,18 @@ class _FluxSelection(ForwardSelection[Fit]):
         """
         if metal.newest.effect.family is not Family.METAL_AT_REST:
             return False
-        apparatus = self._fitter.problem.apparatus
-        every = [t for effect in all_effects().values() for t in effect.anew(apparatus)]
-        anew = [term for term in every if not is_covered(term, before.terms)]
+        anew = self._anew(before)
         alike = decisions.ALIKE * gain + decisions.AS_GOOD * max(metal.misfit, 1.0)
         most = min(metal.held_out() + alike, decisions.AS_LITTLE * metal.held_out())
         fit = self._fitter.fit([*before.terms, *anew])
         return fit.held_out() < most and fit.misfit < decisions.COMPLETE
+
+    def _stood_anew(self, before: Fit, gain: float) -> Fit | None:
+        """Frames and bodies that stand elsewhere, all together, where that explains most of it."""
+        stands = [term for term in self._anew(before) if term.effect.is_stand]
+        fit = self._fitter.fit([*before.terms, *stands])
+        explained = before.held_out() - fit.held_out()
+        return fit if stands and explained > decisions.STEADY * gain else None
 
     def _simplified(self, fit: Fit) -> Fit:
         """Take a simpler effect for an earlier one, which may have absorbed part of the newest."""
@@ -217,6 +232,9 @@ class _FluxSelection(ForwardSelection[Fit]):
             for (expected, term), fit in zip(some, fits, strict=True):
                 if _is_surpassed(expected, term, fitted):  # by one that was fitted beside it
                     continue
+                newest = fit.newest
+                if newest.theta.size and not newest.theta[newest.effect.amounts(newest)].any():
+                    continue  # at its bound, where it is nothing
                 gain = scorer.held_out - fit.held_out() - choice.taken_from_others(fit)
                 fitted.append((gain, fit))
                 table.append(Candidate(fit.newest, term.complexity, gain, gain))

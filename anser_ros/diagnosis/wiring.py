@@ -18,13 +18,13 @@ from anser_ros.diagnosis.problem import Problem
 from anser_ros.effects.correction import Fields, tool_view
 from anser_ros.effects.effect import Site, Term
 from anser_ros.effects.seen import (
-    BODY_TURNED,
     COIL_POLARITY,
     DEAD_CHANNEL,
     SENSOR_POLARITY,
     SWAPPED_CHANNELS,
     SWAPPED_COILS,
 )
+from anser_ros.effects.sensors import BODY_TURNED
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
@@ -71,10 +71,7 @@ def _silent(seen: ComplexArray, wanted: ComplexArray) -> Booleans:
 
 def wiring_faults(problem: Problem) -> list[Term]:
     """Return terms for the faults of wiring and mounting of the tools and emitters."""
-    found: list[Term] = []
-    coils = _swapped_coils(_read(problem, found))
-    if coils is not None:
-        found.append(coils)
+    found = _swapped_coils(_read(problem, ()))
     for number in range(len(problem.tools)):
         found += _rewired(problem, number, found)
     tools = _read(problem, found)
@@ -228,9 +225,8 @@ def _climbed(start: Array, together: Array) -> Array:
 def _quarter_turns(channels: Integers) -> list[Term]:
     """The quarter turns of a body with these channels, the least first."""
     group = sorted(Rotation.create_group('O'), key=lambda one: round(float(one.magnitude()), 6))
-    turns = [np.round(np.degrees(turn.as_rotvec()), 6).tolist() for turn in group[1:]]
     own = tuple(channels.tolist())
-    return [Term(BODY_TURNED, {'channels': own, 'rotation_deg': tuple(turn)}) for turn in turns]
+    return [Term(BODY_TURNED, {'channels': own}, turn.as_rotvec()) for turn in group[1:]]
 
 
 def _turns(plain: _Readings, read: Callable[[Sequence[Term]], _Readings]) -> Iterator[list[Term]]:
@@ -256,8 +252,10 @@ def _likeness(pairs: Sequence[tuple[ComplexArray, ComplexArray]]) -> Array:
     return np.asarray(cross / np.sqrt(np.maximum(np.outer(own, power), 1e-300)))
 
 
-def _moved(alike: Array, is_driven: Booleans) -> Integers:
-    """Rows that are plainly another's; none when they are no permutation."""
+def _moved(
+    alike: Array, is_driven: Booleans, numbers: Integers
+) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Numbers of what is read, and as what, where it is plainly another's and a permutation."""
     rows = np.arange(len(alike))
     order, own = np.argmax(alike, axis=1), np.diag(alike)
     best = alike[rows, order]
@@ -267,29 +265,24 @@ def _moved(alike: Array, is_driven: Booleans) -> Integers:
         & (best > decisions.OTHERS_CORRELATION)
         & (1 - best**2 < decisions.BETTER * (1 - own**2))
     ]
-    return np.asarray(moved if set(order[moved]) == set(moved) else moved[:0])
+    true = order[moved]
+    if not moved.size or set(true) != set(moved):
+        return []
+    return [(tuple(numbers[true].tolist()), tuple(numbers[moved].tolist()))]
 
 
 def _swapped_channels(tool: _Readings) -> list[Term]:
     """Channels of a tool that read as another's prediction."""
     alike = _likeness([(tool.seen, tool.wanted)])
-    moved = _moved(alike, tool.driven)
-    true = np.argmax(alike, axis=1)[moved]
-    site: Site = {
-        'channels': tuple(tool.channels[true].tolist()),
-        'read_as': tuple(tool.channels[moved].tolist()),
-    }
-    return [Term(SWAPPED_CHANNELS, site)] if moved.size else []
+    pairs = _moved(alike, tool.driven, tool.channels)
+    return [Term(SWAPPED_CHANNELS, {'channels': t, 'read_as': r}) for t, r in pairs]
 
 
-def _swapped_coils(tools: Sequence[_Readings]) -> Term | None:
+def _swapped_coils(tools: Sequence[_Readings]) -> list[Term]:
     """Emitters whose tones are like another's prediction, in all sensors, whatever their signs."""
     alike = _likeness([(np.moveaxis(t.seen, 1, 2), np.moveaxis(t.wanted, 1, 2)) for t in tools])
-    moved = _moved(alike, np.ones(len(alike), dtype=bool))
-    if not moved.size:
-        return None
-    true = np.argmax(alike, axis=1)[moved]
-    return Term(SWAPPED_COILS, {'coils': tuple(true.tolist()), 'read_as': tuple(moved.tolist())})
+    pairs = _moved(alike, np.ones(len(alike), dtype=bool), np.arange(len(alike)))
+    return [Term(SWAPPED_COILS, {'coils': true, 'read_as': read}) for true, read in pairs]
 
 
 def _reversed(tools: Sequence[_Readings]) -> list[Term]:

@@ -45,7 +45,6 @@ class Site(TypedDict, total=False):
     coils: tuple[int, ...]  # of crosstalk: the one that leaks, and the one that it leaks into
     read_as: tuple[int, ...]  # for each of the channels or coils, the one whose place it has
     body: str
-    rotation_deg: tuple[float, ...]  # rotation vector of a body in its holder, its own frame
     mutual: Literal[True]  # the leak is the same both ways
     shape: str  # curve of a saturation
     sees: str  # what a saturating channel sees: one tone, or all together
@@ -261,6 +260,8 @@ class Effect(BaseEffect[TermT]):
     gregarious: ClassVar[bool] = False
     # whether it is how a part is installed: installed anew, parts are a rival of metal at rest
     installed: ClassVar[bool] = False
+    # whether it is how a frame or a body stands, all of it
+    is_stand: ClassVar[bool] = False
     # whether its record is how the optical frame lies, as `rotation_deg` and `translation_m`
     is_frame: ClassVar[bool] = False
     # relative error of what it changes at a reference, beyond the survey's, where the field's
@@ -274,10 +275,6 @@ class Effect(BaseEffect[TermT]):
     def candidates(self, apparatus: Apparatus) -> Sequence[TermT]:
         """Return the effect at every site where it may sit, with parameters of zero."""
         return ()
-
-    def anew(self, apparatus: Apparatus) -> Sequence[TermT]:
-        """Return what it is where the same parts are set up anew: a rival of metal at rest."""
-        return self.candidates(apparatus) if self.installed else ()
 
     def columns(self, term: TermT, view: View) -> ComplexArray | None:
         """Return the derivative of the view's flux by the parameters, (F, S, K, q), or None."""
@@ -297,7 +294,7 @@ class Effect(BaseEffect[TermT]):
 
     def started(self, term: TermT, solution: Array) -> Sequence[TermT]:
         """Return start values for the full fit from the solution of the probe."""
-        return (term.with_theta(solution),)
+        return (self.bounded(term.with_theta(solution)),)
 
     def along(
         self, time: Array, course: Array, solution: Array, apparatus: Apparatus
@@ -348,8 +345,8 @@ class Effect(BaseEffect[TermT]):
     def _figures(self, values: Array) -> dict[str, Any]:
         out, start = {}, 0
         for key, (width, factor) in self.recorded.items():
-            part = (factor * values[start : start + width]).tolist()
-            out[key] = part if width > 1 else part[0]
+            if part := (factor * values[start : start + width]).tolist():
+                out[key] = part if width > 1 else part[0]
             start += width
         return out
 

@@ -1,7 +1,7 @@
 """What is wrong with emitters: strength, its drift, leaking tones, place, size."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 
 import numpy as np
@@ -12,6 +12,7 @@ from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.channels import ComplexGain
 from anser_ros.effects.effect import Effect, Remedy, Site, Term, sigmas
 from anser_ros.field.model import Dipoles, EffectRecord, size_figures, spread_along, symmetry_axis
+from anser_ros.physics.rotations import spatial
 
 
 def _of_one(term: Term, emitters: int, factor: complex) -> ComplexArray:
@@ -82,7 +83,7 @@ def _shape(time: Array, tau: float) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class CoilDriftTerm(Term):
-    """Holds the drift of one emitter."""
+    """Holds the drift of one emitter, or of all."""
 
     duration: float = 1.0  # Of the session, s; only the search needs it
 
@@ -93,8 +94,9 @@ class CoilDrift(Effect[CoilDriftTerm]):
     name = 'coil_drift'
     summary = "an emitter's strength changes with time"
     units = {'coil': '1', 'amount': '1', 'tau_s': 's'}
-    plausible = {'amount': (-0.5, 0.5), 'tau_s': (0.5, 1000.0)}
+    plausible = {'amount': (-0.5, 0.5), 'tau_s': (0.25, 1600.0)}
     remedy = Remedy.FLUX
+    size = 'amount'  # the key of a
     typical = (0.1, 1.6)  # some percent, and a time constant within a factor of five
     drifts = True
 
@@ -107,29 +109,30 @@ class CoilDrift(Effect[CoilDriftTerm]):
         """Return the amount's index alone: a drift of nothing has any time constant."""
         return np.array([0])
 
-    def _own(self, term: CoilDriftTerm, view: View) -> ComplexArray:
-        coil, (amount, log_tau) = term.site['coil'], term.theta
-        factor = 1 + amount * _shape(view.time, float(np.exp(log_tau)))
-        return np.asarray(view.linear[:, :, coil] / factor[:, None])
+    def _factor(self, term: CoilDriftTerm, time: Array) -> tuple[ComplexArray, ComplexArray]:
+        """Return what the emitter is multiplied by (F,), and that by the curve's size."""
+        curve = _shape(time, float(np.exp(term.theta[1])))
+        return 1 + term.theta[0] * curve, np.ones(time.size, dtype=complex)
+
+    def _changed(self, term: CoilDriftTerm, view: View, curves: Sequence[Array]) -> ComplexArray:
+        """Return the emitter's flux by the size of some curves (F,)."""
+        factor, slope = self._factor(term, view.time)
+        out, which = view.columns(len(curves)), [term.site['coil']] if term.site else slice(None)
+        own = view.linear[:, :, which] * (slope / factor)[:, None, None]
+        out[:, :, which] = own[..., None] * np.stack(curves, axis=-1)[:, None, None]
+        return out
 
     def columns(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
         """Return the emitter's flux times the derivatives of the curve."""
         amount, log_tau = term.theta
         tau = float(np.exp(log_tau))
-        own, late = self._own(term, view), np.maximum(view.time, 0.0) / tau
-        out = view.columns(2)
-        out[:, :, term.site['coil'], 0] = own * _shape(view.time, tau)[:, None]
-        out[:, :, term.site['coil'], 1] = own * (-amount * late * np.exp(-late))[:, None]
-        return out
+        late = np.maximum(view.time, 0.0) / tau
+        return self._changed(term, view, [_shape(view.time, tau), -amount * late * np.exp(-late)])
 
     def probe(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
         """Return the flux of drifts with three different time constants."""
-        own = self._own(term, view)
-        out = view.columns(len(PROBED_SHARES))
-        for i, share in enumerate(PROBED_SHARES):
-            curve = _shape(view.time, share * term.duration)
-            out[:, :, term.site['coil'], i] = own * curve[:, None]
-        return out
+        curves = [_shape(view.time, share * term.duration) for share in PROBED_SHARES]
+        return self._changed(term, view, curves)
 
     def started(self, term: CoilDriftTerm, solution: Array) -> Sequence[CoilDriftTerm]:
         """Start with the time constant whose curve comes nearest to the probe's sum."""
@@ -142,31 +145,56 @@ class CoilDrift(Effect[CoilDriftTerm]):
             curve = _shape(time, float(tau))
             amount = float(curve @ wanted / (curve @ curve))
             misfits.append((float(np.sum((wanted - amount * curve) ** 2)), amount, np.log(tau)))
-        return (term.with_theta(np.array(min(misfits)[1:])),)
+        return (self.bounded(term.with_theta(np.array(min(misfits)[1:]))),)
 
     def bounded(self, term: CoilDriftTerm) -> CoilDriftTerm:
-        """Keep the time constant between half a second and a quarter of an hour."""
+        """Keep the time constant between a third of a second and 25 minutes."""
         amount, log_tau = term.theta
         return term.with_theta(np.array([amount, np.clip(log_tau, np.log(0.3), np.log(1500.0))]))
 
     def emitter_matrix(self, term: CoilDriftTerm, time: Array, omega: Array) -> ComplexArray:
-        amount, log_tau = term.theta
         matrix = np.repeat(np.eye(omega.size, dtype=complex)[None], time.size, axis=0)
-        coil = term.site['coil']
-        matrix[:, coil, coil] = 1 + amount * _shape(time, float(np.exp(log_tau)))
+        coils = [term.site['coil']] if 'coil' in term.site else np.arange(omega.size)
+        matrix[:, coils, coils] = self._factor(term, time)[0][:, None]
         return matrix
 
     def record(self, term: CoilDriftTerm, covariance: Array) -> EffectRecord:
         sigma, tau = sigmas(covariance), float(np.exp(term.theta[1]))
         return EffectRecord(
             self.name,
-            {'coil': term.site['coil'], 'amount': float(term.theta[0]), 'tau_s': tau},
-            {'amount': float(sigma[0]), 'tau_s': tau * float(sigma[1])},
+            {**term.recorded_site, self.size: float(term.theta[0]), 'tau_s': tau},
+            {self.size: float(sigma[0]), 'tau_s': tau * float(sigma[1])},
         )
 
     def term(self, record: EffectRecord) -> CoilDriftTerm:
-        theta = np.array([float(record.needed('amount')), np.log(float(record.needed('tau_s')))])
+        theta = np.array([float(record.needed(self.size)), np.log(float(record.needed('tau_s')))])
         return CoilDriftTerm(self, self.site_of(record), theta)
+
+
+class CoilPhaseDrift(CoilDrift):
+    """Turns an emitter's phase by a (1 - exp(-t/tau)); theta is a (rad) and log(tau / s)."""
+
+    name = 'coil_phase_drift'
+    summary = "an emitter's phase changes with time"
+    units = {'coil': '1', 'phase_rad': 'rad', 'tau_s': 's'}
+    plausible = {'phase_rad': (-0.5, 0.5), 'tau_s': (0.25, 1600.0)}
+    size = 'phase_rad'
+
+    def _factor(self, term: CoilDriftTerm, time: Array) -> tuple[ComplexArray, ComplexArray]:
+        factor = np.exp(1j * term.theta[0] * _shape(time, float(np.exp(term.theta[1]))))
+        return factor, 1j * factor
+
+
+class CommonDrift(CoilDrift):
+    """Multiplies all emitters alike, or the gain of all channels, which is the same."""
+
+    name = 'common_drift'
+    summary = 'the strength of all emitters, or the gain of all channels, changes with time'
+    units = {'amount': '1', 'tau_s': 's'}
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[CoilDriftTerm]:
+        first = super().candidates(apparatus)[0]
+        return [replace(first, site={})]
 
 
 class CoilCrosstalk(Effect[Term]):
@@ -181,6 +209,7 @@ class CoilCrosstalk(Effect[Term]):
     plausible = {'eps': (-0.5, 0.5)}
     remedy = Remedy.FLUX
     typical = 0.1  # leaks amount to some percent
+    recorded = {'eps': (1, 1.0), 'eps_quadrature': (1, 1.0)}  # a mutual leak has no quadrature
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         coils = range(apparatus.emitters)
@@ -212,12 +241,6 @@ class CoilCrosstalk(Effect[Term]):
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
         return self._matrix(term, omega.size)[None]
-
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        keys = ('eps', 'eps_quadrature')[: term.theta.size]
-        parameters = {**term.recorded_site, **dict(zip(keys, term.theta.tolist(), strict=True))}
-        sigma = sigmas(covariance).tolist()
-        return EffectRecord(self.name, parameters, dict(zip(keys, sigma, strict=True)))
 
     def term(self, record: EffectRecord) -> Term:
         site, eps = self.site_of(record), float(record.needed('eps'))
@@ -284,15 +307,6 @@ class CoilTurnedTerm(Term):
         return np.eye(3) - np.outer(self.axis, self.axis)
 
 
-def _spatial(vector: Array) -> Array:
-    """Return what turn (rad, fixed axes) a step of a rotation vector makes, (3, 3)."""
-    angle, cross = float(np.linalg.norm(vector)), np.cross(vector, np.eye(3)).T
-    if angle < 1e-4:
-        return np.asarray(np.eye(3) + cross / 2)
-    once, twice = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    return np.asarray(np.eye(3) + once * cross + twice * cross @ cross)
-
-
 class CoilTurned(CoilMoved):
     """Theta is the rotation vector of one emitter about its middle, rad, frame fg."""
 
@@ -325,7 +339,7 @@ class CoilTurned(CoilMoved):
             view.axes, view.d_axis[..., coil]
         )
         out = view.columns(3)
-        out[:, :, coil] = -turn @ _spatial(term.seen @ term.theta) @ term.seen
+        out[:, :, coil] = -turn @ spatial(term.seen @ term.theta) @ term.seen
         return out
 
     def _moved(self, term: Term, place: Array, direction: Array) -> tuple[Array, Array]:
@@ -440,6 +454,8 @@ EFFECTS = (
     CoilGain(),
     CoilPhase(),
     CoilDrift(),
+    CoilPhaseDrift(),
+    CommonDrift(),
     CoilCrosstalk(),
     CoilMoved(),
     CoilTurned(),

@@ -90,7 +90,7 @@ class Registration(OpticalEffect[Term]):
     recorded = {'rotation_deg': (3, 180.0 / np.pi), 'translation_m': (3, 1.0)}
     typical = (0.02, 0.02, 0.02, 5e-3, 5e-3, 5e-3)
     installed = True
-    is_frame = True
+    is_frame = is_stand = True
 
     def slopes(self, term: Term, view: View) -> ComplexArray:
         """Return the derivative by a turn about fg's origin and a shift, made the other way."""

@@ -5,15 +5,13 @@ outliers in what it leaves, with one number that says how much.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term
 from anser_ros.field.model import EffectRecord
-from anser_ros.physics.sensor import SensorTable
 
 
 class Wiring(Effect[Term]):
@@ -98,27 +96,8 @@ class CoilPolarity(Wiring):
         return np.diag(signs).astype(complex)[None]
 
 
-class BodyTurned(Wiring):
-    """Turns a body's sensors about its origin by the rotation vector of the site, deg."""
-
-    name = 'body_turned'
-    summary = 'a body stands in its holder by a quarter turn, or its axes are stated so'
-    units = {'channels': '1', 'rotation_deg': 'deg'}
-    remedy = Remedy.SENSORS
-
-    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
-        own = np.isin(sensors.channel, term.site['channels'])[:, None]
-        turn = Rotation.from_rotvec(term.site['rotation_deg'], degrees=True).as_matrix()
-        place, axis = (np.where(own, v @ turn.T, v) for v in (sensors.position, sensors.axis))
-        return replace(sensors, position=place, axis=axis)
-
-    def term(self, record: EffectRecord) -> Term:
-        turn = tuple(float(value) for value in record.needed('rotation_deg'))
-        return Term(self, {**self.site_of(record), 'rotation_deg': turn})
-
-
 SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()
-SENSOR_POLARITY, COIL_POLARITY, BODY_TURNED = SensorPolarity(), CoilPolarity(), BodyTurned()
+SENSOR_POLARITY, COIL_POLARITY = SensorPolarity(), CoilPolarity()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,5 +161,5 @@ def outliers_of(fraction: float, sigma: float, channels: Sequence[int]) -> SeenT
 
 EFFECTS = (
     SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL, SENSOR_POLARITY, COIL_POLARITY,
-    BODY_TURNED, EXCESS_NOISE, OUTLIERS, LOOSE_CONTACT,
+    EXCESS_NOISE, OUTLIERS, LOOSE_CONTACT,
 )  # fmt: skip

@@ -12,7 +12,7 @@ from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term, sigmas, whole_numbers
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.physics.rotations import tangents, tilted
+from anser_ros.physics.rotations import spatial, tangents, tilted
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
 
@@ -40,11 +40,8 @@ class SensorAxis(Effect[SensorAxisTerm]):
             for table in apparatus.tools
             for channel, axis in zip(table.channel.tolist(), table.axis.tolist(), strict=True)
         ]
-        # The turn of all that a tool has is hardly told from another frame of its poses.
-        return [*terms, *(t for t in self.anew(apparatus) if len(t.channels) < len(terms))]
-
-    def anew(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
-        return [SensorAxisTerm(self, {'channels': c}, np.zeros(3)) for c in apparatus.clusters()]
+        parts = [c for c in apparatus.clusters() if len(c) < len(terms)]  # else `BodyTurned`
+        return [*terms, *(SensorAxisTerm(self, {'channels': c}, np.zeros(3)) for c in parts)]
 
     def columns(self, term: SensorAxisTerm, view: View) -> ComplexArray | None:
         """Return the derivative by the axis, along the tangents or across the cluster's turn."""
@@ -171,6 +168,41 @@ class LeverArm(PlacedElsewhere):
         return [Term(self, {'body': body}, np.zeros(3)) for body in bodies]
 
 
+class BodyTurned(Effect[Term]):
+    """Theta is the rotation vector (rad, body) of all of a body's sensors about its origin."""
+
+    name = 'body_turned'
+    summary = 'a body stands turned in its holder, or its axes are stated so'
+    units = {'channels': '1', 'rotation_deg': 'deg'}
+    remedy = Remedy.SENSORS
+    typical = 0.1
+    installed = is_stand = True
+    recorded = {'rotation_deg': (3, 180.0 / np.pi)}
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+        bodies = [tuple(table.channel.tolist()) for table in apparatus.tools if len(table) > 1]
+        return [Term(self, {'channels': channels}, np.zeros(3)) for channels in bodies]
+
+    def complexity(self, term: Term) -> int:
+        """Return that of a registration, which goes before where a body hardly turns."""
+        return 6
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        rows = np.isin(view.sensors.channel, term.site['channels'])
+        if view.is_reference or not rows.any():
+            return None
+        out, way = view.columns(3), view.rotation @ spatial(term.theta)
+        out[:, rows] = np.einsum('fsik,fij->fskj', view.d_turn[:, rows], way)
+        return out
+
+    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
+        own = np.isin(sensors.channel, term.site['channels'])[:, None]
+        turn = Rotation.from_rotvec(term.theta).as_matrix()
+        place, axis = (np.where(own, v @ turn.T, v) for v in (sensors.position, sensors.axis))
+        return replace(sensors, position=place, axis=axis)
+
+
+BODY_TURNED = BodyTurned()
 SIZE_UNIT = 1e-4
 """theta counts squared lengths in units of (10 mm)^2."""
 
@@ -455,7 +487,7 @@ class SensorPickupSpread(SensorSpread):
 
 
 EFFECTS = (
-    SensorAxis(), SensorPosition(), LeverArm(), SensorSize(),
+    SensorAxis(), SensorPosition(), LeverArm(), BODY_TURNED, SensorSize(),
     SensorGainSpread(), SensorDelaySpread(), SensorAxisSpread(), SensorPlaceSpread(),
     SensorPickupSpread(),
 )  # fmt: skip

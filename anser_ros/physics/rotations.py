@@ -131,3 +131,12 @@ def rotation_of_quaternion(quaternion: AnyArray) -> Array:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def spatial(vector: Array) -> Array:
+    """Return what turn (rad, fixed axes) a step of a rotation vector makes, (3, 3)."""
+    angle, cross = float(np.linalg.norm(vector)), np.cross(vector, np.eye(3)).T
+    if angle < 1e-4:
+        return np.asarray(np.eye(3) + cross / 2)
+    once, twice = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + once * cross + twice * cross @ cross)

@@ -384,7 +384,9 @@ def calibrate_sessions(
     becomes; what they read is kept with the model, for baselines to be compared. The first
     session's setup states how accurate fluxes and poses are.
     """
-    options = replace(options, accuracy=sessions[0].setup.accuracy)
+    setup = sessions[0].setup
+    surveyed_m = setup.stated.get('tool_coil_position_m', options.surveyed_m)
+    options = replace(options, accuracy=setup.accuracy, surveyed_m=surveyed_m)
     chosen = next(engine for engine in all_engines() if engine.accepts(sessions, options))
     for engine in () if chosen.is_joint else all_engines():
         if asked := [kind for kind in options.estimate if kind in engine.kinds]:
