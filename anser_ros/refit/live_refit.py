@@ -111,7 +111,8 @@ class LiveRefit:
         self._intake = Intake(self.references.channel, error=FitError)
         self._baseline_check = BaselineCheck(self.baseline)
         self._assembly = self._new_assembly()
-        self._motion = FrameMotion(self._tables.excitation.field, self.references, noise_t)
+        field, emitters = self._tables.excitation.field, self.model.emitters
+        self._motion = FrameMotion(field, self.references, emitters, noise_t)
 
     def _new_assembly(self) -> Assembly:
         phase, settings = self._tables.excitation.phase, self.settings

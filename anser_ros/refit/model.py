@@ -2,6 +2,7 @@
 uncertainty, and the result of a frame.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -26,6 +27,9 @@ Uncertainty = tuple[ComplexArray | None, float]
 
 MOST_MODES = 16
 """Sets of modes that are kept, which bounds the memory; the oldest is dropped."""
+LEAST_COMMON, COMMON_STEP = 2e-3, 1.5
+"""Change that all emitters have in common from which on it may be the references' own gain: it
+moves a coil alone by 0.1 mm at 0.15 m; and the ratio of neighbouring steps in which it counts."""
 KEEP_FRAMES = 25
 """Frames for which an inflation is kept at least before it may fall."""
 RIVAL = 0.05
@@ -69,7 +73,7 @@ class Assembly:
         parts = {h: bank.moments(seen, h) * scale for h in active}
         if witness is not None:
             parts |= {h: part + witness.moments(bank, h) * scale for h, part in parts.items()}
-        change = _Change(stamp_ns, bank, seen, weights, parts, scale, place)
+        change = _Change(stamp_ns, bank, seen, weights, parts, scale, place, _common(drift))
         for h, part in parts.items():
             moments[change.rows(h)] += weights[h] * part
         modes, rest = self._uncertainty(change, typical, witness)
@@ -101,13 +105,14 @@ class Assembly:
         bank, weights, n_modes = change.bank, change.weights, self._n_modes
         ranked = sorted(change.parts, key=lambda h: -float(weights[h]))
         if not ranked:
-            return self._with_base(np.zeros((0, *change.shape), dtype=complex), 0.0)
+            whole = self._with_base(change, np.zeros((0, *change.shape), dtype=complex), 0.0)
+            return self._whole.setdefault((change.common,), (0, whole))[1]
         best = ranked[0]
         rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
         level = posterior.error_level(change.seen, best)
         names = tuple(bank.prior(h).name for h in ranked[:1] + ([] if rival is None else [rival]))
-        key = (bank.rows.tobytes(), names, level, steps, *change.place.rows)
+        key = (bank.rows.tobytes(), names, level, steps, change.common, *change.place.rows)
         self._count += 1
         kept = self._whole.get(key)
         if witness is None and kept is not None and self._count - kept[0] < KEEP_FRAMES:
@@ -121,13 +126,14 @@ class Assembly:
         if errors is None:
             if self._interim is None or self._interim[0] != key:
                 own, rest = self._until_known(change, best, level, n_modes)
-                self._interim = key, self._with_base(own * inflation, rest * inflation)
+                own = own * inflation
+                self._interim = key, self._with_base(change, own, rest * inflation)
             return self._interim[1]
         own, rest = change.modes(errors, best, n_modes)
         own, rest = own * inflation, rest * inflation
         if rival is not None:
             own[-1] += np.sqrt(weights[best] * weights[rival]) * change.between(best, rival)
-        whole = self._with_base(own, rest)
+        whole = self._with_base(change, own, rest)
         if witness is None:
             self._last = _ErrorBefore(bank.rows.tobytes(), best, names[0], level, errors)
             self._interim = None
@@ -135,9 +141,12 @@ class Assembly:
             self._whole[key] = (self._count, whole)
         return whole
 
-    def _with_base(self, own: ComplexArray, rest: float) -> Uncertainty:
-        """Join the error of the change with that of the calibrated model."""
+    def _with_base(self, change: '_Change', own: ComplexArray, rest: float) -> Uncertainty:
+        """Join the error of the change with that of the calibrated model, and a common gain."""
         base = self.base.modes
+        if change.common:
+            shared = change.common * self.base.moments[None]
+            base = shared if base is None else np.concatenate([base, shared])
         if base is not None:  # with rows of zeros for the dipoles that were added
             padded = np.zeros((len(base), *own.shape[1:]), dtype=complex)
             padded[:, : base.shape[1]] = base
@@ -183,6 +192,16 @@ class Assembly:
         return own, float(np.hypot(rest, change.size(best, own[-1])))
 
 
+def _common(drift: ComplexArray) -> float:
+    """Return the change that emitters' strengths have in common by their ``drift`` (K,), in steps.
+
+    References do not say whether emitters fell, or their own gain did, which moves no tool.
+    """
+    size = abs(float(np.median(drift.real))) / LEAST_COMMON
+    steps = math.ceil(math.log(max(size, 1.0)) / math.log(COMMON_STEP))
+    return LEAST_COMMON * COMMON_STEP**steps if size > 1.0 else 0.0
+
+
 class _Dipoles(NamedTuple):
     """The dipoles (N, 3) of a model with some layers, and the rows of each layer by its name."""
 
@@ -202,6 +221,7 @@ class _Change:
     parts: dict[int, ComplexArray]
     scale: ComplexArray
     place: _Dipoles
+    common: float  # change of all emitters that may be the references' own gain
 
     @property
     def shape(self) -> tuple[int, int]:

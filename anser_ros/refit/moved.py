@@ -1,13 +1,15 @@
-"""Asks whether the frame of the references has moved against the board, beside metal or without.
+"""Asks whether the frame of the references, or an emitter, has moved, beside metal or without.
 
-References that slide together are no metal, but clouds of metal explain a slide quite well, and a
-model that follows them is wrong by as much. So "they have moved as one, and metal may be there
-too" is a hypothesis beside each of a bank's: to its covariance come the six columns of what such a
-motion makes of the baseline. Its evidence is against the same baseline however slow the slide is.
+What slides as one is no metal, but clouds of metal explain a slide quite well, and a model that
+follows them is wrong by as much. So "this has moved, and metal may be there too" is a hypothesis
+beside each of a bank's: to its covariance come the columns of what such a motion makes of the
+baseline. Its evidence is against the same baseline however slow the slide is.
 The rules are those of `refit.posterior`: ``1/2 b^T (1 + M)^-1 b - 1/2 log |1 + M|`` is what the
 columns X, whose factors have a variance of one, add to the log likelihood of readings y with the
 precision P, where ``M = X^T P X`` and ``b = X^T P y``.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -24,81 +26,94 @@ LOOK_S = 0.16
 MOVED_ODDS = 20.0
 """Log odds from which on a motion is believed: metal of independent recordings reaches -12 where
 an X-ray head touches the board, and simulated slides of 0.05 mm are at 100 to 200."""
-MOST_KEPT = 16
+MOST_KEPT = 64
 """Hypotheses at a noise level whose matrices are kept."""
 
 
 class FrameMotion:
-    """Watches the frame of some references in the in-phase ``field`` of the emitters.
+    """Watches the frame of some references in the in-phase ``field`` of some ``emitters``, K.
 
-    ``noise_t`` is the unit of readings, T. ``reason`` is why the frame counts as moved; empty
-    where it does not.
+    ``noise_t`` is the unit of readings, T. ``reason`` is what counts as moved; empty for nothing.
     """
 
     reason: str
 
-    def __init__(self, field: FieldFunction, references: SensorTable, noise_t: float) -> None:
-        self._points, self._last_ns = references.position, 0
+    def __init__(
+        self, field: FieldFunction, references: SensorTable, emitters: Sequence[str],
+        noise_t: float,
+    ) -> None:  # fmt: skip
+        self._points, self._last_ns, self._emitters = references.position, 0, emitters
         self._known: dict[tuple[object, ...], tuple[Array, Array, Array]] = {}
         self.forget()
         drawn = DrawnReadings.of(field, references.position, references.axis, references.length)
-        columns = PRIOR_M * drawn.by_place, PRIOR_RAD * drawn.turned(np.zeros(3))
-        self._columns = np.concatenate(columns).reshape(6, -1).T / noise_t
+        whole = PRIOR_M * drawn.by_place, PRIOR_RAD * drawn.turned(np.zeros(3))
+        # (1 + K, 6, S, K): an emitter that moves leaves the readings of the others as they are.
+        columns = np.zeros((1 + len(emitters), 6, *drawn.flux.shape))
+        columns[0] = np.concatenate(whole)
+        for k in range(len(emitters)):
+            columns[1 + k, :3, :, k] = -whole[0][:, :, k]
+        self._columns = columns.reshape(*columns.shape[:2], -1).swapaxes(1, 2) / noise_t
 
     def forget(self) -> None:
         """Believe that nothing has moved, and look with the next frame."""
-        self._next_ns, self._away_m, self.reason = 0.0, 0.0, ''
+        self._next_ns, self._away, self.reason = 0.0, (0, 0.0), ''
 
     def look(self, stamp_ns: int, bank: Bank, seen: FrameEvidence) -> None:
         """Take in a frame's evidence; it is looked at every `LOOK_S`."""
         if self._last_ns <= stamp_ns < self._next_ns:
             return
         self._last_ns, self._next_ns = stamp_ns, stamp_ns + LOOK_S / NANO
-        found, best = [], (-np.inf, np.zeros(6), np.zeros(6))
+        odds, best = np.full(len(self._columns), -np.inf), (-np.inf, 0, np.zeros(6), np.zeros(6))
         for hypothesis in {0, seen.best}:
             columns, inverse, half_log_det = self._known_of(bank, hypothesis, seen.noise)
             precision, curve = bank.precision(seen.noise)[0], seen.curve[hypothesis, 0]
-            b = (precision[hypothesis] * seen.projected[hypothesis, :, 0]) @ columns
-            moved = (inverse @ b[:, :, None])[..., 0]
-            gained = curve + 0.5 * (b * moved).sum(axis=1) - half_log_det
-            evidence = float(seen.log_evidence[hypothesis]) + log_sum(gained) - log_sum(curve)
-            found.append(evidence)
-            top = int(gained.argmax())
-            if evidence > best[0]:
-                best = evidence, moved[top], np.sqrt(np.diag(inverse[top]))
-        odds = log_sum(np.array(found)) - log_sum(seen.log_evidence)
+            weighted = precision[hypothesis] * seen.projected[hypothesis, :, 0]
+            b = weighted @ columns  # (1 + K, A, 6)
+            moved = (inverse @ b[..., None])[..., 0]
+            gained = curve + 0.5 * (b * moved).sum(axis=2) - half_log_det
+            evidence = np.logaddexp.reduce(gained, axis=1) - log_sum(curve)
+            evidence += float(seen.log_evidence[hypothesis])
+            odds = np.logaddexp(odds, evidence)
+            what = int(evidence.argmax())
+            if evidence[what] > best[0]:
+                top = int(gained[what].argmax())
+                sigma = np.sqrt(np.diag(inverse[what, top]))
+                best = float(evidence[what]), what, moved[what, top], sigma
         # Far away a motion is not linear any more, and not seen beside metal: it must come back.
-        if odds > MOVED_ODDS:
+        if float(odds.max()) - log_sum(seen.log_evidence) > MOVED_ODDS:
             self.reason = self._said(*best[1:])
         elif seen.best == 0:
-            self.reason, self._away_m = '', 0.0
+            self.reason, self._away = '', (0, 0.0)
 
-    def _said(self, motion: Array, sigma: Array) -> str:
-        """Return how far a motion (6,) takes the references, where that is certain and too far
-        until the next look.
+    def _said(self, what: int, motion: Array, sigma: Array) -> str:
+        """Return how far a motion (6,) takes the references, or an emitter, where that is certain
+        and too far until the next look.
         """
         shift, turn = PRIOR_M * motion[:3], PRIOR_RAD * motion[3:]
         away = float(np.linalg.norm(shift + np.cross(turn, self._points), axis=1).max())
-        before, self._away_m = self._away_m, away
+        before = self._away[1] if self._away[0] == what else 0.0
+        self._away = what, away
         is_certain = (np.abs(motion) > FAR_SIGMAS * sigma).any()
         if not is_certain or max(away, 2.0 * away - before) < FAR_M:
             return ''
         words = ', '.join(f'{1e3 * v:+.1f}' for v in shift)
-        return (
-            f'the references have moved as one against the board, by up to {1e3 * away:.1f} mm '
-            f'({words} along x, y, z)'
-        )
+        who = f'emitter {self._emitters[what - 1]} has' if what else 'the references have'
+        by = f'by up to {1e3 * away:.1f} mm ({words} along x, y, z)'
+        return f'{who} moved {"on" if what else "as one against"} the board, {by}'
 
     def _known_of(self, bank: Bank, hypothesis: int, noise: float) -> tuple[Array, Array, Array]:
-        """Return what a hypothesis and the noise decide: the columns (n, 6) in its eigenvectors,
-        and for each strength ``(1 + M)^-1`` (A, 6, 6) and half of ``log |1 + M|`` (A,).
+        """Return what a hypothesis and the noise decide for each thing that may move: the columns
+        (1 + K, n, 6) in its eigenvectors, and for each strength ``(1 + M)^-1`` (1 + K, A, 6, 6)
+        and half of ``log |1 + M|`` (1 + K, A).
         """
         key = (bank.rows.tobytes(), bank.names[hypothesis], noise)
         if key not in self._known:
             make_room(self._known, MOST_KEPT)
-            columns = bank.bases[hypothesis].T @ self._columns[bank.rows]
+            columns = bank.bases[hypothesis].T @ self._columns[:, bank.rows]
             precision = bank.precision(noise)[0][hypothesis]
-            inside = np.eye(6) + (precision[:, None] * columns.T) @ columns
+            rows = columns.swapaxes(1, 2)[:, None] * precision[:, None, :]  # (1 + K, A, 6, n)
+            square = rows.reshape(len(rows), -1, rows.shape[3]) @ columns
+            inside = np.eye(6) + square.reshape(*rows.shape[:3], 6)
             half = 0.5 * np.linalg.slogdet(inside)[1]
             self._known[key] = columns, np.linalg.inv(inside), half
         return self._known[key]
