@@ -228,6 +228,15 @@ def paused(world: World, size: float) -> Truth:
     return {}
 
 
+def through(world: World, size: float) -> Truth:
+    """Recordings of 15 s, so many, with pauses of some minutes, of clocks that run through."""
+    starts = np.cumsum(world.rng.uniform(45, 315, int(size)))
+    world.rate_ppm = 250.0
+    _lasting(world, float(starts[-1]) + 15)
+    _cut(world, lambda time: np.abs(np.subtract.outer(time - 7.5, starts)).min(axis=1) < 7.5)
+    return {'clock_rate': ('rate_ppm', world.rate_ppm)}
+
+
 def turned(world: World, size: float) -> Truth:
     """From four fifths on, turns of some degrees and a millimetre, beside stamps that jitter."""
     late, world.rate, world.jitter = 68.0, 5.0, 0.017
@@ -306,6 +315,34 @@ def stepped(world: World, size: float) -> Truth:
     return {}
 
 
+def own_errors(world: World, size: float) -> Truth:
+    """Errors that every tracker has: smooth over places and turns, each sensor's own, mm rms."""
+
+    def change(name: str, rows: Stream) -> None:
+        waves, tilts, ways = (world.rng.normal(0, s, (6, 3)) for s in (8.0, 1.2, 1 / 3))
+        turns = Rotation.from_quat(rows[2])
+        phase = rows[1] @ waves.T + (turns.mean().inv() * turns).as_rotvec() @ tilts.T
+        phase += world.rng.uniform(0, 7, 6)
+        rows[1] += 1e-3 * size * np.cos(phase) @ ways
+        rows[2] = (Rotation.from_rotvec(5e-3 * size * np.sin(phase) @ ways) * turns).as_quat()
+
+    _each(world, change)
+    return {}
+
+
+def received(world: World, size: float) -> Truth:
+    """Stamps of receipt in all streams, and one row in nine twice."""
+
+    def change(name: str, rows: Stream) -> None:
+        jitter = 1e-3 * size * world.rng.normal(size=len(rows[0]))
+        again = 1 + (np.arange(len(jitter)) % 9 == 0)
+        rows[:] = [np.repeat(one, again, axis=0) for one in (rows[0] + jitter, *rows[1:])]
+
+    _each(world, change)
+    _each(world, change, also=True)
+    return {'stamp_jitter': None}
+
+
 KINDS = {
     'late': Kind(stated('offset', 1e-3, 'time_offset', 'offset_s'), (8, 30, 100), ('offset',)),
     'fast': Kind(stated('rate_ppm', 1, 'clock_rate', 'rate_ppm'), (600, 1200, 2500), ('rate',)),
@@ -338,4 +375,7 @@ KINDS = {
         strained, (0.002, 0.003, 0.004), ('place', 'scale'), 2, ('field_distortion',)
     ),
     'stepped': Kind(stepped, (0.05, 0.11, 0.2), ('noise', 'tracked'), 3, ('range_noise',)),
+    'through': Kind(through, (5, 9, 17), ('tracked', 'reference')),
+    'own_errors': Kind(own_errors, (0.4, 0.8, 1.2), ('place',), 1, ('field_distortion',)),
+    'received': Kind(received, (4, 7, 10), ('stamps', 'tracked', 'reference')),
 }

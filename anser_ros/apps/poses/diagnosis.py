@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.apps.poses import start
 from anser_ros.apps.poses.convention import read_rightly
 from anser_ros.apps.poses.effect import PoseTerm, PoseView, Role, pose_effects
+from anser_ros.apps.poses.effects.episodes import in_episode
 from anser_ros.apps.poses.fit import (
     PoseFit,
     fit_poses,
@@ -33,15 +34,20 @@ from anser_ros.apps.poses.problem import (
     Sensing,
     floor_of,
 )
-from anser_ros.apps.poses.search import LEAST_MAP_M, PoseSearch, frame_terms, search_effects
+from anser_ros.apps.poses.search import (
+    LEAST_MAP_M,
+    PoseSearch,
+    frame_terms,
+    search_effects,
+    with_noise,
+)
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSession
 from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.diagnosis.problem import TEST_EVERY
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 
-FEWEST_RECORDINGS = 8
-"""Recordings at rest from which each is judged by a fit of others: fewer leave frames open."""
+FEWEST_RECORDINGS = 8  # at rest, from which each is judged by others: fewer leave frames open
 
 
 @dataclass(frozen=True)
@@ -276,7 +282,7 @@ def diagnose_poses(
         problem = start.pose_problem(session)
         training = problem.in_blocks(train)
         first = start.first_fit(training, start.coarse_offset(training), alone)
-    search = search_effects(first, session, say, is_searched)
+    search = _outside_episodes(search_effects(first, session, say, is_searched), session, say)
     say('held out')
     state = search.fit.state
     # A clock may stand for what else there is besides jitter.
@@ -339,11 +345,28 @@ def _behind(baseline: PoseSession, session: PoseSession, begin: float) -> PoseSe
     return replace(session, sensors=streams, reference=reference)
 
 
+def _outside_episodes(
+    search: PoseSearch, session: PoseSession, say: Callable[[str], None]
+) -> PoseSearch:
+    """The search, again without the poses of episodes, which a map that it found may follow."""
+    problem = search.fit.state.problem
+    rest = [t for t in search.fit.terms if t.role is not Role.MAP]
+    if len(rest) == len(search.fit.terms):
+        return search
+    plain = with_noise(fit_poses(problem, rest))
+    residuals = _residuals(session, problem, plain)
+    inside = [in_episode(sensing, residuals) for sensing in residuals.sensors]
+    if not np.concatenate(inside).any():
+        return search
+    cut = plain.state.problem.rows([~mask for mask in inside])
+    return search_effects(fit_poses(cut, frame_terms(rest)), session, say)
+
+
 def _confirmed(search: PoseSearch, problem: PoseProblem, test: Integers) -> PoseSearch:
-    """The search without effects of place that positions do not confirm."""
+    """The search without effects that positions do not confirm."""
     fit = search.fit
     for index, term in enumerate(fit.terms):
-        if not term.effect.blocks_in_space:
+        if term.role.is_frame:
             continue
         rest = fit_poses(fit.state.problem, [t for t in fit.terms if t is not term])
         why = unconfirmed(rest, fit, term, judged(problem.in_blocks(test), fit))
@@ -356,19 +379,22 @@ def _confirmed(search: PoseSearch, problem: PoseProblem, test: Integers) -> Pose
 
 
 def unconfirmed(rest: PoseFit, fit: PoseFit, term: PoseTerm, unseen: PoseProblem) -> str:
-    """Return why an effect of place is not believed beside the rest; empty where it is.
+    """Return why an effect is not believed beside the rest; empty where it is.
 
     ``rest`` is the fit without it, and ``unseen`` the held-out poses.
 
     Poses near each other err alike, and a few places may ask for what no others confirm. Where
     stamps jitter, an error of places weighs little beside one across the velocity or of turns; a
     map that moves poses but takes nothing off their errors makes up for frames that it has moved.
+    On a path that comes again, a tracker's own errors look like a small offset, lag or scale.
     """
-    if _square(unseen.state(rest.terms), term) < _square(unseen.state(fit.terms), term):
-        return 'held-out poses are worse with it'
     taken = _square(rest.state, term) - _square(fit.state, term)
-    if term.role is Role.MAP and taken < LEAST_MAP_M**2:
-        return f'takes less than {1e3 * LEAST_MAP_M:g} mm off the errors of positions'
+    least = LEAST_MAP_M if term.role is Role.MAP else LEAST_REPORTED_M
+    if taken < least**2:
+        return f'takes less than {1e3 * least:g} mm off the errors of positions'
+    before, after = (_square(unseen.state(one.terms), term) for one in (rest, fit))
+    if term.effect.blocks_in_space and before < after:
+        return 'held-out poses are worse with it'
     return ''
 
 

@@ -52,8 +52,7 @@ LABELS = ('sensor', 'body', 'tool', 'name', 'sensor_id', 'tool_id', 'handle', 'p
 VALID = ('valid', 'visible', 'tracked', 'is_valid')
 """Columns that say whether a row is a pose."""
 NOT_VALID = ('0', 'false', 'no')
-MOST_FALLS = 0.1
-"""Share of times before the one above them from which a column is no time."""
+MOST_FALLS = 0.1  # share of times before the one above them from which a column is no time
 FARTHEST_M = 3.0
 """Median distance, m, from which on positions without a stated unit are not in metres."""
 SHORTEST_INTERVAL_S, LONGEST_INTERVAL_S = 1e-5, 2.0
@@ -65,6 +64,7 @@ PORT_COLUMNS = 13
 """Columns of a port in a ToolTracker file: name, frame, face, state, pose, error, markers."""
 PLUS = ('.mha', '.mhd', '.nrrd')
 _PLUS_FIELD = re.compile(r'^Seq_Frame(\d+)_(\w+?)\s*:?=\s*(.*?)\s*$', re.MULTILINE)
+_NO_COLON = re.compile(r'^\s*(\w+)(?=\s+\S+\s+\w+:)')
 _KEY = re.compile(r'(\w+):\s*((?:[^\s:]+(?:\s+|$)(?!:))*?)(?=\s*\w+:|\s*$)')
 
 
@@ -149,6 +149,7 @@ def _keyed(lines: Sequence[str], path: Path) -> Found:
     """Lines such as ``SensorID: 0 Position: x y z Orientation: a b c d Time: ns``."""
     rows: dict[str, RawRows] = {}
     for line in lines:
+        line = _NO_COLON.sub(r'\1:', line)
         parts = {key: text.split() for key, text in _KEY.findall(line)}
         if len(parts.get('Position', ())) != 3 or len(parts.get('Orientation', ())) != 4:
             continue
@@ -346,6 +347,8 @@ def import_poses(
         rows, unread = read_form(path)
         groups, files = _named(path, rows, None, unit, quaternion), [(path, unread)]
         if reference:
+            if REFERENCE in groups:  # a file that says nothing of its sensor
+                groups['sensor_0'] = groups.pop(REFERENCE)
             rows, unread = read_form(reference[number])
             groups |= _named(reference[number], rows, REFERENCE, None, None)
             files.append((reference[number], unread))

@@ -15,8 +15,7 @@ from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.stamps import NANO, Order, order_of
 
-REFERENCE = 'optical'
-"""Name of the reference among a session's streams."""
+REFERENCE = 'optical'  # name of the reference among a session's streams
 FARTHEST = 1e6
 """Coordinate, m, from which it is a marker for no pose and no position; NDI's is 3.7e28."""
 NO_TURN = 0.1
@@ -24,16 +23,14 @@ NO_TURN = 0.1
 LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
 """How far a pose is from the line between its neighbours if it leaps: m, rad, and in distances of
 these from each other. A hand that shakes turns back within 5 mm at 20 poses a second."""
-MOST_ALIKE = 2.5
-"""Poses with the same stamp from which on stamps are not those of the poses."""
+MOST_ALIKE = 2.5  # poses with the same stamp from which on stamps are not those of the poses
 LEAST_STEP_S, LEAST_INTERVALS, MOST_STEPS = 0.1, 3.0, 5
 """Least leap of stamps, s and intervals, that may be a step of a clock, and most of them."""
 STRETCH, FEWEST_POSES, LEAST_WAY_M = 5, 50, 3e-3
 """Poses before and after a leap that tell the pace, poses of a stream that is looked at, and the
 way, m, that a body would have to go within a leap."""
 LONGEST_JUMP = 3  # rounds; each takes out one pose of a run, or two from its ends
-NOT_UNIT = 0.05
-"""How far the norm of a quaternion may be from one: smaller refuses rounded files."""
+NOT_UNIT = 0.05  # how far the norm of a quaternion may be from one: smaller refuses rounded files
 
 
 @dataclass(frozen=True)
@@ -157,12 +154,15 @@ def sequence_of(name: str, time: Array, position: Array, quaternion: Array) -> P
             f'{name}: quaternions have a norm of {np.median(norm[whole]):.3g}, not 1'
         )
     whole &= ~crooked
-    order = np.argsort(time[whole], kind='stable')
+    turn = quaternion[whole] / norm[whole, None]
+    rows = np.column_stack([time[whole], position[whole], turn])
+    rows = rows[np.argsort(rows[:, 0], kind='stable')]
+    rows = rows[(np.diff(rows, axis=0, prepend=np.nan) != 0).any(axis=1)]  # some stand twice
     return PoseSequence(
         name,
-        time[whole][order],
-        position[whole][order],
-        (quaternion[whole] / norm[whole, None])[order],
+        rows[:, 0],
+        rows[:, 1:4],
+        rows[:, 4:],
         np.sort(time[~whole]),
         int(np.count_nonzero(np.diff(time) < 0)),
         _steps(time[whole], position[whole]),
@@ -213,10 +213,8 @@ def stamp_words(session: PoseSession) -> str:
     return '; '.join(words)
 
 
-LIVE = 'live'
-"""What stands in place of a path in the sessions of running trackers."""
-MOST_POSES = 6000
-"""Poses of a stream that are kept at most: a minute of 100 Hz."""
+LIVE = 'live'  # what stands in place of a path in the sessions of running trackers
+MOST_POSES = 6000  # poses of a stream that are kept at most: a minute of 100 Hz
 
 
 class PoseWindow:
@@ -278,8 +276,9 @@ def _sequence(
 
 FEWEST_PATH_POSES = 4
 """Poses without which there is no path: a cubic piece needs the poses about it."""
-MEDIAN_GAPS = 2.5
-"""Gap in median intervals over which a slow reference is interpolated: one pose may be lost."""
+MEDIAN_GAPS, NEAREST = 2.5, 0.2
+"""Gap in median intervals over which a slow reference is interpolated: one pose may be lost; and
+interval in these of poses of which one is enough: their stamps may err, and slopes burst."""
 STEPS_A_TAU = 20
 """Steps of a filter's grid in its time constant: eight make it too short by three sigmas."""
 SMALLEST_STEP_S = 0.002  # grid of a filter, s: a hand moves by 0.2 mm in it
@@ -302,15 +301,16 @@ class OpticalPath:
 
         Raises `DiagnosisError` when there are too few poses.
         """
-        time = track.time
+        steps = np.diff(track.time, prepend=-np.inf)
+        apart = steps > NEAREST * np.median(steps)
+        time, place, turn = track.time[apart], track.position[apart], track.quaternion[apart]
         if time.size < FEWEST_PATH_POSES:
             raise DiagnosisError(
                 f'the reference has {time.size} different poses, a path needs {FEWEST_PATH_POSES}'
             )
-        turn = track.quaternion.copy()
         flips = np.sign(np.einsum('ij,ij->i', turn[1:], turn[:-1]))
         turn[1:] *= np.cumprod(np.where(flips < 0, -1.0, 1.0))[:, None]
-        values = np.concatenate([track.position, turn], axis=1)
+        values = np.concatenate([place, turn], axis=1)
         gap = max(LONGEST_GAP_S, MEDIAN_GAPS * float(np.median(np.diff(time))))
         # Nothing is known of the motion in a gap: each side of it is a path of its own.
         slopes = np.zeros_like(values)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from clean_poses import MOTIONS, STREAMS, clean_world
 from pose_world import FRAME, SHIFT, World
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.cli.pose_session import pose_verdict
@@ -144,18 +143,6 @@ def test_one_thing_wrong_is_named_with_its_size(wrong, expected):
     assert set(found) == set(expected)
     for name, (key, value, tolerance) in expected.items():
         assert found[name].parameters[key] == pytest.approx(value, abs=tolerance)
-
-
-def test_noise_of_the_reference_is_not_the_filter_of_a_precise_tracker():
-    # Of a slow motion the low pass that takes most of the noise away leaves all as it is.
-    world = World(2, duration=20.0, sensors=1, rate=25.0, optical_rate=60.0)
-    world.noise_m, world.noise_rad = 2e-5, 1e-4
-    knots = np.arange(-2.0, 23.0, 2.5)
-    place, turn = (
-        CubicSpline(knots, world.rng.normal(0, s, (knots.size, 3))) for s in (0.06, 0.25)
-    )
-    world.follow(place, turn)
-    assert not named(diagnose_poses(world.session()))
 
 
 def read_as(order, sign=1):

@@ -120,6 +120,16 @@ def test_a_path_knows_the_noise_of_its_poses_at_a_point_of_the_body():
     assert path.jitter(lever) == pytest.approx(expected, rel=0.05)
 
 
+def test_poses_of_nearly_one_stamp_do_not_bend_a_path():
+    true = np.arange(100) / 20
+    place, turn = World(5).body(true)
+    stamps = np.where(np.arange(100) % 10 == 5, true - 0.0499, true)  # received early
+    path = OpticalPath.through(PoseTrack(stamps, place, turn.as_quat()))
+    found, _, _, known = path.at(true[10:-10] + 0.02)
+    assert known.all()
+    assert np.abs(found - World(5).body(true[10:-10] + 0.02)[0]).max() < 2e-3
+
+
 def test_a_map_of_one_sensor_may_shift_it_and_one_of_all_may_not():
     effect, place = FieldDistortion(), np.array([[0.01, -0.02, 0.03], [0.0, 0.0, 0.0]])
     own, every = effect.at(SETTING, 2, 'sensor_1'), effect.at(SETTING, 2, None)
@@ -151,6 +161,7 @@ def test_metal_is_told_by_the_body_where_stamps_jitter_more_than_it_pulls():
     assert record.parameters['sensors'] == ['sensor_2']
     assert record.parameters['t_start_s'] == pytest.approx(26.0, abs=1.1)
     assert not episodes_of(((26, 38, (4e-3, 4e-3, 4e-3)),), shared_m=1e-3)
+    assert not episodes_of(((26, 38, (0.0, 0.0, 1.7e-3)),))  # the tracker's own error
 
 
 def test_metal_at_one_sensor_leaves_the_episodes_of_others_at_other_times():

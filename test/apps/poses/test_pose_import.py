@@ -71,7 +71,7 @@ def test_a_file_called_optical_alone_is_a_tracker(tmp_path):
 
 
 def test_a_counter_that_restarts_goes_on(tmp_path):
-    path = tool_tracker(tmp_path / 'a.tsv', [(cell(n),) for n in (64000, 64008, 8, 16)],
+    path = tool_tracker(tmp_path / 'a.tsv', [(cell(n, x=n),) for n in (64000, 64008, 8, 16)],
                         ports=('Port 10: X',))  # fmt: skip
     time = import_poses([path]).sensors['port_10'].time
     np.testing.assert_allclose(time, [0, 0.025, 0.025, 0.05], atol=1e-9)
@@ -241,11 +241,20 @@ def test_a_title_and_lines_that_are_no_poses_are_left_out_and_told(tmp_path, cap
     assert session.lost in capsys.readouterr().out
 
 
+def test_a_key_without_a_colon_no_sensors_name_and_rows_that_stand_twice_are_read(tmp_path):
+    rows = [line(k % 2, k, TURN.as_quat(), 10**9 * (k + 1)) for k in range(8)]
+    path = write(tmp_path / 'a.txt', *(row.replace('SensorID:', 'SensorID') for row in rows))
+    optical = write(tmp_path / 'o.txt', *(row[len('SensorID: 0 ') :] for row in 2 * rows))
+    session = import_poses([path], [optical])
+    assert {n: s.size for n, s in session.sensors.items()} == {'sensor_0': 4, 'sensor_1': 4}
+    assert one_of(import_poses([optical], [optical])).size == session.reference.size == 8
+
+
 def test_a_tool_tracker_file_with_its_header_once_more_goes_on(tmp_path):
     path = tool_tracker(tmp_path / 'a.tsv', [(cell(3200 + 320 * k), cell(3200)) for k in range(4)])
     text = path.read_text(encoding='utf-8')
     session = import_poses([write(path, text.strip(), text.strip())])
-    np.testing.assert_allclose(session.sensors['port_10'].time, [0, 1, 2, 3, 3, 4, 5, 6])
+    np.testing.assert_allclose(session.sensors['port_10'].time, range(7))  # one of them twice
     assert not session.lost
 
 

@@ -18,6 +18,8 @@ FEWEST_POSES_OF_WINDOW = 4  # poses that a window needs to be judged: fewer may 
 POSES_OF_WINDOW = 4.5  # on average, so that most windows can be judged
 TIMES = 9.0
 """Squared error of an episode over the median window's: the range of places hardly makes it."""
+OWN = np.array([2e-3, 0.026])
+"""Error of means, m and rad, that a tracker has: data sheets say 0.5 to 1.4 mm, 0.5 deg rms."""
 LONGEST = 0.4
 """Share (0 to 1) of the windows that episodes may be: the median window must be a quiet one."""
 ALIKE = 0.4  # share of a window's squared error that its mean must be; noise has a small one
@@ -66,29 +68,33 @@ def _sizes(
     sensing: Sensing, residuals: PoseResiduals, is_beside: bool
 ) -> tuple[Array, dict[int, Array]]:
     """Squared errors of places and of turns over those of the median window: of poses (n, 2), and
-    of the means of windows (2,), in which jitter cancels.
+    of the means of windows (3,), in which jitter cancels; last these over `OWN`, the larger.
 
     Errors count from the middle of the windows, as frames go a little way with an episode; or
     beside the other sensors, which have the same clock and reference.
     """
     window, errors = windows_of(sensing, residuals), sensing.residual
-    if not is_beside:  # without what errors of the stamps make
-        errors = sensing.noise.whitened(errors, sensing.view.velocity)
-    middles = _middles(sensing, residuals, errors)
+    plain = middles = _middles(sensing, residuals)
     if is_beside:
         others = [_middles(one, residuals) for one in residuals.sensors if one is not sensing]
-        middles = {
+        plain = middles = {
             w: middle - np.median([one[w] for one in others], axis=0)
             for w, middle in middles.items()
             if others and all(w in one for one in others)
         }
+    else:  # without what errors of the stamps make
+        errors = sensing.noise.whitened(errors, sensing.view.velocity)
+        middles = _middles(sensing, residuals, errors)
     if not middles:
         return np.zeros((window.size, 2)), {}
-    centre = np.median(list(middles.values()), axis=0)
-    square = _halves(errors - centre)
+    off, means = (
+        _halves(np.array(list(m.values())) - np.median(list(m.values()), axis=0))
+        for m in (plain, middles)
+    )
+    square = _halves(errors - np.median(list(middles.values()), axis=0))
     usual = np.median([np.median(square[window == w], axis=0) for w in middles], axis=0)
-    means = _halves(np.array(list(middles.values())) - centre)
     means /= np.maximum(np.median(means, axis=0), 1e-18)
+    means = np.column_stack([means, np.max(off / OWN**2, axis=1)])
     return square / np.maximum(usual, 1e-18), dict(zip(middles, means, strict=True))
 
 
@@ -111,8 +117,10 @@ def _episode(sensing: Sensing, residuals: PoseResiduals, is_beside: bool) -> Epi
     window, count = windows_of(sensing, residuals), window_count(residuals)
     poses, sizes = _sizes(sensing, residuals, is_beside)
     is_off, place = poses.max(axis=1) > TIMES, sensing.view.measured
-    loud = [w for w, size in sizes.items() if size.max() > TIMES]
-    high = [w for w in loud if is_beside or _is_shift(sensing, window == w)]
+    loud = [w for w, size in sizes.items() if size[:2].max() > TIMES]
+    shifted = [w for w in loud if is_beside or _is_shift(sensing, window == w)]
+    large = [s for s in _stretches(shifted) if np.mean([sizes[w][2] for w in s]) > 1]
+    high = [w for stretch in large for w in stretch]
     if len(sizes) < count // 3 or len(high) > LONGEST * len(sizes):
         return Episode()
     passed = _place_of(sensing, window, high, is_off)
