@@ -37,11 +37,13 @@ MAY_IMPORT = {
     'diagnosis/diagnose.py': {'seen'},
     'diagnosis/fit.py': {'metal_at_rest'},
     'diagnosis/departure.py': {'moving_metal'},
+    'apps/poses/diagnosis.py': {'episodes'},
 }
 """Modules of single effects that a file may import, as it makes their terms without the search:
 wiring, quarter turns, noise and outliers are seen directly, as no fit could propose them;
 the remainder is fitted beside metal at rest, whichever effect that is; departed metal is asked for
-by a calibration alone, from a way that no search starts from."""
+by a calibration alone, from a way that no search starts from; a map of space is searched again
+without the poses of episodes."""
 FILES = sorted(
     path
     for path in PACKAGE.rglob('*.py')

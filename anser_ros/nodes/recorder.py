@@ -217,7 +217,7 @@ STAMPED = (
 )
 
 
-FROM_0 = 0, math.inf
+FROM_0 = 0, math.inf  # bounds of what has no upper one
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,9 @@ GOLDEN = (5**0.5 - 1) / 2
 """Its multiples by squares, less whole numbers, are spread evenly, in step with no poll."""
 COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
+SHORT_SHARE = 0.125
+"""Largest offset that is looked for in a short recording, as a share of its length: a hand begins
+a motion anew each second or two, and a few of them may be alike at a wrong time."""
 COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
 FAR_STEP_S, FASTEST = 0.1, 3e-3
 """Step, s, of looks beyond that range and at clocks that run apart, by this share at most."""
@@ -221,12 +224,15 @@ def coarse_offset(problem: PoseProblem) -> float:
     if problem.path.is_at_rest:
         return 0.0
     chosen = [p.rows(slice(None, None, max(1, p.size // COARSE_POSES))) for p in problem.sensors]
-    trials = np.arange(-COARSE_S, COARSE_S + COARSE_STEP_S / 2, COARSE_STEP_S)
+    longest = longest_recording(problem)
+    reach = min(COARSE_S, SHORT_SHARE * longest)
+    steps = round(reach / COARSE_STEP_S)
+    trials = COARSE_STEP_S * np.arange(-steps, steps + 1)
     misfits = np.array([_misfit(problem.path, chosen, float(trial)) for trial in trials])
     still = float(misfits[np.argmin(np.abs(trials))])
     best = int(np.argmin(misfits))
     near = float(trials[best]) if misfits[best] < COARSE_OFFSET_MISFIT * still else 0.0
-    far = np.arange(COARSE_S, longest_recording(problem), FAR_STEP_S)
+    far = np.arange(COARSE_S, longest if reach == COARSE_S else 0.0, FAR_STEP_S)
     return _most_alike(problem, near, [(float(o), 0.0) for o in (*-far, *far)])[0]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from tracking_world import NOISE_T, certain_model
 
-from anser_ros.apps.lab import metal_follower, metal_learning
+from anser_ros.apps.lab import metal_follower, metal_learning, metal_track
 from anser_ros.apps.lab.metal_follower import KnownMetalFollower, KnownMetalModels
 from anser_ros.apps.lab.metal_lattice import Coils, KnownMetal, load_known_metal, moved
 from anser_ros.apps.lab.metal_learning import learn_metal
@@ -255,7 +255,7 @@ class TestFollowing:
         scene, state = subject._scene, subject._chosen.state
         scene.misfit = 1e-6
         at, axes = world.TOOL.placed(dive.tools[0].position[8], dive.tools[0].rotation[8])
-        model, placed = metal_follower.field_of(scene, state, at, 24, 1.0)
+        model, placed = metal_track.field_of(scene, state, at, 24, 1.0)
         modes = [replace(model, moments=one, modes=None).flux(at, axes) for one in model.modes]
         which = np.r_[0:6, 12 : 12 + len(state.answers)]
         spread = 0.01 * state.covariance[np.ix_(which, which)]

@@ -112,9 +112,9 @@ NEWEST = QoSProfile(
 )
 """Poses as they come; the newest matters, and there is room for those of a tick at 200 Hz."""
 SILENT_S = 3.5
-# The share of the setup's rate below which the header warns.
-SLOW = 0.5
 """Time, s, after which a node that says nothing counts as silent; it speaks once a second."""
+SLOW = 0.5
+"""Share of the setup's rate below which the header warns: half of the poses are missing."""
 MOST_MARKS = 20
 """Moments that are marked in the curves: more words than these cover the curves."""
 MOST_METAL = 400
