@@ -29,6 +29,7 @@ from pose_faults import KINDS, Truth
 from pose_world import World
 
 from anser_ros.apps.poses.diagnosis import PoseDiagnosis, diagnose_poses
+from anser_ros.errors import AnserError
 
 REPORTED, REPEATED = (351,), (352,)
 REPEATS = 24  # sessions of a kind by which sigmas are judged: their rms is then known to 14 %
@@ -46,6 +47,7 @@ PAIRABLE = list(KINDS)[: list(KINDS).index('far_off')]
 """Kinds that make pairs; the others are faults together already."""
 WITH_PARAMETER = ('late', 'fast', 'scaled', 'jittery', 'filtered', 'far_noise', 'polled')
 CLEAN, PAIRED, REPEATED_NAME = 'clean', 'a pair', 'one slow sensor'
+REFUSED = 'refused'  # in place of names
 
 
 def world_of(seed: int, fewest: int) -> World:
@@ -88,7 +90,11 @@ class Outcome:
 def outcome(world: World, truth: Truth, may: tuple[str, ...] = ()) -> Outcome:
     """Diagnose a world, and compare with what is wrong with it."""
     session, start = world.session(), time.perf_counter()
-    found = diagnose_poses(session)
+    try:
+        found = diagnose_poses(session)
+    except AnserError:
+        took = time.perf_counter() - start
+        return Outcome(tuple(truth), (REFUSED,), {}, (), took, may)
     took = time.perf_counter() - start
     named = {r.name: r for r in found.records if r.name != 'hand_eye'}
     errors = {}

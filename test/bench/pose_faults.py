@@ -375,7 +375,7 @@ KINDS = {
         strained, (0.002, 0.003, 0.004), ('place', 'scale'), 2, ('field_distortion',)
     ),
     'stepped': Kind(stepped, (0.05, 0.11, 0.2), ('noise', 'tracked'), 3, ('range_noise',)),
-    'through': Kind(through, (5, 9, 17), ('tracked', 'reference')),
+    'through': Kind(through, (5, 9, 17), ('tracked', 'reference'), 1, ('time_offset',)),
     'own_errors': Kind(own_errors, (0.4, 0.8, 1.2), ('place',), 1, ('field_distortion',)),
     'received': Kind(received, (4, 7, 10), ('stamps', 'tracked', 'reference')),
 }

@@ -411,15 +411,16 @@ def _middle(turns: Rotation) -> Array:
 def first_fit(problem: PoseProblem, offset: float, is_one_frame: bool) -> PoseFit:
     """Return the best robust fit of the two frames from several starts."""
     offset, rate = coarse_rate(problem, offset)
-    frames = [None] if is_one_frame else _frames(problem, offset)
+    frames = [None] if is_one_frame else _frames(problem, offset, rate)
     fits = [robust_fit(problem, started(problem, offset, frame, rate)) for frame in frames]
     return min(fits, key=first_cost)
 
 
-def _frames(problem: PoseProblem, offset: float) -> list[Array]:
+def _frames(problem: PoseProblem, offset: float, rate: float) -> list[Array]:
     """The rotations to start from, by places and by turns."""
     poses = max(problem.sensors, key=lambda p: p.size)
-    place, turn, _, known = problem.path.at(poses.time - offset)
+    late = offset + rate * (poses.time - problem.setting.start - 0.5 * problem.setting.duration)
+    place, turn, _, known = problem.path.at(poses.time - late)
     turned = Rotation.from_matrix(turn[known]).as_quat()
     return [
         frames_from_places(poses.position[known], place[known]),
