@@ -260,11 +260,9 @@ class DrawnFitter:
         for step in range(STEPS):
             if progress is not None:
                 progress('board, sensors and poses', step / STEPS)
-            self._place(self.values)
             sums = [self._sums(part) for part in self.parts]
             if self._step(sums, step >= SETTLING) < SMALL and step > SETTLING:
                 break
-        self._place(self.values)
         return self._result([self._sums(part) for part in self.parts], step + 1)
 
     def errors(self, values: Array) -> Array:
@@ -391,7 +389,7 @@ class DrawnFitter:
                 ratio = np.diag(found.covariance)[rows] / self.width[rows] ** 2
                 self.width[rows] = _learnt(found.values[rows], ratio, stated)
             found = solve(likelihood, self.width)
-        change, self.values, self.posterior = found.values - self.values, found.values, found
+        change, self.values = found.values - self.values, found.values
         for part, one in zip(self.parts, sums, strict=True):
             part.offset = part.offset + one.step - one.answer @ change
         if is_learning:

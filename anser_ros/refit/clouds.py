@@ -26,7 +26,7 @@ import numpy as np
 from anser_ros.arrays import AnyArray, Array, ComplexArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
-from anser_ros.physics.dipole import field_basis
+from anser_ros.physics.dipole import dipole_field
 from anser_ros.physics.volume import TrackedVolume
 
 LAYER_RATIO = 1.45
@@ -220,8 +220,8 @@ def excitation_for(
     """
 
     def own(points: Array) -> ComplexArray:
-        basis = field_basis(points, model.positions, model.directions)
-        return np.asarray(np.einsum('pna,nk->pka', basis, model.moments, optimize=True))
+        field = dipole_field(points, model.positions, model.directions, model.moments)
+        return np.asarray(field.swapaxes(1, 2))
 
     region = replace(region_of(own if drawing is None else drawing), stated=volume)
     points = region.volume.samples()

@@ -105,8 +105,11 @@ class Assembly:
         bank, weights, n_modes = change.bank, change.weights, self._n_modes
         ranked = sorted(change.parts, key=lambda h: -float(weights[h]))
         if not ranked:
-            whole = self._with_base(change, np.zeros((0, *change.shape), dtype=complex), 0.0)
-            return self._whole.setdefault((change.common,), (0, whole))[1]
+            alone = (change.common,)
+            if alone not in self._whole:
+                none = np.zeros((0, *change.shape), dtype=complex)
+                self._whole[alone] = 0, self._with_base(change, none, 0.0)
+            return self._whole[alone][1]
         best = ranked[0]
         rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))

@@ -65,12 +65,15 @@ def is_for_drawing(sessions: Sequence[Session], options: Options) -> bool:
     tools = [tool for session in sessions for tool in session.tools]
     if options.layout is not None or not options.estimate or not tools:
         return False
-    if any(tool.is_followed for tool in tools) or NominalBoard.of(sessions[0].setup).model is None:
+    if any(tool.is_followed for tool in tools):
         return False
     posed = [tool for tool in tools if tool.has_pose.any()]
     if usable_frames(posed) < FEWEST_SCAN_FRAMES or len(posed) < len(tools):
-        return len(posed) < len(tools) and all(tool.sensors.is_single.all() for tool in tools)
-    return not is_thick(posed) or sum(int(m.usable.sum()) for m in posed) < RICH.count**2
+        is_open = len(posed) < len(tools) and all(t.sensors.is_single.all() for t in tools)
+    else:
+        is_open = not is_thick(posed) or sum(int(m.usable.sum()) for m in posed) < RICH.count**2
+    # The drawing's dipoles take a second, so they come last.
+    return is_open and NominalBoard.of(sessions[0].setup).model is not None
 
 
 def fit_to_drawing(
