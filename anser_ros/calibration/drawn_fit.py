@@ -232,7 +232,8 @@ class DrawnFitter:
         # A single coil's place and gain are the plate's and the board's.
         one = all(len(m.sensors) == 1 for m in measurements)
         kept = [kind for kind in kinds if kind in SENSORS and (kind == 'axes' or not one)]
-        self.sensors = SensorParameters(measurements, kept, generator.frequencies_hz)
+        tones = generator.frequencies_hz
+        self.sensors = SensorParameters(measurements, kept, tones, is_free=False)
         self.parts = list(_parts(measurements, typed))
         self.middle = np.mean(np.concatenate([p.stated.position for p in self.parts]), axis=0)
         self.count = len(generator.centres)

@@ -154,6 +154,7 @@ class SensorParameters:
         measurements: Sequence[Measurements],
         kinds: Sequence[str],
         tones_hz: Sequence[float] = (),
+        is_free: bool = True,  # whether no drawing holds the field
     ) -> None:
         omega = 2.0 * np.pi * np.array(tones_hz or (0.0,))
         self.tones_hz, self.omega = tuple(tones_hz), omega - omega.mean()
@@ -163,7 +164,7 @@ class SensorParameters:
         bodies = {m.body for m in measurements}
         for own in ([m for m in measurements if m.body == body] for body in bodies):
             estimated -= set() if has_turned(own) else {SHARED_SHIFT}
-            if len(own[0].sensors) == 1 and not has_turned(own, 1):
+            if is_free and len(own[0].sensors) == 1 and not has_turned(own, 1):
                 estimated -= {'axes'}  # a tilt that all poses share is the field's too
         if not self.omega.any():
             estimated -= {'delays'}
