@@ -26,6 +26,7 @@ _NODES = {
     'field_model': 'serves the field model, and refits it while it runs',
     'tracker': 'fluxes to poses with covariance',
     'recorder': 'records the topics into an MCAP bag',
+    'grid': 'guides a coil through the places of a plate, and writes them as a session',
     'replay': 'publishes a bag again: replay BAG [--rate R] [--loop]',
     'cu_simulator': 'a control unit behind a pseudo-terminal',
     'monitor': 'a live table of sensors, rates and latencies',
