@@ -221,9 +221,8 @@ class PlateGuide:
         moved = flux[half:].mean(axis=0) - flux[:half].mean(axis=0)
         change = float(np.sqrt(np.mean(np.abs(moved) ** 2)))
         most = max(NOISY * np.sqrt(2.0) * tracking_noise(self.setup), STILL * size)
-        return noise <= most and change <= max(
-            CHANGE * 2.0 * noise / len(flux) ** 0.5, STILL * size
-        )
+        least = max(CHANGE * 2.0 * noise / len(flux) ** 0.5, STILL * size)
+        return bool(noise <= most and change <= least)
 
     def _found(self, flux: ComplexArray) -> tuple[Array, Array]:
         """Where the drawn board puts the coils, less their arms, m, and their axes (S, 3)."""
