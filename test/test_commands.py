@@ -44,6 +44,7 @@ WRONG = {
     'paper': ['--sessions', NOWHERE, '--out', 'x'],
     'pivot': [NOWHERE],
     'place': [NOWHERE, '--references', '4', '--out', 'x'],
+    'plan': [NOWHERE],
     'setup': [NOWHERE, '--out', 'x'],
     'views': [NOWHERE, '--out', 'x'],
     'warm_up': ['--gremlin'],

@@ -87,7 +87,7 @@ def test_rests_are_taken_and_what_is_wrong_is_said_at_once(tmp_path):
         rests.append(said(guide, hand.to(place + off)))
         if row == 30:  # one that is seated badly is kept on demand
             guide.undo()
-            assert 'mm too far high' in said(guide, hand.to(place + off + [0, 0, 9e-3]))
+            assert '9 mm too far up' in said(guide, hand.to(place + off + [0, 0, 9e-3]))
             assert guide.keep() == 'place 31 is taken' and guide.undo()
             said(guide, hand.to(place + off))
     assert rests == [f'place {row + 1} is taken' for row in range(49)] and guide.is_complete

@@ -3,6 +3,7 @@
 import argparse
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,7 @@ class GridGuide(AnserNode):
         rows = [','.join(f'{1e3 * value:.3f}' for value in place) for place in self._places]
         out.with_suffix('.csv').write_text('\n'.join(['x_mm,y_mm,z_mm', *rows, '']), 'utf-8')
         for name in ACTIONS:
-            self.create_service(Trigger, f'grid/{name}', self._serve(name))
+            self.create_service(Trigger, f'grid/{name}', partial(self._on_ask, name))
         self._setup_source = setup_source(self, self._on_setup)
         self._fluxes = NewestSource(self, 'tool/flux', self._on_flux)
         threading.Thread(target=self._listen, name='keys', daemon=True).start()
@@ -82,28 +83,24 @@ class GridGuide(AnserNode):
             stamp_ns, points = read_frame(message, guide.setup.frame_id, self.count)
             self._after(guide.take(stamp_ns, points.channel, points.flux, points.flags))
 
-    def _serve(self, name: str) -> Any:
-        def serve(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            response.success, response.message = True, self._do(name)
-            return response
-
-        return serve
+    def _on_ask(self, name: str, _request: Any, response: Any) -> Any:
+        response.success, response.message = True, self._do(name)
+        return response
 
     def _listen(self) -> None:
         """Take what is asked for in the terminal, until its input ends."""
         for line in sys.stdin:
-            for name in ACTIONS:
-                if line.strip() and name.startswith(line.strip().lower()):
-                    self.given(self._do)(name)
+            asked = [name for name in ACTIONS if name.startswith(line.strip().lower() or '?')]
+            for name in asked:
+                self.given(self._do)(name)
 
     def _do(self, name: str) -> str:
-        guide = self._guide
-        if name == 'end':
-            self.stop(0)
-        words = 'waiting for a setup' if guide is None else self._said
-        if guide is not None and name != 'end':
-            words = {'undo': guide.undo, 'skip': guide.skip, 'keep': guide.keep}[name]()
-            self._after(words)
+        if name == 'end' or self._guide is None:
+            if name == 'end':
+                self.stop(0)
+            return self._said
+        words = str(getattr(self._guide, name)())
+        self._after(words)
         return words
 
     def _after(self, words: str) -> None:

@@ -6,7 +6,7 @@ the places around it, but for what a drawing is wrong over that distance.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ import numpy as np
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.frames.intake import GOOD, reading_codes
+from anser_ros.sessions.drawn_calibration import WAYS
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import sensor_table, session_of, tracking_noise
 from anser_ros.sessions.tracked_session import track_session
@@ -25,31 +26,20 @@ from anser_ros.wire.recorded import Bag, RecordedFluxes, optical_topic
 from anser_ros.wire.setup import Setup, dump_setup
 from anser_ros.wire.tables import read_table
 
-
-class Plate(NamedTuple):
-    """Describes a square plate: places a side, their distance (m) and the coil's height (m)."""
-
-    side: int
-    pitch_m: float
-    height_m: float
-
-
 PLATES = {
-    '7x7': Plate(7, 42.86e-3, 84e-3),
-    '9x9': Plate(9, 33.3e-3, 84e-3),
-    'duplo': Plate(7, 31.75e-3, 15e-3 + 5.5 * 19.2e-3),
+    '7x7': (7, 42.86e-3, 84e-3),
+    '9x9': (9, 33.3e-3, 84e-3),
+    'duplo': (7, 31.75e-3, 15e-3 + 5.5 * 19.2e-3),
 }
-"""Plates of Anser's owners. Duplo: bricks of 2 x 2 studs, the coil half a brick above five, which
-are 19.2 mm high each, on the board's case of 15 mm."""
+"""Plates of Anser's owners: places a side, their distance, m, and the coil's height, m. Duplo:
+bricks of 2 x 2 studs, the coil half a brick above five of 19.2 mm, on a case of 15 mm."""
 REST_S, FEWEST = 1.0, 8
 """Time that a coil rests until it is taken, s, and frames of it at least."""
 GAP = 3.0
 """Distance of two frames, in periods, from which on it is not known where the coil was between."""
-STILL = 1e-3
-"""Part of the fluxes by which they change in a rest at most: 0.03 mm at 8 cm."""
-CHANGE, NOISY = 3.0, 3.0
-"""The same in standard deviations of noise, and noise of a rest at most, in units of the stated
-one: a hand that trembles makes more."""
+STILL, NOISY = 1e-3, 3.0
+"""Part of the fluxes by which they change in a rest at most, 0.03 mm at 8 cm, and the same in
+standard deviations of noise, which is as many times the stated one at most: a hand trembles."""
 APART_M = 7e-3
 """Distance from a place to where the drawn board puts the coil, beyond that of the places around:
 it was up to 6.6 mm for the drawings of ten boards, and other places are 30 mm off."""
@@ -57,8 +47,6 @@ FIRST_M = 16e-3
 """The same of the first place, which has none around it: a plate laid by eye."""
 AROUND = 4
 """Places around that are looked at."""
-WAYS = (('left', 'right'), ('front', 'back'), ('low', 'high'))
-"""Words for -x, x, -y, y, -z and z."""
 
 
 def places_of(name: str, pitch_m: float = 0.0, heights_m: Sequence[float] = ()) -> Array:
@@ -72,16 +60,15 @@ def places_of(name: str, pitch_m: float = 0.0, heights_m: Sequence[float] = ()) 
         if not Path(name).is_file():
             raise ParameterError(f'no plate {name!r}: there are {", ".join(PLATES)}, or a table')
         return read_table(name).positions()
-    plate = PLATES[name]
-    step, heights = pitch_m or plate.pitch_m, heights_m or [plate.height_m]
+    side, pitch, height = PLATES[name]
+    step, heights = pitch_m or pitch, heights_m or [height]
     if not (0.0 < step < 1.0 and all(0.0 < height < 1.0 for height in heights)):
         raise ParameterError('pitch and heights must be between 0 and 1 m')
-    line = step * (np.arange(plate.side) - (plate.side - 1) / 2.0)
+    line = step * (np.arange(side) - (side - 1) / 2.0)
     return np.array([(x, y, z) for z in heights for y in line for x in line])
 
 
-@dataclass(frozen=True)
-class Rest:
+class Rest(NamedTuple):
     """Holds what the coils of a probe read in a rest."""
 
     stamp_ns: int  # of its middle
@@ -132,7 +119,8 @@ class PlateGuide:
         """Take in a frame (C, K); return in words what came of a rest that it ends, if it does."""
         if self.is_complete:
             return ''
-        if self._window and stamp_ns - self._window[-1][0] > GAP * self._period_ns:
+        late_ns = GAP * SECOND_NS / self.setup.flux_rate_hz
+        if self._window and stamp_ns - self._window[-1][0] > late_ns:
             self._window.clear()
         rows = {int(channel): i for i, channel in enumerate(channels)}
         own = [rows[channel] for channel in self.sensors.channel.tolist() if channel in rows]
@@ -142,21 +130,18 @@ class PlateGuide:
         self._window.append((stamp_ns, flux[own]))
         if len(self._window) < (self._window.maxlen or 0):
             return ''
-        if not self._is_still():
-            self._has_moved = True
-            return ''
-        if not self._has_moved:
+        is_still, had_moved = self._is_still(), self._has_moved
+        self._has_moved = had_moved or not is_still
+        if not (is_still and had_moved):
             return ''
         stamps, fluxes = zip(*self._window, strict=True)
         mean = np.mean(fluxes, axis=0)
         found, axes = self._found(mean)
         reading = Rest(stamps[len(stamps) // 2], mean, found)
         self._forget_motion()
+        self._refused = reading
         complaint = self._complaint(reading, axes)
-        if complaint:
-            self._refused = reading
-            return f'not taken: {complaint}'
-        return self._keep(reading)
+        return f'not taken: {complaint}' if complaint else self.keep()
 
     def undo(self) -> str:
         """Forget the place before; return in words what is next."""
@@ -168,49 +153,40 @@ class PlateGuide:
 
     def skip(self) -> str:
         """Pass over the next place."""
-        if not self.is_complete:
-            self._forget_motion()
-            self.taken.append(None)
-            return f'place {len(self.taken)} is passed over'
-        return self.words
+        if self.is_complete:
+            return self.words
+        self._forget_motion()
+        self.taken.append(None)
+        return f'place {len(self.taken)} is passed over'
 
     def keep(self) -> str:
         """Take the rest that was refused last as it is."""
-        if self._refused is None or self.is_complete:
+        if self._refused is None:
             return 'no rest was refused'
-        return self._keep(self._refused)
+        self.taken.append(self._refused)
+        self._refused = None
+        return f'place {len(self.taken)} is taken'
 
     def write(self, path: Path) -> None:
         """Write the readings as a session whose poses are the places; the file is replaced.
 
         Raises `BagError` when it cannot be written.
         """
-        rows = [row for row, reading in enumerate(self.taken) if reading is not None]
         draft = path.with_name(f'.{path.name}.part')
         draft.unlink(missing_ok=True)
         with SessionWriter(draft, self.setup.frame_id) as writer:
-            for count, row in enumerate(rows):
-                reading = self.taken[row]
-                assert reading is not None
-                if count == 0:
-                    writer.write_setup(dump_setup(self.setup), reading.stamp_ns)
-                writer.write_readings(self.setup.sensors, reading.stamp_ns, reading.flux)
-                place, turn = self.places[row].tolist(), (0.0, 0.0, 0.0, 1.0)
-                writer.write_pose(optical_topic(self.body), reading.stamp_ns, place, turn)
+            for place, rest in zip(self.places.tolist(), self.taken, strict=False):
+                if rest is not None:
+                    if not writer.record.messages:
+                        writer.write_setup(dump_setup(self.setup), rest.stamp_ns)
+                    writer.write_readings(self.setup.sensors, rest.stamp_ns, rest.flux)
+                    upright = (0.0, 0.0, 0.0, 1.0)
+                    writer.write_pose(optical_topic(self.body), rest.stamp_ns, place, upright)
         draft.replace(path)
-
-    @property
-    def _period_ns(self) -> float:
-        return SECOND_NS / self.setup.flux_rate_hz
 
     def _forget_motion(self) -> None:
         self._window.clear()
         self._has_moved, self._refused = False, None
-
-    def _keep(self, reading: Rest) -> str:
-        self._refused = None
-        self.taken.append(reading)
-        return f'place {len(self.taken)} is taken'
 
     def _is_still(self) -> bool:
         """Whether both halves of the window agree, and it scatters as noise does."""
@@ -221,7 +197,7 @@ class PlateGuide:
         moved = flux[half:].mean(axis=0) - flux[:half].mean(axis=0)
         change = float(np.sqrt(np.mean(np.abs(moved) ** 2)))
         most = max(NOISY * np.sqrt(2.0) * tracking_noise(self.setup), STILL * size)
-        least = max(CHANGE * 2.0 * noise / len(flux) ** 0.5, STILL * size)
+        least = max(NOISY * 2.0 * noise / np.sqrt(len(flux)), STILL * size)
         return bool(noise <= most and change <= least)
 
     def _found(self, flux: ComplexArray) -> tuple[Array, Array]:
@@ -255,7 +231,7 @@ class PlateGuide:
         if distances[nearest] <= APART_M:
             again = ' again' if any(i == nearest for i, _ in known) else ''
             return f'that is place {nearest + 1}{again}, not {row + 1}'
-        size, way = 1e3 * np.abs(off), WAYS
-        words = [f'{size[j]:.0f} mm too far {way[j][int(off[j] > 0)]}' for j in range(3)]
+        size = 1e3 * np.abs(off)
+        words = [f'{size[j]:.0f} mm too far {WAYS[j][int(off[j] > 0)]}' for j in range(3)]
         far = ', '.join(words[j] for j in np.argsort(-size) if size[j] >= size.max() / 3.0)
         return f'the coil lies {far}, beside the places around. Is it seated, and the pitch right?'
