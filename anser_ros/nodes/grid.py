@@ -110,6 +110,8 @@ class GridGuide(AnserNode):
             return
         if any(guide.taken):
             guide.write(self._out)
+        else:
+            self._out.unlink(missing_ok=True)
         self._show(words)
         if guide.is_complete:
             self.stop(0)
