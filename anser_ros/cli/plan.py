@@ -29,8 +29,9 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Region, region_of
 from anser_ros.sessions.calibration import generator_of
 from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
-from anser_ros.sessions.plate import places_of
 from anser_ros.sessions.session import sensor_table
+from anser_ros.simulation.recording import GridScan
+from anser_ros.simulation.world import Lissajous, Path
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import read_config
 
@@ -50,13 +51,13 @@ CAMERA = np.array([7e-5] * 3 + [4e-4] * 3)
 
 
 class Effort(NamedTuple):
-    """Describes readings: of sensors at F poses, and the errors of what is stated of these."""
+    """Describes readings at some times, s, of sensors on a path."""
 
     words: str
     sensors: SensorTable
-    position: Array  # (F, 3), m
-    rotation: Array  # (F, 3, 3)
-    errors: Array | None = None  # (6,), m and rad; None where no pose is stated
+    path: Path
+    times: Array
+    errors: Array | None = None  # (6,), of stated poses, m and rad; None where none is stated
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,9 +88,8 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     for count, effort in enumerate(efforts):
         tell(effort.words, count / len(efforts))
         models[effort.words] = calibrated(effort, generator, noise_t)
-    rows = [
-        {'effort': words, **pose_sigmas(model, region, noise_t)} for words, model in models.items()
-    ]
+    figures = {words: pose_sigmas(model, region, noise_t) for words, model in models.items()}
+    rows = [{'effort': words, **found} for words, found in figures.items()]
     document = {'schema': SCHEMA, 'body': body, 'efforts': rows}
     written = output.write_files(args.out, {DOCUMENT: document, FIGURE: _figure(rows)})
     head = ['effort', 'field mm', 'with the noise of a window mm', 'and of the frame mm']
@@ -108,53 +108,44 @@ def efforts_of(tool: SensorTable, region: Region) -> Iterator[Effort]:
     probe = replace(
         tool.select(np.arange(1)), position=np.zeros((1, 3)), axis=np.array([[0.0, 0.0, 1.0]])
     )
-    middle, half = np.array([*region.centre, 0.0]), region.half
+    half, (low, high) = region.half, WORKING
     for planes, words in ((1, '49 places, one height'), (2, '49 places at two heights')):
-        heights = [half * height for height in PLANES[:planes]]
-        places = middle + places_of('7x7', 2.0 * REACH * half / 6.0, heights)
-        flat = np.tile(np.eye(3), (len(places), 1, 1))
-        yield Effort(words, probe, places, flat, drawn.PLACE)
-    for seconds, words in ((10, '10 s'), (60, '60 s')):
-        yield Effort(f'the tool moved by hand for {words}', tool, *_hand(seconds, region))
-    yield Effort('60 s before an optical tracker', tool, *_hand(60, region), CAMERA)
-
-
-def _hand(seconds: int, region: Region) -> tuple[Array, Array]:
-    """Places (F, 3), m, and turns (F, 3, 3) of a hand at 5 Hz through the volume."""
-    time = np.arange(0.0, seconds, 0.2)
-    waves = [np.sin(w * time + p) for w, p in ((0.9, 0.0), (1.3, 1.0), (1.7, 2.0))]
-    low, high = WORKING
-    size = region.half * np.array([REACH, REACH, (high - low) / 2.0])
-    middle = [*region.centre, region.half * (high + low) / 2.0]
-    turns = [np.sin(w * time + p) for w, p in ((0.7, 2.0), (1.1, 0.5), (0.8, 1.0))]
-    turn = Rotation.from_rotvec(0.8 * np.stack(turns, axis=1)).as_matrix()
-    return middle + np.stack(waves, axis=1) * size, np.asarray(turn)
+        heights = tuple(half * height for height in PLANES[:planes])
+        plate = GridScan(7, 2.0 * REACH * half, heights, tilt_rad=0.0)
+        yield Effort(words, probe, plate, np.arange(float(plate.frames)), drawn.PLACE)
+    centre, size = half * (high + low) / 2.0, half * (high - low) / 2.0
+    hand = Lissajous((0.0, 0.0, centre), (REACH * half, REACH * half, size))
+    minute = np.arange(0.0, 60.0, 0.2)
+    yield Effort('the tool moved by hand for 10 s', tool, hand, minute[:50])
+    yield Effort('the tool moved by hand for 60 s', tool, hand, minute)
+    yield Effort('60 s before an optical tracker', tool, hand, minute, CAMERA)
 
 
 def calibrated(effort: Effort, generator: Generator, noise_t: float) -> FieldModel:
     """Return the model of an effort on a board that is made as boards are."""
-    rng = np.random.default_rng(SEED)
-    drawing = drawn.Drawing(generator)
+    rng, drawing, count = np.random.default_rng(SEED), drawn.Drawing(generator), len(effort.times)
+    stated, turns = map(np.array, zip(*map(effort.path, effort.times.tolist()), strict=True))
+    stated += generator.middle
     errors = np.zeros((len(generator.centres), drawn.OWN))
     for kind, own in drawn.KINDS.items():
         errors[:, own] = drawn.COIL[kind] * rng.normal(size=errors[:, own].shape)
-    board, sensors, count = drawing.dipoles(errors), effort.sensors, len(effort.position)
+    board, sensors = drawing.dipoles(errors), effort.sensors
     if len(sensors) > 1:
         shift = drawn.SENSORS['places'] * rng.normal(size=sensors.position.shape)
         sensors = replace(sensors, position=sensors.position + shift)
     tilt = drawn.SENSORS['axes'] * rng.normal(size=(len(sensors), 2))
     sensors = replace(sensors, axis=tilted(sensors.axis, tilt))
     off = (0.0 if effort.errors is None else effort.errors) * rng.normal(size=(count, 6))
-    turned = Rotation.from_rotvec(off[:, 3:]).as_matrix() @ effort.rotation
-    points, axes = sensors.placed(effort.position + off[:, :3], turned)
+    turned = Rotation.from_rotvec(off[:, 3:]).as_matrix() @ turns
+    points, axes = sensors.placed(stated + off[:, :3], turned)
     lengths = np.tile(sensors.length, count)
     flux = board.flux(points.reshape(-1, 3), axes.reshape(-1, 3), lengths)
     flux = flux.reshape(count, len(sensors), -1)
     flux = flux + noise_t * (rng.normal(size=flux.shape) + 1j * rng.normal(size=flux.shape))
     there = np.ones(flux.shape[:2], dtype=bool)
     read = Measurements(
-        effort.sensors.body[0], effort.sensors, np.arange(float(count)), flux, there,
-        np.zeros(there.shape, dtype=np.int64), effort.position, effort.rotation, there[:, 0],
+        effort.sensors.body[0], effort.sensors, effort.times, flux, there,
+        np.zeros(there.shape, dtype=np.int64), stated, turns, there[:, 0],
     )  # fmt: skip
     # What all gains share is the board's strength, and in what they differ is learnt at once.
     is_typed, kinds = [effort.errors is not None], ('axes', 'places')
