@@ -28,7 +28,7 @@ from anser_ros.physics.rotations import tangents, tilted
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Region, region_of
 from anser_ros.sessions.calibration import generator_of
-from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
+from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import sensor_table
 from anser_ros.simulation.recording import GridScan
 from anser_ros.simulation.world import Lissajous, Path
@@ -46,6 +46,8 @@ BANDS = np.linspace(0.4, 2.2, 10)
 """Heights of the picture, in halves of the board."""
 COILS, SEED, STEP = 60, 1, 1e-5
 """Coils at each height of which poses are judged, seed, and step of differences, m and rad."""
+FEWEST = 5
+"""Emitters at least: a single coil's pose has as many numbers."""
 CAMERA = np.array([7e-5] * 3 + [4e-4] * 3)
 """Jitter of an optical tracker's poses, m and rad."""
 
@@ -76,14 +78,15 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     body = args.body or next(iter(setup.bodies), None)
     if board.board is None or board.field is None or body not in setup.bodies:
         raise SetupError(f'no board that can be drawn, or no tool {body!r}, in the setup')
+    if len(setup.emitter_names) < FEWEST:
+        raise SetupError(f'a single coil has no pose over fewer than {FEWEST} emitters')
     output.make_folder(args.out)
     nominal = nominal_model(board.board, drawn.FINE)
     generator = replace(generator_of(setup), nominal=nominal)
-    whole = region_of(board.field)
-    region = Region(whole.centre, whole.half, stated_volume(setup))
+    region = region_of(board.field)
     tool = sensor_table(setup.tool_sensors).of_body(body)
     noise_t = setup.accuracy.flux_noise_t
-    efforts = list(efforts_of(tool, region))
+    efforts = list(efforts_of(tool, region, len(generator.emitters)))
     models = {'the drawing alone': nominal}
     for count, effort in enumerate(efforts):
         tell(effort.words, count / len(efforts))
@@ -103,8 +106,11 @@ def _sums(row: dict[str, Any]) -> Array:
     return np.asarray(np.sqrt(np.cumsum(np.square(parts))))
 
 
-def efforts_of(tool: SensorTable, region: Region) -> Iterator[Effort]:
-    """Yield the efforts with a tool: its first coil on plates, and all of it moved by hand."""
+def efforts_of(tool: SensorTable, region: Region, emitters: int) -> Iterator[Effort]:
+    """Yield the efforts with a tool: its first coil on plates, and all of it moved by hand.
+
+    Without a camera it must be rigid, with more readings than a pose takes.
+    """
     probe = replace(
         tool.select(np.arange(1)), position=np.zeros((1, 3)), axis=np.array([[0.0, 0.0, 1.0]])
     )
@@ -116,8 +122,9 @@ def efforts_of(tool: SensorTable, region: Region) -> Iterator[Effort]:
     centre, size = half * (high + low) / 2.0, half * (high - low) / 2.0
     hand = Lissajous((0.0, 0.0, centre), (REACH * half, REACH * half, size))
     minute = np.arange(0.0, 60.0, 0.2)
-    yield Effort('the tool moved by hand for 10 s', tool, hand, minute[:50])
-    yield Effort('the tool moved by hand for 60 s', tool, hand, minute)
+    if len(tool) > 1 and len(tool) * emitters > 6:
+        yield Effort('the tool moved by hand for 10 s', tool, hand, minute[:50])
+        yield Effort('the tool moved by hand for 60 s', tool, hand, minute)
     yield Effort('60 s before an optical tracker', tool, hand, minute, CAMERA)
 
 
