@@ -72,6 +72,8 @@ def test_rests_are_taken_and_what_is_wrong_is_said_at_once(tmp_path):
     guide = PlateGuide(hand.setup, places)
     off = np.array([2e-3, -1e-3, 1e-3])  # of a plate laid by eye
     assert said(guide, hand.to(places[0] + off, rest_s=0.6)) == ''  # moved on too early
+    unplugged = [(t, np.nan * flux) for t, flux in hand.to(places[0])]
+    assert said(guide, unplugged) == 'not taken: the coil gives no reading. Is it connected?'
     assert 'upside down' in said(guide, hand.to(places[0] + off, up=-UP))
     assert said(guide, hand.to(places[0] + off)) == 'place 1 is taken'
     hand.at = hand.at + [0.0, 0.0, 0.03]  # lifted, and put down in the same hole

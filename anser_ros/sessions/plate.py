@@ -98,7 +98,7 @@ class PlateGuide:
         self._refused: Rest | None = None
         frames = max(FEWEST, round(REST_S * setup.flux_rate_hz))
         self._window: deque[tuple[int, ComplexArray]] = deque(maxlen=frames)
-        self._has_moved = True
+        self._has_moved, self._silent = True, 0
 
     @property
     def is_complete(self) -> bool:
@@ -126,7 +126,10 @@ class PlateGuide:
         own = [rows[channel] for channel in self.sensors.channel.tolist() if channel in rows]
         if len(own) < len(self.sensors) or (reading_codes(flux[own], flags[own]) != GOOD).any():
             self._window.clear()
-            return ''
+            self._silent += 1
+            is_said = self._silent == self._window.maxlen
+            return 'not taken: the coil gives no reading. Is it connected?' if is_said else ''
+        self._silent = 0
         self._window.append((stamp_ns, flux[own]))
         if len(self._window) < (self._window.maxlen or 0):
             return ''
