@@ -24,8 +24,9 @@ from anser_ros.cli.commands import NODES as ALL_NODES
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 POLICY = Path(__file__).resolve().parents[1] / 'config' / 'sros2_policy.xml'
-SIMULATED = ('cu_simulator', 'replay')
-"""What belongs on no graph that is secured; all other nodes of the package have an enclave."""
+SIMULATED = ('cu_simulator', 'grid', 'replay')
+"""What belongs on no graph that is secured: simulations, and the guide through a plate, which is
+gone through before. All other nodes of the package have an enclave."""
 NODES = tuple(node for node in ALL_NODES if node not in SIMULATED)
 SETTLES_S = 60.0
 """Longest time, s, for all topics of a setup to appear."""

@@ -182,6 +182,7 @@ ROS = 'rclpy'
 """Module that every node needs, and that pip does not install with this package."""
 ROS_REMEDY = 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
 NEEDED = {
+    'grid': ('mcap',),
     'recorder': ('mcap',),
     'replay': ('mcap', 'mcap_ros2', 'zstandard'),
     **{node: needed for table in extensions.tables('NEEDED') for node, needed in table.items()},

@@ -10,9 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from chromium import BROWSER_OPTIONS
 from conftest import wait
 from dashboard_world import OFF_M, SENSORS, PretendedChain, browser_path, ten_sensors
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import serialize_message
@@ -42,6 +44,8 @@ from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.operator_words import LastStatus
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.diagnostics import Level, Status, diagnostic_array
 from anser_ros.nodes.traces import latency_of
 from anser_ros.sessions.nominal_board import tracked_volume
 from anser_ros.sessions.starting_model import save_model
@@ -82,6 +86,11 @@ def test_the_drawn_volume_is_that_in_which_poses_are_accepted(ros, stated):
     source.look()
     volume = tracked_volume(setup)
     assert source.world()['volume_m'] == [list(volume.low), list(volume.high)]
+    assert source.status()['findings'] == [(1, 'no watcher runs')]
+    words = 'place 1 is taken; place 2 of 49 is next'  # the guide through a plate is read here too
+    said = diagnostic_array('anser/grid', [Status('', Level.OK, words)], Time())
+    node.create_publisher(DiagnosticArray, '/diagnostics', qos.EVENTS).publish(said)
+    assert wait(lambda: source.look() or source.status()['findings'] == [(0, words)])
     node.destroy_node()
 
 

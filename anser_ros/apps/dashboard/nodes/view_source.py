@@ -321,16 +321,16 @@ class ViewSource:
         return sorted(found)
 
     def _findings(self) -> list[tuple[int, str]]:
-        name = f'{self.namespace}/watcher'
-        if name not in self._statuses or self._is_silent(name):
-            return [(1, 'no watcher runs')]
-        parts = [
-            (status.level, f'{part.partition(": ")[2]}: {status.message}')
-            for part, status in self._statuses.items()
-            if part.startswith(f'{name}: ') and not self._is_silent(part)
-        ]
-        own = self._statuses[name]
-        return [(own.level, own.message), *parts]
+        found = []
+        for name in (f'{self.namespace}/grid', f'{self.namespace}/watcher'):
+            if name in self._statuses and not self._is_silent(name):
+                found.append((self._statuses[name].level, self._statuses[name].message))
+                found += [
+                    (status.level, f'{part.partition(": ")[2]}: {status.message}')
+                    for part, status in self._statuses.items()
+                    if part.startswith(f'{name}: ') and not self._is_silent(part)
+                ]
+        return found or [(1, 'no watcher runs')]
 
 
 def _point(point: Any) -> list[Any]:
