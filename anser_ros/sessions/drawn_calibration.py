@@ -117,13 +117,14 @@ def fit_to_drawing(
 def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measurements]:
     """The tools at the poses where the drawn board puts most of their coils, each by itself.
 
-    A turn about a single axis stays open, and is any.
+    Where few emitters place no coil, that is where it puts all of them together. A turn about a
+    single axis stays open, and is any.
     """
     assert nominal is not None
     settings = TrackerSettings(gate=NO_GATE, max_sigma_m=1.0)
-    tracked, out = track_session(session, nominal, settings).sensors, []
+    tracked, out = track_session(session, nominal, settings), list[Measurements]()
     for tool in session.tools:
-        series = [tracked[name].estimates for name in tool.sensors.name]
+        series = [tracked.sensors[name].estimates for name in tool.sensors.name]
         # Coils that are a little off contradict their body, which is no fault of their places.
         known = np.array([[e.state in (OK, INCONSISTENT) for e in one] for one in series]).T
         places = np.array([[e.position for e in one] for one in series]).swapaxes(0, 1)
@@ -143,6 +144,10 @@ def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measureme
             position[row], rotation[row] = np.median(middles, axis=0), turn
             off = np.linalg.norm(middles - position[row], axis=1)
             enough[row] = np.median(off) < NEAR_M
+        whole = tracked.bodies[tool.body].estimates if tool.body in tracked.bodies else ()
+        for row, body in enumerate(whole):
+            if not known[row].any() and body.state == OK and body.rotation is not None:
+                position[row], rotation[row], enough[row] = body.position, body.rotation, True
         out.append(
             replace(tool, position=position, rotation=rotation, has_pose=enough, track=None)
         )
