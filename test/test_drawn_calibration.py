@@ -175,6 +175,24 @@ def test_a_tool_moved_by_hand_calibrates_without_a_camera(setup):
     assert {'sensor_gain_spread', 'sensor_axis_spread', 'sensor_place_spread'} <= names
 
 
+@pytest.mark.parametrize(('emitters', 'seed'), [([1, 3, 6], 12), ([0, 1, 2, 4, 5, 7], 13)])
+def test_a_board_of_few_emitters_calibrates_by_whole_tools(setup, emitters, seed):
+    coils = tuple(setup.emitter.coils[k] for k in emitters)
+    world = World(replace(setup, emitter=replace(setup.emitter, coils=coils)), seed)
+    session = world.waved(12.0)
+    tracked = track_session(session, calibrated(session).model)
+    series = tracked.bodies['tool']
+    assert series.ok.mean() > 0.95
+    position, _ = hand(session.tools[0].time / 10.0)
+    found = [(e, p) for e, p in zip(series.estimates, position, strict=True) if e.state == 'ok']
+    places, error = np.array([e.position for e, _ in found]), [e.position - p for e, p in found]
+    assert _rms(np.array(error)) < 2e-3
+    true = np.array([p for _, p in found])
+    assert _rms(_registered(places, true) - true) < 6e-4
+    sigma = np.array([e.sigma_position_m for e, _ in found])
+    assert np.mean(np.linalg.norm(error, axis=1) > 3.0 * sigma) < 0.01
+
+
 @pytest.mark.long
 def test_the_command_calibrates_a_tool_that_was_waved(shared, tmp_path):
     folder, out = shared / 'sessions' / 'nocamera', tmp_path / 'model.yaml'
