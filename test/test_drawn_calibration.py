@@ -241,8 +241,19 @@ def test_what_was_typed_wrongly_is_named_with_its_size(setup):
     same = {key: getattr(tool, key)[:48] for key in ('time', 'position', 'rotation')}
     with pytest.raises(FitError, match=r'one of the typed places 1\d to 1\d was missed'):
         calibrated(replace(session, tools=(replace(rest, **same),)))
-    for position in (tool.position * [-1.0, 1.0, 1.0], tool.position[:, [1, 0, 2]]):
-        with pytest.raises(FitError, match=r'\d+ mm \(median\) from where it was typed'):
+    quarter = tool.position @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    wrongs = {
+        r'mirrored, x has the other sign: .* \d+ mm \(median\) .* \d mm with': [-1, 1, 1]
+        * tool.position,
+        r'mirrored, y has the other sign': tool.position * [1, -1, 1],
+        r'x and y are exchanged: .* \d mm with that undone': tool.position[:, [1, 0, 2]],
+        r'exchanged, and their signs': tool.position[:, [1, 0, 2]] * [-1, -1, 1],
+        r'plate is turned by (89|9\d) deg, and -?\d, -?\d, -?\d mm away': quarter,
+        r'plate is turned by -?\d deg, and 2\d, -?\d, -?\d mm away': tool.position - [0.025, 0, 0],
+        r'are places in another order': np.random.default_rng(0).permutation(tool.position),
+    }
+    for words, position in wrongs.items():
+        with pytest.raises(FitError, match=words):
             calibrated(wrongly(session, position=position))
 
 

@@ -272,7 +272,12 @@ class DrawnFitter:
         return most
 
     def coils(self) -> Dipoles:
-        """Return the dipoles (N) of the drawn coils, in the frame of the typed places."""
+        """Return the dipoles (N) of the drawn coils, in the frame of the typed places.
+
+        What the drawing lacks is left to moments of their own that they get.
+        """
+        rest, _ = self.groups.pop(list(KINDS).index('rest'))
+        self.width[rest] = 1e-12
         self._settle(PLACING_STEPS)
         shift, turn, scale = np.split(self.values[self.plate], [3, 6])
         back, own = _turned(turn), slice(len(self.drawing.owner))
