@@ -175,6 +175,24 @@ def test_a_tool_moved_by_hand_calibrates_without_a_camera(setup):
     assert {'sensor_gain_spread', 'sensor_axis_spread', 'sensor_place_spread'} <= names
 
 
+@pytest.mark.parametrize(('emitters', 'seed'), [([1, 3, 6], 12), ([0, 1, 2, 4, 5, 7], 13)])
+def test_a_board_of_few_emitters_calibrates_by_whole_tools(setup, emitters, seed):
+    coils = tuple(setup.emitter.coils[k] for k in emitters)
+    world = World(replace(setup, emitter=replace(setup.emitter, coils=coils)), seed)
+    session = world.waved(12.0)
+    tracked = track_session(session, calibrated(session).model)
+    series = tracked.bodies['tool']
+    assert series.ok.mean() > 0.95
+    position, _ = hand(session.tools[0].time / 10.0)
+    found = [(e, p) for e, p in zip(series.estimates, position, strict=True) if e.state == 'ok']
+    places, error = np.array([e.position for e, _ in found]), [e.position - p for e, p in found]
+    assert _rms(np.array(error)) < 2e-3
+    true = np.array([p for _, p in found])
+    assert _rms(_registered(places, true) - true) < 6e-4
+    sigma = np.array([e.sigma_position_m for e, _ in found])
+    assert np.mean(np.linalg.norm(error, axis=1) > 3.0 * sigma) < 0.01
+
+
 @pytest.mark.long
 def test_the_command_calibrates_a_tool_that_was_waved(shared, tmp_path):
     folder, out = shared / 'sessions' / 'nocamera', tmp_path / 'model.yaml'
@@ -223,8 +241,19 @@ def test_what_was_typed_wrongly_is_named_with_its_size(setup):
     same = {key: getattr(tool, key)[:48] for key in ('time', 'position', 'rotation')}
     with pytest.raises(FitError, match=r'one of the typed places 1\d to 1\d was missed'):
         calibrated(replace(session, tools=(replace(rest, **same),)))
-    for position in (tool.position * [-1.0, 1.0, 1.0], tool.position[:, [1, 0, 2]]):
-        with pytest.raises(FitError, match=r'\d+ mm \(median\) from where it was typed'):
+    quarter = tool.position @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    wrongs = {
+        r'mirrored, x has the other sign: .* \d+ mm \(median\) .* \d mm with': [-1, 1, 1]
+        * tool.position,
+        r'mirrored, y has the other sign': tool.position * [1, -1, 1],
+        r'x and y are exchanged: .* \d mm with that undone': tool.position[:, [1, 0, 2]],
+        r'exchanged, and their signs': tool.position[:, [1, 0, 2]] * [-1, -1, 1],
+        r'plate is turned by (89|9\d) deg, and -?\d, -?\d, -?\d mm away': quarter,
+        r'plate is turned by -?\d deg, and 2\d, -?\d, -?\d mm away': tool.position - [0.025, 0, 0],
+        r'are places in another order': np.random.default_rng(0).permutation(tool.position),
+    }
+    for words, position in wrongs.items():
+        with pytest.raises(FitError, match=words):
             calibrated(wrongly(session, position=position))
 
 

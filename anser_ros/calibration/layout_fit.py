@@ -14,21 +14,21 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from anser_ros.arrays import Array, ComplexArray
+from anser_ros.calibration.drawn_fit import drawn_where_read
 from anser_ros.calibration.layouts import (
     FREE_KINDS,
     Generator,
     Layout,
     fit_clusters,
     fit_coaxial,
+    moments_of_field,
     place,
 )
-from anser_ros.calibration.least_squares import GramFactor, as_complex, as_real
+from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
-from anser_ros.calibration.placement import CoilPlacer
 from anser_ros.calibration.readings import DipoleSites, usable_readings, usable_weights, with_pose
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
-from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.settings import Accuracy
 
@@ -44,19 +44,16 @@ its coils changes by half."""
 LEAST_HEIGHT = 0.8
 """Lowest point of that volume as a fraction of the lowest reading's height: there the field is at
 most twice as strong, and farther down it changes too fast for a layer of dipoles."""
-PROJECTION_DAMPING = 1e-6
-"""Damping when a known field is expressed by dipoles: it keeps parallel columns from making huge
-moments."""
 
 
 class ScaledNominal:
     """Holds the nominal field in and around a measured volume, scaled to the measurements."""
 
     def __init__(self, nominal: FieldModel, measurements: Sequence[Measurements]) -> None:
-        self.nominal = nominal
         self.points, self.axes = volume_lattice(measurements)
-        self.gains = emitter_gains(nominal, measurements)
-        self.flux = nominal.flux(self.points, self.axes) * self.gains
+        gains = emitter_gains(nominal, measurements)
+        self.nominal = replace(nominal, moments=nominal.moments * gains)
+        self.flux = self.nominal.flux(self.points, self.axes)
 
     def moments(self, dipoles: DipoleSites) -> ComplexArray:
         """Return the moments (N, K), A m^2, with which N dipoles make the drawn field best."""
@@ -88,15 +85,6 @@ def emitter_gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> 
         above += (drawn.conj() * flux).sum(axis=0)
         below += (np.abs(drawn) ** 2).sum(axis=0)
     return np.asarray(above / np.maximum(below, 1e-300))
-
-
-def moments_of_field(
-    points: Array, axes: Array, flux: Array, dipoles: DipoleSites
-) -> ComplexArray:
-    """Moments (N, K), A m^2, that make given real fluxes (P, 2K), T, best."""
-    factor = GramFactor(len(dipoles), flux.shape[1])
-    factor.add(flux_basis(points, axes, None, dipoles.positions, dipoles.directions), flux)
-    return as_complex(factor.spectrum().solve(PROJECTION_DAMPING))
 
 
 RICH = Layout('layer', 16, 1.8, 0.0)
@@ -189,8 +177,8 @@ class LayoutPlacer:
     def placed(self, layout: Layout) -> tuple[DipoleSites, ComplexArray | None]:
         """Return a layout's dipoles as its rule places them."""
         if layout.kind == 'drawing' and self.scaled is not None:
-            nominal = self.scaled.nominal
-            return CoilPlacer(nominal).sites, nominal.moments * self.scaled.gains
+            drawn = self.scaled.nominal
+            return DipoleSites(drawn.positions, drawn.directions), drawn.moments
         dipoles = place(layout, self.generator)
         return dipoles, self._prior(layout, dipoles)
 
@@ -206,12 +194,15 @@ class LayoutPlacer:
 
         Those on an axis stay on it, those of a drawn coil or of a cluster move together.
         """
+        if layout.kind == 'drawing' and self.scaled is not None:
+            coils = drawn_where_read(
+                corrected, replace(self.generator, nominal=self.scaled.nominal)
+            )
+            return DipoleSites(coils.positions, coils.directions), coils.moments
         rows = sum(m.flux.shape[0] * m.flux.shape[1] for m in corrected)
         step = max(1, -(-rows // MOST_MOVING_ROWS))
         thin = [m.frames(np.arange(0, len(m.time), step)) for m in corrected]
         shares = [w[::step] for w in weights]
-        if layout.kind == 'drawing' and self.scaled is not None:
-            return CoilPlacer(self.scaled.nominal).fit(thin, shares)
         if layout.kind in FREE_KINDS:
             found = fit_clusters(thin, shares, self.generator.centres)
             return found if layout.kind == 'cluster' else found.shared, None

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from anser_ros.arrays import Array
-from anser_ros.calibration.least_squares import as_real
+from anser_ros.arrays import Array, ComplexArray
+from anser_ros.calibration.least_squares import GramFactor, as_complex, as_real
 from anser_ros.calibration.readings import DipoleSites, weighted_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
@@ -34,6 +34,18 @@ FIRST_SPACING_M = 1e-3
 sensors gives the same first fit."""
 ENDED = 1e-10
 """Relative change of the sum of squares at which the search has ended."""
+PROJECTION_DAMPING = 1e-6
+"""Damping when a known field is expressed by dipoles: it keeps parallel columns from making huge
+moments."""
+
+
+def moments_of_field(
+    points: Array, axes: Array, flux: Array, dipoles: DipoleSites
+) -> ComplexArray:
+    """Moments (N, K), A m^2, that make given real fluxes (P, 2K), T, best."""
+    factor = GramFactor(len(dipoles), flux.shape[1])
+    factor.add(flux_basis(points, axes, None, dipoles.positions, dipoles.directions), flux)
+    return as_complex(factor.spectrum().solve(PROJECTION_DAMPING))
 
 
 def coaxial(centres: Array, axes: Array, count: int, spacing_m: Array) -> DipoleSites:

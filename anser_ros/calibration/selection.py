@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.calibration.drawn_fit import is_of_coils
 from anser_ros.calibration.layout_fit import (
     LayoutPlacer,
     free_bases,
@@ -34,7 +35,6 @@ from anser_ros.calibration.moments import (
     pose_precision,
     pose_terms,
 )
-from anser_ros.calibration.placement import CoilPlacer
 from anser_ros.calibration.readings import DipoleSites, basis_rows, with_pose
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -341,11 +341,9 @@ class _Search:
             is_clear = free.score * (1.0 + LEAST_GAIN) < straight.score
             found.append(free if is_clear else straight)
         else:
-            coils = CoilPlacer(self.generator.nominal)
-            if coils.possible and len(coils.sites) <= MOST_DIPOLES:
-                found.append(
-                    self.score(Layout('drawing', len(coils.sites), 1.0, 0.0, self.prior, True))
-                )
+            count = len(self.generator.nominal.positions)
+            if is_of_coils(self.generator.nominal) and count <= MOST_DIPOLES:
+                found.append(self.score(Layout('drawing', count, 1.0, 0.0, self.prior, True)))
         return found
 
     def climb(self, start: Layout, counts: Sequence[int]) -> LayoutCandidate:

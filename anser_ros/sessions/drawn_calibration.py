@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.drawn_fit import DrawnFit, DrawnFitter, evenly
 from anser_ros.calibration.held_out import HeldOutTally
@@ -52,6 +53,8 @@ MOST_ASTRAY = 0.1
 OTHER_PITCH = 0.05
 """Relative difference of a pitch from the typed one that is named: far more than a drawn board's
 own errors make of it."""
+IN_A_LINE = 0.01
+"""Ratio of a plate's square widths below which its places lie in a line, which tells no mirror."""
 CLEAR = 2.0
 """Standard deviations from which on an emitter is said to be elsewhere than drawn."""
 
@@ -117,13 +120,14 @@ def fit_to_drawing(
 def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measurements]:
     """The tools at the poses where the drawn board puts most of their coils, each by itself.
 
-    A turn about a single axis stays open, and is any.
+    Where few emitters place no coil, that is where it puts all of them together. A turn about a
+    single axis stays open, and is any.
     """
     assert nominal is not None
     settings = TrackerSettings(gate=NO_GATE, max_sigma_m=1.0)
-    tracked, out = track_session(session, nominal, settings).sensors, []
+    tracked, out = track_session(session, nominal, settings), list[Measurements]()
     for tool in session.tools:
-        series = [tracked[name].estimates for name in tool.sensors.name]
+        series = [tracked.sensors[name].estimates for name in tool.sensors.name]
         # Coils that are a little off contradict their body, which is no fault of their places.
         known = np.array([[e.state in (OK, INCONSISTENT) for e in one] for one in series]).T
         places = np.array([[e.position for e in one] for one in series]).swapaxes(0, 1)
@@ -143,6 +147,10 @@ def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measureme
             position[row], rotation[row] = np.median(middles, axis=0), turn
             off = np.linalg.norm(middles - position[row], axis=1)
             enough[row] = np.median(off) < NEAR_M
+        whole = tracked.bodies[tool.body].estimates if tool.body in tracked.bodies else ()
+        for row, body in enumerate(whole):
+            if not known[row].any() and body.state == OK and body.rotation is not None:
+                position[row], rotation[row], enough[row] = body.position, body.rotation, True
         out.append(
             replace(tool, position=position, rotation=rotation, has_pose=enough, track=None)
         )
@@ -183,19 +191,38 @@ def check_typed(typed: Measurements, drawn: Measurements) -> str:
             f'there on each reading belongs to the next place, {1e3 * pitch:.0f} mm or more off'
         )
     middle, centre = places[known].mean(axis=0), there[known].mean(axis=0)
-    turn = nearest_rotation((there[known] - centre).T @ (places[known] - middle))
-    arms, ways = (places[known] - middle) @ turn.T, there[known] - centre
-    scale = float((arms * ways).sum() / (arms**2).sum())
-    rest = np.linalg.norm(ways - scale * arms, axis=1)
-    if np.mean(rest > NEAR_M) <= MOST_ASTRAY and abs(scale - 1.0) > OTHER_PITCH:
+    arms, ways = places[known] - middle, there[known] - centre
+    one, sizes, other = np.linalg.svd(ways[:, :2].T @ arms[:, :2])
+    turn = np.eye(3)
+    turn[:2, :2] = one @ other
+    scale = float((arms @ turn.T * ways).sum() / (arms**2).sum())
+    rest = np.linalg.norm(ways - scale * arms @ turn.T, axis=1)
+    away = f'{1e3 * np.median(off[known]):.0f} mm (median) from where it was typed'
+    if np.mean(rest > NEAR_M) <= MOST_ASTRAY and sizes[1] > IN_A_LINE * sizes[0]:
+        if abs(scale - 1.0) > OTHER_PITCH:
+            raise FitError(
+                f'{typed.body}: the places lie {scale:.3f} times as far apart as typed: '
+                f'{1e3 * scale * pitch:.2f} mm where {1e3 * pitch:.2f} mm are typed'
+            )
         raise FitError(
-            f'{typed.body}: the places lie {scale:.3f} times as far apart as typed: '
-            f'{1e3 * scale * pitch:.2f} mm where {1e3 * pitch:.2f} mm are typed'
+            f'{typed.body}: {_plate_words(turn, centre - middle)}: the drawn board puts the coil '
+            f'{away}, and {1e3 * np.median(rest):.0f} mm with that undone'
         )
     return (
-        f'{typed.body}: the drawn board puts the coil {1e3 * np.median(off[known]):.0f} mm '
-        '(median) from where it was typed: is the plate turned, mirrored or elsewhere?'
+        f'{typed.body}: the drawn board puts the coil {away}, and no turn, mirror image or other '
+        'pitch of the plate explains it: are places in another order, or elsewhere?'
     )
+
+
+def _plate_words(turn: Array, shift: Array) -> str:
+    """How a plate stands that is turned or mirrored (3, 3) in its plane, and shifted (3,), m."""
+    if np.linalg.det(turn) > 0.0:
+        angle = DEGREES * np.arctan2(turn[1, 0], turn[0, 0])
+        x, y, z = 1e3 * shift
+        return f'the plate is turned by {angle:.0f} deg, and {x:.0f}, {y:.0f}, {z:.0f} mm away'
+    if abs(turn[0, 1]) > abs(turn[0, 0]):
+        return f'x and y are exchanged{"" if turn[0, 1] > 0.0 else ", and their signs"}'
+    return f'the plate is mirrored, {"y" if turn[0, 0] > 0.0 else "x"} has the other sign'
 
 
 def _calibration(
