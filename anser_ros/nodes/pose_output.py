@@ -6,16 +6,25 @@ import time
 from collections import Counter
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from rclpy.serialization import serialize_message
+from yaml import YAMLError
 
+from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status
-from anser_ros.physics.rotations import quaternion_of_axis, quaternion_of_rotation
+from anser_ros.physics.rotations import (
+    quaternion_of_axis,
+    quaternion_of_rotation,
+    rotation_of_quaternion,
+)  # fmt: skip
 from anser_ros.pose_states import FRAMES_IN, OK, STALE
 from anser_ros.stamps import SECOND_NS, is_live, pack_stamp, set_stamp
 from anser_ros.tracking.estimate import PoseEstimate
-from anser_ros.wire.setup import topic_of
+from anser_ros.wire.recorded import unit_quaternions
+from anser_ros.wire.setup import FIELD_GENERATOR, topic_of
+from anser_ros.wire.text_files import read_text, read_yaml
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -150,6 +159,61 @@ class PoseTopic:
         values.update({f'{FRAMES_IN}{name}': count for name, count in sorted(self.states.items())})
         level = Level.OK if state == OK else Level.STALE if state == STALE else Level.WARN
         return Status(self.name, level, state, values)
+
+
+def board_pose_of(table: Any) -> tuple[float, ...]:
+    """Return x y z, m, and quaternion x y z w of the board that a tracker's parameters state.
+
+    A file of ``anser handeye`` has the way from the other tracker's frame to the board's. Raises
+    `ParameterError` when a pose is no pose, or is missing where there is a parent frame.
+    """
+    path: str = table.registration_file
+    numbers: tuple[float, ...] = table.board_pose
+    try:
+        if path:
+            found = read_yaml(read_text(path))
+            if 'board_pose' in found:
+                numbers = tuple(map(float, found['board_pose']))
+            else:
+                turn = rotation_of_quaternion(np.array(found['registration_quaternion_xyzw'])).T
+                place = -turn @ np.array(found['registration_translation_m'], dtype=float)
+                numbers = *place.tolist(), *quaternion_of_rotation(turn)
+    except (KeyError, TypeError, ValueError, YAMLError) as error:
+        raise ParameterError(f'parameter registration_file: {path}: no pose ({error})') from error
+    is_pose = len(numbers) == 7 and bool(np.isfinite(unit_quaternions(numbers[3:])).all())
+    if not (is_pose and np.isfinite(numbers).all()) and (numbers or table.parent_frame):
+        raise ParameterError(f'parameter board_pose: x y z qx qy qz qw needed, got {numbers}')
+    return numbers
+
+
+class BoardFrame:
+    """States on /tf_static where the board is, for those who come later too."""
+
+    def __init__(self, node: Any) -> None:
+        self._node = node
+        self._publisher: Any = None
+
+    def state(self, parent: str, prefix: str, numbers: tuple[float, ...]) -> None:
+        """State the board's pose in a parent frame; nothing without one."""
+        if not parent:
+            return
+        if TFMessage is None:
+            self._node.warn('no_tf_static', 'no /tf_static: tf2_msgs is not installed')
+            return
+        if self._publisher is None:
+            self._publisher = self._node.create_publisher(TFMessage, '/tf_static', qos.LATCHED)
+        found = transform_of(parent, f'{prefix}{FIELD_GENERATOR}', numbers)
+        found.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(TFMessage(transforms=[found]))
+
+
+def transform_of(parent: str, child: str, numbers: tuple[float, ...]) -> TransformStamped:
+    """Return the transform of a frame by its pose in another: x y z, m, quaternion x y z w."""
+    found = TransformStamped(child_frame_id=child)
+    found.header.frame_id = parent
+    place, turn = found.transform.translation, found.transform.rotation
+    place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = numbers
+    return found
 
 
 def transform_publisher(node: Any) -> Any:
