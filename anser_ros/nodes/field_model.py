@@ -115,6 +115,8 @@ class FieldModelNode(AnserNode):
         self._stated = stated_by(table)
         self._file_model = model_of(table.model_file)
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
+        if self._baseline_bag is not None and self._baseline_bag.lost:
+            self.warn('baseline_damaged', f'{table.baseline_file}: {self._baseline_bag.lost}')
         self._setup_text = self._no_baseline = ''
         self._setup: Setup | None = None
         self._references: SensorTable | None = None

@@ -64,9 +64,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         f'{" x ".join(f"{side * 1e2:.0f}" for side in size)} cm; in frames that took no part '
         f"{known.misfit:.1%} of the references' readings are left"
     )
-    return output.Result(
-        document, output.loss_notes(args.session, session.lost), (words,), (args.out,)
-    )
+    return output.Result(document, output.loss_notes(session), (words,), (args.out,))
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
