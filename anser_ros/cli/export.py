@@ -22,9 +22,5 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     tell(f'reading {args.bag}')
     rows, lost = export_bag(args.bag, args.out, args.format)
     document = {'schema': SCHEMA, 'rows': rows, 'lost': lost}
-    return Result(
-        document,
-        (f'{args.bag}: {lost}',) if lost else (),
-        (),
-        tuple(args.out / name for name in rows),
-    )
+    notes = (f'{args.bag}: {lost}',) if lost else ()
+    return Result(document, notes, (), tuple(args.out / name for name in rows))
