@@ -116,14 +116,13 @@ def test_headers_decide(tmp_path, head):
 
 @pytest.mark.parametrize('form', ['{}T08:53:{}Z', '{} 08:53:{}', '{}T10:53:{}+02:00'])
 def test_dates_are_times(tmp_path, form):
-    rows = [
-        [form.format('2025-10-09', f'{20 + 0.25 * k:06.3f}'), *r[1:]] for k, r in enumerate(ROWS)
-    ]
+    dates = [form.format('2025-10-09', f'{20 + 0.25 * k:06.3f}') for k in range(len(ROWS))]
+    rows = [[date, *row[1:]] for date, row in zip(dates, ROWS, strict=True)]
     path = tmp_path / 'poses.csv'
     path.write_text(rows_of('timestamp,x,y,z,qx,qy,qz,qw', *rows))
     session = import_poses([path])
     assert session.start_ns == 1_760_000_000 * 10**9
-    np.testing.assert_allclose(session.sensors['poses'].time, 0.25 * np.arange(len(ROWS)))
+    np.testing.assert_allclose(session.sensors['poses'].time, 0.25 * np.arange(12), atol=1e-6)
 
 
 MATRIX = [(*np.eye(4)[:3].ravel(),)] * 9
