@@ -75,7 +75,10 @@ async def inner(_scope, _receive, send):
 
 @pytest.mark.parametrize('stated', [None, ((-0.1, -0.12, 0.06), (0.1, 0.1, 0.3))])
 def test_the_drawn_volume_is_that_in_which_poses_are_accepted(ros, stated):
-    node = polling_node('view', '/anser')
+    owner = ros.create_node('owner', namespace='/anser')
+    owner.qos_overrides = []
+    node = polling_node(owner)
+    owner.destroy_node()
     source = ViewSource(node, 'optical', pytest.fail, lambda _: False)
     setup = replace(parse_setup(ten_sensors()), volume=stated)
     source.setup_text = dump_setup(setup)
