@@ -457,6 +457,15 @@ def page(ros, start, tmp_path):
     assert dashboard.interrupt() == 0
 
 
+SIZES = """() => {
+  const of = (e) => { const b = e.getBoundingClientRect(); return [b.width, b.height]; };
+  return {
+    boxes: [...document.querySelectorAll('.scene, .chart')].map((e) => [of(e), of(e.querySelector('canvas'))]),
+    width: innerWidth, inside: document.documentElement.scrollWidth };
+}"""
+"""What the browser says of the sizes of scene and curves, and of the whole page."""
+
+
 def test_it_opens_offline_and_shows_ten_sensors(page):
     opened, chain, address = page
     instrument = opened.locator('.instrument')
@@ -479,6 +488,24 @@ def test_it_opens_offline_and_shows_ten_sensors(page):
     assert float(good[7]) == pytest.approx(90.0, abs=0.6), 'residual, pT'
     assert float(good[8]) > 0.0, 'poses a second'
     assert 'something <b>new</b>' in opened.locator('.loop').inner_text(), 'as text, not as HTML'
+
+    assert 'Record while the tool moves' in opened.locator('.loop').inner_text(), 'first use'
+    assert 'no model to load' in opened.locator('[title*="no model to load"]').get_attribute(
+        'title'
+    )
+    why = opened.locator('.why[data-testid], .why').first
+    why.click()
+    assert 'open' in why.get_attribute('class').split()
+    for size in ((1280, 800), (390, 844)):  # one beside the other, one below the other
+        opened.set_viewport_size(dict(zip(('width', 'height'), size, strict=True)))
+        assert wait(lambda width=size[0]: opened.evaluate(SIZES)['width'] == width)
+        boxes = opened.evaluate(SIZES)
+        (scene, canvas), *curves = boxes['boxes']
+        assert np.allclose(scene, canvas, atol=3.0) and min(scene) > 200.0, (
+            'the scene fills its box'
+        )
+        assert all(min(curve[0]) > 100.0 for curve in curves) and len(curves) == 2
+        assert boxes['inside'] <= boxes['width'], 'nothing is wider than the window'
 
     opened.get_by_role('button', name='Record').click()
     opened.get_by_text('the disk is full').wait_for(timeout=60_000)
