@@ -104,16 +104,10 @@ PLANES = {'x': (1, 2), 'y': (0, 2), 'z': (0, 1)}
 
 
 def plot_field(
-    model: Model,
-    emitter: int | str = 0,
-    *,
-    normal: str = 'y',
-    at_m: float = 0.0,
-    low_m: tuple[float, float] | None = None,
-    high_m: tuple[float, float] = (0.2, 0.2),
-    axes: Any = None,
+    model: Model, emitter: int | str = 0, *, normal: str = 'y', at_m: float = 0.0, axes: Any = None
 ) -> Any:
-    """Draw the field of an emitter in a plane: its strength, and the lines that it follows.
+    """Draw the field of an emitter in a plane, up to 20 cm from the board's middle along each axis
+    and from 2 cm above it on: its strength, and the lines that it follows.
 
     Parameters
     ----------
@@ -124,9 +118,6 @@ def plot_field(
         Axis of fg across the plane, ``x``, ``y`` or ``z``.
     at_m : float
         Where the plane crosses that axis, m.
-    low_m, high_m : (float, float)
-        Corners of the part that is drawn, m, along the other two axes; by default from 2 cm above
-        the board on, or around its middle.
     axes : matplotlib.axes.Axes, optional
         Where it is drawn; by default in a new figure.
 
@@ -156,8 +147,8 @@ def plot_field(
     if normal not in PLANES:
         raise ParameterError(f'normal must be x, y or z, got {normal!r}')
     across, up = PLANES[normal]
-    first, second = low_m or (-0.2, -0.2 if normal == 'z' else 0.02)
-    right, top = np.linspace(first, high_m[0], 61), np.linspace(second, high_m[1], 61)
+    right = np.linspace(-0.2, 0.2, 61)
+    top = right if normal == 'z' else np.linspace(0.02, 0.2, 61)
     points = np.full((61, 61, 3), at_m)
     points[..., across], points[..., up] = np.meshgrid(right, top)
     vectors = field(points)[..., column].real

@@ -122,8 +122,7 @@ class PoseTopic:
         """Return the transform of the good pose just published, which had a stamp, ns."""
         moved = self._transform
         set_stamp(moved.header.stamp, stamp_ns)
-        place, turn = moved.transform.translation, moved.transform.rotation
-        place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = self._values
+        fill(moved, self._values)
         return moved
 
     def state(self, stale_after_s: float) -> tuple[str, str]:
@@ -186,34 +185,30 @@ def board_pose_of(table: Any) -> tuple[float, ...]:
     return numbers
 
 
-class BoardFrame:
-    """States on /tf_static where the board is, for those who come later too."""
+def state_board(node: Any, publisher: Any, table: Any) -> Any:
+    """State the board's pose in its parent frame, if it has one, for those who come later too.
 
-    def __init__(self, node: Any) -> None:
-        self._node = node
-        self._publisher: Any = None
+    Return the publisher of /tf_static, which is made with the first statement.
+    """
+    numbers = board_pose_of(table)
+    if not table.parent_frame:
+        return publisher
+    if TFMessage is None:
+        node.warn('no_tf_static', 'no /tf_static: tf2_msgs is not installed')
+        return publisher
+    publisher = publisher or node.create_publisher(TFMessage, '/tf_static', qos.LATCHED)
+    found = TransformStamped(child_frame_id=f'{table.frame_prefix}{FIELD_GENERATOR}')
+    found.header.frame_id = table.parent_frame
+    found.header.stamp = node.get_clock().now().to_msg()
+    fill(found, numbers)
+    publisher.publish(TFMessage(transforms=[found]))
+    return publisher
 
-    def state(self, parent: str, prefix: str, numbers: tuple[float, ...]) -> None:
-        """State the board's pose in a parent frame; nothing without one."""
-        if not parent:
-            return
-        if TFMessage is None:
-            self._node.warn('no_tf_static', 'no /tf_static: tf2_msgs is not installed')
-            return
-        if self._publisher is None:
-            self._publisher = self._node.create_publisher(TFMessage, '/tf_static', qos.LATCHED)
-        found = transform_of(parent, f'{prefix}{FIELD_GENERATOR}', numbers)
-        found.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(TFMessage(transforms=[found]))
 
-
-def transform_of(parent: str, child: str, numbers: tuple[float, ...]) -> TransformStamped:
-    """Return the transform of a frame by its pose in another: x y z, m, quaternion x y z w."""
-    found = TransformStamped(child_frame_id=child)
-    found.header.frame_id = parent
-    place, turn = found.transform.translation, found.transform.rotation
+def fill(moved: TransformStamped, numbers: tuple[float, ...]) -> None:
+    """Write x y z, m, and the quaternion x y z w into a transform."""
+    place, turn = moved.transform.translation, moved.transform.rotation
     place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = numbers
-    return found
 
 
 def transform_publisher(node: Any) -> Any:

@@ -21,9 +21,8 @@ from anser_ros.chain.tracking_half import TrackingHalf
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.nodes.pose_output import (
-    BoardFrame,
     PoseTopic,
-    board_pose_of,
+    state_board,
     transform_message,
     transform_publisher,
 )  # fmt: skip
@@ -210,8 +209,7 @@ class TrackerNode(AnserNode):
         self._counted = 0, 0
         self._model_age_ns = 0
         self._transforms = transform_publisher(self) if table.publish_tf else None
-        self._board = BoardFrame(self)
-        self._board.state(table.parent_frame, table.frame_prefix, board_pose_of(table))
+        self._board = state_board(self, None, table)
         warm_up()
         setups = one_source.setup_source(self, self._on_setup)
         # The executor takes topics in this order, so a model finds its uncertainty there.
@@ -414,7 +412,7 @@ class TrackerNode(AnserNode):
         """Track on with the new settings or model, from where the tools were."""
         if old.model_file != new.model_file:
             self._exchange(model_of(new.model_file))
-        self._board.state(new.parent_frame, new.frame_prefix, board_pose_of(new))
+        self._board = state_board(self, self._board, new)
         self._settings = settings_of(new)
         if self._half is not None and self._setup is not None:
             self._half.set_up(settings_for(self._setup, self._settings, self._file_model))
