@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from anser_ros.api.calibration import CalibrationResult, calibrate
+    from anser_ros.api.design import plot_field, simulate
     from anser_ros.api.diagnosis import DiagnosisResult, diagnose
     from anser_ros.api.model import Model
     from anser_ros.api.recording import load_setup, write_session
@@ -28,6 +29,8 @@ _HOMES = {
     'diagnose': 'api.diagnosis',
     'load_session': 'sessions.session',
     'load_setup': 'api.recording',
+    'plot_field': 'api.design',
+    'simulate': 'api.design',
     'track': 'api.tracking',
     'write_session': 'api.recording',
 }
@@ -35,8 +38,8 @@ _HOMES = {
 
 __all__ = [
     'CalibrationResult', 'DiagnosisResult', 'Model', 'Session', 'Setup', 'TrackedPoses',
-    'TrackingResult', 'calibrate', 'diagnose', 'load_session', 'load_setup', 'track',
-    'write_session',
+    'TrackingResult', 'calibrate', 'diagnose', 'load_session', 'load_setup', 'plot_field',
+    'simulate', 'track', 'write_session',
 ]  # fmt: skip
 
 

@@ -3,7 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from anser_ros.errors import ParameterError
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -22,3 +24,14 @@ def complex_of(parts: Array) -> ComplexArray:
 def pairs_of(values: ComplexArray) -> Any:
     """Return complex numbers as a record has them, as lists of [re, im]."""
     return np.stack([values.real, values.imag], axis=-1).tolist()
+
+
+def numbers_of(given: ArrayLike, what: str, last: int | None = None) -> Array:
+    """Return an array, whose last axis has a length; raises `ParameterError` if it is none."""
+    try:
+        values = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ParameterError(f'{what} must be numbers: {error}') from error
+    if last is not None and values.shape[-1:] != (last,):
+        raise ParameterError(f'{what} must be (..., {last}), got {values.shape}')
+    return values

@@ -41,7 +41,7 @@ ARGUMENTS = {
     'replay': ('', 'bag that is played in place of a control unit'),
     'composed': ('false', 'whether acquisition, field model and tracker are one process, live'),
     'optical': ('/optical', 'namespace of the optical poses'),
-    'frame_prefix': ('', 'prefix of the frames of poses and of /tf'),
+    'frame_prefix': ('', 'prefix of the frames of poses, clouds, metal and /tf'),
     'record': ('', 'whether a bag is recorded; by default true, but for a replay'),
     'directory': ('recordings', 'folder of the bags'),
     'watch': ('false', 'whether effects that the model lacks are reported in /diagnostics'),
@@ -142,6 +142,7 @@ def generate_launch_description():
                         board_seed=value('board_seed'),
                         **optical,
                         **board,
+                        **prefix,
                     ),
                     process(
                         'live',
@@ -153,8 +154,14 @@ def generate_launch_description():
                         **prefix,
                     ),
                     process('replay', wanted('is_played'), [value('replay')], **optical),
-                    process('acquisition', wanted('is_acquired'), device=value('device'), **board),
-                    process('field_model', apart, **model, **baseline),
+                    process(
+                        'acquisition',
+                        wanted('is_acquired'),
+                        device=value('device'),
+                        **board,
+                        **prefix,
+                    ),
+                    process('field_model', apart, **model, **baseline, **prefix),
                     process('tracker', apart, **model, **prefix),
                     process('recorder', wanted('record'), directory=value('directory'), **optical),
                     process(

@@ -2,6 +2,7 @@
 
 import doctest
 import importlib
+import json
 import re
 import runpy
 import subprocess
@@ -12,13 +13,22 @@ import pytest
 from conftest import REPO
 
 import anser_ros
-from anser_ros import Model, load_session, load_setup, track, write_session
+from anser_ros import (
+    Model,
+    load_session,
+    load_setup,
+    plot_field,
+    simulate,
+    track,
+    write_session,
+)  # fmt: skip
+from anser_ros.api.given import shown
 from anser_ros.errors import BagError, FitError, ParameterError, SetupError
 
 MODULES = (
     pytest.param('calibration', marks=pytest.mark.long),
     pytest.param('diagnosis', marks=pytest.mark.long),
-    'model', 'recording', 'tracking',
+    'design', 'model', 'recording', 'tracking',
 )  # fmt: skip
 # A meta path hook in whose presence nothing of ROS can be imported.
 NO_ROS = """
@@ -156,12 +166,71 @@ def test_what_is_none_is_refused(tmp_path):
     assert load_setup(str(REPO / 'config/demo_setup.yaml')).bodies == ('tool_a',)
 
 
+@pytest.mark.parametrize(
+    ('call', 'said'),
+    [
+        (lambda s, m: load_session(5), 'a session or its path is wanted, got int'),
+        (lambda s, m: Model.load(None), 'a model is wanted as a path, got NoneType'),
+        (lambda s, m: load_setup(5), 'a setup document is wanted as a path'),
+        (lambda s, m: m.save(1), 'a file to write is wanted'),
+        (lambda s, m: write_session(5, SETUP, [], []), 'a file to write is wanted'),
+        (lambda s, m: write_session('x.mcap', SETUP, ['a'], []), 'times must be numbers'),
+        (lambda s, m: write_session('x.mcap', SETUP, [0.0], 'a'), 'flux must be complex'),
+        (lambda s, m: track(s, 5), 'a model is wanted'),
+        (lambda s, m: track(s, m, gate='wide'), 'gate must be numbers'),
+        (lambda s, m: anser_ros.diagnose(None, m), 'a session or its path is wanted'),
+        (lambda s, m: anser_ros.calibrate([s, 5]), 'a session or its path is wanted'),
+        (lambda s, m: anser_ros.calibrate(s, dipoles='x'), 'dipoles must be a number'),
+        (lambda s, m: anser_ros.calibrate(s, estimate=['x']), 'estimate must be some of'),
+        (lambda s, m: m.flux('a', 'b'), 'positions must be numbers'),
+        (lambda s, m: m.field([0.0, 0.0]), r'points must be \(\.\.\., 3\)'),
+        (lambda s, m: plot_field(m, 'k9'), "no emitter 'k9'"),
+        (lambda s, m: plot_field(m, normal='w'), 'normal must be x, y or z'),
+        (lambda s, m: simulate(SETUP, 5), 'times, positions and quaternions'),
+        (lambda s, m: simulate(SETUP, {}), 'poses at the same times of pen'),
+        (lambda s, m: simulate(SETUP, poses(2), -1.0), 'noise must be T'),
+    ],
+)
+def test_what_is_of_another_type_is_refused_in_words(call, said):
+    session = simulate(SETUP, poses(2))
+    with pytest.raises(ParameterError, match=said):
+        call(session, Model.nominal(SETUP))
+
+
+def test_a_simulation_measures_the_field_of_its_model():
+    """Without noise it is the flux of the model; sessions and models may be given as they are."""
+    times, position, turn = poses(3)
+    model = Model.nominal(SETUP)
+    session = simulate(SETUP, (times, position + [0.0, 0.02, 0.1], turn), 0.0, model=model)
+    (tool,), place = session.tools, [[0.0, 0.02, 0.1]] * 3
+    np.testing.assert_allclose(tool.flux[:, 0], model.flux(place, [[1.0, 0.0, 0.0]] * 3))
+    np.testing.assert_allclose(model.field(place)[:, 0], tool.flux[:, 0])
+    np.testing.assert_allclose(session.reference.flux[0, 0], model.field([0.0, 0.0, 0.1])[2])
+    assert load_session(session) is session and Model.load(model.field) == model
+    path = times, position + [0.0, 0.02, 0.1], turn
+    noisy = [simulate(SETUP, path, 1e-9, seed=s).tools[0].flux for s in range(40)]
+    assert np.std(noisy, axis=0).mean() == pytest.approx(1.4e-9, rel=0.2)
+    assert max(len(repr(one)) for one in (session, session.setup, tool, model, model.field)) < 200
+
+
+def test_a_bar_is_drawn_on_the_standard_error(capsys):
+    with shown(True, 'track') as tell:
+        tell(0.5)
+        tell('fit', 1.0)
+    drawn = capsys.readouterr().err.split('\r')
+    assert drawn[1].split() == ['track', f'[{"#" * 15}', ']', '50%'] and '100%' in drawn[2]
+    with shown(None, 'track') as tell:
+        assert tell is None
+
+
 def test_tracks_are_saved_as_arrays(tmp_path):
-    session = load_session(REPO / 'bags' / 'moving.mcap')
-    result = track(session, Model.load(REPO / 'config' / 'demo_model.yaml'))
+    session = str(REPO / 'bags' / 'moving.mcap')
+    result = track(session, str(REPO / 'config' / 'demo_model.yaml'))
     result.save(str(tmp_path / 'poses.npz'))
     assert len(repr(result)) < 2000 and 'tool_a: 200 of 200 frames' in repr(result)
-    assert len(repr(session)) < 200 and dict(result).keys() == set(result)
+    assert dict(result).keys() == set(result)
+    whole = result.to_dataframe()
+    assert len(whole) == 2000 and set(whole['name']) == set(result)
     table = result['tool_a'].to_dataframe()
     np.testing.assert_array_equal(table['position_z_m'], result['tool_a'].position[:, 2])
     assert len(table) == 200 and set(table['state']) == {'ok'}
@@ -201,3 +270,14 @@ def test_example_runs(name, tmp_path, monkeypatch, capsys):
 
 def test_every_example_is_run():
     assert {path.stem for path in EXAMPLES.glob('*.py')} == set(SAID)
+
+
+def test_the_notebook_finds_a_layout(monkeypatch, capsys):
+    """Its cells run in order; the best layout is better than the worst."""
+    monkeypatch.setenv('MPLBACKEND', 'Agg')
+    names = {}
+    for cell in json.loads((EXAMPLES / 'design_coils.ipynb').read_text())['cells']:
+        if cell['cell_type'] == 'code':
+            exec(''.join(cell['source']), names)
+    assert 'best 0.' in capsys.readouterr().out
+    assert 0.0 < 1.5 * names['errors'].min() < names['errors'].max() < 5.0

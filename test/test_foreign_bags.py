@@ -54,6 +54,23 @@ def describe(folder, names, count):
     (folder / 'metadata.yaml').write_text(text)
 
 
+def test_joined_files_are_read_one_after_the_other(tmp_path):
+    """As `cat` joins them; also where both are alike, so that the index fits by chance."""
+    rows = [pose(k) for k in range(COUNT)]
+    first = mcap(tmp_path / 'a.mcap', rows[:100]).read_bytes()
+    second = mcap(tmp_path / 'b.mcap', rows[100:]).read_bytes()
+    both = tmp_path / 'both.mcap'
+    for parts, count in (((first, second), COUNT), ((first, first, first), 3 * 100)):
+        both.write_bytes(b''.join(parts))
+        salvage = Salvage()
+        assert len(list(iter_messages(both, salvage))) == count
+        assert f'{len(parts)} files are joined in both.mcap' in salvage.lost
+    both.write_bytes(first[:-20] + second)
+    assert 'breaks off' not in read(both)[1] and '2 files are joined' in read(both)[1]
+    both.write_bytes(first[: len(first) // 3] + second)
+    assert 'breaks off' in read(both)[1] and '2 files are joined' in read(both)[1]
+
+
 def read(path):
     salvage = Salvage()
     (poses,) = published_poses(path, salvage=salvage).values()
@@ -126,7 +143,17 @@ class TestSqlite:
         poses, lost = read(bag)
         assert poses.stamp_ns.size == COUNT and not lost
         assert (bag / 'bag_0.db3').read_bytes() == before
-        (bag / 'bag_0.db3-wal').unlink()
+        log, about = bag / 'bag_0.db3-wal', bag / 'metadata.yaml'
+        whole, counts = log.read_bytes(), about.read_text()
+        about.unlink()
+        page = 24 + int.from_bytes(whole[8:12], 'big')
+        for end in (-1, -page, len(whole) // 2):  # within a page, between two of one commit
+            log.write_bytes(whole[:end])
+            assert 'bag_0.db3-wal breaks off' in read(bag)[1]
+        log.write_bytes(b'')
+        assert not read(bag)[1], 'as a recorder leaves it that closed its file'
+        about.write_text(counts)
+        log.unlink()
         poses, lost = read(bag)
         assert poses.stamp_ns.size == COUNT // 2
         assert lost == '150 of the 300 messages that metadata.yaml counts are there'

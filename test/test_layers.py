@@ -32,7 +32,7 @@ ALLOWED = {
         'effects', 'field', 'physics',
     },
     'simulation': {'sessions', 'metal', 'physics', 'wire'},
-    'api': {'sessions', 'tracking', 'calibration', 'field', 'wire'},
+    'api': {'simulation', 'sessions', 'tracking', 'calibration', 'field', 'physics', 'wire'},
     '__init__.py': {'api', 'sessions', 'wire'},
     'cli': {
         'simulation', 'sessions', 'diagnosis', 'tracking', 'calibration', 'refit', 'effects',
@@ -58,7 +58,7 @@ ROOMS = {
     'mcap_ros2': ('wire/bag.py', 'wire/bag_writer.py'),
     'pyigtl': (),
     'rich': (*NODES, *COMMANDS),
-    'matplotlib': ('apps/lab/experiments/', *COMMANDS),
+    'matplotlib': ('api/', 'apps/lab/experiments/', *COMMANDS),
     'dask': ('apps/lab/cli/batch.py',),
     'distributed': ('apps/lab/cli/batch.py',),
     'magpylib': (),

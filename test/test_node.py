@@ -17,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from anser_ros.apps.dashboard.nodes.view_source import Polled, polling_node
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.runtime import parameters, qos
 from anser_ros.nodes.runtime import process as processes
@@ -287,7 +288,27 @@ class TestGraph:
         out = node.create_publisher(String, 'out', qos.LATCHED)
         assert taken.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
         assert out.qos_profile.durability == DurabilityPolicy.VOLATILE
-        node.destroy_node()
+        assert qos.STREAM.reliability == ReliabilityPolicy.RELIABLE, 'other topics have it too'
+        polled = polling_node(node)
+        seen = Polled(polled, String, 'in', qos.STREAM)._subscription.qos_profile
+        assert seen.reliability == ReliabilityPolicy.BEST_EFFORT
+        for one in (polled, node):
+            one.destroy_node()
+
+    @pytest.mark.parametrize(
+        ('name', 'value', 'words'),
+        [
+            ('/anser/out.publisher.reliabilty', 'best_effort', 'there are: history, depth'),
+            ('/anser/out.publisher.reliability', 'best', 'none of system_default'),
+            ('/anser/out.depth', 5, 'publisher or subscription'),
+            ('out.publisher.depth', 5, 'a full name'),
+            ('/anser/out.publisher.depth', 0, '0 is no depth'),
+        ],
+    )
+    def test_what_overrides_nothing_is_refused(self, ros, name, value, words):
+        pair = Parameter(f'qos_overrides.{name}', value=value)
+        with pytest.raises(ParameterError, match=words):
+            type('Sample', (AnserNode,), {'NAME': 'sample'})(parameter_overrides=[pair])
 
 
 def test_the_executor_is_the_one_told_of_events_where_rclpy_has_it(monkeypatch):

@@ -216,6 +216,9 @@ class TestFaults:
             ({}, {'n': (1, 'no setup', {}), 'n: tip': (3, 'stale', {})}, ''),
             ({'n': (1, 'found', {})}, {'n: metal': (1, 'new', {})}, 'anser/n: metal: new'),
             ({'n': (0, 'ok', {})}, {'n': (3, 'ended', {})}, ''),
+            ({'acquisition': (3, 'ended', {}), 'n': (0, 'ok', {})}, {'n': (1, 'stale', {})}, ''),
+            ({'acquisition': (2, 'no port', {}), 'replay': (3, 'ended', {}), 'n': (0, 'ok', {})},
+             {'n': (1, 'stale', {})}, 'anser/n: stale'),
             ({'recorder': (0, 'ok', {})}, {'recorder': (2, 'full', {})}, ''),
         ],
     )  # fmt: skip

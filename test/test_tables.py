@@ -114,6 +114,17 @@ def test_headers_decide(tmp_path, head):
     np.testing.assert_allclose(poses.time, 0.05 * np.arange(len(ROWS)), atol=1e-6)
 
 
+@pytest.mark.parametrize('form', ['{}T08:53:{}Z', '{} 08:53:{}', '{}T10:53:{}+02:00'])
+def test_dates_are_times(tmp_path, form):
+    dates = [form.format('2025-10-09', f'{20 + 0.25 * k:06.3f}') for k in range(len(ROWS))]
+    rows = [[date, *row[1:]] for date, row in zip(dates, ROWS, strict=True)]
+    path = tmp_path / 'poses.csv'
+    path.write_text(rows_of('timestamp,x,y,z,qx,qy,qz,qw', *rows))
+    session = import_poses([path])
+    assert session.start_ns == 1_760_000_000 * 10**9
+    np.testing.assert_allclose(session.sensors['poses'].time, 0.25 * np.arange(12), atol=1e-6)
+
+
 MATRIX = [(*np.eye(4)[:3].ravel(),)] * 9
 REFUSED = {
     'angles': (
@@ -152,6 +163,13 @@ REFUSED = {
     'times that fall': (
         rows_of('', *((9 - k % 3, *r[1:]) for k, r in enumerate(ROWS)), separator=' '),
         'the times do not ascend',
+    ),
+    'stamps that are never set': (
+        rows_of('time,x,y,z,qx,qy,qz,qw', *((0, *r[1:]) for r in ROWS)), 'all 12 times are 0 s'
+    ),
+    'the time of the day': (
+        rows_of('time,x,y,z,qx,qy,qz,qw', *((f'08:53:{k}', *r[1:]) for k, r in enumerate(ROWS))),
+        'give times in s or as 2025-10-09T08:53:20.000Z',
     ),
     'a word': (PLAIN.replace('0.02', 'MISSING', 3), "line 2: y_m is 'MISSING'"),
     'a short row': (PLAIN.replace('0.02,-0.3,', '', 1), 'line 2 has 6 cells, the header 8'),

@@ -1,5 +1,6 @@
 """The node tracker over DDS: poses, states, parameters, and a recorded session."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -167,6 +168,49 @@ def test_transforms_where_they_are_installed(tracker, monkeypatch):
     move = frames['tool_a'].transform.translation
     assert np.linalg.norm(np.array([move.x, move.y, move.z]) - position) < 3e-4
     assert frames['tool_a'].header.frame_id == 'fg'
+
+
+def test_where_the_board_is_is_stated(ros, tmp_path, monkeypatch):
+    """By parameters, by a registration, and anew where they change; what is no pose is refused."""
+    sent, names = [], []
+    monkeypatch.setattr(pose_output, 'TFMessage', lambda transforms: transforms[0])
+    publisher = SimpleNamespace(publish=sent.append, get_subscription_count=lambda: 0)
+    plain = TrackerNode.create_publisher
+
+    def create(self, kind, topic, profile, **options):
+        names.append((topic, profile.durability.name))
+        return publisher if topic.startswith('/tf') else plain(self, kind, topic, profile)
+
+    def given(**values):
+        return [Parameter(name, value=value) for name, value in values.items()]
+
+    monkeypatch.setattr(TrackerNode, 'create_publisher', create)
+    pose = [0.4, 0.0, 0.1, 0.0, 0.0, 0.6, 0.8]
+    node = TrackerNode(
+        parameter_overrides=given(parent_frame='base', board_pose=pose, frame_prefix='left_')
+    )
+    try:
+        assert ('/tf_static', 'TRANSIENT_LOCAL') in names
+        assert (sent[0].header.frame_id, sent[0].child_frame_id) == ('base', 'left_fg')
+        turn = sent[0].transform.rotation
+        assert (sent[0].transform.translation.x, turn.z, turn.w) == (0.4, 0.6, 0.8)
+        file = tmp_path / 'handeye.json'
+        found = {
+            'registration_quaternion_xyzw': [0.0, 0.0, 0.6, 0.8],
+            'registration_translation_m': [1.0, 0.0, 0.0],
+        }
+        file.write_text(json.dumps(found))
+        assert node.set_parameters(given(registration_file=str(file)))[0].successful
+        place, turn = sent[-1].transform.translation, sent[-1].transform.rotation
+        assert (place.x, place.y, turn.z) == pytest.approx((-0.28, 0.96, -0.6))
+        for wrong in (tmp_path / 'none.json', 5):
+            text = str(wrong) if wrong != 5 else ''
+            refused = node.set_parameters(given(registration_file=text, board_pose=[1.0]))
+            assert not all(one.successful for one in refused)
+    finally:
+        node.destroy_node()
+    with pytest.raises(ParameterError, match='board_pose: x y z'):
+        TrackerNode(parameter_overrides=given(parent_frame='base'))
 
 
 def test_the_volume_of_the_setup_holds_unless_a_parameter_says_another(tracker):

@@ -6,12 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
 from tracking_world import flux_points
 
+from anser_ros.errors import LayoutError
+from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.monitor import Monitor
 from anser_ros.nodes.pose_output import PoseTopic
 from anser_ros.nodes.recorder import Recorder
 from anser_ros.nodes.replay import Replay
+from anser_ros.nodes.streams.clouds import read_frame
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import encode_flux
@@ -68,6 +72,20 @@ def test_a_recorder_and_a_monitor_take_what_is_their_boards(ros, tmp_path):
         for node in (recorder, monitor):
             node.close()
             node.destroy_node()
+
+
+def test_clouds_and_metal_have_their_boards_prefix(ros):
+    """And whoever reads them takes a board's frame with any prefix."""
+    node = node_of(FieldModelNode, 'left', frame_prefix='left_')
+    try:
+        assert (node._shown_frame, node._frame_id) == ('left_fg', 'fg')
+    finally:
+        node.destroy_node()
+    cloud = PointCloud2()
+    for frame, said in (('left_fg', 'no stamp'), ('base', "frame 'base'")):
+        cloud.header.frame_id = frame
+        with pytest.raises(LayoutError, match=said):
+            read_frame(cloud, 'fg', lambda *_: None)
 
 
 def test_frames_have_their_boards_prefix(ros):

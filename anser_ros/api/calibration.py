@@ -1,21 +1,22 @@
 """Offers calibration as a function: sessions in, a model with its held-out error out."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from anser_ros.api.given import Figures, Progress, shown
 from anser_ros.api.model import Model
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import to_document
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.errors import FitError
+from anser_ros.errors import FitError, ParameterError
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
-from anser_ros.sessions.session import Session
+from anser_ros.sessions.session import SessionSource, load_session
 
 
 @dataclass(frozen=True)
-class CalibrationResult:
+class CalibrationResult(Figures):
     """Holds a calibrated model and how good it is.
 
     Attributes
@@ -29,6 +30,7 @@ class CalibrationResult:
         Everything that ``calibration.json`` holds.
     """
 
+    ROWS = 'emitters'
     model: Model
     heldout_flux_rmse_t: float
     flux_error_t: float
@@ -37,24 +39,20 @@ class CalibrationResult:
     def __repr__(self) -> str:
         return f'CalibrationResult({self.model}, held out {self.heldout_flux_rmse_t:.3g} T)'
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of ``calibration.json`` (``docs/interfaces.md``)."""
-        return dict(self.figures)
-
 
 def calibrate(
-    sessions: Session | Sequence[Session],
+    sessions: SessionSource | Sequence[SessionSource],
     *,
     dipoles: int | None = None,
     estimate: Sequence[str] = KINDS,
     force: bool = False,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress = None,
 ) -> CalibrationResult:
     """Fit a field model to recorded sessions of one board.
 
     Parameters
     ----------
-    sessions : Session or sequence of Session
+    sessions : Session or path, or sequence of such
         With tool fluxes and optical poses.
     dipoles : int, optional
         Use a layer of so many by so many vertical dipoles on the board. By default the layout is
@@ -64,8 +62,9 @@ def calibrate(
         them; all of `KINDS` by default, none when it is empty.
     force : bool
         Whether to return a model that is worse on held-out readings than the nominal one.
-    progress : callable, optional
-        Called with the stage in words, and the finished share from 0 to 1.
+    progress : bool or callable, optional
+        True shows a bar; a function is called with the stage in words, and the finished share
+        from 0 to 1.
 
     Raises
     ------
@@ -73,6 +72,9 @@ def calibrate(
         When the data cannot determine a model, with the number needed and the number found; when
         the sessions are of different boards; or when the nominal model is better and ``force`` is
         not set.
+
+    ParameterError
+        When ``dipoles`` or ``estimate`` is none of what they may be.
 
     Examples
     --------
@@ -82,13 +84,19 @@ def calibrate(
     (144, True)
     >>> result.model.save('model.yaml')
     """
-    given = [sessions] if isinstance(sessions, Session) else list(sessions)
+    several = isinstance(sessions, Sequence) and not isinstance(sessions, str)
+    given = [load_session(one) for one in (sessions if several else [sessions])]  # type: ignore
     if not given:
         raise FitError('a calibration needs at least one session')
     check_same_board(given)
+    if dipoles is not None and (not isinstance(dipoles, int) or dipoles < 1):
+        raise ParameterError(f'dipoles must be a number of at least 1, got {dipoles!r}')
+    if isinstance(estimate, str) or set(estimate) - set(KINDS):
+        raise ParameterError(f'estimate must be some of {", ".join(KINDS)}, got {estimate!r}')
     layout = None if dipoles is None else Layout('layer', dipoles, 1.0, 0.0)
     options = Options(layout=layout, estimate=tuple(estimate))
-    found = calibrate_sessions(given, options, progress)
+    with shown(progress, 'calibrate') as tell:
+        found = calibrate_sessions(given, options, tell)
     figures = to_document(found)
     if not found.better_than_nominal and not force:
         raise FitError(

@@ -1,16 +1,17 @@
 """Offers diagnosis as a function: session and model in, named effects and a better model out."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from anser_ros.api.model import Model
+from anser_ros.api.given import Figures, Progress, shown
+from anser_ros.api.model import Model, ModelSource
 from anser_ros.sessions.diagnosis import diagnose_session, other_way, to_document
-from anser_ros.sessions.session import Session
+from anser_ros.sessions.session import SessionSource, load_session
 
 
 @dataclass(frozen=True)
-class DiagnosisResult:
+class DiagnosisResult(Figures):
     """Holds what a model lacks on a session.
 
     Attributes
@@ -23,6 +24,7 @@ class DiagnosisResult:
         Everything that ``diagnosis.json`` holds: parameters, uncertainties, held-out errors.
     """
 
+    ROWS = 'effects'
     model: Model
     effects: tuple[str, ...]
     figures: Mapping[str, Any]
@@ -30,29 +32,25 @@ class DiagnosisResult:
     def __repr__(self) -> str:
         return f'DiagnosisResult({", ".join(self.effects) or "no effect"}; {self.model})'
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of ``diagnosis.json`` (``docs/interfaces.md``)."""
-        return dict(self.figures)
-
 
 def diagnose(
-    session: Session,
-    model: Model,
+    session: SessionSource,
+    model: ModelSource,
     *,
-    baseline: Session | None = None,
-    progress: Callable[[str], None] | None = None,
+    baseline: SessionSource | None = None,
+    progress: Progress = None,
 ) -> DiagnosisResult:
     """Find what a model lacks on a session, name the effects, and correct them.
 
     Parameters
     ----------
-    session : Session
+    session : Session or path
         With optical poses of at least one tool.
-    model : Model
-    baseline : Session, optional
+    model : Model or path
+    baseline : Session or path, optional
         Distortion-free recording of the same board; with it the reference sensors are used.
-    progress : callable, optional
-        Called with the stage in words.
+    progress : bool or callable, optional
+        True shows the stage; a function is called with it in words.
 
     Raises
     ------
@@ -74,11 +72,14 @@ def diagnose(
     >>> found.effects
     ()
     """
-    if way := other_way(session):
-        other = way.diagnose(session, model.field, progress)
-        corrected, figures = other.model, way.to_document(other)
-    else:
-        found = diagnose_session(session, model.field, baseline, progress)
-        corrected, figures = found.diagnosis.model, to_document(found)
+    recorded, field = load_session(session), Model.load(model).field
+    clean = None if baseline is None else load_session(baseline)
+    with shown(progress, 'diagnose') as tell:
+        if way := other_way(recorded):
+            other = way.diagnose(recorded, field, tell)
+            corrected, figures = other.model, way.to_document(other)
+        else:
+            found = diagnose_session(recorded, field, clean, tell)
+            corrected, figures = found.diagnosis.model, to_document(found)
     names = tuple(effect['name'] for effect in figures['effects'])
     return DiagnosisResult(Model(corrected), names, figures)

@@ -7,7 +7,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from anser_ros.api.given import path_of
 from anser_ros.api.recording import SetupSource, load_setup
+from anser_ros.arrays import numbers_of
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
@@ -24,6 +26,8 @@ class Model:
     ----------
     field : FieldModel
         The dipoles that make the field, their moments and the effects that the model corrects.
+        Called with points (..., 3), m, in fg it returns each emitter's field there, (..., 3, K),
+        T at nominal current.
 
     Examples
     --------
@@ -34,6 +38,8 @@ class Model:
     >>> flux = model.flux([[0.0, 0.0, 0.15]], [[0.0, 0.0, 1.0]])
     >>> flux.shape, flux.dtype
     ((1, 8), dtype('complex128'))
+    >>> model.field([[0.0, 0.0, 0.15], [0.0, 0.0, 0.2]]).shape
+    (2, 3, 8)
     """
 
     field: FieldModel
@@ -44,9 +50,21 @@ class Model:
         return f'Model({count} dipoles of {len(self.emitters)} emitters{effects})'
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a model file; raises `ModelFileError` when it is not one."""
-        return cls(load_model(path))
+    def load(cls, path: 'ModelSource') -> Self:
+        """Read a model file; a model is returned as it is.
+
+        Raises
+        ------
+        ModelFileError
+            When the file is no model.
+        ParameterError
+            When what is given is neither a path nor a model.
+        """
+        if isinstance(path, Model):
+            return cls(path.field)
+        if isinstance(path, FieldModel):
+            return cls(path)
+        return cls(load_model(path_of(path, 'a model')))
 
     @classmethod
     def nominal(cls, setup: SetupSource) -> Self:
@@ -68,7 +86,7 @@ class Model:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model file that every command and node loads; raises `ModelFileError`."""
-        save_model(path, self.field)
+        save_model(path_of(path, 'a file to write'), self.field)
 
     @property
     def emitters(self) -> tuple[str, ...]:
@@ -105,7 +123,7 @@ class Model:
         ParameterError
             When the two shapes differ, or do not end in 3, or an axis is not a unit vector.
         """
-        points, axes = np.asarray(position, dtype=float), np.asarray(axis, dtype=float)
+        points, axes = numbers_of(position, 'positions'), numbers_of(axis, 'axes')
         if points.shape != axes.shape or points.shape[-1:] != (3,):
             raise ParameterError(
                 f'positions and axes must both be (..., 3), got {points.shape} and {axes.shape}'
@@ -114,3 +132,6 @@ class Model:
         if not (np.abs(length - 1.0) <= AXIS_TOLERANCE).all():
             raise ParameterError(f'axes must be unit vectors, got length {length.max():.4g}')
         return self.field.flux(points, axes)
+
+
+ModelSource = Model | FieldModel | str | os.PathLike[str]

@@ -3,14 +3,14 @@
 import os
 import time as clock
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from anser_ros.arrays import Array
+from anser_ros.api.given import path_of
+from anser_ros.arrays import Array, numbers_of
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.stamps import NANO
 from anser_ros.wire.bag_writer import SessionWriter
@@ -49,7 +49,7 @@ def load_setup(source: SetupSource) -> Setup:
         return parse_setup(yaml.safe_dump(dict(source), sort_keys=False))
     if isinstance(source, str) and ('\n' in source or not source.endswith(('.yaml', '.yml'))):
         return parse_setup(source)
-    return parse_setup(read_text(source, SetupError))
+    return parse_setup(read_text(path_of(source, 'a setup document'), SetupError))
 
 
 def write_session(
@@ -122,15 +122,18 @@ def write_session(
     >>> load_session('own.mcap').tools[0].flux.shape
     (5, 1, 1)
     """
-    checked = load_setup(setup)
+    file, checked = path_of(path, 'a file to write'), load_setup(setup)
     seconds = _ascending(times, 'times')
-    values = np.asarray(flux, dtype=np.complex128)
+    try:
+        values = np.asarray(flux, dtype=np.complex128)
+    except (TypeError, ValueError) as error:
+        raise ParameterError(f'flux must be complex numbers: {error}') from error
     wanted = (seconds.size, len(checked.sensors), len(checked.emitter.coils))
     if values.shape != wanted:
         raise ParameterError(
             f'flux must be (times, sensors, coils) = {wanted} by the setup, got {values.shape}'
         )
-    tracks = _checked_poses(checked, poses or {})
+    tracks = poses_given(checked, poses or {})
     origin = clock.time_ns() if start_ns is None else start_ns
     stamps = [origin + round(t / NANO) for t in seconds.tolist()]
     pose_stamps = {
@@ -140,8 +143,8 @@ def write_session(
     if min([stamps[0], *(s[0] for s in pose_stamps.values())]) <= 0:
         raise ParameterError('a stamp is not positive: give a larger start_ns')
     if overwrite:
-        Path(path).unlink(missing_ok=True)
-    with SessionWriter(Path(path), checked.frame_id) as writer:
+        file.unlink(missing_ok=True)
+    with SessionWriter(file, checked.frame_id) as writer:
         writer.write_setup(dump_setup(checked), stamps[0])
         for stamp, frame in zip(stamps, values, strict=True):
             writer.write_readings(checked.sensors, stamp, frame)
@@ -153,7 +156,7 @@ def write_session(
 
 
 def _ascending(times: ArrayLike, what: str) -> Array:
-    seconds = np.asarray(times, dtype=np.float64)
+    seconds = numbers_of(times, what)
     if seconds.ndim != 1 or seconds.size == 0 or not np.isfinite(seconds).all():
         raise ParameterError(f'{what} must be a list of finite numbers, got {seconds.shape}')
     if not (np.diff(seconds) > 0.0).all():
@@ -161,16 +164,20 @@ def _ascending(times: ArrayLike, what: str) -> Array:
     return seconds
 
 
-def _checked_poses(
+def poses_given(
     setup: Setup, poses: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]]
 ) -> dict[str, tuple[Array, Array, Array]]:
+    """Return poses of bodies as arrays; raises `ParameterError` where they are none."""
     checked = {}
-    for body, (times, positions, quaternions) in poses.items():
+    for body, given in poses.items():
+        if not isinstance(given, tuple | list) or len(given) != 3:
+            raise ParameterError(f'poses of {body} must be times, positions and quaternions')
+        times, positions, quaternions = given
         if body not in setup.bodies:
             raise ParameterError(f'no body {body!r} in the setup: {", ".join(setup.bodies)}')
         seconds = _ascending(times, f'times of {body}')
-        position = np.asarray(positions, dtype=np.float64)
-        quaternion = np.asarray(quaternions, dtype=np.float64)
+        position = numbers_of(positions, f'positions of {body}')
+        quaternion = numbers_of(quaternions, f'quaternions of {body}')
         if position.shape != (seconds.size, 3) or quaternion.shape != (seconds.size, 4):
             raise ParameterError(
                 f'poses of {body} need positions ({seconds.size}, 3) and quaternions '

@@ -1,17 +1,18 @@
 """Offers tracking as a function: a session and a model in, arrays of poses out."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.api.model import Model
-from anser_ros.arrays import Array, Booleans, Integers
+from anser_ros.api.given import Progress, path_of, shown
+from anser_ros.api.model import Model, ModelSource
+from anser_ros.arrays import Array, Booleans, Integers, numbers_of
 from anser_ros.pose_states import OK
-from anser_ros.sessions.session import Session
+from anser_ros.sessions.session import SessionSource, load_session
 from anser_ros.sessions.tracked_session import PoseSeries, to_document, track_session
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import TrackerSettings
@@ -115,6 +116,13 @@ class TrackingResult:
         """Return the errors against the optical poses, as in ``evaluation.json``."""
         return dict(self.figures)
 
+    def to_dataframe(self) -> Any:
+        """Return the data frames of all bodies and sensors as one, with a column ``name``."""
+        import pandas
+
+        tables = {name: self[name].to_dataframe() for name in self}
+        return pandas.concat(tables, names=['name']).reset_index('name').reset_index(drop=True)
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all arrays to an ``.npz`` file, each under ``NAME:ATTRIBUTE``."""
         arrays = {
@@ -124,34 +132,34 @@ class TrackingResult:
             for key, value in vars(poses).items()
             if isinstance(value, np.ndarray)
         }
-        with open(path, 'wb') as stream:
+        with path_of(path, 'a file to write').open('wb') as stream:
             np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
 
 def track(
-    session: Session,
-    model: Model,
+    session: SessionSource,
+    model: ModelSource,
     *,
     refit: bool = False,
-    baseline: Session | None = None,
+    baseline: SessionSource | None = None,
     gate: float | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = None,
 ) -> TrackingResult:
     """Track every coil and every rigid body of a session, exactly as the live nodes do.
 
     Parameters
     ----------
-    session : Session
-    model : Model
+    session : Session or path
+    model : Model or path
     refit : bool
         Whether the model follows the session's reference sensors, frame by frame.
-    baseline : Session, optional
+    baseline : Session or path, optional
         Distortion-free recording of the same board; a refit needs one.
     gate : float, optional
         Largest residual of a pose in units of the expected one; the tracker's default when not
         given. Infinity refuses no pose for what the model lacks: to measure errors, never for use.
-    progress : callable, optional
-        Called with the finished share from 0 to 1.
+    progress : bool or callable, optional
+        True shows a bar; a function is called with the finished share from 0 to 1.
 
     Raises
     ------
@@ -171,11 +179,15 @@ def track(
     >>> result.to_dict()['bodies']['tool_a']['position_rmse_m'] < 0.2e-3
     True
     """
-    settings = TrackerSettings() if gate is None else TrackerSettings(gate=gate)
-    found = track_session(session, model.field, settings, baseline, refit, progress=progress)
+    stated = {} if gate is None else {'gate': float(numbers_of(gate, 'gate'))}
+    settings = TrackerSettings(**stated)  # type: ignore[arg-type]
+    recorded, field = load_session(session), Model.load(model).field
+    clean = None if baseline is None else load_session(baseline)
+    with shown(progress, 'track') as tell:
+        found = track_session(recorded, field, settings, clean, refit, progress=tell)
     tables: dict[str, dict[str, TrackedPoses]] = {}
     for group, series in (('sensors', found.sensors), ('bodies', found.bodies)):
-        tables[group] = {name: _poses(one, session.start_ns) for name, one in series.items()}
+        tables[group] = {name: _poses(one, recorded.start_ns) for name, one in series.items()}
     return TrackingResult(tables['sensors'], tables['bodies'], to_document(found))
 
 

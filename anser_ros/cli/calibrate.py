@@ -107,10 +107,9 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
             '--force writes it'
         )
     save_model(args.out, calibration.model)
-    lost = [note for one in sessions for note in output.loss_notes(one.path, one.lost)]
     return output.Result(
         document,
-        (*lost, *document['unobservable'], *document['contradictions']),
+        (*output.loss_notes(*sessions), *document['unobservable'], *document['contradictions']),
         (_table(calibration, document), *_populations(calibration)),
         tuple(filter(None, (args.out, args.report))),
     )

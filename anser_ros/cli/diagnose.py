@@ -68,7 +68,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     written = output.write_files(args.out, {'report.html': report, 'diagnosis.json': document})
     return output.Result(
         document,
-        (*snapshot_notes(args.model, model), *output.loss_notes(args.session, session.lost)),
+        (*snapshot_notes(args.model, model), *output.loss_notes(session, baseline)),
         (
             output.terminal_table(['held out', 'before', 'after'], held_out_rows(document)),
             verdict(document),

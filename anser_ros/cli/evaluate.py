@@ -300,7 +300,7 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         shown.append(_refit_line(document['refit'], models is None))
     notes = (
         *sessions.snapshot_notes(args.model, model),
-        *output.loss_notes(args.session, session.lost),
+        *output.loss_notes(session, baseline),
         *(_few_notes(session) if args.refit else ()),
     )  # fmt: skip
     return output.Result(document, notes, tuple(shown), tuple(written))

@@ -2,7 +2,7 @@
 
 import argparse
 
-from anser_ros.cli.output import Result, Tell, add_json, add_out, loss_notes, make_folder
+from anser_ros.cli.output import Result, Tell, add_json, add_out, make_folder
 from anser_ros.sessions.import_export import CSV, FORMATS, export_bag
 
 SCHEMA = 'anser_export/1'
@@ -22,6 +22,5 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     tell(f'reading {args.bag}')
     rows, lost = export_bag(args.bag, args.out, args.format)
     document = {'schema': SCHEMA, 'rows': rows, 'lost': lost}
-    return Result(
-        document, loss_notes(args.bag, lost), (), tuple(args.out / name for name in rows)
-    )
+    notes = (f'{args.bag}: {lost}',) if lost else ()
+    return Result(document, notes, (), tuple(args.out / name for name in rows))

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from anser_ros.cli.output import Result, Tell, add_json, add_list, check_new_file, loss_notes
+from anser_ros.cli.output import Result, Tell, add_json, add_list, check_new_file
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.import_export import import_bag, parse_remaps
 from anser_ros.sessions.table_import import import_tables
@@ -46,7 +46,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         notes = [f'{count} messages of {topic} left out' for topic, count in left_out.items()]
     return Result(
         {'schema': SCHEMA, 'messages': counts, 'left_out': left_out, 'lost': lost},
-        (*loss_notes(str(args.source), lost), *notes),
+        (*([f'{args.source}: {lost}'] if lost else []), *notes),
         tuple(f'{topic}: {count} messages' for topic, count in sorted(counts.items())),
         (args.out,),
     )

@@ -292,6 +292,6 @@ def terminal_table(head: Sequence[str], rows: Iterable[Sequence[str]], **style: 
     return shown
 
 
-def loss_notes(session: str, lost: str) -> tuple[str, ...]:
-    """State what a session has lost, where it has."""
-    return (f'{session}: {lost}',) if lost else ()
+def loss_notes(*sessions: Any) -> tuple[str, ...]:
+    """State what recordings have lost, where they have; None is left out."""
+    return tuple(f'{one.path}: {one.lost}' for one in sessions if one is not None and one.lost)

@@ -29,6 +29,10 @@ class Measurements:
     track: PoseTrack | None = None
     session: str = ''  # whose frame the poses are in, and whose mount the body is on
 
+    def __repr__(self) -> str:
+        frames, sensors, emitters = self.flux.shape
+        return f'Measurements({self.body}: {frames} frames, {sensors} coils, {emitters} emitters)'
+
     @property
     def usable(self) -> Booleans:
         """Return the mask (F, S) of the values that have a pose and are valid."""

@@ -14,9 +14,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array, ComplexArray, numbers_of
 from anser_ros.errors import ModelFileError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.physics.dipole import dipole_field, flux_basis
@@ -353,6 +354,17 @@ class FieldModel:
         spans = None if lengths is None else np.broadcast_to(lengths, points.shape[:-1]).ravel()
         flux = self.dipoles.flux(points.reshape(-1, 3), axes.reshape(-1, 3), spans)
         return flux.reshape(*points.shape[:-1], -1)
+
+    def __repr__(self) -> str:
+        return f'FieldModel({len(self.positions)} dipoles, emitters {", ".join(self.emitters)})'
+
+    def __call__(self, points: ArrayLike) -> ComplexArray:
+        """Return each emitter's field (..., 3, K), T, at points (..., 3), m, both in fg.
+
+        Raises `ParameterError` when the points are of another shape, or no numbers.
+        """
+        places = numbers_of(points, 'points', 3)
+        return self.dipoles.field(places.reshape(-1, 3)).reshape(*places.shape, -1)
 
     @property
     def dipoles(self) -> Dipoles:

@@ -21,7 +21,7 @@ from anser_ros.nodes import acquisition_status
 from anser_ros.nodes.acquisition_stream import FluxFrame, FluxStream, MeasuredAccuracy, WallClock
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.parameters import parameter, prefix_parameter
 from anser_ros.nodes.runtime.process import TURN_S, main
 from anser_ros.nodes.streams.clouds import flux_cloud, readings_of
 from anser_ros.nodes.streams.one_source import Backlog, too_slow
@@ -59,6 +59,7 @@ class AcquisitionParameters:
     device: str = parameter(
         '/dev/ttyACM0', "the control unit's port, or auto: listen on all ports for its hello"
     )
+    frame_prefix: str = prefix_parameter()
     protocol: str = parameter('anser', 'protocol of the control unit', choices=tuple(PROTOCOLS))
     baud: int = parameter(
         DEFAULT_BAUD, 'baud rate of the line; ignored over USB', within=(9600, 50_000_000)
@@ -110,6 +111,7 @@ class Acquisition(AnserNode):
         super().__init__(**options)
         table = self.parameters
         self._setup = parse_setup(read_config(table.setup_file))
+        self._frame_id = f'{table.frame_prefix}{self._setup.frame_id}'
         self._calibration = parse_channels(read_config(table.channels_file))
         self._setup_publisher = self.create_publisher(String, 'setup', qos.LATCHED)
         self._tool_publisher = self.create_publisher(PointCloud2, 'tool/flux', qos.STREAM)
@@ -298,7 +300,7 @@ class Acquisition(AnserNode):
         publishers = self._tool_publisher, self._reference_publisher  # poses come first
         for publisher, points in zip(publishers, (frame.tool, frame.reference), strict=True):
             if len(points.channel) and publisher.get_subscription_count():
-                publisher.publish(flux_cloud(points, self._setup.frame_id, stamp_ns))
+                publisher.publish(flux_cloud(points, self._frame_id, stamp_ns))
         self._frame = frame
         self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
         return reference is not None

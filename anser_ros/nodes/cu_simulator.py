@@ -19,7 +19,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes.pose_output import PackedMessage
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
+from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, prefix_parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.physics.rotations import quaternion_of_rotation
 from anser_ros.simulation import line, world
@@ -40,6 +40,7 @@ LONGEST_LAG_S = 0.25
 @dataclass(frozen=True)
 class CuSimulatorParameters:
     link: str = parameter('/tmp/anser_cu', 'path under which the port can be opened')
+    frame_prefix: str = prefix_parameter()
     setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')
     channels_file: str = parameter(
         'demo_channels.yaml', 'channel calibration: a path, or a file of config/'
@@ -154,7 +155,7 @@ class CuSimulator(AnserNode):
             )
             for body in setup.bodies
         }
-        self._message = PackedMessage(PoseStamped, setup.frame_id, 7)
+        self._message = PackedMessage(PoseStamped, f'{table.frame_prefix}{setup.frame_id}', 7)
         self._prepared: deque[Piece] = deque()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name='control_unit')

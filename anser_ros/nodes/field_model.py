@@ -19,7 +19,7 @@ from anser_ros.frames.intake import Frame, Intake
 from anser_ros.nodes import field_model_io, field_model_refit
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter, stated, stated_by
+from anser_ros.nodes.runtime.parameters import parameter, prefix_parameter, stated, stated_by
 from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
 from anser_ros.nodes.streams.one_source import LOOK_S, NewestSource, sender_words, setup_source
@@ -46,6 +46,7 @@ from anser_ros.wire.setup import Setup, parse_setup
 class FieldModelParameters:
     """Holds the parameters of the field model's server."""
 
+    frame_prefix: str = prefix_parameter()
     model_file: str = parameter(
         NOMINAL,
         "model to start from: a file, or nominal for that of the setup's own geometry",
@@ -114,6 +115,8 @@ class FieldModelNode(AnserNode):
         self._stated = stated_by(table)
         self._file_model = model_of(table.model_file)
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
+        if self._baseline_bag is not None and self._baseline_bag.lost:
+            self.warn('baseline_damaged', f'{table.baseline_file}: {self._baseline_bag.lost}')
         self._setup_text = self._no_baseline = ''
         self._setup: Setup | None = None
         self._references: SensorTable | None = None
@@ -256,11 +259,15 @@ class FieldModelNode(AnserNode):
         if result is None:
             self.count('frames_between_refits')
         else:
-            self._metal.show(result, self._frame_id, frame.stamp_ns)
+            self._metal.show(result, self._shown_frame, frame.stamp_ns)
 
     @property
     def _frame_id(self) -> str:
         return self._setup.frame_id if self._setup is not None else 'fg'
+
+    @property
+    def _shown_frame(self) -> str:
+        return f'{self.parameters.frame_prefix}{self._frame_id}'
 
     @property
     def _follows(self) -> bool:
@@ -292,7 +299,7 @@ class FieldModelNode(AnserNode):
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
         # A model that is about to be judged lets trackers wait for the verdict on their frame.
         self._output.publish(
-            model, self._frame_id, self._stamp_ns, follows or is_waiting, withheld
+            model, self._shown_frame, self._stamp_ns, follows or is_waiting, withheld
         )
         if model is not self._model:
             self.count('models')

@@ -48,11 +48,11 @@ from anser_ros.wire.setup import Setup, topic_of
 
 
 def pose_in(message: PoseStamped, frame_id: str, body: str) -> tuple[Array, Array]:
-    """Return position (3,), m, and rotation (3, 3) of a body in a frame.
+    """Return position (3,), m, and rotation (3, 3) of a body in a frame, with any prefix.
 
     Raises `FrameError` when the pose is given in another frame, or is no pose.
     """
-    if message.header.frame_id != frame_id:
+    if not message.header.frame_id.endswith(frame_id):
         raise FrameError(f'the pose of {body} is in {message.header.frame_id!r}, not {frame_id!r}')
     numbers = pose_numbers(message.pose)
     position, quaternion = np.array(numbers[:3]), unit_quaternions(numbers[3:])

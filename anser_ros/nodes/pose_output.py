@@ -6,16 +6,25 @@ import time
 from collections import Counter
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from rclpy.serialization import serialize_message
+from yaml import YAMLError
 
+from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status
-from anser_ros.physics.rotations import quaternion_of_axis, quaternion_of_rotation
+from anser_ros.physics.rotations import (
+    quaternion_of_axis,
+    quaternion_of_rotation,
+    rotation_of_quaternion,
+)  # fmt: skip
 from anser_ros.pose_states import FRAMES_IN, OK, STALE
 from anser_ros.stamps import SECOND_NS, is_live, pack_stamp, set_stamp
 from anser_ros.tracking.estimate import PoseEstimate
-from anser_ros.wire.setup import topic_of
+from anser_ros.wire.recorded import unit_quaternions
+from anser_ros.wire.setup import FIELD_GENERATOR, topic_of
+from anser_ros.wire.text_files import read_text, read_yaml
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -113,8 +122,7 @@ class PoseTopic:
         """Return the transform of the good pose just published, which had a stamp, ns."""
         moved = self._transform
         set_stamp(moved.header.stamp, stamp_ns)
-        place, turn = moved.transform.translation, moved.transform.rotation
-        place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = self._values
+        fill(moved, self._values)
         return moved
 
     def state(self, stale_after_s: float) -> tuple[str, str]:
@@ -150,6 +158,57 @@ class PoseTopic:
         values.update({f'{FRAMES_IN}{name}': count for name, count in sorted(self.states.items())})
         level = Level.OK if state == OK else Level.STALE if state == STALE else Level.WARN
         return Status(self.name, level, state, values)
+
+
+def board_pose_of(table: Any) -> tuple[float, ...]:
+    """Return x y z, m, and quaternion x y z w of the board that a tracker's parameters state.
+
+    A file of ``anser handeye`` has the way from the other tracker's frame to the board's. Raises
+    `ParameterError` when a pose is no pose, or is missing where there is a parent frame.
+    """
+    path: str = table.registration_file
+    numbers: tuple[float, ...] = table.board_pose
+    try:
+        if path:
+            found = read_yaml(read_text(path))
+            if 'board_pose' in found:
+                numbers = tuple(map(float, found['board_pose']))
+            else:
+                turn = rotation_of_quaternion(np.array(found['registration_quaternion_xyzw'])).T
+                place = -turn @ np.array(found['registration_translation_m'], dtype=float)
+                numbers = *place.tolist(), *quaternion_of_rotation(turn)
+    except (KeyError, TypeError, ValueError, YAMLError) as error:
+        raise ParameterError(f'parameter registration_file: {path}: no pose ({error})') from error
+    is_pose = len(numbers) == 7 and bool(np.isfinite(unit_quaternions(numbers[3:])).all())
+    if not (is_pose and np.isfinite(numbers).all()) and (numbers or table.parent_frame):
+        raise ParameterError(f'parameter board_pose: x y z qx qy qz qw needed, got {numbers}')
+    return numbers
+
+
+def state_board(node: Any, publisher: Any, table: Any) -> Any:
+    """State the board's pose in its parent frame, if it has one, for those who come later too.
+
+    Return the publisher of /tf_static, which is made with the first statement.
+    """
+    numbers = board_pose_of(table)
+    if not table.parent_frame:
+        return publisher
+    if TFMessage is None:
+        node.warn('no_tf_static', 'no /tf_static: tf2_msgs is not installed')
+        return publisher
+    publisher = publisher or node.create_publisher(TFMessage, '/tf_static', qos.LATCHED)
+    found = TransformStamped(child_frame_id=f'{table.frame_prefix}{FIELD_GENERATOR}')
+    found.header.frame_id = table.parent_frame
+    found.header.stamp = node.get_clock().now().to_msg()
+    fill(found, numbers)
+    publisher.publish(TFMessage(transforms=[found]))
+    return publisher
+
+
+def fill(moved: TransformStamped, numbers: tuple[float, ...]) -> None:
+    """Write x y z, m, and the quaternion x y z w into a transform."""
+    place, turn = moved.transform.translation, moved.transform.rotation
+    place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = numbers
 
 
 def transform_publisher(node: Any) -> Any:

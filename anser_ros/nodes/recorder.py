@@ -164,6 +164,10 @@ def report(
     return f'{text}; {words} (named in the log)', faults
 
 
+SENDERS = 'acquisition', 'replay'
+"""Nodes that send fluxes: what others lack after their end is no fault."""
+
+
 class Faults:
     """Finds what has gone wrong between two messages of ``/diagnostics`` of one namespace."""
 
@@ -176,7 +180,8 @@ class Faults:
         """Return the first fault in words; empty for none.
 
         It is a fault when a node or a part that was fine is so no more, when a pose was withheld
-        meanwhile, and when a node finds something new.
+        meanwhile, and when a node finds something new; nothing is where the senders of fluxes have
+        ended, as they do when asked to.
         """
         faults = [
             f'{name}: {now.message}'
@@ -184,7 +189,9 @@ class Faults:
             if name.startswith(self._begin) and name != self._own and self._is_new(name, now)
         ]
         self._last.update(statuses)
-        return faults[0] if faults else ''
+        senders = [self._last.get(f'{self._begin}{name}') for name in SENDERS]
+        is_over = {one.message for one in senders if one is not None} == {'ended'}
+        return faults[0] if faults and not is_over else ''
 
     def _is_new(self, name: str, now: LastStatus) -> bool:
         before = self._last.get(name)

@@ -20,11 +20,22 @@ from anser_ros.chain.frame import AnsweredFrames, FrameReadings
 from anser_ros.chain.tracking_half import TrackingHalf
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
+from anser_ros.nodes.pose_output import (
+    PoseTopic,
+    state_board,
+    transform_message,
+    transform_publisher,
+)  # fmt: skip
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import STALE_AFTER_S, parameter, stated, stated_by
+from anser_ros.nodes.runtime.parameters import (
+    STALE_AFTER_S,
+    parameter,
+    prefix_parameter,
+    stated,
+    stated_by,
+)  # fmt: skip
 from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams import one_source
 from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
@@ -56,9 +67,15 @@ class TrackerParameters:
     tips_file: str = parameter(
         '', "tips.yaml of pivot, or a setup document, whose tips replace the setup's own"
     )
-    frame_prefix: str = parameter(
-        '',
-        "prefix of the frames of poses and of /tf, the board's too, if there are several boards",
+    frame_prefix: str = prefix_parameter()
+    parent_frame: str = parameter(
+        '', 'frame in which /tf_static states where the board is; empty: not stated', live=True
+    )
+    board_pose: tuple[float, ...] = parameter(
+        (), "the board's pose in it: x y z, m, and quaternion x y z w", live=True
+    )
+    registration_file: str = parameter(
+        '', 'handeye.json, or another file with board_pose, in place of that', live=True
     )
     allow_uncalibrated: bool = parameter(
         False, 'whether poses are given by the nominal model though field_model withholds them'
@@ -192,6 +209,7 @@ class TrackerNode(AnserNode):
         self._counted = 0, 0
         self._model_age_ns = 0
         self._transforms = transform_publisher(self) if table.publish_tf else None
+        self._board = state_board(self, None, table)
         warm_up()
         setups = one_source.setup_source(self, self._on_setup)
         # The executor takes topics in this order, so a model finds its uncertainty there.
@@ -394,6 +412,7 @@ class TrackerNode(AnserNode):
         """Track on with the new settings or model, from where the tools were."""
         if old.model_file != new.model_file:
             self._exchange(model_of(new.model_file))
+        self._board = state_board(self, self._board, new)
         self._settings = settings_of(new)
         if self._half is not None and self._setup is not None:
             self._half.set_up(settings_for(self._setup, self._settings, self._file_model))

@@ -100,6 +100,8 @@ def model_for(
     geometry makes no nominal one.
     """
     if name == NOMINAL:
+        if resurveyed:
+            raise ModelFileError('--resurveyed has no effect with the nominal model')
         return nominal_model(board_of(session.setup))
     model = with_new_survey(load_model(name, snapshot), session.setup, resurveyed)
     check_fits(model, session)

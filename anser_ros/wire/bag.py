@@ -16,6 +16,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
+from itertools import pairwise
+from mmap import ACCESS_READ, mmap
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,6 +46,10 @@ _BROKEN = (
 _RECORD_LIMIT = 256 * 2**20
 """Largest record, and unpacked chunk, that is read, bytes: more is damage, or hostile."""
 
+MAGIC = b'\x89MCAP0\r\n'
+"""How a file of MCAP begins and ends."""
+HEADER = b'\x01'
+"""What follows at its begin: the opcode of its header."""
 PAGE = 4096
 """Bytes that sqlite3 writes as one, by default."""
 LOGS = ('-wal', '-journal')
@@ -155,7 +161,7 @@ def _unchunked(record: Any) -> tuple[list[Any], bool]:
 def _mcap(path: Path, salvage: Salvage) -> Iterator[_Found]:
     """Yield the messages of a file; raises `BagError` when it is no MCAP file."""
     with path.open('rb') as stream:
-        if stream.read(8) != b'\x89MCAP0\r\n':
+        if stream.read(8) != MAGIC:
             words = 'not an MCAP file' if path.stat().st_size else 'the file is empty'
             raise BagError(f'{path}: {words}')
         stream.seek(0)
@@ -412,10 +418,49 @@ def _file(path: Path, stack: ExitStack, salvage: Salvage) -> Iterator[_Found]:
             with plain.open('r+b') as stream:
                 stream.seek(whole)
                 stream.write(b'\xff' * (size - whole))
+    for log in logs:
+        if log.name.endswith(LOGS[0]) and _breaks_off(log.read_bytes()):
+            salvage.add(f'{log.name} breaks off: what was written last is lost')
     try:
-        yield from _sqlite(plain, salvage) if plain.suffix == '.db3' else _mcap(plain, salvage)
+        if plain.suffix == '.db3':
+            yield from _sqlite(plain, salvage)
+        for part in _apart(plain, stack, salvage) if plain.suffix == '.mcap' else ():
+            yield from _mcap(part, salvage)
     except BagError as error:  # about what was unpacked, which nobody knows
         raise BagError(str(error).replace(str(plain), str(path))) from error
+
+
+def _breaks_off(log: bytes) -> bool:
+    """Whether a log of sqlite3 ends in the middle of a page, or of what belongs together.
+
+    Frames of another salt are older ones that were not written over yet (sqlite.org/fileformat).
+    """
+    frame, salt = 24 + int.from_bytes(log[8:12], 'big'), log[16:24]
+    heads = [log[at : at + 24] for at in range(32, len(log), frame)]
+    own = [head for head in heads if head[8:16] == salt]
+    is_whole = len(log) < 32 or (len(log) - 32) % frame == 0
+    return not is_whole or bool(own and own[-1][4:8] == b'\0\0\0\0')
+
+
+def _apart(path: Path, stack: ExitStack, salvage: Salvage) -> Iterator[Path]:
+    """A file of MCAP, or each of several that were joined: the index of the last knows only it."""
+    with path.open('rb') as stream:
+        if not path.stat().st_size:
+            yield path
+            return
+        data = stack.enter_context(mmap(stream.fileno(), 0, access=ACCESS_READ))
+    begins = [0]
+    while (begin := data.find(MAGIC + HEADER, begins[-1] + 1)) >= 0:
+        begins.append(begin)
+    if len(begins) == 1:
+        yield path
+        return
+    salvage.add(f'{len(begins)} files are joined in {path.name}, and are read one after the other')
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    for number, (begin, end) in enumerate(pairwise([*begins, len(data)])):
+        part = folder / f'{number}_{path.name}'
+        part.write_bytes(data[begin:end])
+        yield part
 
 
 def _stated_size(path: Path) -> int:

@@ -118,6 +118,10 @@ class Setup:
     tips: Mapping[str, TipSpec] = field(default_factory=dict)
     said: frozenset[str] = frozenset()  # names of values that were stated over the document's
 
+    def __repr__(self) -> str:
+        count = len(self.emitter.coils)
+        return f'Setup({count} emitters, {len(self.sensors)} coils of {", ".join(self.bodies)})'
+
     @cached_property
     def refit(self) -> RefitSettings:
         """Return how the refit follows: what is stated, and defaults for the rest."""

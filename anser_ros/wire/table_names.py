@@ -65,7 +65,8 @@ def meaning_of(name: str, unit: str = '') -> Meaning:
         words.remove(stated[-1])
     is_span = len(words) == 1 and UNITS.get(words[0]) in TIME_NS
     if is_span or words == ['t'] or TIME.intersection(words[:1] + words[-1:]):
-        return Meaning('time', '', unit or UNITS.get(words[0], ''), tuple(words))
+        group = tuple(word for word in words if word not in UNITS)
+        return Meaning('time', '', unit or UNITS.get(words[0], ''), group)
     if ANGLES.intersection(words) or unit in ('deg', 'rad'):
         return Meaning('angle', '', unit)
     kind, axis, place = _axis(words)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.arrays import Array
+from anser_ros.arrays import Array, Integers
 from anser_ros.errors import ParameterError
 from anser_ros.wire.table_names import LENGTH_M, is_unit, meaning_of, triples
 from anser_ros.wire.text_files import read_text
@@ -32,6 +32,7 @@ TITLE_LINES = 60
 GAPS = ('', '-', '--', 'na', 'n/a', '#n/a', 'nan', 'null', 'none')
 """Words for no number."""
 _NUMBER, _WHOLE = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?', r'[-+]?\d{1,18}|1\d{18}'
+_DATE = r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d'
 _IS_NUMBER = re.compile(_NUMBER, re.IGNORECASE).fullmatch
 _COMMA = re.compile(r'(?<=\d),(?=\d+(?:e[-+]?\d+)?$)', re.IGNORECASE)  # of a decimal
 
@@ -65,16 +66,24 @@ class Table:
     def array(self, name: str) -> NDArray[Any]:
         """Return a column (n,): whole numbers as such, others with NaN for a gap.
 
-        Raises `ParameterError` for a word, with its line.
+        Dates by ISO 8601 become ns since 1970; without a zone they are of UTC. Raises
+        `ParameterError` for a word, with its line.
         """
         words = self.words(name)
         if words.str.fullmatch(_WHOLE).all():
             return np.asarray(words.astype(np.int64))
+        if words.str.match(_DATE).all():
+            return _nanoseconds(words, f'{self.path}: {name}')
         words = words.mask(words.str.casefold().isin(GAPS), 'nan')
         if len(bad := words[~words.str.fullmatch(f'{_NUMBER}|[-+]?inf|nan', case=False)]):
+            is_time = ':' in bad.iloc[0]
+            remedy = (
+                'give times in s or as 2025-10-09T08:53:20.000Z'
+                if is_time else 'leave the cell empty where there is none'
+            )  # fmt: skip
             raise ParameterError(
                 f'{self.path}: line {bad.index[0]}: {name} is {bad.iloc[0]!r}, which is no '
-                'number; leave the cell empty where there is none'
+                f'number; {remedy}'
             )
         return np.asarray(words.astype(np.float64))
 
@@ -105,6 +114,16 @@ class Table:
             )
         names = [self.names[axes[axis]] for axis in 'xyz']
         return LENGTH_M[units.pop()] * self.numbers(names, with_gaps=with_gaps)
+
+
+def _nanoseconds(words: Any, what: str) -> Integers:
+    import pandas
+
+    try:
+        dates = pandas.to_datetime(words, utc=True, format='ISO8601').dt.tz_localize(None)
+    except ValueError as error:
+        raise ParameterError(f'{what} has a date that is none: {error}') from error
+    return np.asarray(dates.to_numpy(dtype='datetime64[ns]').astype(np.int64))
 
 
 def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:

@@ -76,12 +76,20 @@ class Scene {
     const way = new THREE.Vector3(...to[from]).normalize();
     const middle = this.extent.getCenter(new THREE.Vector3());
     this.seen = from;
-    this.controls.target.copy(middle);
-    // As near as all corners of board and volume are in sight.
-    for (let far = 0.2 * this.size; far < 20 * this.size; far *= 1.04) {
-      this.camera.position.copy(middle).addScaledVector(way, far);
-      this.camera.lookAt(middle);
+    const stand = (target, far) => {
+      this.controls.target.copy(target);
+      this.camera.position.copy(target).addScaledVector(way, far);
+      this.camera.lookAt(target);
       this.camera.updateMatrixWorld();
+    };
+    // As near as all corners of board and volume are in sight, their picture in the middle.
+    for (let far = 0.2 * this.size; far < 20 * this.size; far *= 1.04) {
+      stand(middle, far);
+      const heights = this.corners().map((corner) => corner.project(this.camera).y);
+      const high = (Math.max(...heights) + Math.min(...heights)) / 2 - 0.07; // above the key
+      const up = new THREE.Vector3(0, 1, 0).applyQuaternion(this.camera.quaternion);
+      const reach = far * Math.tan(THREE.MathUtils.degToRad(this.camera.fov / 2));
+      stand(middle.clone().addScaledVector(up, high * reach), far);
       if (this.corners().every((corner) => this.isSeen(corner))) break;
     }
     this.controls.update();

@@ -22,6 +22,9 @@ POINT_TICKS = 6
 LOOK_S = 2.0
 """Time between two looks at recordings and model, s: a folder of a thousand bags takes 25 ms."""
 STYLE = Path(__file__).with_name('page.css').read_text(encoding='utf-8')
+HINT = 'Record while the tool moves all over the volume for half a minute, stop, and diagnose.'
+LEAST_SHARE = 0.05
+"""Finished share of a command from which on its remaining time is told."""
 LEVELS = ('ok', 'warn', 'bad', 'bad')
 """Classes of the levels of diagnostic_msgs."""
 # Their libraries, three.js and ECharts, are what the instrument imports.
@@ -52,6 +55,7 @@ class Screen:
         with ui.element('div').classes('chain'):
             self._nodes = ui.html(sanitize=False).classes('nodes')
             self._why = ui.html(sanitize=False).classes('why').mark('why')
+            self._why.on('click', lambda: self._why.classes(toggle='open'))
         with ui.element('div').classes('desk'):
             self._instrument = Instrument().on('ready', self._ready)
             with ui.element('div').classes('panel loop'):
@@ -177,11 +181,13 @@ class Screen:
         self._once(self._offer, (loop.names, loop.chosen))
         self._once(self._cancel.set_visibility, loop.is_running)
         self._once(self._progress.set_visibility, loop.is_running)
-        message = loop.message
+        message = loop.message or ('' if loop.names else HINT)
         if job is not None and loop.is_running:
             known = not math.isnan(job.share)
             self._once(self._show_share, job.share if known else -1.0)
-            message = f'{job.kind}: {job.stage or "begins"}, {job.seconds:.0f} s'
+            rest_s = job.seconds * (1.0 / job.share - 1.0) if job.share > LEAST_SHARE else 0.0
+            left = f', about {rest_s:.0f} s left' if rest_s else ''
+            message = f'{job.kind}: {job.stage or "begins"}, {job.seconds:.0f} s{left}'
         warning = '' if loop.is_running else loop.warning
         self._once(self._message.set_text, warning or message)
         self._once(self._show_trouble, bool(warning) or loop.is_trouble)

@@ -244,7 +244,7 @@ def _unit_of(time: Array) -> str:
     """The unit that times can have; empty if they do not count since 1970, and no tracker gives
     them in seconds: they are whole numbers, or far apart."""
     known = time[np.isfinite(time)]
-    if not known.size:
+    if not known.size or not np.ptp(known):
         return 's'
     middle, apart = np.median(known), np.median(np.diff(known, append=known[-1:]))
     unit = next((u for low, high, u in UNITS_OF_TIME if low < middle < high), 's')

@@ -5,6 +5,7 @@ an error is logged, counted and shown in ``/diagnostics``, and the node lives on
 """
 
 import argparse
+import copy
 import functools
 import threading
 import time
@@ -63,6 +64,8 @@ DIAGNOSTICS_PERIOD_S = 1.0
 """Time between two messages in /diagnostics, s, as other ROS nodes have it."""
 WARNING_PERIOD_S = 10.0
 """Least time between two warnings of one kind in the log, s."""
+OVERRIDES_S = 10.0
+"""Time, s, after which a node has the topics that parameters may override."""
 LONGEST_TURN_S = 0.05
 """Time, s, that a timer waits while another thread works in its node, before it is left out until
 the next time: other nodes of the process wait meanwhile."""
@@ -106,7 +109,9 @@ class AnserNode(Node):
         self._throttle = Throttle(WARNING_PERIOD_S)
         self._fault: str | None = None
         self._faults_reported = 0
+        self._has_checked = False
         self.started_s = time.monotonic()
+        self.streams: Node = self
         options.setdefault('namespace', NAMESPACE)
         super().__init__(self.NAME, **options)
         self.parameters = self._declare_table()
@@ -171,6 +176,7 @@ class AnserNode(Node):
 
     def publish_diagnostics(self) -> None:
         """Publish all statuses now."""
+        self._check_overrides()
         self._send_statuses(self._status_with_counters(), *self.part_statuses())
 
     def publish_end(self) -> None:
@@ -219,19 +225,36 @@ class AnserNode(Node):
         if bounded:
             options['raw'] = True
         guarded = self._guard(self._in_turn(unpacked))
-        options = {**self._qos_options(), **options}
-        return super().create_subscription(msg_type, topic, guarded, qos_profile, **options)
+        profile, own = self.overridable(qos_profile)
+        return super().create_subscription(msg_type, topic, guarded, profile, **own, **options)
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
         """Publish as rclpy does; parameters ``qos_overrides`` are honoured."""
-        options = {**self._qos_options(), **options}
-        return super().create_publisher(msg_type, topic, qos_profile, **options)
+        profile, own = self.overridable(qos_profile)
+        return super().create_publisher(msg_type, topic, profile, **own, **options)
 
-    def _qos_options(self) -> dict[str, Any]:
-        """What lets parameters override a quality of service; nothing where none does."""
-        if not any(name.startswith(parameters.QOS) for name in self._parameter_overrides):
-            return {}
-        return {'qos_overriding_options': QoSOverridingOptions(qos.OVERRIDABLE)}
+    @property
+    def qos_overrides(self) -> list[Parameter]:
+        """Return the parameters that override a quality of service."""
+        given = self._parameter_overrides.items()
+        return [value for name, value in given if name.startswith(parameters.QOS)]
+
+    def overridable(self, profile: Any) -> tuple[Any, dict[str, Any]]:
+        """Return a profile of a topic's own, and what lets parameters change it."""
+        if not self.qos_overrides:
+            return profile, {}
+        return copy.copy(profile), {
+            'qos_overriding_options': QoSOverridingOptions(qos.OVERRIDABLE)
+        }
+
+    def _check_overrides(self) -> None:
+        """State once, some time after the start, which overrides are of topics of no use here."""
+        if time.monotonic() - self.started_s < OVERRIDES_S or self._has_checked:
+            return
+        self._has_checked = True
+        for one in self.qos_overrides:
+            if not (self.has_parameter(one.name) or self.streams.has_parameter(one.name)):
+                self.get_logger().info(f'{one.name}: this node has no such topic so far')
 
     def create_timer(
         self, timer_period_sec: float, callback: Callback, *args: Any, **options: Any
@@ -312,6 +335,8 @@ class AnserNode(Node):
         unknown = [name for name in given if not parameters.is_known(table, name)]
         if unknown:
             parameters.build(table, dict.fromkeys(sorted(unknown)))
+        for one in self.qos_overrides:
+            qos.check_override(one.name, one.value)
         for name, rule in parameters.rules(table).items():
             default = getattr(table, name)
             ros_default = list(default) if isinstance(default, tuple) else default

@@ -158,6 +158,11 @@ def optical_parameter() -> Any:
     return parameter(OPTICAL.rstrip('/'), 'namespace of the optical poses: NAMESPACE/BODY/pose')
 
 
+def prefix_parameter() -> Any:
+    """Return the parameter of a node that publishes in the board's frame."""
+    return parameter('', "prefix of the frames, the board's too, if there are several boards")
+
+
 def tracked_parameter() -> Any:
     """Return the parameter of a node that has to do with the poses of another tracker."""
     return parameter(

@@ -1,6 +1,10 @@
 """Sets the quality of service of every topic: one profile a kind of topic, alike on both ends."""
 
+from typing import Any
+
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+
+from anser_ros.errors import ParameterError
 
 
 def _reliable(depth: int, *, is_latched: bool = False) -> QoSProfile:
@@ -26,5 +30,25 @@ STREAM = _reliable(100)
 OTHERS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 # /diagnostics and /tf, as everybody else has them.
 EVENTS = _reliable(100)
-OVERRIDABLE = [QoSPolicyKind[name] for name in ('HISTORY', 'DEPTH', 'RELIABILITY', 'DURABILITY')]
+POLICIES: dict[str, Any] = {
+    'history': HistoryPolicy, 'depth': int, 'reliability': ReliabilityPolicy,
+    'durability': DurabilityPolicy,
+}  # fmt: skip
 """What parameters ``qos_overrides`` may change."""
+OVERRIDABLE = [QoSPolicyKind[name.upper()] for name in POLICIES]
+
+
+def check_override(name: str, value: Any) -> None:
+    """Raise `ParameterError` where a parameter ``qos_overrides...`` overrides nothing."""
+    topic, end, policy = (*name.split('.', 1)[-1].rsplit('.', 2), '', '')[:3]
+    if not topic.startswith('/') or end not in ('publisher', 'subscription'):
+        raise ParameterError(f'parameter {name}: a full name, publisher or subscription, policy')
+    if policy not in POLICIES:
+        raise ParameterError(f'parameter {name}: no policy; there are: {", ".join(POLICIES)}')
+    kind = POLICIES[policy]
+    if kind is int:
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise ParameterError(f'parameter {name}: {value!r} is no depth')
+    elif str(value).upper() not in kind.__members__:
+        known = ', '.join(known.lower() for known in kind.__members__)
+        raise ParameterError(f'parameter {name}: {value!r} is none of {known}')

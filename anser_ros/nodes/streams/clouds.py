@@ -78,13 +78,13 @@ def layout_of(message: PointCloud2) -> tuple[list[PointFieldTuple], int, int, An
 
 
 def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, FluxPoints]:
-    """Read a flux message that must be in a frame; its peculiarities are counted.
+    """Read a flux message that must be in a frame, with any prefix; its peculiarities are counted.
 
     The counters are ``fluxes_big_endian``, ``fluxes_other_frame_id``, ``fluxes_without_stamp``.
     Raises `LayoutError` when it is in another frame, has no stamp, or is no flux cloud.
     """
     given_id = message.header.frame_id
-    if given_id != frame_id:
+    if not given_id.endswith(frame_id):
         count('fluxes_other_frame_id', 1)
         raise LayoutError(f'fluxes in the frame {given_id!r}, the setup is in {frame_id!r}')
     if message.is_bigendian:

@@ -79,7 +79,10 @@ async def inner(_scope, _receive, send):
 
 @pytest.mark.parametrize('stated', [None, ((-0.1, -0.12, 0.06), (0.1, 0.1, 0.3))])
 def test_the_drawn_volume_is_that_in_which_poses_are_accepted(ros, stated):
-    node = polling_node('view', '/anser')
+    owner = ros.create_node('owner', namespace='/anser')
+    owner.qos_overrides = []
+    node = polling_node(owner)
+    owner.destroy_node()
     source = ViewSource(node, 'optical', pytest.fail, lambda _: False)
     setup = replace(parse_setup(ten_sensors()), volume=stated)
     source.setup_text = dump_setup(setup)
@@ -463,6 +466,24 @@ def page(ros, start, tmp_path):
     assert dashboard.interrupt() == 0
 
 
+SIZES = """() => {
+  const of = (e) => { const b = e.getBoundingClientRect(); return [b.width, b.height]; };
+  return {
+    boxes: [...document.querySelectorAll('.scene, .chart')].map(
+      (e) => [of(e), of(e.querySelector('canvas'))]),
+    width: innerWidth, inside: document.documentElement.scrollWidth };
+}"""
+"""What the browser says of the sizes of scene and curves, and of the whole page."""
+
+
+def is_laid_out(sizes):
+    """Whether the scene fills its box, the curves are seen, and nothing is beside the window."""
+    (scene, canvas), *curves = sizes['boxes']
+    fills = np.allclose(scene, canvas, atol=3.0) and min(scene) > 200.0
+    are_seen = len(curves) == 2 and all(min(curve[0]) > 100.0 for curve in curves)
+    return fills and are_seen and sizes['inside'] <= sizes['width']
+
+
 def test_it_opens_offline_and_shows_ten_sensors(page):
     opened, chain, address = page
     instrument = opened.locator('.instrument')
@@ -485,6 +506,14 @@ def test_it_opens_offline_and_shows_ten_sensors(page):
     assert float(good[7]) == pytest.approx(90.0, abs=0.6), 'residual, pT'
     assert float(good[8]) > 0.0, 'poses a second'
     assert 'something <b>new</b>' in opened.locator('.loop').inner_text(), 'as text, not as HTML'
+
+    assert 'Record while the tool moves' in opened.locator('.loop').inner_text(), 'first use'
+    assert opened.locator('button[title*="no model to load"]').is_disabled()
+    opened.locator('.why').click()
+    opened.locator('.why.open').wait_for()
+    for width, height in ((1280, 800), (390, 844)):  # in two columns, in one
+        opened.set_viewport_size({'width': width, 'height': height})
+        assert wait(lambda: is_laid_out(opened.evaluate(SIZES)))
 
     opened.get_by_role('button', name='Record').click()
     opened.get_by_text('the disk is full').wait_for(timeout=60_000)

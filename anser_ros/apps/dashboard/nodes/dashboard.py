@@ -151,10 +151,10 @@ class Dashboard(AnserNode):
         from anser_ros.apps.dashboard.server import PageServer, token_for
 
         table = self.parameters
-        self._streams = polling_node(self.get_name(), self.get_namespace())
+        self.streams = polling_node(self)
         self._client = ChainClient(self)
         refuse = partial(self.warn, 'messages_refused')
-        self._source = ViewSource(self._streams, table.optical, refuse, self._client.is_there)
+        self._source = ViewSource(self.streams, table.optical, refuse, self._client.is_there)
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         folder = RecordingFolder(Path(table.directory))
         if words := folder.trouble():
@@ -183,7 +183,7 @@ class Dashboard(AnserNode):
     def close(self) -> None:
         self._loop.cancel()
         self._server.end()
-        self._streams.destroy_node()
+        self.streams.destroy_node()
 
 
 if __name__ == '__main__':

@@ -4,6 +4,7 @@ Between two looks a message costs no Python: an executor would run Python for ea
 needs only the newest; the middleware keeps as many as the queue is deep.
 """
 
+import copy
 import math
 import os
 import struct
@@ -16,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -65,11 +67,12 @@ STREAMS = '_streams'
 """What the name of the node that is polled has behind that of its process."""
 
 
-def polling_node(name: str, namespace: str) -> Node:
+def polling_node(owner: Any) -> Node:
     """Return a node beside another one, for no executor: its subscriptions are polled."""
     return Node(
-        f'{name}{STREAMS}', namespace=namespace, start_parameter_services=False,
-        enable_rosout=False, use_global_arguments=False,
+        f'{owner.get_name()}{STREAMS}', namespace=owner.get_namespace(),
+        start_parameter_services=False, enable_rosout=False, use_global_arguments=False,
+        parameter_overrides=owner.qos_overrides,
     )  # fmt: skip
 
 
@@ -82,8 +85,9 @@ class Polled:
     def __init__(self, node: Node, message_type: type, topic: str, profile: QoSProfile) -> None:
         self._node, self._type = node, message_type
         self._subscription = node.create_subscription(
-            message_type, topic, _never, profile, raw=True
-        )
+            message_type, topic, _never, copy.copy(profile), raw=True,
+            qos_overriding_options=QoSOverridingOptions(qos.OVERRIDABLE),
+        )  # fmt: skip
 
     def take(self) -> list[tuple[bytes, dict[str, int]]]:
         """Return what has come since the last time, serialised, the oldest first."""

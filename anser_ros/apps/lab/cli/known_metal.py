@@ -44,7 +44,8 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         raise ParameterError('--name must not be empty')
     session = load_session(args.session).with_stated(output.stated_values(args))
     model = model_for(args.model, session)
-    prepared = prepare(session, model, load_session(args.baseline))
+    baseline = load_session(args.baseline)
+    prepared = prepare(session, model, baseline)
     output.check_file(args.out)
     # Loaded here, as each evaluation would pay for it, which asks this module for its option.
     from anser_ros.apps.lab.metal_learning import learn
@@ -64,9 +65,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         f'{" x ".join(f"{side * 1e2:.0f}" for side in size)} cm; in frames that took no part '
         f"{known.misfit:.1%} of the references' readings are left"
     )
-    return output.Result(
-        document, output.loss_notes(args.session, session.lost), (words,), (args.out,)
-    )
+    return output.Result(document, output.loss_notes(session, baseline), (words,), (args.out,))
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

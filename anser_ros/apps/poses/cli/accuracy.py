@@ -134,8 +134,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     written = output.write_files(args.out, {'accuracy.json': document, 'report.html': report})
     if verdict is not None and args.history is not None:
         written = (*written, keep(found, args.history, verdict.figures))
-    lost = [one.session for one in recordings if one.session.lost]
-    notes = tuple(f'{session.path}: {session.lost}' for session in lost)
+    notes = output.loss_notes(*(one.session for one in recordings))
     return output.Result(document, notes, _shown(found, document), written)
 
 

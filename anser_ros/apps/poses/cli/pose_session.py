@@ -414,7 +414,7 @@ def diagnose(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     )
     head = ['with lever arms, mm', 'corrected, mm', 'corrected, deg']
     shown = _by_sensor_text(document, head), pose_verdict(document)
-    return output.Result(document, output.loss_notes(args.session, session.lost), shown, written)
+    return output.Result(document, output.loss_notes(session), shown, written)
 
 
 def evaluate(args: argparse.Namespace, tell: output.Tell) -> output.Result:
@@ -441,7 +441,7 @@ def evaluate(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         sizes = [f'{1e3 * one.position_m:.2f} mm' for one in (found.before, found.after)]
         words = f'Held out, the error is {sizes[0]} before and {sizes[1]} after the model.'
     return output.Result(
-        document, output.loss_notes(args.session, session.lost),
+        document, output.loss_notes(session),
         (_by_sensor_text(diagnosis, head), words), (*written, args.out / 'poses.csv'),
     )  # fmt: skip
 
