@@ -458,7 +458,11 @@ class DrawnFitter:
         self.values[self.sensed] = gains
         self.values[self.level][:2] = level.real - 1.0, level.imag
         self._place(self.values)
-        model = self._model(found.covariance)
+        # So their product is known, though neither is by itself.
+        known, first = np.eye(len(found.values)), self.sensed.start + self.sensors.rows('gains')
+        for part, rows in enumerate(first.reshape(-1, 2).T):
+            known[self.level.start + part, rows] = 1.0 / max(len(rows), 1)
+        model = self._model(known @ found.covariance @ known.T)
         sensed = replace(
             found, values=gains, width=self.width[self.sensed],
             covariance=found.covariance[self.sensed, self.sensed],
