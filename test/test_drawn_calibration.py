@@ -14,6 +14,7 @@ from conftest import REPO
 from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.calibrate import Options
+from anser_ros.calibration.result import to_document
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli.main import main
 from anser_ros.errors import FitError
@@ -155,9 +156,9 @@ def test_a_plate_of_typed_places_calibrates(setup, heights, most_m):
     assert raw < 3.0 * np.sqrt(3.0) * result.model.shift_sigma_m + 3.0 * most_m
     assert result.better_than_nominal
     assert result.fit.noise_t < 1.5 * NOISE_T
-    rows = result.more['emitters_off']
+    rows = to_document(result)['emitters']
     found = np.array([row['shift_m'] for row in rows])
-    sigma = np.array([row['shift_sigma_m'] for row in rows])
+    sigma = np.array([row['uncertainty']['shift_m'] for row in rows])
     assert (np.abs(found - world.shift) < 4.0 * sigma).mean() > 0.95
     assert np.corrcoef(found.ravel(), world.shift.ravel())[0, 1] > 0.6
     words = ' '.join(row['words'] for row in rows)
@@ -199,7 +200,9 @@ def test_the_command_calibrates_a_tool_that_was_waved(shared, tmp_path):
     waved = str(folder / 'waved_short.mcap')
     assert main(['calibrate', waved, '--out', str(out), '--report', str(tmp_path)]) == 0
     document = json.loads((tmp_path / 'calibration.json').read_text())
-    assert len(document['emitters_off']) == 8
+    emitter = document['emitters'][7]
+    assert {'name', 'flux_rmse_t', 'tilt_rad', 'strength', 'uncertainty'} <= {*emitter}
+    assert len(document['frame']['shift_sigma_m']) == len(document['frame']['turn_sigma_rad']) == 3
     session, true = load_session(folder / 'check_tool.mcap'), folder / 'check_tool_truth.npz'
     tracked = track_session(session, load_model(out)).sensors.values()
     error, sigma, known = [], [], []

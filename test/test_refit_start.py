@@ -45,11 +45,11 @@ class Held:
 
         def held(*given, report, **named):
             report(self.share)
-            assert self.let.wait(PATIENCE_S)
+            self.let.wait()
             return build(*given, report=report, **named)
 
         def held_refit(*given, **named):
-            assert self.let.wait(PATIENCE_S)
+            self.let.wait()
             return refit(*given, **named)
 
         monkeypatch.setattr(tables, 'build_tables', held)

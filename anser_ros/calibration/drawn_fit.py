@@ -202,6 +202,8 @@ class DrawnFit:
     model: FieldModel  # without corrections of sensors; its modes are what is open but the frame
     errors: Array  # (K, OWN): of the coils, and their standard deviations
     sigma: Array
+    # (6,), m and rad: of a motion of all coils as one, about the middle of the drawing's places
+    frame_sigma: Array
     plate: Array  # (7,): place (m), turn (rad) and scale of the typed places
     sensors: SensorParameters
     posterior: Posterior  # of the sensors' parameters
@@ -460,9 +462,9 @@ class DrawnFitter:
         self._place(self.values)
         # So their product is known, though neither is by itself.
         known, first = np.eye(len(found.values)), self.sensed.start + self.sensors.rows('gains')
-        for part, rows in enumerate(first.reshape(-1, 2).T):
-            known[self.level.start + part, rows] = 1.0 / max(len(rows), 1)
-        model = self._model(known @ found.covariance @ known.T)
+        for phase, rows in enumerate(first.reshape(-1, 2).T):
+            known[self.level.start + phase, rows] = 1.0 / max(len(rows), 1)
+        model, frame_sigma = self._model(known @ found.covariance @ known.T)
         sensed = replace(
             found, values=gains, width=self.width[self.sensed],
             covariance=found.covariance[self.sensed, self.sensed],
@@ -473,14 +475,14 @@ class DrawnFitter:
             without[self.sensed.start + self.sensors.rows(kind)] = 1e-12
             evidence[kind] = found.evidence - solve(likelihood, without).evidence
         return DrawnFit(
-            model, self.board, found.sigma[self.own].reshape(self.count, OWN),
+            model, self.board, found.sigma[self.own].reshape(self.count, OWN), frame_sigma,
             found.values[self.plate], self.sensors, sensed, evidence, self.noise_t, self.jitter,
             tuple(self.parts), tuple(held_out),
             float((found.covariance * likelihood.information).sum()), steps,
         )  # fmt: skip
 
-    def _model(self, covariance: Array) -> FieldModel:
-        """The field's model with its modes, and the frame's part of what is open.
+    def _model(self, covariance: Array) -> tuple[FieldModel, Array]:
+        """The field's model with its modes, and the frame's part (6,) of what is open.
 
         The frame's motion is that which makes the field over the board most like a given one.
         """
@@ -509,10 +511,11 @@ class DrawnFitter:
         arms = _carried(drawing.places, self.middle)
         shift = np.sqrt(np.einsum('pij,jk,pik->', arms, frame, arms) / (3.0 * len(arms)))
         nominal = drawing.nominal
-        return FieldModel(
+        model = FieldModel(
             here.positions, here.directions, here.moments, nominal.emitters,
             nominal.frequencies_hz, modes=modes, shift_sigma_m=float(shift),
         )  # fmt: skip
+        return model, np.sqrt(np.diag(frame))
 
     def _modes(self, covariance: Array, columns: ComplexArray, flux: Array) -> ComplexArray:
         """The strongest modes (R, N + L, K) of what is open of the field."""

@@ -316,6 +316,8 @@ class Calibration:
     candidates: tuple[LayoutCandidate, ...] = ()  # all layouts that were compared
     contradictions: tuple[str, ...] = ()  # a line for everything of which two sessions disagree
     undetermined: tuple[str, ...] = ()  # lines on what the readings cannot determine
+    # of each emitter how it differs from its drawing, where that was found, as plain data
+    emitters: Sequence[Mapping[str, Any]] = ()
     # sections that only some engine's calibrations have in their document, as plain data
     more: Mapping[str, Any] = field(default_factory=dict)
 
@@ -361,6 +363,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
     inside, span = calibration.residuals, calibration.residuals.span_t
     each = zip(calibration.model.emitters, inside.each_t, held_out.error.T, strict=True)
     nominal = calibration.nominal_rmse_t
+    off = [dict(own) for own in calibration.emitters] or [{}] * len(calibration.model.emitters)
     return {
         'schema': 'anser_calibration/1',
         'n_measurements': calibration.n_measurements,
@@ -370,8 +373,13 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
         'heldout_n_rmse_percent': 100.0 * rms(held_out.error) / span,
         'heldout_n_mae_percent': 100.0 * float(np.abs(held_out.error).mean()) / span,
         'emitters': [
-            {'name': name, 'flux_rmse_t': float(fitted), 'heldout_flux_rmse_t': rms(outside)}
-            for name, fitted, outside in each
+            {
+                'name': name,
+                'flux_rmse_t': float(fitted),
+                'heldout_flux_rmse_t': rms(outside),
+                **own,
+            }
+            for (name, fitted, outside), own in zip(each, off, strict=True)
         ],
         'marginal': {
             'noise_t': held_out.noise_t,

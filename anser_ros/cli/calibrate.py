@@ -133,7 +133,8 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     rows += [(effect.name, _parameters(effect)) for effect in calibration.model.effects]
     for effect in calibration.scan.reported_effects:
         rows.append((f'{effect.name}, not in the model', _parameters(effect)))
-    rows += [(one['name'], one['words']) for one in document.get('emitters_off', ())]
+    of_emitters = zip(calibration.model.emitters, calibration.emitters, strict=False)
+    rows += [(name, own['words']) for name, own in of_emitters]
     return output.terminal_table(['', ''], rows, title='calibration', show_header=False)
 
 

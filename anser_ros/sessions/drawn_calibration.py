@@ -264,8 +264,11 @@ def _calibration(
         residuals=residuals(now, model),
         scan=Scan(now, accuracy, corrected, (), sensors if all(typed) else None),
         nominal_rmse_t=residuals(stated, nominal).rmse_t if all(typed) and nominal else None,
-        undetermined=(frame,), more={
-            'emitters_off': emitter_rows(fit, generator),
+        undetermined=(frame,), emitters=emitter_rows(fit, generator), more={
+            'frame': {
+                'shift_sigma_m': fit.frame_sigma[:3].tolist(),
+                'turn_sigma_rad': fit.frame_sigma[3:].tolist(),
+            },
             'plate': {
                 'shift_m': fit.plate[:3].tolist(), 'turn_rad': fit.plate[3:6].tolist(),
                 'scale': float(1.0 + fit.plate[6]),
@@ -280,7 +283,7 @@ WAYS = (('left', 'right'), ('front', 'back'), ('down', 'up'))
 """Words for the ways along -x, x, -y, y, -z and z."""
 
 
-def emitter_rows(fit: DrawnFit, generator: Generator) -> list[dict[str, object]]:
+def emitter_rows(fit: DrawnFit, generator: Generator) -> tuple[dict[str, object], ...]:
     """Return of each emitter how it differs from its drawing, with one sigma, and in words."""
     rows = []
     for name, error, sigma in zip(generator.emitters, fit.errors, fit.sigma, strict=True):
@@ -300,11 +303,13 @@ def emitter_rows(fit: DrawnFit, generator: Generator) -> list[dict[str, object]]
             )
         rows.append(
             {
-                'name': name,
-                'shift_m': error[:3].tolist(), 'shift_sigma_m': sigma[:3].tolist(),
-                'tilt_rad': error[3:5].tolist(), 'tilt_sigma_rad': sigma[3:5].tolist(),
-                'strength': float(1.0 + error[6]), 'strength_sigma': float(sigma[6]),
+                'shift_m': error[:3].tolist(), 'tilt_rad': error[3:5].tolist(),
+                'strength': float(1.0 + error[6]),
+                'uncertainty': {
+                    'shift_m': sigma[:3].tolist(), 'tilt_rad': sigma[3:5].tolist(),
+                    'strength': float(sigma[6]),
+                },
                 'words': f'{name} ' + (' and '.join(words) or 'is as drawn'),
             }
         )  # fmt: skip
-    return rows
+    return tuple(rows)
