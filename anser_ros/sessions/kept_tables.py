@@ -75,8 +75,8 @@ class KeptTables:
         self._given = setup, model, references
         self._ahead = ahead or ReadAhead(None, None)
         places = [getattr(references, f.name) for f in fields(references)]
-        # What changes with the code that computes tables.
-        code = [(str(f), f.stat().st_mtime_ns, f.stat().st_size) for f in PACKAGE.rglob('*.py')]
+        # What changes with the code that computes tables, in whichever copy of the package.
+        code = [(str(f.relative_to(PACKAGE)), f.read_text('utf-8')) for f in PACKAGE.rglob('*.py')]
         made_by, stated = [np.__version__, *sorted(code)], dict(setup.stated)
         key = fingerprint_of(
             [made_by, setup.identity.board, setup.volume, stated, model.fingerprint, places]
