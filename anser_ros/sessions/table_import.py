@@ -257,8 +257,9 @@ class _Import:
             fault = fault if min(stamps) > 0 else 'a stamp is not after 1970; is start_ns missing?'
             raise ParameterError(f'{table.path}: {fault}')
         if different < len(stamps):
-            words = 'the same stamp twice; cut to seconds, or another unit of time?'
-            raise ParameterError(f'{table.path}: {words}')
+            raise ParameterError(
+                f'{table.path}: the same stamp twice: cut to seconds, other unit?'
+            )
         return stamps
 
     def _add_fluxes(self, given_entry: Any, what: str, setup: Setup) -> None:
