@@ -144,7 +144,7 @@ def test_columns_of_csv_become_a_session_with_poses(folder, moving, capsys):
         ({'file': 'torn.npz'}, 'cannot be read'),
         ({'colour': 'red'}, 'no key colour'),
         ({'stamp': 'B'}, 'so B is not a column'),
-        ({'stamp': 'z'}, 'the same stamp twice'),
+        ({'stamp': 'z'}, 'stamps are alike: are they set'),
         ({'time': {'unit': 'h'}}, 'fluxes[0]: time: unit must be among s, ms'),
     ],
 )

@@ -186,11 +186,16 @@ def test_another_board_in_another_namespace(tmp_path, capsys):
     assert grid['Plane Cell Count'] * grid['Cell Size'] == pytest.approx(0.5)
 
 
-def test_the_scene_of_slicer_hides_a_tool_without_a_pose(tmp_path, monkeypatch):
+def test_the_scene_of_slicer_hides_a_tool_without_a_pose(tmp_path, monkeypatch, capsys):
     """Run with stand-ins of Slicer's modules, which are not here."""
-    (tmp_path / 'two.yaml').write_text(TWO_TOOLS)
     command = ['views', str(tmp_path / 'two.yaml'), '--out', str(tmp_path), '--slicer']
-    assert main(command) == 0
+    for name, said in (
+        ('probe_of_the_other_board', 'is cut to e_of_the_other_board'),
+        ('probe', ''),
+    ):
+        (tmp_path / 'two.yaml').write_text(TWO_TOOLS.replace('probe', name))
+        assert main(command) == 0
+        assert said in capsys.readouterr().err
     modules = {name: MagicMock() for name in ('qt', 'slicer', 'vtk')}
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from anser_ros.api.given import Figures, Progress, shown
+from anser_ros.api.given import Figures, Progress, SessionSource, session_given, shown
 from anser_ros.api.model import Model
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.layouts import Layout
@@ -12,7 +12,6 @@ from anser_ros.calibration.result import to_document
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
-from anser_ros.sessions.session import SessionSource, load_session
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def calibrate(
     >>> result.model.save('model.yaml')
     """
     several = isinstance(sessions, Sequence) and not isinstance(sessions, str)
-    given = [load_session(one) for one in (sessions if several else [sessions])]  # type: ignore
+    given = [session_given(one) for one in (sessions if several else [sessions])]  # type: ignore
     if not given:
         raise FitError('a calibration needs at least one session')
     check_same_board(given)

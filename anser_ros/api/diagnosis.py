@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from anser_ros.api.given import Figures, Progress, shown
+from anser_ros.api.given import Figures, Progress, SessionSource, session_given, shown
 from anser_ros.api.model import Model, ModelSource
 from anser_ros.sessions.diagnosis import diagnose_session, other_way, to_document
-from anser_ros.sessions.session import SessionSource, load_session
 
 
 @dataclass(frozen=True)
@@ -72,8 +71,8 @@ def diagnose(
     >>> found.effects
     ()
     """
-    recorded, field = load_session(session), Model.load(model).field
-    clean = None if baseline is None else load_session(baseline)
+    recorded, field = session_given(session), Model.load(model).field
+    clean = None if baseline is None else session_given(baseline)
     with shown(progress, 'diagnose') as tell:
         if way := other_way(recorded):
             other = way.diagnose(recorded, field, tell)

@@ -4,22 +4,20 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
-from anser_ros.errors import ParameterError
+from anser_ros.sessions.session import Session, load_session
 
+SessionSource = Session | str | os.PathLike[str]
 Progress = bool | Callable[..., None] | None
 """True draws a bar on the standard error, in a terminal and in a notebook alike."""
 BAR = 30
 """Length of a bar, characters."""
 
 
-def path_of(given: str | os.PathLike[str], what: str) -> Path:
-    """Return a path; raises `ParameterError` for anything else."""
-    if isinstance(given, str | os.PathLike):
-        return Path(given)
-    raise ParameterError(f'{what} is wanted as a path, got {type(given).__name__}')
+def session_given(given: SessionSource) -> Session:
+    """Return a session, which is read where its path is given."""
+    return given if isinstance(given, Session) else load_session(given)
 
 
 @contextmanager

@@ -7,7 +7,6 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from anser_ros.api.given import path_of
 from anser_ros.api.recording import SetupSource, load_setup
 from anser_ros.arrays import numbers_of
 from anser_ros.errors import ParameterError
@@ -16,6 +15,7 @@ from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.wire.setup_values import AXIS_TOLERANCE
+from anser_ros.wire.text_files import path_of
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,13 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from anser_ros.api.given import path_of
 from anser_ros.arrays import Array, numbers_of
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.stamps import NANO
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import optical_topic, unit_quaternions
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
-from anser_ros.wire.text_files import read_text
+from anser_ros.wire.text_files import path_of, read_text
 
 SetupSource = Setup | Mapping[str, Any] | str | os.PathLike[str]
 

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.api.given import Progress, path_of, shown
+from anser_ros.api.given import Progress, SessionSource, session_given, shown
 from anser_ros.api.model import Model, ModelSource
 from anser_ros.arrays import Array, Booleans, Integers, numbers_of
 from anser_ros.pose_states import OK
-from anser_ros.sessions.session import SessionSource, load_session
 from anser_ros.sessions.tracked_session import PoseSeries, to_document, track_session
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import TrackerSettings
+from anser_ros.wire.text_files import path_of
 
 
 @dataclass(frozen=True)
@@ -181,8 +181,8 @@ def track(
     """
     stated = {} if gate is None else {'gate': float(numbers_of(gate, 'gate'))}
     settings = TrackerSettings(**stated)  # type: ignore[arg-type]
-    recorded, field = load_session(session), Model.load(model).field
-    clean = None if baseline is None else load_session(baseline)
+    recorded, field = session_given(session), Model.load(model).field
+    clean = None if baseline is None else session_given(baseline)
     with shown(progress, 'track') as tell:
         found = track_session(recorded, field, settings, clean, refit, progress=tell)
     tables: dict[str, dict[str, TrackedPoses]] = {}

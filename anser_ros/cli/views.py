@@ -45,11 +45,12 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
     make_folder(args.out)
     topics = Topics(space, args.optical.rstrip('/'), f'{args.frame_prefix}{setup.frame_id}')
     rviz = yaml.safe_dump(rviz_view(setup, topics), sort_keys=False, allow_unicode=True)
-    names = [name[-20:] for name in (*setup.bodies, *(s.name for s in setup.tool_sensors))]
-    scene = re.sub('(?m)^DEVICES = .*', f'DEVICES = {names}', read_config(SLICER))
+    cut = {name: name[-20:] for name in (*setup.bodies, *(s.name for s in setup.tool_sensors))}
+    notes = tuple(f'{n} is cut to {c}' for n, c in cut.items() if args.slicer and n != c)
+    scene = re.sub('(?m)^DEVICES = .*', f'DEVICES = {[*cut.values()]}', read_config(SLICER))
     views = {RVIZ: rviz, FOXGLOVE: foxglove_view(setup, topics)}
     written = write_files(args.out, views | ({SLICER: scene} if args.slicer else {}))
-    return Result({'schema': SCHEMA, 'files': list(map(str, written))}, written=written)
+    return Result({'schema': SCHEMA, 'files': list(map(str, written))}, notes, written=written)
 
 
 class Topics(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from anser_ros.chain.frame import ChainFrame, FrameReadings
-from anser_ros.errors import BagError, ParameterError
+from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
 from anser_ros.frames.intake import GOOD, reading_codes
 from anser_ros.physics.pose_track import PoseTrack
@@ -168,21 +168,13 @@ def session_of(bag: Bag) -> Session:
     return Session(bag.path, bag.setup, start, tuple(tools), reference, bag.lost)
 
 
-SessionSource = Session | str | os.PathLike[str]
-
-
-def load_session(path: SessionSource) -> Session:
-    """Read a bag as a session that is plausible; a session is returned as it is.
+def load_session(path: str | os.PathLike[str]) -> Session:
+    """Read a bag as a session that is plausible.
 
     Poses of an optical tracker that stood still while the tool moved are left out; `Session.lost`
     reports this. Raises `BagError` when the bag can't be read; `PlausibilityError` when units,
-    clocks or the order of quaternions contradict what was recorded; `ParameterError` for
-    what is no path.
+    clocks or the order of quaternions contradict what was recorded.
     """
-    if isinstance(path, Session):
-        return path
-    if not isinstance(path, str | os.PathLike):
-        raise ParameterError(f'a session or its path is wanted, got {type(path).__name__}')
     # Nodes that read no bag run where the packages that read bags are not installed.
     from anser_ros.wire.bag import read_bag
 

@@ -250,13 +250,16 @@ class _Import:
             if not np.isfinite(values).all():
                 raise ParameterError(f'{table.path}: {entry.get("stamp")} has values not finite')
             stamps = [start_ns + round(v * unit_ns) for v in values.tolist()]
-        if not stamps:
-            raise ParameterError(f'{table.path}: no rows')
+        if (different := len(set(stamps))) < 2 and len(stamps) != 1:
+            words = f'all {len(stamps)} stamps are alike: are they set?' if stamps else 'no rows'
+            raise ParameterError(f'{table.path}: {words}')
         if fault := stamp_fault(min(stamps), max(stamps)) or '1970' * (min(stamps) <= 0):
             fault = fault if min(stamps) > 0 else 'a stamp is not after 1970; is start_ns missing?'
             raise ParameterError(f'{table.path}: {fault}')
-        if len(set(stamps)) < len(stamps):
-            raise ParameterError(f'{table.path}: the same stamp twice; is the unit of time right?')
+        if different < len(stamps):
+            raise ParameterError(
+                f'{table.path}: the same stamp twice: cut to seconds, other unit?'
+            )
         return stamps
 
     def _add_fluxes(self, given_entry: Any, what: str, setup: Setup) -> None:

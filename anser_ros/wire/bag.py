@@ -37,7 +37,7 @@ from anser_ros.wire import recorded
 from anser_ros.wire.cdr import DEFINITIONS
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
 from anser_ros.wire.setup import parse_setup
-from anser_ros.wire.text_files import read_yaml
+from anser_ros.wire.text_files import path_of, read_yaml
 
 _BROKEN = (
     McapError, ValueError, struct.error, EOFError, IndexError, KeyError, MemoryError,
@@ -334,7 +334,7 @@ def _rename_words(topics: Mapping[str, str]) -> str:
 def read_bag(path: str | os.PathLike[str]) -> recorded.Bag:
     """Read a recorded session; raises `BagError`, also without a setup or without fluxes."""
     salvage, collector = Salvage(), _Collector()
-    for raw in iter_messages(path, salvage):
+    for raw in iter_messages(path_of(path, 'a session'), salvage):
         collector.add(raw)
     if not collector.setups:
         raise BagError(f'{os.fspath(path)}: the bag has no setup; anser import --setup adds one')

@@ -69,7 +69,8 @@ SCHEMA = 'anser_poses/1'
 
 def legal_name(text: str) -> str:
     """Return a name as near to a text as a topic can have: ``EM run-1`` is EM_run_1."""
-    plain = unicodedata.normalize('NFKD', text).encode('ascii', 'ignore').decode()
+    parted = unicodedata.normalize('NFKD', text.replace('ß', 'ss'))
+    plain = parted.encode('ascii', 'ignore').decode()
     return topic_of(re.sub('[^a-zA-Z0-9_/]+', '_', plain).strip('_/') or BODY)
 
 

@@ -15,6 +15,13 @@ import yaml
 from anser_ros.errors import AnserError, ModelFileError, ParameterError, SetupError
 
 
+def path_of(given: str | os.PathLike[str], what: str) -> Path:
+    """Return a path; raises `ParameterError` for anything else."""
+    if isinstance(given, str | os.PathLike):
+        return Path(given)
+    raise ParameterError(f'{what} is wanted as a path, got {type(given).__name__}')
+
+
 def read_text(
     path: str | os.PathLike[str],
     kind: type[AnserError] = ParameterError,

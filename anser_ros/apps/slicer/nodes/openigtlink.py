@@ -323,7 +323,7 @@ class OpenIGTLink(AnserNode):
             if name not in self._pose_subscriptions:
                 self._set_state(name, 'no pose yet')
                 self._pose_subscriptions[name] = self.create_subscription(
-                    PoseStamped, f'{topic_of(name)}/pose', partial(self._on_pose, name), qos.STREAM
+                    PoseStamped, f'{topic_of(name)}/pose', partial(self._on_pose, name), qos.OTHERS
                 )
 
     def _on_pose(self, name: str, message: PoseStamped) -> None:
