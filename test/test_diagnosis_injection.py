@@ -78,6 +78,35 @@ def test_what_drifts_is_named_with_its_size():
         assert record.parameters[effect.size] == pytest.approx(amount, rel=0.05)
 
 
+def changed(factors: np.ndarray, **spread: float) -> dict:
+    """Records of a tool whose emitters are multiplied by factors (F or 1, K), by their labels."""
+    made = world(3, 375, 3)
+    made.tool = replace(made.tool, flux=made.tool.flux * factors[:, None])
+    problem = replace(made.problem(), references=None)
+    problem = replace(problem, spread=replace(problem.spread, **spread))
+    found = diagnose(problem, made.model).findings
+    return {f.term.label if f.term else f.record.name: f.record.parameters for f in found}
+
+
+def test_phases_of_all_emitters_are_named_one_by_one():
+    phases = [0.004, -0.003, 0.006]
+    named = changed(np.exp(1j * np.array([phases])))
+    assert set(named) == {f'coil_phase (coil {k})' for k in range(3)}
+    found = [named[f'coil_phase (coil {k})']['phase_rad'] for k in range(3)]
+    np.testing.assert_allclose(found, phases, atol=3e-4)
+
+
+def test_a_curve_that_does_not_hold_gives_way_to_a_step():
+    step = np.where(np.arange(375)[:, None] > 150, [[1.006, 1.0, 1.0]], 1.0)
+    assert set(changed(step)) == {'coil_fluctuation (coil 0)'}
+
+
+def test_nothing_is_named_that_the_model_may_be_wrong_by():
+    gain = np.full((1, 3), 1.001)
+    assert set(changed(gain)) == {'common_gain'}
+    assert not changed(gain, flux_t=2e-9)
+
+
 @pytest.mark.parametrize('quarter', [0.0, 90.0])
 def test_a_body_and_a_frame_that_stand_elsewhere_are_named_as_such(quarter):
     made, turn = world(1, 375, 3), Rotation.from_rotvec([1.0, quarter, 0.5], degrees=True)

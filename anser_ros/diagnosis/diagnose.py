@@ -23,7 +23,7 @@ from anser_ros.diagnosis.problem import (
     train_blocks,
 )
 from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
-from anser_ros.diagnosis.wiring import wiring_faults
+from anser_ros.diagnosis.wiring import check_size, wiring_faults
 from anser_ros.effects.correction import Fields, changed_illumination
 from anser_ros.effects.effect import Family, Remedy, Term
 from anser_ros.effects.seen import EXCESS_NOISE, known_share, outliers_of
@@ -233,7 +233,9 @@ def diagnose(
 
 def screen(problem: Problem) -> Screened:
     """Name the faults of the wiring, and leave out dead channels and values that stand out."""
-    known = wiring_faults(problem.thinned(WIRING_FRAMES))
+    few = problem.thinned(WIRING_FRAMES)
+    check_size(few)
+    known = wiring_faults(few)
     whole = _without_dead(problem, known)
     return Screened(tuple(known), whole, whole if known else screening.clean_start(whole))
 
@@ -284,6 +286,8 @@ def _settled(
         refused += [(term, check) for check, term in dropped]
         gone = [term for _, term in dropped]
         rest = [t for t in fit.terms if not any(t is term or t.belongs_to(term) for term in gone)]
+        # No curve, no constant: what it went before has a chance, once.
+        rest += [p for t in gone if (p := search.passed.pop(t.label, None)) is not None]
         fit = settled(fitter, refit_spreads(fitter.problem, rest))
     return settled(last, refit_spreads(last.problem, fit.terms), FINE), tuple(refused)
 

@@ -19,6 +19,10 @@ from anser_ros.effects.effect import Effect, Remedy, Site, Term, sigmas
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 
+PHASE_ALONE = 0.3
+"""A gain whose modulus is off by less than this share of its phase is a phase: drivers and cables
+turn currents by milliradians and leave their size. Larger hides a gain beside a phase."""
+
 
 class ComplexGain(Effect[Term]):
     """Theta is the real and imaginary part of (gain - 1) of what the site names."""
@@ -26,6 +30,15 @@ class ComplexGain(Effect[Term]):
     plausible = {'gain': (0.2, 3.0), 'phase_deg': (-60.0, 60.0)}
     remedy = Remedy.FLUX
     typical = 0.3  # gains are within some ten percent of one
+
+    def rivals(self, term: Term, other: Term) -> bool:
+        """Rival phases of emitters where the modulus is hardly another one.
+
+        If all phases are off, what is left of them last is also a phase of the channels.
+        """
+        gain = 1 + complex(*term.theta)
+        phase = abs(np.angle(gain))
+        return other.effect.gregarious and abs(abs(gain) - 1) < PHASE_ALONE * phase
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record modulus and argument of the gain, each with its deviation along its own way."""

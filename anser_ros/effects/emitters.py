@@ -57,7 +57,7 @@ class CoilPhase(Effect[Term]):
     remedy = Remedy.FLUX
     typical = 30.0  # phases of amplifiers and of their references are off by some degrees
     recorded = {'phase_rad': (1, PHASE_UNIT)}
-    inexact = 0.05  # phases of single sensors, which it leaves, are off by some mrad too
+    inexact = 0.1  # phases of single sensors, which it leaves, are off by some mrad too
     gregarious = True  # one wrong reference of the phases turns all of them, each by its own
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:

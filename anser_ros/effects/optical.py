@@ -133,6 +133,10 @@ class OpticalScale(OpticalEffect[Term]):
     def prior(self, term: Term) -> Array:
         return np.concatenate([np.full(term.theta.size - 3, 0.01), np.full(3, 5e-3)])
 
+    def rivals(self, term: Term, other: Term) -> bool:
+        """Rival a frame that stands elsewhere; what it leaves then shows the axis."""
+        return 'axis' in term.site and other.effect.is_frame
+
     def complexity(self, term: Term) -> int:
         """Return that of a registration and its own: a frame that stands elsewhere goes before."""
         return 6 + term.theta.size if 'axis' in term.site else super().complexity(term)
