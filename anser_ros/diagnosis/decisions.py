@@ -13,9 +13,7 @@ Gains are judged in units of the *misfit*, the mean square of the remaining resi
 unexplained residuals a gain must be larger in proportion to be significant.
 
 An effect declares the cost of its parameters (`Effect.complexity`), and the share of its power
-that its model may miss (`Effect.inexact`). Schwarz's penalty as the price of a fluctuation, and
-the spread by noise for `as_good`, named the few cases that were tried the same way and none better
-(`docs/log.md`).
+that its model may miss (`Effect.inexact`).
 
 Unless a number says otherwise, it was chosen by hand on injected effects with seeds below 100
 (`test/injection.py`); cases of later seeds that led to a rule are named in `docs/log.md`.
@@ -58,9 +56,8 @@ pose to pose, so only a glitch stands out so far. Smaller takes jitter for glitc
 glitches in the fit."""
 PLACE_RATIO = 40.0
 """The same for readings and frames of a body that rested at each place for seconds: its neighbours
-in time are centimetres away, and what the field's model misses differs between them. Over the
-middle of a simulated board single readings of an older model had 6 to 18; a contact that fails
-has thousands. Smaller takes a model's errors for loose contacts."""
+in time are centimetres away, and what the field's model misses differs between them, by up to 18
+(a contact that fails has thousands). Smaller takes a model's errors for loose contacts."""
 WHOLE_FRAME_SHARE = 0.5
 """Share of a frame's readings, and of frames that lost any, from which whole frames are out: more
 bad than good, so that what is left of the frame is not to be believed either."""
@@ -89,15 +86,11 @@ LEAST_GAIN_SHARE_BESIDE_METAL = 0.01
 LEAST_OF_EXCESS = 0.4
 """Share of what is left to explain that an explanation with freedom in time (a fluctuation, or
 metal at another place in each block) must explain: less than that is another effect's trace along
-its columns. On unused seeds (`docs/log.md`) twice as much called a low pass a gain, half changed
-no name, and the marginal likelihood alone gave one wrong name less. It was not put in its place,
-as on metal that moves it fits fluctuations that are all refused, for two thirds more time."""
+its columns. Twice as much called a low pass a gain, half changed no name (`docs/log.md`)."""
 LEAST_OF_NOISE = 0.05
 """Share of the noise's power that a fluctuation must explain: a field model's own error is alike
-in neighbouring frames and channels, and any freedom takes some of it. On unused seeds
-(`docs/log.md`) twice as much changed no name, and without it three small effects that are missed
-got their names; but a clean session, with a model from a scan in which all was a little wrong, got
-a loose axis that explains 0.015."""
+in neighbouring frames and channels, and any freedom takes some of it. Without it a clean session
+got a loose axis that explains 0.015 (`docs/log.md`)."""
 REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""
@@ -143,9 +136,8 @@ parameter that it spares. Together they are less than what a further effect with
 must gain (`LEAST_GAIN`, `PER_PARAMETER`), so what is given up would not have been accepted."""
 ALIKE = 0.02
 """Share of a gain by which two explanations may differ that the data do not distinguish: metal of
-an unknown shape leaves about as much. Within it a rival is listed, and metal rests. Half, twice as
-much, and Laplace's evidence of both explanations in its place, changed no name, but the two runs
-that asked were far from it (`docs/log.md`)."""
+an unknown shape leaves about as much. Within it a rival is listed, and metal rests. Half and
+twice as much changed no name (`docs/log.md`)."""
 STEADY = 0.8
 """Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
 tried first: freedom in every frame also takes off what is another effect's."""
@@ -223,10 +215,8 @@ KNOWN_SIGMAS = 3.0
 chance alone does in one session of 700."""
 MOST_EXCESS_OF_OUTLIERS = 0.3
 """Unexplained power over the floor's up to which frames that stand out are outliers: a model that
-is wrong by more makes some itself. Larger names outliers that are another effect's; smaller leaves
-true ones unnamed if there is a small unknown. On unused seeds (`docs/log.md`) half and twice as
-much changed no name. With no bound the outliers of six runs would be named that are not now, and a
-hum would be called outliers, of which there are none."""
+is wrong by more makes some itself. Larger names outliers that are another effect's, and with no
+bound a hum; smaller leaves true ones unnamed if there is a small unknown (`docs/log.md`)."""
 
 # Each of the next four lies above all that normal noise reached in 200 draws of 100 frames with 48
 # readings, the fewest of a watch on two clusters and four coils; more frames or readings reach

@@ -37,8 +37,8 @@ class ComplexGain(Effect[Term]):
         If all phases are off, what is left of them last is also a phase of the channels.
         """
         gain = 1 + complex(*term.theta)
-        phase = abs(np.angle(gain))
-        return other.effect.gregarious and abs(abs(gain) - 1) < PHASE_ALONE * phase
+        phase = abs(float(np.angle(gain)))
+        return bool(other.effect.gregarious) and abs(abs(gain) - 1) < PHASE_ALONE * phase
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record modulus and argument of the gain, each with its deviation along its own way."""
