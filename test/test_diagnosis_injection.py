@@ -107,6 +107,24 @@ def test_nothing_is_named_that_the_model_may_be_wrong_by():
     assert not changed(gain, flux_t=2e-9)
 
 
+def test_a_moved_emitter_is_one_fault_where_its_gradient_is_hardly_known():
+    rng, made = np.random.default_rng(5), world(5, 375, 4)
+    effect, base = all_effects()['coil_moved'], made.model.dipoles
+    term = effect.candidates(made.problem().apparatus)[1].with_theta([-0.003, 0.0, 0.003])
+    moved = effect.sources(term, base, base, None)
+    for one in ('tool', 'reference'):
+        old = getattr(made, one)
+        at = made.true_pose() if one == 'tool' else (old.position, old.rotation)
+        places, axes = (part.reshape(-1, 3) for part in old.sensors.placed(*at))
+        change = moved.flux(places, axes, None).reshape(old.flux.shape)
+        if one == 'reference':
+            change = change * (1 + 0.6 * rng.normal(size=(1, len(old.sensors), 1)))
+        setattr(made, one, replace(old, flux=old.flux + change))
+    [record] = [f.record for f in diagnose(made.problem(), made.model).findings]
+    assert (record.name, record.parameters['coil']) == ('coil_moved', 1)
+    np.testing.assert_allclose(record.parameters['shift_m'], [-0.003, 0, 0.003], atol=1e-4)
+
+
 @pytest.mark.parametrize('quarter', [0.0, 90.0])
 def test_a_body_and_a_frame_that_stand_elsewhere_are_named_as_such(quarter):
     made, turn = world(1, 375, 3), Rotation.from_rotvec([1.0, quarter, 0.5], degrees=True)

@@ -239,6 +239,8 @@ class _FluxSelection(ForwardSelection[Fit]):
                 if _is_surpassed(expected, term, fitted):  # by one that was fitted beside it
                     continue
                 newest = fit.newest
+                if any(newest.belongs_to(term) for term in before.terms):
+                    continue
                 if newest.theta.size and not newest.theta[newest.effect.amounts(newest)].any():
                     continue  # at its bound, where it is nothing
                 gain = scorer.held_out - fit.held_out() - choice.taken_from_others(fit)

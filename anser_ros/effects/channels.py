@@ -279,6 +279,11 @@ class Pickup(Effect[Term]):
         return Term(self, self.site_of(record), parts.T.ravel() / PICKUP_UNIT)
 
 
+ONE_EMITTER = 0.9
+"""Share of a reference's changed power from which it is one emitter's: what moves a reference, or
+disturbs it, shows in others too."""
+
+
 class ReferenceChanged(Pickup):
     """Acts as `Pickup` on a reference sensor, which rests: any lasting change is a constant."""
 
@@ -291,6 +296,12 @@ class ReferenceChanged(Pickup):
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         ours = apparatus.tool_channels
         return self._at([c for c in apparatus.channels if c not in ours], apparatus)
+
+    def belongs(self, term: Term, other: Term) -> bool:
+        """Belong to an emitter that moved, if hardly another one's readings have changed."""
+        power = np.abs(complex_of(term.theta)) ** 2
+        own = power[other.site['coil']] if other.effect.gradient_error else 0.0
+        return bool(own > ONE_EMITTER * power.sum())
 
 
 SATURATION_UNIT = 1e12
