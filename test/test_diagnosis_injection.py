@@ -44,17 +44,6 @@ def test_effects_of_the_table_are_named_and_nothing_else():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ('name', 'called'),
-    [('coil_steps', 'coil_fluctuation'), ('channels_swapped', 'swapped_channels')],
-)
-def test_an_effect_of_no_table_gets_a_name_of_its_own(name, called):
-    result, _ = found(name, 4)
-    assert [f.record.name for f in result.findings] == [called]
-    assert result.flux_rms_after_t < 1.1 * result.flux_rms_floor_t
-
-
-@pytest.mark.long
 @pytest.mark.parametrize('name', ['quantised', 'channel_lag'])
 def test_what_nothing_describes_stays_unexplained(name):
     result, _ = found(name, 5, emitters=4)
@@ -112,13 +101,12 @@ def test_a_moved_emitter_is_one_fault_where_its_gradient_is_hardly_known():
     effect, base = all_effects()['coil_moved'], made.model.dipoles
     term = effect.candidates(made.problem().apparatus)[1].with_theta([-0.003, 0.0, 0.003])
     moved = effect.sources(term, base, base, None)
-    for one in ('tool', 'reference'):
+    wrong = 1 + 0.6 * rng.normal(size=(1, len(made.reference.sensors), 1))
+    for one, factor in (('tool', 1.0), ('reference', wrong)):
         old = getattr(made, one)
         at = made.true_pose() if one == 'tool' else (old.position, old.rotation)
         places, axes = (part.reshape(-1, 3) for part in old.sensors.placed(*at))
-        change = moved.flux(places, axes, None).reshape(old.flux.shape)
-        if one == 'reference':
-            change = change * (1 + 0.6 * rng.normal(size=(1, len(old.sensors), 1)))
+        change = factor * moved.flux(places, axes, None).reshape(old.flux.shape)
         setattr(made, one, replace(old, flux=old.flux + change))
     [record] = [f.record for f in diagnose(made.problem(), made.model).findings]
     assert (record.name, record.parameters['coil']) == ('coil_moved', 1)

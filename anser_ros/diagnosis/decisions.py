@@ -86,7 +86,7 @@ LEAST_GAIN_SHARE_BESIDE_METAL = 0.01
 LEAST_OF_EXCESS = 0.4
 """Share of what is left to explain that an explanation with freedom in time (a fluctuation, or
 metal at another place in each block) must explain: less than that is another effect's trace along
-its columns. Twice as much called a low pass a gain, half changed no name (`docs/log.md`)."""
+its columns. Twice as much called a low pass a gain (`docs/log.md`)."""
 LEAST_OF_NOISE = 0.05
 """Share of the noise's power that a fluctuation must explain: a field model's own error is alike
 in neighbouring frames and channels, and any freedom takes some of it. Without it a clean session
@@ -95,10 +95,10 @@ REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""
 OWN_METAL = 2.0
-"""Gain of metal at rest, over the power that the model states of its own error in all readings,
-below which the metal may be the model's: what was taken off a scan with metal near leaves a field
-that is metal's, by 2.3 of its stated sigmas in `dirty/scan_metal`, the only such scan that was
-tried. Larger hides faint metal (2.0: what moves a tool by 0.03 mm); smaller names what is none."""
+"""Gain of metal at rest, over the power that the model states of its own error in all readings
+(of any other effect 1), below which it may be the model's: what was taken off a scan with metal
+near leaves a field that is metal's, by 2.3 of its stated sigmas in `dirty/scan_metal`, the only
+one tried. Larger hides faint metal (2.0: what moves a tool by 0.03 mm)."""
 COMPLETE = 3.0
 """Misfit up to which parts that were set up anew explain a session, so that they are its rival to
 metal at rest. They have so many parameters that beside another effect they take off much of what
@@ -136,8 +136,7 @@ parameter that it spares. Together they are less than what a further effect with
 must gain (`LEAST_GAIN`, `PER_PARAMETER`), so what is given up would not have been accepted."""
 ALIKE = 0.02
 """Share of a gain by which two explanations may differ that the data do not distinguish: metal of
-an unknown shape leaves about as much. Within it a rival is listed, and metal rests. Half and
-twice as much changed no name (`docs/log.md`)."""
+an unknown shape leaves about as much. Within it a rival is listed, and metal rests."""
 STEADY = 0.8
 """Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
 tried first: freedom in every frame also takes off what is another effect's."""
@@ -170,8 +169,7 @@ moving metal be named without asking whether rest and one more effect would do."
 LIMITS_LEFT, REST_LEFT = 2.0, 0.5
 """What the linear score of an effect beside metal at rest may leave for it to be fitted: so many
 times what the two must come down to, and such a share (0 to 1) of what metal at rest leaves alone.
-Smaller passes over effects whose fit explains more than their score; larger spends fits in
-vain."""
+Smaller passes over effects whose fit explains more than their score."""
 MOST_EFFECTS_AT_REST = 3
 """Effects that are tried together with metal at rest before metal counts as moving. Fewer let
 metal move for what rest and one more effect explain; each further one costs a full fit."""
@@ -191,9 +189,8 @@ LEAST_OF_THE_REST = 0.2
 larger is unknown, and the effect is probably its trace."""
 LEAST_POWER_SIGMAS = 6.0
 """Standard deviations of the noise's power from which a remainder counts. A normal variable passes
-it once in 1e9, the power of normal noise in one cell of 400 frames once in 5e7. Where the median
-cell is taken its spread is a quarter larger, and a normal variable passes once in 1e6. Noise that
-depends on its neighbours passes oftener. One test per effect is made."""
+it once in 1e9, the power of normal noise in one cell of 400 frames once in 5e7. Noise that depends
+on its neighbours passes oftener. One test per effect is made."""
 MODEL_ERROR = 1.3
 """Variance over the noise's up to which a field model may be wrong, whatever it says: of a board
 beyond what was scanned. It is not held against an effect on everything."""
@@ -206,10 +203,9 @@ reads of one emitter): taking the pose out spreads a trace of each change over a
 # --- whether what stays is noise ---------------------------------------------------------------
 LEAST_NOISE_GROWTH = 1.15
 """Factor from which noise counts as grown. A channel's spread over 400 frames of eight emitters is
-known to 1 %, so it is no chance; how much is worth a name was chosen, as the rest, by hand."""
+known to 1 %, so it is no chance."""
 FEWEST_OUTLIERS = 0.004
-"""Share of frames from which outliers are named. Normal noise makes none in a session: a reading
-of 16 values passes its limit once in 5e12, one of 8 values once in 1e7."""
+"""Share of frames from which outliers are named. Normal noise makes none in a session."""
 KNOWN_SIGMAS = 3.0
 """Standard deviations by which a share of frames may exceed the one that the model knows of, which
 chance alone does in one session of 700."""

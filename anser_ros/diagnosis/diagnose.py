@@ -139,15 +139,11 @@ def corrected_model(
         for mode, own in zip(wide, modes, strict=True):
             np.add.at(mode, rows[: model.positions.shape[0]], own)
         modes = wide
+    # References were read in the field without these.
     return replace(
-        model,
-        positions=merged.positions,
-        directions=merged.directions,
-        moments=merged.moments,
-        modes=modes,
-        effects=(*model.effects, *records),
-        references=None,  # they were read in the field without these
-    )
+        model, positions=merged.positions, directions=merged.directions, moments=merged.moments,
+        modes=modes, effects=(*model.effects, *records), references=None,
+    )  # fmt: skip
 
 
 def _merged(dipoles: Dipoles) -> tuple[Dipoles, Integers]:
@@ -324,18 +320,10 @@ def conclude(
     if excess > decisions.DEPENDENT * floor**2:
         depends = tuple(dict.fromkeys([*(depending if grown else ()), *named]))
     return Diagnosis(
-        findings=tuple(findings),
-        flux_rms_before_t=rms(before),
-        flux_rms_after_t=rms(after),
-        flux_rms_floor_t=floor,
+        findings=tuple(findings), flux_rms_before_t=rms(before), flux_rms_after_t=rms(after),
+        flux_rms_floor_t=floor, depends_on=depends,
         unexplained=excess / possible if significant and possible > 0 else 0.0,
-        depends_on=depends,
-        tests_before=tuple(screening.structure_tests(before)),
-        tests_after=tests,
-        model=corrected_model(model, fit.terms, records, cleaned.fields),
-        search=search,
-        refused=confirmed.refused,
-        before=before,
-        after=after,
-        terms=fit.terms,
-    )
+        tests_before=tuple(screening.structure_tests(before)), tests_after=tests,
+        model=corrected_model(model, fit.terms, records, cleaned.fields), search=search,
+        refused=confirmed.refused, before=before, after=after, terms=fit.terms,
+    )  # fmt: skip

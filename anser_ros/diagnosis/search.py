@@ -122,9 +122,8 @@ class _FluxSelection(ForwardSelection[Fit]):
                 return shaped
         term = best.newest
         is_own = _may_be_the_model_s(gain, best)
-        if not is_worthwhile(gain, term.complexity, best):
-            return None
-        if is_own and not (term.effect.family.is_metal and fit.misfit > decisions.COMPLETE):
+        rivalled = term.effect.family.is_metal and fit.misfit > decisions.COMPLETE
+        if not is_worthwhile(gain, term.complexity, best) or (is_own and not rivalled):
             return None
         if term.effect.family.is_metal:
             if gain < decisions.REMNANT * search.metal_gain:

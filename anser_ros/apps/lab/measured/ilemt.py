@@ -39,20 +39,17 @@ CONCENTRIC = ((-0.015, 0.0, 0.010),) * 3
 TONES = (7500.0, 10500.0, 13500.0), (300.0, 330.0, 360.0)  # of the bands, Hz
 MD, LD = PATTERNS = 'so{}_se{}_md', 'so{}_se{}_ld'
 ROTATED, SIMPLE = 'cal_9_16_premo_rotated_dipole', SENSOR[:1]
-TRACKED = {
+SETS = {
     'dipole': (ROTATED, DIPOLE, 0, SENSOR, PATTERNS),
     'concentric': ('cal_7_30_premo_cmu', CONCENTRIC, 0, SENSOR, PATTERNS),
     'low': (ROTATED, DIPOLE, 1, SENSOR, PATTERNS),
     'turned': (ROTATED, DIPOLE, 0, (*SENSOR, *SOURCE), PATTERNS),
-}
-"""Folder, places of the coils and band of each set, its fixtures, files to learn and to track."""
-HAPPENED = {
     'again': ('cal_9_2_premo_rotated_dipole', DIPOLE, 0, SIMPLE, (MD, f'{MD}2')),
     'later': ('cal_08_31_premo_rotated_dipole', DIPOLE, 0, SIMPLE, PATTERNS),
     'crossed': ('cal_9_15_premo_cmu', CONCENTRIC, 0, SOURCE[1:2], (LD, MD)),
     'reversed': ('cal_5_19_premo_cmu', CONCENTRIC, 0, SIMPLE, ('Z_rot_md', 'Z_rot_ld')),
 }
-"""The same of sets in whose last file something happened, or nothing."""
+"""Folder, places of the coils and band of each set, its fixtures, files to learn and to track."""
 ASKED = {
     'again': (), 'later': ('common_gain',), 'reversed': ('sensor_polarity',),
     'crossed': ('coil_phase', 'coil_phase', 'coil_polarity'), 'moved': ('registration',),
@@ -60,8 +57,8 @@ ASKED = {
     'both': ('coil_polarity', 'sensor_polarity'), 'phases': ('coil_phase',) * 3,
     'step': ('coil_fluctuation',),
 }  # fmt: skip
-"""Effects that have to be named, and no others: there, where the dipole's source was moved, and
-where its fine pattern is changed here."""
+"""Effects that have to be named, and no others: in the last files of sets, where the dipole's
+source was moved, and where its fine pattern is changed here."""
 FACTORS = {  # of the readings, by sensor and emitter
     'reversed_md': np.array([[1.0], [1.0], [-1.0]]), 'gain': np.full((1, 1), 1.003),
     'both': np.outer([1.0, 1.0, -1.0], [-1.0, 1.0, 1.0]),
@@ -119,7 +116,7 @@ def _write(bag: Path, file: Path, setup: Setup, band: int, source: str, sensor: 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write a session of each set, pattern and pair of fixtures, and of each fault."""
     bags, setups = [], {}
-    for name, (where, places, band, fixtures, patterns) in (TRACKED | HAPPENED).items():
+    for name, (where, places, band, fixtures, patterns) in SETS.items():
         coils = tuple(
             Coil(axis, recipe.vector(FG @ np.array(place)), 0.0, tone)
             for axis, place, tone in zip('xyz', places, TONES[band], strict=True)
@@ -135,7 +132,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
             file = folder / where / f'{pattern.format(source, sensor)}.npz'
             bag = into / f'{NAME}_{name}_{source}_{sensor}_{pattern.rpartition("_")[2]}.mcap'
             bags.append(_write(bag, file, setups[name], band, source, sensor))
-    for name in (name for name in ASKED if name not in HAPPENED):
+    for name in (name for name in ASKED if name not in SETS):
         where, pattern = ('cal_9_1_premo_rotated_dipole', MD) if name == 'moved' else (ROTATED, LD)
         file = folder / where / f'{pattern.format(HOME, HOME)}.npz'
         bags.append(_write(into / f'{NAME}_{name}.mcap', file, setups['dipole'], 0, HOME, HOME))
@@ -145,7 +142,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
 def tried(bags: list[Path]) -> dict[str, tuple[list[Path], list[Path]]]:
     """Return what is learnt and what is tracked: each set's patterns, and one the other way."""
     found = {}
-    for name in TRACKED | HAPPENED:
+    for name in SETS:
         own = [bag for bag in bags if bag.stem.split('_')[1] == name]
         found[name] = own[: len(own) // 2], own[len(own) // 2 :]
     return {**found, 'dipole-backwards': found['dipole'][::-1]}
@@ -157,7 +154,7 @@ def commands(bags: list[Path], out: Path) -> list[list[str]]:
     for name, (learnt, tracked) in tried(bags).items():
         model = str(out / f'{name}.yaml')
         made.append(['calibrate', *map(str, learnt), '--out', model])
-        verb = 'diagnose' if name in HAPPENED else 'evaluate'
+        verb = 'diagnose' if name in ASKED else 'evaluate'
         made += [[verb, str(b), '--model', model, '--out', str(out / b.stem)] for b in tracked]
     model = str(out / 'dipole.yaml')
     told = [b for b in bags if b.stem.partition('_')[2] in ASKED]
@@ -170,7 +167,7 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
     """Return the errors of the patterns that were tracked, of all frames, beside the makers'."""
     found, nan = [], float('nan')
     for name, (_, tracked) in tried(bags).items():
-        if name in HAPPENED:
+        if name in ASKED:
             continue
         own = [bag for bag in tracked if name != 'turned' or bag.stem.split('_')[2] != HOME]
         each = [recipe.ran(out / bag.stem, 'evaluation.json') for bag in own]
